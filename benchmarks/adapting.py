@@ -31,7 +31,7 @@ from distributed import Client
 from distributed.deploy.spec import ProcessInterface
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from lidarpool.run.pipeline.task_records import TaskRecord, placement_violations, recorded
+from lidarpool.run.pipeline.task_records import TaskRecord, call_recorded, placement_violations
 from poolpart import Partition
 from poolpart.deploy import start_partitions
 
@@ -108,7 +108,7 @@ def read_counts(dask_scheduler: Any = None) -> tuple[Counter[str], Counter[str]]
 
 def run_task(partition: str, number: int) -> tuple[int, TaskRecord]:
     """Run a small task; return its number and the record of its execution."""
-    return recorded("run", partition, int, number)
+    return call_recorded("run", partition, int, number)
 
 
 def waves(partition: Partition, sizes: Sequence[int], seed: int) -> list[tuple[int, TaskRecord]]:

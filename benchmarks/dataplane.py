@@ -36,7 +36,7 @@ from lidarpool.columns.parts import pack
 from lidarpool.report.output import CLOUD, SurveyOutput, run_survey
 from lidarpool.run.cluster.checks import slots_needed
 from lidarpool.run.cluster.cluster import local_client
-from lidarpool.run.job_source import OneJob
+from lidarpool.run.job_source import SingleJob
 from lidarpool.run.options import RunOptions
 from lidarpool.run.pipeline import rigs
 from lidarpool.run.pipeline.stage_messages import Receipt
@@ -226,7 +226,7 @@ class Cluster:
             folder=folder / RUN_FOLDER,
             collectors=self._sizes.collectors,
         )
-        jobs = OneJob(Job(HALL, survey, None))
+        jobs = SingleJob(Job(HALL, survey, None))
         screen = Screen(lambda _: None)
         page = CountingPage()
         result, _ = run_survey(jobs, options, output, screen, page)

@@ -20,7 +20,7 @@ from random import Random
 from typing import Any
 
 from benchmarks.scale import GPUS_EACH
-from lidarpool.run.pipeline.policies import batches_per_task, max_under_way
+from lidarpool.run.pipeline.policies import batches_per_task, max_weight_in_flight
 
 GPUS = (10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 HEARTBEATS = 0.07  # share of the scheduler's core; Dask has 200 a second at most
@@ -63,7 +63,7 @@ def batches_a_second(
     Their processes share `cores`; None: each has its own.
     """
     clusters = _Clusters(gpus, seconds, costs, cores, shards)
-    tasks_under_way = shards * max_under_way(gpus, collectors_of(gpus))
+    tasks_under_way = shards * max_weight_in_flight(gpus, collectors_of(gpus))
     number = count()
     finished_tasks = 0
     start = 0.0

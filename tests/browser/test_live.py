@@ -12,7 +12,7 @@ from lidarpool import Job, Scene, Survey
 from lidarpool.pages.live_page import live_page
 from lidarpool.run.cluster.cluster import ClusterConnection
 from lidarpool.run.cluster.connection import local_client
-from lidarpool.run.job_source import OneJob
+from lidarpool.run.job_source import SingleJob
 from lidarpool.run.listener import Listener
 from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Screen
@@ -36,7 +36,7 @@ def live(monkeypatch):
     """Return a page, and the job that it follows, a survey of many small batches."""
     monkeypatch.setattr("lidarpool.run.pipeline.policies.scans_per_batch", lambda *_: 10)
     survey = Survey(poses=[(0, 0, 1 + step / 20) for step in range(SCANS // 36)])
-    job = OneJob(Job(Scene.seed(), survey))
+    job = SingleJob(Job(Scene.seed(), survey))
     with live_page(title="yard", port=0, browser=False) as live:
         yield live, job
 

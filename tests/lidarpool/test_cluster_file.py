@@ -119,7 +119,7 @@ def test_a_cluster_that_does_not_start(tmp_path):
         pytest.raises(
             LidarError, match=r"c.yaml: distributed.SSHCluster could not be started \(.*"
         ),
-        file.started(print),
+        file.start(print),
     ):
         pass
 

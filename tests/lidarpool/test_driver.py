@@ -22,7 +22,7 @@ from lidarpool.run.pipeline.committed_results import CommittedResults
 from lidarpool.run.pipeline.dispatch import PIECES
 from lidarpool.run.pipeline.failures import JobError
 from lidarpool.run.pipeline.pipeline import ANNOUNCED, STALL_S, Pipeline
-from lidarpool.run.pipeline.policies import LATE_S, MAX_SPAN, TASK_SECONDS, max_under_way
+from lidarpool.run.pipeline.policies import LATE_S, MAX_SPAN, TASK_SECONDS, max_weight_in_flight
 from lidarpool.run.pipeline.stage_messages import (
     ColumnsLost,
     Failed,
@@ -559,7 +559,7 @@ def test_a_suspect_that_is_innocent_is_not_divided(run):
 
 
 def test_batches_under_way_are_bounded_whoever_is_slow(run):
-    most = max_under_way(2, 2)
+    most = max_weight_in_flight(2, 2)
     run.stages.advice = 1
     for _ in range(5 * most):
         run.step()
@@ -809,7 +809,7 @@ def test_stage_1_always_has_jobs_before_it_and_few_of_them(empty):
     begin()
     assert begun >= ANNOUNCED
     empty.until(begin)
-    assert 32 <= most <= 2 * max_under_way(2, 2, 32)
+    assert 32 <= most <= 2 * max_weight_in_flight(2, 2, 32)
 
 
 def test_slots_are_wanted_as_long_as_there_is_work(run):

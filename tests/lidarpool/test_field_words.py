@@ -7,7 +7,7 @@ import pytest
 
 from lidarpool import Planning
 from lidarpool.identity.field_words import describe_changes, describe_fields
-from lidarpool.run.job_source import fields_of
+from lidarpool.run.job_source import describe_inputs
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.words import rounded
@@ -18,7 +18,7 @@ POSES = [[x, 0, 1] for x in range(30)]
 def words(**sections):
     """Return the fields of the survey of a scenario."""
     built = prepare(Scenario.from_data({"scene": "seed", "poses": [[0, 0, 1]]} | sections))
-    return fields_of(built.scene, built.survey, built.job.planning)
+    return describe_inputs(built.scene, built.survey, built.job.planning)
 
 
 @pytest.mark.extended(every=3)

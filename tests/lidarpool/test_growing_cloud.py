@@ -16,7 +16,7 @@ from lidarpool import Job, LidarError, Scene, Sensor, Survey, read_cloud, save_c
 from lidarpool.clouds import ply
 from lidarpool.report import growing_cloud
 from lidarpool.report.growing_cloud import GrowingCloud, write_cloud
-from lidarpool.run.job_source import OneJob
+from lidarpool.run.job_source import SingleJob
 from lidarpool.run.store.run_store import RunStore
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.sweeps.sweeps import Sweeps
@@ -32,7 +32,7 @@ FEW = {0: [40, 50], **{scan: [scan % 2] for scan in range(2, 12)}}
 @pytest.fixture
 def store(tmp_path):
     """Store of an empty run."""
-    return RunStore(OneJob(Job(SCENE, SURVEY)), location=tmp_path / "run")
+    return RunStore(SingleJob(Job(SCENE, SURVEY)), location=tmp_path / "run")
 
 
 def add(store, growing, first, counts, offset=0):

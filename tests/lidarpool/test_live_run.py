@@ -26,7 +26,7 @@ from lidarpool.pages.live_page import LivePage, live_page
 from lidarpool.pages.run_status import busy_slots
 from lidarpool.report.campaign_output import run_campaign
 from lidarpool.run import listener
-from lidarpool.run.job_source import OneJob
+from lidarpool.run.job_source import SingleJob
 from lidarpool.run.listener import Listener
 from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Progress, Screen
@@ -41,10 +41,10 @@ SCENE = Scene.from_meshes([box("Wall", (5, -9, 0), (6, 9, 4))])  # beside the se
 WETNESS = Column("wetness", "float32", "%", "how wet it is", source="intensity")
 
 
-def make_job(scans: int) -> OneJob:
+def make_job(scans: int) -> SingleJob:
     """Make a survey from two poses, 1 m and 5 m up, in cells of half a meter."""
     poses = [(0, 0, 1), (0, 0, 5)]
-    return OneJob(Job(SCENE, Survey(Sensor.grid(), poses, steps=scans // 2, precision_m=0.5)))
+    return SingleJob(Job(SCENE, Survey(Sensor.grid(), poses, steps=scans // 2, precision_m=0.5)))
 
 
 @contextmanager
@@ -87,12 +87,12 @@ def test_frames_and_their_parts_are_shown_in_order_at_the_pace(monkeypatch):
     )
     passed = Listener(page, pace=0.1)
     parts = [SimpleNamespace(name=name, first=first) for name, first in (("b", 2), ("a", 0))]
-    passed.parts(parts)
+    passed.on_parts(parts)
     assert shown == []
     for scan, time_s in enumerate((0.0, 0.1, 0.2, 0.3, 0.0)):  # the last of a second sensor
         if scan == 3:
             clock.now += 5
-        passed.frame(SimpleNamespace(scan=scan, time_ns=time_s * 1e9))
+        passed.on_frame(SimpleNamespace(scan=scan, time_ns=time_s * 1e9))
     assert shown == [(7, "a"), (7, 0), (8, 1), (9, "b"), (9, 2), (14, 3), (14, 4)]
 
 
@@ -141,7 +141,7 @@ def test_a_resumed_run_shows_what_the_earlier_one_has_left(tmp_path):
 def test_a_run_is_watched_from_its_first_part_to_its_path():
     planning = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=2, iterations=20)
     survey = Survey(poses=[(0, 0, 1), (0, 0, 3)], columns=["intensity", WETNESS])
-    job = OneJob(Job(SCENE, survey, planning))
+    job = SingleJob(Job(SCENE, survey, planning))
     seen = []
     busy = set()
     scans = []

@@ -6,7 +6,7 @@ import pytest
 from distributed import Client
 from tests.clusters import cluster_of
 
-from lidarpool.run.pipeline.task_records import placement_violations, recorded
+from lidarpool.run.pipeline.task_records import call_recorded, placement_violations
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def twice(x, *, plus=0):
 def test_tasks_report_time_and_place_and_those_that_escape_are_found_out(client):
     before = time.time()
     futures = [
-        client.submit(recorded, "s", "A", twice, i, plus=1, pure=False, workers=[name])
+        client.submit(call_recorded, "s", "A", twice, i, plus=1, pure=False, workers=[name])
         for i, name in enumerate(["A-0", "B-0", "plain"])
     ]
     results, records = zip(*(future.result() for future in futures), strict=True)

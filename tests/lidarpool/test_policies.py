@@ -15,10 +15,10 @@ from lidarpool.run.pipeline.policies import (
     TASKS_PER_COLLECTOR,
     TASKS_PER_SLOT,
     batches_per_task,
-    handovers,
+    choose_handovers,
+    choose_offers,
+    find_loss,
     late_after_s,
-    loss,
-    offers,
     scans_per_batch,
     slots_wanted,
 )
@@ -101,7 +101,7 @@ def test_slots_are_wanted_for_what_is_left():
 
 def test_the_worker_with_the_least_work_for_its_slots_gets_the_next_batch():
     slots = {A: 1, B: 3}
-    chosen = offers([casting(0, A), casting(1, B), *waiting(9)], slots, max_weight=99)
+    chosen = choose_offers([casting(0, A), casting(1, B), *waiting(9)], slots, max_weight=99)
     assert numbers(chosen)[:3] == [(10, B), (11, B), (12, A)]
     assert Counter(where for _, where in chosen) == {
         A: TASKS_PER_SLOT - 1,
@@ -110,7 +110,7 @@ def test_the_worker_with_the_least_work_for_its_slots_gets_the_next_batch():
 
 
 def sizes(there, per_task=4):
-    return [len(task) for task, _ in offers(there, {A: 1, B: 1}, 99, per_task)]
+    return [len(task) for task, _ in choose_offers(there, {A: 1, B: 1}, 99, per_task)]
 
 
 def test_small_batches_share_tasks_and_wait_for_others_where_nobody_waits_for_them():
@@ -126,32 +126,32 @@ def test_small_batches_share_tasks_and_wait_for_others_where_nobody_waits_for_th
 
 def test_the_only_worker_is_left_to_a_suspect():
     suspect = batch(0, suspect=INTERSECT)
-    assert offers([suspect, *[casting(n, A) for n in (1, 2)]], {A: 1}, 20) == []
-    assert numbers(offers([suspect, *waiting(9)], {A: 1}, 20)) == [(0, A)]
+    assert choose_offers([suspect, *[casting(n, A) for n in (1, 2)]], {A: 1}, 20) == []
+    assert numbers(choose_offers([suspect, *waiting(9)], {A: 1}, 20)) == [(0, A)]
 
 
 def test_a_collector_on_the_host_of_the_columns_is_preferred():
     there = [batch(n, BatchState.CAST, worker) for n, worker in enumerate((A, B, A, A, A, A, A))]
-    chosen = handovers(there, {"collect-0": "tcp://b:7", "collect-1": "tcp://a:7"})
+    chosen = choose_handovers(there, {"collect-0": "tcp://b:7", "collect-1": "tcp://a:7"})
     assert dict(numbers(chosen)) == {
         0: "collect-1", 1: "collect-0", 2: "collect-1", 3: "collect-1", 4: "collect-0",
         5: "collect-0",
     }  # fmt: skip
     assert len(chosen) == 2 * TASKS_PER_COLLECTOR
-    assert handovers(there, {}) == []
+    assert choose_handovers(there, {}) == []
 
 
 def test_a_suspect_is_collected_alone():
     collectors = {"collect-0": A, "collect-1": B}
     suspect = batch(5, BatchState.CAST, A, suspect="collect")
     other = batch(6, BatchState.CAST, A)
-    assert numbers(handovers([other, suspect], collectors)) == [(5, "collect-0")]
+    assert numbers(choose_handovers([other, suspect], collectors)) == [(5, "collect-0")]
     busy = batch(7, BatchState.COLLECTING, A, "collect-1")
-    assert handovers([suspect, other, busy], collectors) == []
+    assert choose_handovers([suspect, other, busy], collectors) == []
     busy = batch(7, BatchState.COLLECTING, A, "collect-1", suspect="collect")
-    assert handovers([other, busy], collectors) == []
+    assert choose_handovers([other, busy], collectors) == []
     assert numbers(
-        handovers([other, batch(8, BatchState.CAST, A, suspect="intersect")], collectors)
+        choose_handovers([other, batch(8, BatchState.CAST, A, suspect="intersect")], collectors)
     )
 
 
@@ -163,8 +163,8 @@ HERE = PartitionSnapshot(frozenset({A, B}), frozenset(), {A: 1, B: 1})
 def test_a_silent_worker_is_left_if_there_is_another():
     seen = PartitionSnapshot(frozenset({A, B}), frozenset({A}), {B: 1})
     for place in (BatchState.CASTING, BatchState.CAST):
-        assert loss(batch(0, place, A), seen, 1, 0.0, LATE_S) is Outcome.GONE
-        assert loss(batch(0, place, A), seen, 0, 0.0, LATE_S) is None
+        assert find_loss(batch(0, place, A), seen, 1, 0.0, LATE_S) is Outcome.GONE
+        assert find_loss(batch(0, place, A), seen, 0, 0.0, LATE_S) is None
 
 
 @pytest.mark.parametrize(
@@ -179,7 +179,7 @@ def test_a_silent_worker_is_left_if_there_is_another():
 )
 def test_a_worker_that_takes_no_tasks_ends_what_it_has_begun(task, reason):
     seen = PartitionSnapshot(HERE.members, frozenset(), {B: 1}, tasks={"0": task} if task else {})
-    assert loss(casting(0, A), seen, 1, 0.0, LATE_S) is reason
+    assert find_loss(casting(0, A), seen, 1, 0.0, LATE_S) is reason
 
 
 def record(number: int, resources: tuple[str, ...] = ("GPU",), every: float = 1.0) -> TaskRecord:

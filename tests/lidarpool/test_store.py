@@ -20,7 +20,7 @@ from lidarpool import Campaign, Job, LidarError, Planning, Scene, Sensor, Survey
 from lidarpool.columns.parts import mark_name, part_name, probe_name
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.plan import run_trial
-from lidarpool.run.job_source import OneJob
+from lidarpool.run.job_source import SingleJob
 from lidarpool.run.store.run_store import RunStore
 from lidarsim.io.storage import Storage
 from lidarsim.scene.shapes import seed_objects
@@ -38,7 +38,7 @@ def add(store, first, stop, job=None):
 
 def opened(place=None, parts=None, *, job=JOB, backend="auto", resume=False):
     """Store of a survey."""
-    return RunStore(OneJob(job), backend, place, parts, resume=resume)
+    return RunStore(SingleJob(job), backend, place, parts, resume=resume)
 
 
 def names(folder):
@@ -74,13 +74,13 @@ def unfinished(folder):
 
 def test_a_run_from_its_beginning_to_its_end(folder):
     store = opened(folder)
-    assert (store.committed_in_words, store.only_job.complete, store.only_job.resumed) == (
+    assert (store.committed_text, store.only_job.complete, store.only_job.resumed) == (
         "",
         False,
         0,
     )
     add(store, 2, 6)
-    assert store.committed_in_words == "4 of 6 scans" and store.only_job.progress().points == 12
+    assert store.committed_text == "4 of 6 scans" and store.only_job.progress().points == 12
     add(store, 0, 2)
     store.only_job.committed.advance_frames(6)
     assert store.only_job.complete
@@ -88,7 +88,7 @@ def test_a_run_from_its_beginning_to_its_end(folder):
     assert cloud.scan.tolist() == np.repeat(np.arange(6), 3).tolist()
     assert len(store.only_job.points()) == 18 == store.only_job.parts.point_count
     for scan in range(6):
-        points = store.only_job.points_of_scan(scan)
+        points = store.only_job.read_scan(scan)
         assert set(points.scan) == {scan} and "time" in points.columns
         assert np.array_equal(points.positions, cloud.positions[3 * scan : 3 * scan + 3])
     hits = store.only_job.hit_counts()
@@ -179,7 +179,7 @@ def test_trials_are_gone_on_with_too(folder):
     job = replace(JOB, planning=PLANNING)
     store = opened(folder, job=job)
     store.db.add_trials(store.only_job.committed, [run_trial(PLANNING, 1)])
-    assert store.committed_in_words == "1 of 2 planning trials"
+    assert store.committed_text == "1 of 2 planning trials"
     store.db.close()
     again = opened(folder, resume=True, job=job)
     assert [trial.trial for trial in again.only_job.trials] == [1] and not again.only_job.complete
@@ -469,14 +469,14 @@ def test_a_lost_database_is_made_again_though_drivers_end_meanwhile(folder):
     (folder / "run.db").unlink()
     for end in ("killed", "interrupted", "alive"):
         store, job = campaign(folder, resume=True)
-        assert store.begun and not store.committed_in_words  # nothing is taken over yet
+        assert store.begun and not store.committed_text  # nothing is taken over yet
         if end != "alive":
             store.close() if end == "interrupted" else store.db.close()
     store.open_job(job)
     add(store, 0, 2, job)
     store.close()
     store, _ = campaign(folder, resume=True)
-    assert store.committed_in_words == "0 of 2 jobs"
+    assert store.committed_text == "0 of 2 jobs"
     store.db.close()
     remove_run(folder)
     campaign(folder)[0].db.close()

@@ -12,7 +12,7 @@ from rich.console import Console
 
 import lidarpool.cli.commands
 from lidarpool.cli.terminal import PlainLines, Terminal, WrittenLines
-from lidarpool.run.progress import Progress, bars, bars_here
+from lidarpool.run.progress import Progress, bars, local_progress_bars
 
 
 def progress(seconds: float, scans: int, trials: int = 0) -> Progress:
@@ -138,6 +138,6 @@ def test_a_script_has_bars_at_a_terminal_and_nothing_elsewhere(terminal, monkeyp
     stream.isatty = lambda: terminal
     monkeypatch.setattr(sys, "stderr", stream)
     monkeypatch.setenv("TERM", "xterm")
-    with bars_here() as show:
+    with local_progress_bars() as show:
         show(progress(1.0, 50))
     assert ("2 intersect" in stream.getvalue()) == terminal

@@ -32,7 +32,7 @@ def look(monkeypatch):
         there = PartitionSnapshot(queued_jobs=look.coming)
         monkeypatch.setattr(watch, "take_snapshot", lambda client, name: there)
         clock.now = seconds
-        watching.look()
+        watching.check()
 
     look.watching = watching
     look.told = told

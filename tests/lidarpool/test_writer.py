@@ -22,7 +22,7 @@ def jobs(tmp_path, monkeypatch):
     clock = SimpleNamespace(now=0.0)
     monkeypatch.setattr(writer, "time", SimpleNamespace(monotonic=lambda: clock.now))
     tasks = SimpleNamespace(
-        running={}, take_done=list, take_failed=list, cancel=list,
+        running={}, pop_finished=list, pop_failed=list, cancel=list,
         submit=lambda jobs, *_, **__: written.append(len(jobs)),
     )  # fmt: skip
     db = SimpleNamespace(meta={"mark": "0" * 16})

@@ -21,7 +21,7 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.run.job_source import identity_of
+from lidarpool.run.job_source import input_fingerprints
 from lidarsim import Actor, Returns, box
 from lidarsim.numerics.vectors import rotate_into_frames
 from lidarsim.simulator.rig import Rig
@@ -252,6 +252,6 @@ def test_an_actor_must_be_there_as_long_as_the_survey_lasts(street):
     with pytest.raises(LidarError, match=uncovered):
         Job(scene, Survey(poses=[(0, 0, 1)] * 7))
     assert (
-        identity_of(Job(scene, Survey(poses=[(0, 0, 1)])))["scene"]
-        != (identity_of(Job(street, Survey(poses=[(0, 0, 1)])))["scene"])
+        input_fingerprints(Job(scene, Survey(poses=[(0, 0, 1)])))["scene"]
+        != (input_fingerprints(Job(street, Survey(poses=[(0, 0, 1)])))["scene"])
     )

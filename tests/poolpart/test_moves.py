@@ -18,7 +18,7 @@ from tests.poolpart.helpers import (
     worker_name,
 )
 
-from lidarpool.run.pipeline.task_records import recorded
+from lidarpool.run.pipeline.task_records import call_recorded
 from poolpart import Partition, Pool, PoolError, n_workers, per_host, rest, steward
 from poolpart.workers import worker_identities
 
@@ -325,8 +325,8 @@ def test_a_worker_that_is_killed_while_it_moves(nannies, wait_until, monkeypatch
     parts = Pool.from_client(nannies).divide({"A": per_host(1), "B": rest()})
     target = members(parts["A"])[0]
     moving = members(parts["B"])[0]
-    tasks = [parts["B"].submit(recorded, "s", "B", brief) for _ in range(20)]
-    tasks += [parts["A"].submit(recorded, "s", "A", brief) for _ in range(20)]
+    tasks = [parts["B"].submit(call_recorded, "s", "B", brief) for _ in range(20)]
+    tasks += [parts["A"].submit(call_recorded, "s", "A", brief) for _ in range(20)]
     pids = nannies.run(os.getpid)
     killed = []
     declare = steward.call_worker

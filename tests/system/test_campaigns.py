@@ -668,7 +668,7 @@ def test_a_campaign_whose_only_job_was_harmed_goes_on(client, here, unwritten, m
         path.unlink()
     for _ in range(2):  # what is to be done again is forgotten first, and nothing else is there
         with monkeypatch.context() as patched, pytest.raises(LidarError, match="no cluster"):
-            patched.setattr(lidarpool.run.cluster.cluster, "client_of", refuse)
+            patched.setattr(lidarpool.run.cluster.cluster, "open_client", refuse)
             unwritten.run(here / "ds", client=client, resume=True)
     assert unwritten.run(here / "ds", client=client, resume=True).done == 3
     (here / "ds" / "run").mkdir()  # a run that was killed as it removed itself

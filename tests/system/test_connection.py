@@ -15,8 +15,8 @@ from tests.commands import RunningCommand
 
 from lidarpool import LidarError
 from lidarpool.run.cluster import watch
-from lidarpool.run.cluster.connection import connected, local_client
-from lidarpool.run.cluster.watch import Waiting
+from lidarpool.run.cluster.connection import connect_client, local_client
+from lidarpool.run.cluster.watch import WaitTimer
 
 
 @pytest.mark.extended
@@ -82,7 +82,7 @@ def test_a_scheduler_that_never_starts_is_named_with_the_time(address, monkeypat
     told: list[str] = []
     with (
         pytest.raises(LidarError, match=rf"responded at '{address}' within 1.5 s \("),
-        connected(address, waiting=Waiting(1.5, told.append)),
+        connect_client(address, waiting=WaitTimer(1.5, told.append)),
     ):
         pytest.fail("it is connected")
     assert told[0].startswith(f"waiting for the scheduler at {address} for up to ")

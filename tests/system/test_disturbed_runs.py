@@ -11,7 +11,7 @@ from lidarpool import LidarError, Planning, ScanFrame, Scene, Sensor, Survey, si
 from lidarpool.run.cluster.watch import WATCH_EVERY_S
 from lidarpool.run.pipeline.pipeline import Pipeline
 from lidarpool.run.pipeline.task_records import placement_violations
-from lidarpool.run.planning_trials import TrialPump
+from lidarpool.run.planning_trials import TrialRunner
 from poolpart.workers import worker_identities
 
 # Enough batches that the run is still under way when something happens to it.
@@ -132,7 +132,7 @@ def test_an_error_in_the_callback_passes_through_and_stops_the_run(
 
 
 @pytest.mark.slow(keep=("Pipeline",))
-@pytest.mark.parametrize("pump", [Pipeline, TrialPump])
+@pytest.mark.parametrize("pump", [Pipeline, TrialRunner])
 def test_an_interrupt_while_starting_leaves_nothing(cluster_client, monkeypatch, pump, left_over):
     method = "open" if pump is Pipeline else "step"
     original = getattr(pump, method)

@@ -11,8 +11,8 @@ from tests.clusters import thread_cluster
 
 from lidarpool import LidarError
 from lidarpool.connection.tls_files import TlsFiles
-from lidarpool.run.cluster.connection import connected, local_cluster
-from lidarpool.run.cluster.watch import Waiting
+from lidarpool.run.cluster.connection import connect_client, local_cluster
+from lidarpool.run.cluster.watch import WaitTimer
 from poolpart import Pool
 
 
@@ -37,8 +37,8 @@ def encrypted(tmp_path_factory) -> Iterator[tuple[str, TlsFiles]]:
 
 def told(address: str, files: TlsFiles | None = None) -> str:
     # Waiting would mend none of it, and is not done.
-    waiting = Waiting(3600)
-    with pytest.raises(LidarError) as refused, connected(address, files, waiting):
+    waiting = WaitTimer(3600)
+    with pytest.raises(LidarError) as refused, connect_client(address, files, waiting):
         pytest.fail("it let us in")
     assert "\n" not in str(refused.value)
     return str(refused.value)
@@ -49,14 +49,14 @@ def test_the_right_certificate_is_let_in(encrypted, tmp_path):
     both = tmp_path / "both.pem"
     both.write_bytes(files.cert.read_bytes() + files.key.read_bytes())
     for given in (files, TlsFiles(files.ca, both)):
-        with connected(address, given) as client:
+        with connect_client(address, given) as client:
             assert client.scheduler_info()["address"] == address
     configured = {
         "distributed.comm.tls.ca-file": str(files.ca),
         "distributed.comm.tls.client.cert": str(files.cert),
         "distributed.comm.tls.client.key": str(files.key),
     }
-    with dask.config.set(configured), connected(address) as client:
+    with dask.config.set(configured), connect_client(address) as client:
         assert client.scheduler_info()["address"] == address
 
 

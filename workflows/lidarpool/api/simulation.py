@@ -20,8 +20,8 @@ from ..identity.shard import Shard
 from ..pages import page_of
 from ..plan import Planning
 from ..report.campaign_output import run_campaign
-from ..run.job_source import OneJob
-from ..run.options import RunKeywords, RunOptions, options_of_call
+from ..run.job_source import SingleJob
+from ..run.options import RunKeywords, RunOptions, check_keywords
 from ..run.pipeline.stage_messages import ScanFrame
 from ..run.progress import Progress, Screen
 from ..run.run_result import CampaignRun, RunResult
@@ -142,9 +142,9 @@ def simulate(
     >>> print(len(result.cloud), "points")                            # doctest: +SKIP
     1613 points
     """
-    chosen = options_of_call("simulate", options, without=_NOT_OF_SURVEYS)
+    chosen = check_keywords("simulate", options, without=_NOT_OF_SURVEYS)
     run_options = RunOptions(**chosen)
-    jobs = OneJob(Job(scene, survey, planning))
+    jobs = SingleJob(Job(scene, survey, planning))
     if run_options.starts_workers:  # before the folder is changed
         check_backend_here(run_options.backend)
     with page_of(jobs, run_options.live) as page:
@@ -221,7 +221,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             of a different campaign or version. The message states the cause and the remedy.
         """
         target = output_destination(out)
-        chosen = options_of_call("run", options, without=_NOT_OF_CAMPAIGNS)
+        chosen = check_keywords("run", options, without=_NOT_OF_CAMPAIGNS)
         folder = Storage.at(target).below(RUN_FOLDER)
         run_options = RunOptions(folder=folder, **chosen).with_pool(self.pool, chosen)
         jobs = self.of_shard(Shard(*shard))
@@ -270,7 +270,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             is lost.
         """
         check_number("ahead", ahead, whole=True, ge=1)
-        chosen = options_of_call("stream", options, without=_NOT_OF_STREAMS)
+        chosen = check_keywords("stream", options, without=_NOT_OF_STREAMS)
         if split is not None and split not in self.splits:
             hint = (
                 did_you_mean(split, self.splits)

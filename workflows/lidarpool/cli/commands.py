@@ -367,7 +367,7 @@ def run(
         )
     else:
         scenario = Scenario.load(paths[0], of_mesh)
-        settings["made_of"] = {"path": str(paths[0].absolute()), "options": of_mesh}
+        settings["scenario_source"] = {"path": str(paths[0].absolute()), "options": of_mesh}
         run_scenario(scenario, out, terminal, options, backend, extent=extent, **settings)
 
 
@@ -418,13 +418,13 @@ def doctor(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
     """  # noqa: D301 - Click requires the character \b
     from poolpart import Pool
 
-    from ..run.cluster.connection import connected
+    from ..run.cluster.connection import connect_client
     from .doctor import advice_line, check_environment, find_cluster_fault, result_lines
 
     found: Iterable[WorkerInfo] = ()
     fault = ""
     if scheduler is not None:
-        with connected(scheduler, files) as client:
+        with connect_client(scheduler, files) as client:
             pool = Pool.from_client(client)
             found = pool.workers
             fault = find_cluster_fault(pool)

@@ -19,7 +19,7 @@ from lidarsim.words import listed, plural, rounded, scans_in_words
 from ..identity.job_errors import summarize_errors
 from ..report.output import SurveyOutput
 from ..run.forecast import forecast
-from ..run.job_source import OneJob
+from ..run.job_source import SingleJob
 from ..run.options import RunOptions
 from ..run.pipeline.stage_names import GPU
 from ..scenario.advice import advice, unlabeled
@@ -100,7 +100,7 @@ def forecast_scenario(
                 out,
                 options.with_pool(scenario.pool, {"backend": backend}),
                 client,
-                refuse=None if has_jobs else lambda: output.check_existing(OneJob(job)),
+                refuse=None if has_jobs else lambda: output.check_existing(SingleJob(job)),
             )
         figures["notes"] += advice(prepared)
         figures["warnings"] += implausibilities(prepared)

@@ -34,7 +34,7 @@ from ..report.campaign_output import (
 from ..report.campaign_output import run_campaign as cast_campaign
 from ..report.output import CLOUD, SurveyOutput, run_survey
 from ..report.report import summarize_report
-from ..run.job_source import OneJob
+from ..run.job_source import SingleJob
 from ..run.options import RunOptions
 from ..run.run_result import RunResult
 from ..run.runner import cast_to_store
@@ -58,12 +58,12 @@ def run_scenario(
     *,
     extent: str | None = None,
     shard: Shard | None = None,
-    made_of: Mapping[str, Any] = MappingProxyType({}),
+    scenario_source: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Run a scenario, write the result and print a summary.
 
     If a `shard` is selected, only its scans are run. The run store is kept for a later merge, and
-    `made_of` is saved in it.
+    `scenario_source` is saved in it.
 
     Raises
     ------
@@ -83,10 +83,16 @@ def run_scenario(
     if shard is None:
         _run_survey(prepared, out, options, terminal, extent)
         return
-    jobs = OneJob(prepared.job, shard, title=scenario.title)
-    made_of = {**made_of, "extent": extent or "page", "scans": prepared.survey.scan_count}
+    jobs = SingleJob(prepared.job, shard, title=scenario.title)
+    scenario_source = {
+        **scenario_source,
+        "extent": extent or "page",
+        "scans": prepared.survey.scan_count,
+    }
     with result_folder(out), page_of(jobs, options.live) as page:
-        result = cast_to_store(jobs, options, terminal, page, made_of=made_of, target=out)
+        result = cast_to_store(
+            jobs, options, terminal, page, scenario_source=scenario_source, target=out
+        )
     points = len(result.points)
     line = (
         f"{describe_shard(str(shard))} in {out}: {plural(points, 'point')}. To combine the shards, "
@@ -111,7 +117,7 @@ def _run_survey(
     job = prepared.job
     for note in advice(prepared):
         terminal.tell(note)
-    jobs = OneJob(job, title=prepared.scenario.title)
+    jobs = SingleJob(job, title=prepared.scenario.title)
     output = SurveyOutput(out, job.survey, job.outputs, extent or "page", prepared.scenario)
     with page_of(jobs, options.live) as page:
         result, report = run_survey(jobs, options, output, terminal, page, compare)

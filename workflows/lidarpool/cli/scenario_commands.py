@@ -221,14 +221,14 @@ def check(
       lidarpool check part.stl --unit mm --sensor ouster/os1-64 --pose 0,0,1.9
     """  # noqa: D301 - Click requires the character \b
     print_first_step("reading the scene", quiet=as_json)
-    from ..run.cluster.connection import connected
+    from ..run.cluster.connection import connect_client
     from ..run.cluster_file import ClusterFile
     from ..run.options import RunOptions
     from .forecast_text import forecast_scenario
 
     try:
         file = None if cluster is None else ClusterFile.load(cluster)
-        with nullcontext() if scheduler is None else connected(scheduler, files) as client:
+        with nullcontext() if scheduler is None else connect_client(scheduler, files) as client:
             run_options = RunOptions(cluster=file)
             figures, lines = forecast_scenario(
                 scenario,

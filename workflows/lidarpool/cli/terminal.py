@@ -19,7 +19,7 @@ from lidarsim.words import plural
 
 from ..processes.logs import set_logs
 from ..processes.streams import TolerantStream
-from ..run.progress import Pace, Progress, Screen, Show, bars, progress_rows, waiting_reason
+from ..run.progress import Progress, ProgressRate, Screen, Show, bars, progress_rows, waiting_reason
 from .shared_options import WARNED
 
 # Minimum and maximum interval between progress lines in a log. Within these limits, the interval is
@@ -150,7 +150,11 @@ class PlainLines:
     def __init__(self, stream: Any) -> None:
         self.stream = stream
         self._next = PLAIN_EVERY_S[0]  # elapsed time in seconds at which the next line is due
-        self._paces = {"survey": Pace(), "planning": Pace(), "campaign": Pace()}
+        self._paces = {
+            "survey": ProgressRate(),
+            "planning": ProgressRate(),
+            "campaign": ProgressRate(),
+        }
         self._completed: set[str] = set()
         self._waiting_reason = ""  # empty while the run makes progress
 
@@ -168,7 +172,7 @@ class PlainLines:
             self._next = elapsed_s + min(max(min_s, elapsed_s / 10), max_s)
         scans = progress.scans
         scans_done = min(progress.collected, progress.framed)
-        sweeps = f" ({progress.sweeps_in_words})" if progress.sweeps else ""
+        sweeps = f" ({progress.sweeps_text})" if progress.sweeps else ""
         all_sweeps = f" ({plural(progress.sweeps, 'sweep')})" if progress.sweeps else ""
         survey_summary = f"{scans:,} scans{all_sweeps}, {progress.points:,} points"
         survey_unit = f"scans{sweeps}, {progress.points:,} points"

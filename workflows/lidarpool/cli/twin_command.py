@@ -78,7 +78,7 @@ def twin(
     from ..reconstruction.building import SCENARIO_FILE
     from ..reconstruction.building import twin as build
     from ..reconstruction.finished_steps import STEPS_FOLDER, FinishedSteps
-    from ..run.cluster.connection import connected
+    from ..run.cluster.connection import connect_client
 
     if resume and overwrite:
         raise click.UsageError("`--resume` and `--overwrite` cannot be combined.")
@@ -95,7 +95,7 @@ def twin(
         if not as_json:
             click.echo(f"{line} …", err=True)
 
-    with nullcontext() if scheduler is None else connected(scheduler, files) as client:
+    with nullcontext() if scheduler is None else connect_client(scheduler, files) as client:
         built = build(recording, client=client, folder=steps, resume=resume, tell=tell, **settings)
     paths = [click.format_filename(path) for path in built.save(out)]
     scenario = shlex.quote(str(out / SCENARIO_FILE))

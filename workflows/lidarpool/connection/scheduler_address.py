@@ -69,7 +69,7 @@ def read_scheduler_file(
 
 
 def _read(path: Path) -> str:
-    """Read the address from a scheduler file. Raises LidarError if that is not possible."""
+    """Read the address from a scheduler file. Raise LidarError if this is not possible."""
     if not path.exists():
         raise MissingFileError(
             f"The scheduler file {path} does not exist. Start the scheduler with "

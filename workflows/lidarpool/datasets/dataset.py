@@ -162,7 +162,7 @@ class DataSet:
         row: JobRow,
         cloud: CloudLike,
         sweeps: Sweeps,
-        made_of: Sequence[Sequence[str]] = (),
+        input_files: Sequence[Sequence[str]] = (),
         *,
         listing: Listing | None = None,
     ) -> JobRow:
@@ -179,7 +179,7 @@ class DataSet:
             Points of all sweeps of the job.
         sweeps
             Sweeps of the job.
-        made_of
+        input_files
             Names and hashes of the job's input files.
         listing
             Storage that records the written files, even if an error occurs.
@@ -228,7 +228,7 @@ class DataSet:
             manifest |= {"sensors": [*zip(sweeps.sensors, sweeps_per_sensor, strict=True)]}
             manifest |= {"classes": dict(sweeps.classes)} if sweeps.classes else {}
             manifest |= {"materials": sweeps.materials} if sweeps.materials else {}
-            manifest |= {"made_of": made_of, "files": dict(sorted(storage.files.items()))}
+            manifest |= {"made_of": input_files, "files": dict(sorted(storage.files.items()))}
             self._write_manifest(storage, row, manifest)
         return row
 

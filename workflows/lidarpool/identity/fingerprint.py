@@ -52,7 +52,7 @@ def fingerprint(*values: Any) -> str:
     Raises
     ------
     LidarError
-        If a value has no fingerprint; the message names the value.
+        If a value cannot be hashed. The message names the value.
 
     Examples
     --------
@@ -95,7 +95,7 @@ def _hash_array(array: np.ndarray[Any, Any]) -> bytes:
 
 
 class _Digest:
-    """Accumulates a hash from values of any supported type."""
+    """Hash that is accumulated from values of any supported type."""
 
     def __init__(self) -> None:
         self._hash = hashlib.sha256()

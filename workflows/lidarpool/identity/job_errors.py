@@ -27,13 +27,13 @@ def summarize_errors(errors: Iterable[tuple[str, str]], max_jobs: int = 5) -> li
     >>> summarize_errors([("0001", "job 1: no hall"), ("0004", "job 4: no hall"), ("0009", "no")])
     ['jobs 0001, 0004: no hall', 'job 0009: no']
     """
-    values_by_job: dict[str, dict[str, str]] = {}  # {message: {job: its values}}
+    values_by_job: dict[str, dict[str, str]] = {}  # {message: {job: values of the job}}
     for job, message in errors:
         reason, _, values = message.partition(_VALUES)
         values_by_job.setdefault(_NUMBER.sub("", reason, count=1), {})[job] = values
     lines = []
     for reason, jobs in values_by_job.items():
-        of_job = next(iter(jobs.values())) if len(jobs) == 1 else ""
+        job_values = next(iter(jobs.values())) if len(jobs) == 1 else ""
         line = f"{'jobs' if len(jobs) > 1 else 'job'} {listed([*jobs], max_jobs)}: {reason}"
-        lines.append(f"{line}{_VALUES.replace(chr(10), ' ')}{of_job}" if of_job else line)
+        lines.append(f"{line}{_VALUES.replace(chr(10), ' ')}{job_values}" if job_values else line)
     return lines

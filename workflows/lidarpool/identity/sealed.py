@@ -12,9 +12,9 @@ _SEAL = re.compile(rb',\n"crc": (\d{1,10})\}\n\Z')
 
 
 class SealedWriter:
-    """Writes a JSON object in pieces and completes it with a checksum.
+    """Writer for a JSON object that is written in pieces and ends with a checksum.
 
-    Call `write` for each piece, and `seal` at the end.
+    Call `write` for each piece and `seal` at the end.
     """
 
     def __init__(self, file: IO[bytes]) -> None:

@@ -28,7 +28,7 @@ def describe_shard(text: str) -> str:
 class Shard:
     """One of several equal shares of a run.
 
-    Raises LidarError if the number is not between 1 and the total.
+    Raise LidarError if the number is not between 1 and the total.
     """
 
     number: int  # number of this shard, starting at 1

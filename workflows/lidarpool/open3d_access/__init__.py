@@ -1,1 +1,1 @@
-"""Open3D, imported without its viewers, and its neighbor search."""
+"""Access to Open3D without its viewers, and to its nearest neighbor search."""

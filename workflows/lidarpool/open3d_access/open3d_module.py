@@ -31,7 +31,7 @@ def load_open3d() -> Any:
     # An extension module whose import was interrupted cannot be imported again.
     with deferred_interrupts(), _LOCK:
         try:
-            return _extension("open3d.pybind")
+            return _import_extension("open3d.pybind")
         except (ImportError, OSError) as error:
             advice = (
                 "On Debian and Ubuntu, run `apt-get install libegl1 libgl1 libgomp1 libusb-1.0-0`."
@@ -46,7 +46,7 @@ def load_open3d() -> Any:
             ) from error
 
 
-def _extension(name: str) -> Any:
+def _import_extension(name: str) -> Any:
     spec = None if {"open3d", name} & sys.modules.keys() else find_spec("open3d")
     if spec is None:
         return import_module(name)

@@ -64,7 +64,7 @@ class LivePage(RunPage):
 
     def begun(self, job: StoredJob) -> None:
         """Show the only job, including scans that were committed earlier."""
-        if job.committed_in_words:
+        if job.committed_text:
             self._status.progress = job.progress()
         self._views.jobs = {0: LiveJob(job)}
         self._status.state = "starting the worker processes"

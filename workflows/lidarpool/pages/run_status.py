@@ -11,7 +11,14 @@ from typing import Any
 
 from poolpart import Partition, PartitionStats
 
-from ..run.progress import STAGES, Pace, Progress, in_words, time_in_words, waiting_reason
+from ..run.progress import (
+    STAGES,
+    Progress,
+    ProgressRate,
+    format_duration,
+    format_rate,
+    waiting_reason,
+)
 
 POLL_EVERY_S = 1.0  # minimum time between polls of the partition statistics
 MAX_LOADS = 6  # number of polls that are averaged
@@ -24,7 +31,7 @@ class RunStatus:
         self.state = "starting"
         self.over = False
         self.progress: Progress | None = None
-        self._pace = Pace()
+        self._pace = ProgressRate()
         # Formatted rate and remaining time.
         self._rate = ""
         self._time_left = ""
@@ -42,7 +49,7 @@ class RunStatus:
             if unit and rate < 1:
                 period = "min"
                 rate *= 60
-            self._rate = f"{in_words(rate)}{unit}/{period}"
+            self._rate = f"{format_rate(rate)}{unit}/{period}"
             self._time_left = self._pace.time_left(progress.seconds, *counts)
 
     def finish(self, seconds: float, points: int | None) -> None:
@@ -66,7 +73,7 @@ class RunStatus:
         return {
             "state": state,
             "over": self.over,
-            "time": "" if progress is None else time_in_words(progress.seconds),
+            "time": "" if progress is None else format_duration(progress.seconds),
             "seconds": None if progress is None else progress.seconds,
             "rate": self._rate,
             "left": self._time_left,

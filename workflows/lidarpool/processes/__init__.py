@@ -1,1 +1,1 @@
-"""Processes on a machine: forking, shared memory, output streams, logs and tracing."""
+"""Support for processes on one machine, such as forking, shared memory, logs and tracing."""

@@ -7,5 +7,6 @@ import os
 
 def processor_count() -> int:
     """Return the number of processors that this process may use."""
-    known = hasattr(os, "sched_getaffinity")  # macOS does not have it
-    return len(os.sched_getaffinity(0)) if known else os.cpu_count() or 1
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -69,7 +69,7 @@ class TimelineStep(NamedTuple):
 
 
 def _age_s() -> float:
-    """Return the seconds since the start of this process."""
+    """Return the time since the start of this process in seconds."""
     if not hasattr(time, "CLOCK_BOOTTIME"):  # a system other than Linux
         return time.time() - psutil.Process().create_time()
     # psutil derives the start from the boot time, which was off by a second on machines whose clock

@@ -1,4 +1,4 @@
-"""Trace points, with which tests observe and interrupt a run."""
+"""Trace points, which allow tests to observe and interrupt a run."""
 
 from __future__ import annotations
 

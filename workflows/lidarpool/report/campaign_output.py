@@ -32,7 +32,7 @@ from ..identity.sealed import seal_json, unseal_json
 from ..identity.shard import ALL, Shard, describe_shard
 from ..identity.software import describe_difference, software
 from ..run.cluster.cluster import ClusterConnection
-from ..run.committed import Committed
+from ..run.committed import CommittedRun
 from ..run.listener import Listener
 from ..run.options import RunOptions
 from ..run.progress import Screen
@@ -214,17 +214,17 @@ class DataSetOutput:
         if record := earlier.record:
             store.cast_with(record["backend"], record["casting"])
             rows = [row for row in earlier.rows if row.number in self.campaign.numbers]
-            store.adopt(rows, sensors=json.dumps(record["sensors"]))
+            store.add_finished(rows, sensors=json.dumps(record["sensors"]))
         elif options.may_continue:
             store.notes += [earlier.note] * bool(earlier.note)
             self._adopt_finished_jobs(store)
         # Finished jobs may have been added to the store above.
-        begun = store.begun or bool(store.committed_in_words)
+        begun = store.begun or bool(store.committed_text)
         list_dataset_files(self.dataset.storage, begun=begun)
         wrong = earlier.wrong
         if not record:
             wrong = _check_jobs(self.dataset, store.rows(), options.verify, self.campaign)
-        if not store.committed_in_words:
+        if not store.committed_text:
             self.campaign.check_files()
         retried = store.db.failed() if options.retry_failed else ()
         store.forget([*wrong, *retried])
@@ -246,9 +246,9 @@ class DataSetOutput:
                     store.cast_with(made_with["backend"], made_with["casting"])
                 if made_with == store.made_with:
                     rows.append(replace(row, seconds=seconds.get(row.number)))
-        store.adopt(rows)
+        store.add_finished(rows)
 
-    def publish(self, committed: Committed) -> CampaignRun:
+    def publish(self, committed: CommittedRun) -> CampaignRun:
         """Write the shared files, and remove the run store unless a job has failed."""
         store = committed.store
         seconds = time.monotonic() - self.begun_at

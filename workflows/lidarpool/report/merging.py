@@ -27,8 +27,8 @@ from ..identity.shard import ALL, Shard
 from ..identity.software import software
 from ..open3d_access.open3d_module import load_open3d
 from ..plan import Trial
-from ..run.committed import Committed
-from ..run.job_source import OneJob
+from ..run.committed import CommittedRun
+from ..run.job_source import SingleJob
 from ..run.options import RunOptions
 from ..run.pipeline.committed_results import CommittedResults
 from ..run.pipeline.stage_messages import Receipt
@@ -37,7 +37,7 @@ from ..run.run_result import CampaignRun
 from ..run.runner import open_store
 from ..run.store.database import FILE, DamagedError, RunDatabase
 from ..run.store.remote import fetch_database
-from ..run.store.run_store import RUN_FOLDER, RunStore, parts_of, remove_run, with_sensors
+from ..run.store.run_store import RUN_FOLDER, RunStore, add_sensors, parts_of, remove_run
 from ..scenario.empty_cloud import NO_POINTS, empty_jobs_warning
 from ..scenario.prepare import prepare
 from ..scenario.scenario import Scenario
@@ -144,7 +144,7 @@ def merge(
     _check_separate(Storage.at(target), shard_storages)
     is_survey_shard = False
     with suppress(LidarError):  # the result would overwrite the points of the shard
-        is_survey_shard = "made_of" in _read_folder(Storage.at(target)).record
+        is_survey_shard = "scenario_source" in _read_folder(Storage.at(target)).record
     if is_survey_shard:
         raise LidarError(
             f"{target} contains a shard of a survey. Specify another folder with `--out`."
@@ -158,7 +158,7 @@ def merge(
         mistakes.lines = ["There are no shards to merge. Specify the folders of the shards."]
     if not (partial and shard_folders):
         mistakes.tell()
-    if "made_of" in shard_folders[0].record:
+    if "scenario_source" in shard_folders[0].record:
         return _merge_survey(shard_folders, target, partial, scenario, screen)
     with result_folder(target), screen.status("merging the data set"):
         return _merge_dataset(shard_folders, Storage.at(target), partial, screen)
@@ -240,10 +240,10 @@ def _read_survey(storage: Storage, run: Storage) -> _ShardFolder:
         try:
             with closing(RunDatabase(path, durable=False)) as db:
                 meta = {"casting": "{}", "fields": "{}"} | db.meta
-                texts = ("identity", "fields", "casting", "made_of")
+                texts = ("identity", "fields", "casting", "scenario_source")
                 record = {**meta, "files": [], **{name: json.loads(meta[name]) for name in texts}}
                 shard = Shard.parse(record["identity"].pop("shard"))
-                scan_count = record["made_of"]["scans"]
+                scan_count = record["scenario_source"]["scans"]
                 job = CommittedResults(0, shard.scans(scan_count))
                 db.read(job)
                 if job.missing_count:
@@ -398,7 +398,7 @@ def _merged_record(shard_folders: Sequence[_ShardFolder], fallback: _ShardFolder
     """
     sensors = dict[str, str]()
     for folder in shard_folders:
-        sensors = with_sensors(sensors, folder.record["sensors"].items())
+        sensors = add_sensors(sensors, folder.record["sensors"].items())
     cast = next((folder for folder in shard_folders if folder.record["casting"]), fallback)
     campaign = max(shard_folders, key=lambda folder: folder.run_size).record["campaign"]
     return {**cast.record, "sensors": sensors, "campaign": campaign}
@@ -493,17 +493,17 @@ def _merge_survey(
     _check_same_run(shard_folders)
     notes = _collect_notes(shard_folders, partial=partial)
     record = shard_folders[0].record
-    made_of = record["made_of"]
-    path = Path(scenario or made_of["path"])
+    scenario_source = record["scenario_source"]
+    path = Path(scenario or scenario_source["path"])
     if not path.exists():
         raise MissingFileError(
             f"{path}, the scenario of these shards, does not exist. Specify its new path with "
             "`--scenario`."
         )
     with screen.status("reading the scene"):
-        prepared = prepare(Scenario.load(path, made_of["options"]))
+        prepared = prepare(Scenario.load(path, scenario_source["options"]))
         job = prepared.job
-        jobs = OneJob(job)
+        jobs = SingleJob(job)
         identity = jobs.identity
     if differs := [name for name in identity if identity[name] != record["identity"][name]]:
         changed = describe_changes(record["fields"], jobs.fields)
@@ -512,7 +512,9 @@ def _merge_survey(
             f"different{f' ({changed})' * bool(changed)}. Specify the scenario of the shards "
             "with `--scenario`."
         )
-    output = SurveyOutput(out, job.survey, job.outputs, made_of["extent"], prepared.scenario)
+    output = SurveyOutput(
+        out, job.survey, job.outputs, scenario_source["extent"], prepared.scenario
+    )
     options = RunOptions(folder=Storage.at(out).below(RUN_FOLDER), resume=True)
     with output.lock() as folder:
         if not options.continues_run:
@@ -520,7 +522,7 @@ def _merge_survey(
         with open_store(jobs, options, screen) as store:
             _copy_points(store, shard_folders, notes)
             load_open3d()
-            result = Committed(store).result(screen)
+            result = CommittedRun(store).result(screen)
             return output.publish(folder, result, store, screen)[1]
 
 
@@ -567,5 +569,5 @@ def _copy_points(
     if damaged:
         raise LidarError(_missing_or_damaged(damaged))
     # If there are no trials, the first shard, which plans the path, is missing.
-    store.take_over(only.job if only.trials else replace(only.job, planning=None))
+    store.reassign_points(only.job if only.trials else replace(only.job, planning=None))
     store.notes = [*notes]

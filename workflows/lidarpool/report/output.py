@@ -35,7 +35,7 @@ from ..identity.field_words import describe_changes
 from ..open3d_access.open3d_module import load_open3d
 from ..processes import timeline
 from ..run.cluster.cluster import Cluster, ClusterConnection
-from ..run.job_source import OneJob
+from ..run.job_source import SingleJob
 from ..run.listener import Listener
 from ..run.options import RunOptions
 from ..run.progress import Screen
@@ -60,7 +60,7 @@ _FORMAT_OF_FILE = {row.file: name for name, row in FORMATS.items() if row.file !
 
 
 def run_survey(
-    jobs: OneJob,
+    jobs: SingleJob,
     options: RunOptions,
     output: SurveyOutput,
     screen: Screen,
@@ -156,7 +156,7 @@ class SurveyOutput:
         with result_folder(self.target) as folder:
             yield folder
 
-    def check_existing(self, inputs: OneJob | RunResult, *, overwrite: bool = False) -> None:
+    def check_existing(self, inputs: SingleJob | RunResult, *, overwrite: bool = False) -> None:
         """Check that the target contains nothing that must not be replaced.
 
         Raises

@@ -1,1 +1,1 @@
-"""Runs: one way from jobs to results, on a cluster, that can be resumed."""
+"""Runs, which process jobs on a cluster and can be resumed."""

@@ -1,4 +1,4 @@
-"""Cluster files: YAML with the cluster to start for a run, and its workers."""
+"""Cluster files, which describe in YAML the cluster and workers to start for a run."""
 
 from __future__ import annotations
 
@@ -23,26 +23,29 @@ from poolpart.deploy.clusters import INFO_MARK
 
 from .pipeline.stage_names import GPU, LIDAR, OTHER
 
-# A scheduler that SSH has started outlives a driver that was killed: it ends after this time
-# without tasks.
+# A scheduler that was started over SSH keeps running if the driver is killed, so it exits after
+# being idle for this time.
 _IDLE_TIMEOUT = "1h"
-_CONNECT_TIMEOUT = "30s"  # limit for a host to answer
+_CONNECT_TIMEOUT = "30s"  # time limit for connecting to a host
 
 
 class WorkerGroup(BaseModel):
-    """Workers of a partition; extra fields override arguments of the cluster."""
+    """Workers of a partition.
+
+    Extra fields override the arguments of the cluster for these workers.
+    """
 
     model_config = ConfigDict(extra="allow", frozen=True, strict=True)
 
     workers: int = Field(1, ge=0, le=10_000)
-    adapt: list[int] | None = Field(None, min_length=2, max_length=2)  # least and greatest number
+    adapt: list[int] | None = Field(None, min_length=2, max_length=2)  # minimum and maximum number
     idle_s: float | None = Field(None, ge=0, allow_inf_nan=False)
     slots: int = Field(1, ge=1, le=10_000)
     hosts: list[str] | None = Field(None, min_length=1)
 
     @property
     def worker_limit(self) -> int:
-        """Largest number of workers."""
+        """Maximum number of workers."""
         if self.adapt:
             return self.adapt[1]
         counted = self.hosts and "workers" not in self.model_fields_set
@@ -51,8 +54,8 @@ class WorkerGroup(BaseModel):
     def __str__(self) -> str:
         return f"{self.adapt[0]} to {self.worker_limit}" if self.adapt else str(self.worker_limit)
 
-    def mistake(self) -> str:
-        """Return a message about a wrong number of workers, or no text without a mistake."""
+    def describe_mistake(self) -> str:
+        """Return an error message if the number of workers is invalid, or an empty string."""
         if self.adapt is None:
             return "" if self.idle_s is None else "idle_s requires adapt, such as `adapt: [0, 8]`."
         if "workers" in self.model_fields_set:
@@ -67,21 +70,27 @@ class WorkerGroup(BaseModel):
 
 
 class ClusterFile(BaseModel):
-    """The cluster to start, as docs/how-to/queues.md describes."""
+    """Description of a cluster to start.
+
+    See docs/how-to/queues.md for the format.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    cluster: str  # class, such as ``dask_jobqueue.SLURMCluster`` or ``distributed.SSHCluster``
+    cluster: str  # class such as ``dask_jobqueue.SLURMCluster`` or ``distributed.SSHCluster``
     arguments: dict[str, Any] = {}
     partitions: dict[str, WorkerGroup]
     _source: str = PrivateAttr("cluster file")
 
     @classmethod
     def load(cls, path: Path) -> ClusterFile:
-        """Read a file and import the class of the cluster, but start no worker.
+        """Read a cluster file and import the class of the cluster, without starting workers.
 
-        LidarError if the file cannot be read, a field is wrong, a package is missing, or the class
-        is not a cluster.
+        Raises
+        ------
+        LidarError
+            If the file cannot be read, a field is invalid, a package is missing, or the class is
+            not a supported cluster.
         """
         content = read_yaml(path, "a cluster file contains cluster:, arguments: and partitions:")
         with sentences(cls, path, content):
@@ -94,18 +103,18 @@ class ClusterFile(BaseModel):
                     f"{did_you_mean(name, (GPU, LIDAR, OTHER))} The partitions of a survey are "
                     f"{GPU}, {LIDAR} and {OTHER}."
                 )
-            if mistake := workers.mistake():
+            if mistake := workers.describe_mistake():
                 raise LidarError(f"{path}: partitions.{name}.{mistake}")
-        file._factory()
+        file._import_class()
         return file
 
     @property
     def slots(self) -> dict[str, int]:
-        """Largest number of slots of each partition."""
+        """Maximum number of slots in each partition."""
         return {name: group.worker_limit * group.slots for name, group in self.partitions.items()}
 
     def require(self, required_slots: Mapping[str, int]) -> None:
-        """Raise LidarError if a partition cannot have the required slots."""
+        """Raise LidarError if a partition has fewer slots than required."""
         for name, required in required_slots.items():
             if (available := self.slots.get(name, 0)) < required:
                 raise LidarError(
@@ -123,15 +132,24 @@ class ClusterFile(BaseModel):
         return f"{self.cluster.rpartition('.')[2]}: {total}, {partitions}"
 
     @contextmanager
-    def started(self, tell: Callable[[str], object]) -> Iterator[SpecCluster]:
-        """Start the cluster with its workers, which run or are in a queue, while the body runs.
+    def start(self, tell: Callable[[str], object]) -> Iterator[SpecCluster]:
+        """Start the cluster and its workers, and stop them when the context exits.
 
-        `tell` is called with messages about failing workers. LidarError if the cluster does not
-        start, or does not accept an argument.
+        Workers may still be waiting in the queue of a batch system when the body starts.
+
+        Parameters
+        ----------
+        tell
+            Function that is called with messages about failing workers.
+
+        Raises
+        ------
+        LidarError
+            If the cluster does not start or does not accept an argument.
         """
         arguments = dict(self.arguments)
         partitions = self.model_dump(exclude_unset=True)["partitions"]
-        factory = self._factory()
+        factory = self._import_class()
         ssh_lines: list[str] = []
         try:
             if factory is SSHCluster:
@@ -143,15 +161,15 @@ class ClusterFile(BaseModel):
                     ("connect_options", "connect_timeout", _CONNECT_TIMEOUT),
                 ):
                     arguments[option] = {key: value} | arguments.get(option, {})
-            with _listening(ssh_lines):
+            with _capture_ssh_output(ssh_lines):
                 cluster = factory(**arguments)
                 try:
                     start_partitions(cluster, partitions, tell)
                 except BaseException:
                     cluster.close()
                     raise
-        except Exception as error:  # sbatch, SSH and constructors raise any error
-            # The messages of jobqueue go on with all arguments.
+        except Exception as error:  # sbatch, SSH and constructors may raise any error
+            # In messages of dask-jobqueue, this text is followed by all arguments.
             message = str(error).partition(" Very likely")[0]
             message = ": ".join(
                 [message, *[line for line in ssh_lines if INFO_MARK not in line][-1:]]
@@ -163,11 +181,11 @@ class ClusterFile(BaseModel):
         with cluster:
             yield cluster
 
-    def _factory(self) -> Any:
-        """Return the class of the cluster, or raise LidarError for another name."""
+    def _import_class(self) -> Any:
+        """Import the class of the cluster. Raise LidarError if it is not a supported cluster."""
         package, _, name = self.cluster.rpartition(".")
         try:
-            # Keeps the signal handlers of this process: dask-jobqueue installs its own.
+            # dask-jobqueue installs signal handlers, which must not replace those of this process.
             with deferred_interrupts():
                 factory = getattr(import_module(package), name, None)
         except ModuleNotFoundError as error:
@@ -191,8 +209,8 @@ class ClusterFile(BaseModel):
 
 
 @contextmanager
-def _listening(lines: list[str]) -> Iterator[None]:
-    """Append output of processes that SSH starts, which Dask only logs, to `lines`."""
+def _capture_ssh_output(lines: list[str]) -> Iterator[None]:
+    """Append the output of processes that are started over SSH to `lines`. Dask only logs it."""
 
     def info(line: str, *arguments: object) -> None:
         lines.append(line)

@@ -1,4 +1,4 @@
-"""What a run has committed, and the result of a survey that is made of it."""
+"""Committed run, and the result of a survey that is created from it."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from .store.run_store import RunStore
 
 
 @dataclass(frozen=True)
-class Committed:
-    """The store of a run, whose jobs are all committed, and the totals of casting them.
+class CommittedRun:
+    """Run whose jobs have all been committed to its store.
 
     Attributes
     ----------
     store
         Store of the run.
     stages
-        Totals of the tasks in each stage; empty if all points come from an earlier run.
+        Totals of the tasks in each stage, which are empty if all points come from an earlier run.
     seconds, survey_seconds, planning_seconds
-        Wall time of the run since its store was opened, of the survey and of the planning.
+        Wall time of the run since its store was opened, of the survey, and of the planning, in
+        seconds.
     replayed
         Number of batches that were cast or sent more than once.
     """
@@ -38,16 +39,16 @@ class Committed:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes of the run, after the warnings about its scenario."""
+        """Warnings about the scenario, followed by the notes of the run."""
         only_job = self.store.only_job
         place_problem = "" if only_job is None else only_job.job.place_problem
         notes = (*self.store.warnings, place_problem, *self.store.notes)
         return tuple(dict.fromkeys(filter(None, notes)))
 
     def result(self, screen: Screen) -> RunResult:
-        """Return the result of the only job, and warn if it has no points."""
+        """Return the result of a survey, and warn if it has no points."""
         only_job = self.store.only_job
-        assert only_job is not None, "of a survey"
+        assert only_job is not None, "the run is a survey"
         job = only_job.job
         trials = tuple(sorted(only_job.trials, key=lambda trial: trial.trial))
         points = only_job.points()
@@ -76,7 +77,7 @@ class Committed:
         )
 
     def _warn_of_empty_cloud(self, screen: Screen) -> None:
-        """Warn that the only job has no points, and add a note unless the run is a shard."""
+        """Warn that the survey has no points, and add a note unless the run is a shard."""
         store = self.store
         assert store.only_job is not None
         job = store.only_job.job

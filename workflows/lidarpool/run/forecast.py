@@ -1,4 +1,4 @@
-"""Estimate of a run's scans, memory and disk, without starting a worker."""
+"""Estimates of the scans, points, memory and disk space of a run, without starting workers."""
 
 from __future__ import annotations
 
@@ -51,16 +51,17 @@ from .pipeline.stage_names import GPU, LIDAR, OTHER
 from .store.database import FILE
 from .store.run_store import RUN_FOLDER
 
-# Measured on Linux: a worker process with Dask loaded.
-PROCESS_BYTES = 300 << 20  # 110 MiB of these for numba, which compiles loops
-PARTICLE_BYTES = 140  # memory of a particle of the swarm, for each corner of its path
-PART_BYTES = 2500  # disk of a part's head, and of its row in the database
-FIRST_PARTS = 60  # parts of one or a few scans, written before batches become large
+# Memory of a worker process in which Dask is loaded, measured on Linux. It includes 110 MiB for
+# numba, which compiles loops.
+PROCESS_BYTES = 300 << 20
+PARTICLE_BYTES = 140  # memory per waypoint of a particle in path planning
+PART_BYTES = 2500  # disk space of a part's header and its row in the database
+FIRST_PARTS = 60  # number of small parts that are written before batches become large
 SCAN_BYTES = 64  # memory of a scan in the driver
-SUMMARY_BYTES = 28  # disk of a scan in the database
-FORMAT_BYTES = 30  # largest size of a point in an exported file without its columns: LAS
-REPORT_BYTES = 32 << 20  # disk of pictures and report
-TRAJECTORY_POSES = 1000  # poses that measure the length of a trajectory
+SUMMARY_BYTES = 28  # disk space of a scan in the database
+FORMAT_BYTES = 30  # maximum size of a point in exported files (LAS) without its columns
+REPORT_BYTES = 32 << 20  # disk space of the pictures and the report
+TRAJECTORY_POSES = 1000  # number of samples for the length of a trajectory
 
 
 def forecast(
@@ -71,17 +72,30 @@ def forecast(
     *,
     refuse: Callable[[], object] | None = None,
 ) -> dict[str, Any]:
-    """Estimate the scans, rays, points, memory and disk of a run, and whether the run is possible.
+    """Estimate the scans, rays, points, memory and disk space of a run, and whether it can run.
 
-    The run is on the cluster of `client`, on the cluster that `options` describe, or on a cluster
-    of this machine. No cluster is started, and nothing is written to `folder`, the output folder.
-    `refuse` raises a LidarError if that folder holds another result.
+    No cluster is started, and nothing is written to the output folder.
+
+    Parameters
+    ----------
+    job
+        Survey to estimate.
+    folder
+        Output folder.
+    options
+        Options of the run, which may describe a cluster.
+    client
+        Client of an existing cluster. By default, the run is on the cluster in `options`, or on a
+        cluster on this machine.
+    refuse
+        Function that raises a LidarError if the output folder contains a different result.
 
     Returns
     -------
     dict
-        Plain data for JSON, sizes in bytes. `reasons` say why it cannot run, each with what to
-        do. `memory` is of all processes on this machine, or, on another cluster, of a GPU worker.
+        Values that can be serialized as JSON, with sizes in bytes. If the run is not possible,
+        `reasons` explains why and suggests remedies. `memory` is that of all processes on this
+        machine or, on a different cluster, that of one casting worker.
     """
     scene = job.scene
     survey = job.survey
@@ -103,14 +117,14 @@ def forecast(
     cluster = _cluster_of(job, options, client, mistakes, notes)
     backend = cluster.backend
     estimate = None
-    # Casting in this process needs as much memory as on a worker: it would fail or be killed.
+    # Casting sample rays in this process requires as much memory as casting on a worker.
     if _worker_bytes(job) + cast_bytes(scene, survey) <= MEMORY_LIMIT:
         estimate = sample_survey(scene, survey)
         if not estimate["hits"]:
             warnings.append(f"{EMPTY}: {empty_cloud_reason(scene, survey)}")
-    # Without an estimate every ray may hit.
+    # Without an estimate, assume that every ray hits a surface.
     points = estimate["points"] if estimate else survey.ray_count // survey.keep_every
-    # Scans of the largest batches; small batches take less memory.
+    # Size of the largest batches, which determine the peak memory.
     scans_per_batch = max_scans_per_batch(
         scans_that_fit(scene, survey, options.batch_mb * MB, on_device=backend == "cuda"),
         survey.scan_count,
@@ -131,15 +145,15 @@ def forecast(
     return {
         "can_run": not mistakes.lines,
         "reasons": mistakes.lines,
-        "occupied": occupied,  # True if the folder of the result holds another result
+        "occupied": occupied,  # whether the output folder contains a run or a different result
         "notes": notes,
         "warnings": warnings,
         "objects": len(scene.object_names),
         "triangles": scene.triangles,
         "masked": list(scene.masked),
-        "performance": _performance(survey),  # {name of a sensor: "ideal" or "datasheet"}
-        "unseen": _unseen(job),  # {name of a sensor: names of the objects that it does not see}
-        # In the coordinates of the scenario: world coordinates are these plus `world.origin`.
+        "performance": _performance(survey),  # {sensor name: "ideal" or "datasheet"}
+        "unseen": _unseen(job),  # {sensor name: names of objects that are hidden from the sensor}
+        # In scenario coordinates. Adding `world.origin` results in world coordinates.
         "bounds": (scene.bounds + (scene.origin - scene.world_origin)).tolist(),
         "epsg": survey.epsg,
         "world_origin": scene.world_origin.tolist(),
@@ -160,12 +174,12 @@ def forecast(
 
 
 class _Cluster(NamedTuple):
-    """The cluster of a run, as far as it is known."""
+    """Properties of a run's cluster that are known before the run starts."""
 
     slots: dict[str, dict[str, int]]  # {partition: {"needed": …, "there": …}}
-    casters: int  # casting workers
+    casters: int  # number of casting workers
     backend: str | None  # None if not known yet
-    memory: int  # bytes; 0 for machines that are not started yet
+    memory: int  # bytes, or 0 for machines that have not been started yet
 
 
 def _cluster_of(
@@ -199,7 +213,7 @@ def _cluster_of(
             check_backend_here(options.backend)
             usable = [name for name, reason in available_backends().items() if not reason]
             backend = usable[0] if options.backend == "auto" else options.backend
-            # Dask gives each worker of a local cluster its share of the memory.
+            # In a local cluster, Dask divides the memory among the workers.
             worker_memory = MEMORY_LIMIT / CPU_COUNT
             check_memory(job, options, backend, worker_memory, "a casting worker on this machine")
     slots = {
@@ -213,36 +227,42 @@ def _cluster_of(
 def _disk(
     job: Job, points: int, scans_per_batch: int, exports: int, result: Path | Storage
 ) -> dict[str, Any]:
-    """Return the disk that a run and its result need, and the free disk, in bytes.
+    """Estimate the disk space in bytes of a run and its result, and return the free space.
 
-    A run needs disk for parts and database. Large parts are of `scans_per_batch` scans.
+    The run requires space for its parts and its database. Large parts contain `scans_per_batch`
+    scans.
     """
     survey = job.survey
     faces = job.scene.kept_triangles
     point_bytes = _point_bytes(job)
     large_parts = -(-survey.scan_count // scans_per_batch)
     part_count = min(survey.scan_count, large_parts + FIRST_PARTS)
-    # Each part names the triangles that its rays hit.
+    # Each part stores the number of hits of each triangle that its rays hit.
     tally_bytes = 12 * min(faces, survey.ray_count // large_parts // 10) * large_parts
     run_bytes = point_bytes * points + PART_BYTES * part_count + tally_bytes
     run_bytes += SUMMARY_BYTES * survey.scan_count
-    # A row of the PLY has doubles for coordinates at most; a chunk exists twice.
+    # PLY files store coordinates with up to 8 bytes, and one chunk exists twice.
     cloud_bytes = (point_bytes + 16) * (points + min(points, CHUNK_POINTS))
     export_bytes = (point_bytes + FORMAT_BYTES) * points * exports
     result_bytes = cloud_bytes + export_bytes + REPORT_BYTES + 36 * faces
     result_bytes += instrument_bytes(survey, exports)
-    # Files for a remote storage, but no parts, are first written to a temporary folder.
+    # Files for remote storage, except for parts, are first written to a temporary folder.
     folder = Path(tempfile.gettempdir()) if isinstance(result, Storage) else result
-    free = shutil.disk_usage(_existing(folder)).free
+    free = shutil.disk_usage(_closest_existing(folder)).free
     return {"parts": run_bytes, "result": result_bytes, "free": free, "folder": str(folder)}
 
 
 def _shortages(
     disk: dict[str, Any], available_bytes: int, required_bytes: int, *, stored: bool
 ) -> list[str]:
-    """Return messages if the disk or the memory is too small.
+    """Return messages if the disk space or the memory is insufficient.
 
-    The result is `stored` or in a folder. 0 available bytes of memory are unknown.
+    Parameters
+    ----------
+    available_bytes
+        Available memory, or 0 if it is unknown.
+    stored
+        Whether the result is written to a remote storage rather than a folder.
     """
     messages = []
     disk_bytes = disk["result"] + (0 if stored else disk["parts"])
@@ -263,7 +283,7 @@ def _shortages(
 
 
 def _performance(survey: Survey) -> dict[str, str]:
-    """Return whether each sensor is ideal or as in its data sheet, by the name of the sensor."""
+    """Describe by sensor name whether each sensor is ideal or matches its data sheet."""
     performance = {}
     pairs = zip(survey.carried, survey.noise_each, survey.returns_each, strict=True)
     for carried, noise, returns in pairs:
@@ -277,7 +297,10 @@ def _performance(survey: Survey) -> dict[str, str]:
 
 
 def _unseen(job: Job) -> dict[str, list[str]]:
-    """Return the names of the objects that a sensor does not see, without sensors that see all."""
+    """Return the names of the objects that are hidden from each sensor.
+
+    Sensors that see all objects are omitted.
+    """
     scene = job.scene
     pairs = zip(job.survey.carried, unseen_objects(scene, job.survey), strict=True)
     names = scene.object_names
@@ -289,9 +312,10 @@ def _unseen(job: Job) -> dict[str, list[str]]:
 
 
 def _drive(survey: Survey) -> dict[str, Any] | None:
-    """Describe the trajectory of a moving platform, and the revolutions of each sensor.
+    """Describe the trajectory of a moving platform and the revolutions of each sensor.
 
-    The distance per cycle of an airborne scanner is that on flight lines while the sensor fires.
+    For airborne scanners, the distance per revolution is computed from the speed on flight lines
+    while the sensor fires.
     """
     if not survey.path.moves:
         return None
@@ -329,16 +353,16 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
     }
 
 
-def _existing(folder: Path) -> Path:
-    """Return a folder, or its innermost existing parent."""
+def _closest_existing(folder: Path) -> Path:
+    """Return a folder, or its closest parent that exists."""
     return next(path for path in (folder, *folder.absolute().parents) if path.exists())
 
 
 def _folder_notes(location: Path | Storage) -> list[str]:
-    """Return notes on the folder of a result, or raise LidarError if it is not writable."""
+    """Return notes on the output folder. Raise LidarError if it is not writable."""
     if isinstance(location, Storage):
-        location.claim()  # leaves nothing
-    elif not (folder := _existing(location)).is_dir():
+        location.claim()  # leaves no files behind
+    elif not (folder := _closest_existing(location)).is_dir():
         raise LidarError(f"{folder} is a file. Pass a folder for the results with `--out`.")
     elif not os.access(folder, os.W_OK | os.X_OK):
         raise LidarError(
@@ -353,19 +377,19 @@ def _folder_notes(location: Path | Storage) -> list[str]:
 
 
 def _worker_bytes(job: Job) -> int:
-    """Return the memory of a casting worker, without the scans under way, in bytes."""
+    """Estimate the memory of a casting worker in bytes, excluding scans in flight."""
     return PROCESS_BYTES + rig_bytes(job.scene, job.survey)
 
 
 def _rest_bytes(job: Job, points: int, planners: int) -> int:
-    """Return the memory of all processes of a machine but casting workers, in bytes."""
+    """Estimate the memory in bytes of all processes on this machine except casting workers."""
     scene = job.scene
     swarm = job.planning.particles * job.planning.waypoints if job.planning else 0
     planning = PROCESS_BYTES + PARTICLE_BYTES * swarm
-    # A chunk of points is merged, written and read back.
+    # Chunks of points are merged, written and read again.
     chunk_bytes = 6 * (_point_bytes(job) + 24) * min(points, CHUNK_POINTS)
     shown_triangles = scene.kept_triangles + DRAWN_TRIANGLES
-    if not scene.masked:  # masked triangles are cut into more triangles
+    if not scene.masked:  # masked triangles are divided into more triangles
         shown_triangles = min(scene.triangles, shown_triangles)
     driver = 2 * SCENE_TRIANGLE * shown_triangles + INSTANCE * len(scene.instances or ())
     driver += chunk_bytes + SCAN_BYTES * job.survey.scan_count

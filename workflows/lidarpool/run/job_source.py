@@ -1,4 +1,4 @@
-"""The jobs of a run: the single job of a survey, or the jobs of a campaign, made a few ahead."""
+"""Sources of jobs for a run, which is either the single job of a survey or a campaign."""
 
 from __future__ import annotations
 
@@ -30,18 +30,21 @@ from ..scenario.job import Job
 from ..scenario.static_scene import SceneCache
 from .pipeline.failures import JobError
 
-MAX_READY = 16  # jobs that are made ahead, since small jobs are cast several at a time
-MAX_SCENES = 2  # scenes of the jobs that are made ahead
-STOP_S = 10.0  # wait for a job that is being made when the run ends
-CONTENT = ("scene", "survey", "planning")  # the fields of a job that its result depends on
+MAX_READY = 16  # jobs that are created in advance, because small jobs are cast together
+MAX_SCENES = 2  # maximum number of scenes in the jobs that are created in advance
+STOP_S = 10.0  # time limit for a job that is still being created when the run ends
+CONTENT = ("scene", "survey", "planning")  # fields of a job that determine its result
 
 
-def identity_of(job: Job) -> dict[str, str]:
-    """Return fingerprints of the inputs of a job.
+def input_fingerprints(job: Job) -> dict[str, str]:
+    """Return the fingerprints of a job's scene, survey and planning.
 
-    Equal fingerprints give equal bytes.
+    Jobs with the same fingerprints produce the same bytes.
 
-    JobError if a sensor, column or trajectory has a field without a fingerprint.
+    Raises
+    ------
+    JobError
+        If a sensor, column or trajectory has a field that cannot be hashed.
     """
     try:
         return {name: fingerprint(getattr(job, name)) for name in CONTENT}
@@ -49,10 +52,10 @@ def identity_of(job: Job) -> dict[str, str]:
         raise JobError(str(error)) from error
 
 
-def fields_of(scene: Scene, survey: Survey, planning: Planning | None) -> dict[str, str]:
-    """Return the fields that a result depends on, in words, named as in a scenario.
+def describe_inputs(scene: Scene, survey: Survey, planning: Planning | None) -> dict[str, str]:
+    """Describe the fields that a result depends on, by their path in a scenario.
 
-    Positions are in the scene's local coordinates.
+    Positions are in the local coordinates of the scene.
     """
     size_m = np.ptp(scene.bounds, axis=0)
     values: dict[str, Any] = {
@@ -76,8 +79,8 @@ def fields_of(scene: Scene, survey: Survey, planning: Planning | None) -> dict[s
 
 
 @dataclass(frozen=True, eq=False)
-class OneJob:
-    """A survey as the only job of its run, which does the scans of a shard."""
+class SingleJob:
+    """Survey as the only job of a run, or one shard of a survey."""
 
     survey_job: Job
     shard: Shard = ALL
@@ -88,59 +91,65 @@ class OneJob:
 
     @cached_property
     def only_job(self) -> Job:
-        """The job as this shard does it: only the first shard plans the path."""
+        """Job of this shard. It includes path planning only in the first shard."""
         job = self.survey_job
         return job if self.shard.number == 1 else job.with_fields(planning=None)
 
     @cached_property
     def identity(self) -> Mapping[str, str]:
-        """Fingerprints of scene, survey and planning."""
-        return identity_of(self.survey_job)
+        """Fingerprints of the scene, the survey and the planning."""
+        return input_fingerprints(self.survey_job)
 
     @cached_property
     def fields(self) -> Mapping[str, str]:
-        """Fields of scene, survey and planning, in words."""
+        """Descriptions of the fields of the scene, the survey and the planning."""
         job = self.survey_job
-        return fields_of(job.scene, job.survey, job.planning)
+        return describe_inputs(job.scene, job.survey, job.planning)
 
 
-Jobs = OneJob | CampaignSpec  # the jobs of a run
+Jobs = SingleJob | CampaignSpec  # source of the jobs in a run
 
 
 def failed_row(jobs: Jobs, number: int, error: object) -> JobRow:
-    """Return the row of a job of a campaign that has failed, and perhaps cannot be made."""
-    assert isinstance(jobs, CampaignSpec), "surveys end with their job"
+    """Create the table row of a failed job in a campaign."""
+    assert isinstance(jobs, CampaignSpec), "a survey fails together with its job"
     values: Mapping[str, Value | None] = {}
-    with suppress(Exception):  # the values themselves may be the cause
+    with suppress(Exception):  # the values may be the cause of the error
         values = jobs.values(number)
     message = jobs.without_folders(str(error))
     return JobRow(number, jobs.name(number), jobs.split(number), dict(values), message)
 
 
-class JobMaker:
-    """Makes the jobs of a campaign with their sweeps in a thread, a few ahead.
+class JobProducer:
+    """Thread that creates the jobs of a campaign and their sweeps in advance.
 
-    `numbers` are the numbers of the remaining jobs, and `columns` names of the columns that the
-    data set needs.
+    Parameters
+    ----------
+    jobs
+        The campaign.
+    numbers
+        Numbers of the remaining jobs.
+    columns
+        Names of the columns that the data set requires.
     """
 
     def __init__(self, jobs: Jobs, numbers: Iterable[int], columns: Sequence[str]) -> None:
-        assert isinstance(jobs, CampaignSpec), "surveys have their job"
+        assert isinstance(jobs, CampaignSpec), "the job of a survey already exists"
         self._campaign = jobs
         self._numbers = numbers
         self._columns = columns
         self._cache = SceneCache()
         self._ready: Queue[Job | JobRow | BaseException | None] = Queue(MAX_READY)
         self._stopped = Event()
-        self._full = False  # True while the thread waits because of the memory of scenes
-        self.ended = False  # True after the last job was taken
+        self._full = False  # True while the thread waits to limit the memory of scenes
+        self.ended = False  # True after the last job has been taken
         self._thread = Thread(target=self._work, name="jobs", daemon=True)
         self._thread.start()
 
-    def take(self, *, wait: bool = False) -> Job | JobRow | None:
-        """Return the next job, or the row of a job that cannot be made.
+    def pop(self, *, wait: bool = False) -> Job | JobRow | None:
+        """Remove and return the next job, or the table row of a job that cannot be created.
 
-        None after the last job, or without `wait` while no job is ready.
+        Return None after the last job or, unless `wait` is True, if no job is ready.
         """
         try:
             entry = None if self.ended else self._ready.get(block=wait)
@@ -151,8 +160,8 @@ class JobMaker:
             raise entry
         return entry
 
-    def has(self, jobs: int) -> bool:
-        """Return True if `jobs` jobs are ready, or the thread waits until jobs are taken."""
+    def has_ready(self, jobs: int) -> bool:
+        """Return True if this number of jobs is ready, or if no more jobs can become ready."""
         waits = self._full or not self._thread.is_alive()
         return waits or self._ready.qsize() >= min(jobs, MAX_READY)
 
@@ -169,17 +178,17 @@ class JobMaker:
     def _make(self, number: int) -> Job | JobRow:
         try:
             job = self._campaign.job(number, self._cache, self._columns)
-            _ = job.sweeps  # computed in this thread, for they take a while
+            _ = job.sweeps  # computed here, because it takes some time
             return job
         except MemoryError:
             raise
         except Exception as error:
-            # A class of the user's own may raise anything: the other jobs go on.
+            # User-defined classes may raise any error, which must not affect the other jobs.
             reason = str(error) if isinstance(error, LidarError) else repr(error)
             return failed_row(self._campaign, number, reason)
 
     def _put(self, entry: Job | JobRow | BaseException | None) -> bool:
-        """Put an entry into the queue, and return False if the maker was stopped before."""
+        """Put an entry into the queue, and return False if the thread was stopped meanwhile."""
         while not self._stopped.is_set():
             scenes = [ready.scene for ready in [*self._ready.queue] if isinstance(ready, Job)]
             self._full = len({id(scene.vertices) for scene in scenes}) > MAX_SCENES
@@ -192,6 +201,6 @@ class JobMaker:
         return False
 
     def close(self) -> None:
-        """Stop making jobs."""
+        """Stop the thread."""
         self._stopped.set()
         self._thread.join(STOP_S)

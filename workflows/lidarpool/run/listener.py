@@ -1,4 +1,4 @@
-"""What a run reports while it casts: committed parts and frames, at the pace of the scanner."""
+"""Live output of a run, which passes on committed parts and frames at the pace of the scanner."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from .run_page import RunPage
 
 
 class Listener:
-    """Passes committed parts and frames of a survey to the page and to the caller of a run.
+    """Listener that passes committed parts and frames of a survey to the live page and the caller.
 
     The methods are called in the thread of the run.
 
     Parameters
     ----------
     page
-        Page of the run.
+        Live page of the run.
     on_frame
         Function that is called with each frame, in scan order.
     on_parts
-        Function that is called with committed parts; it must return at once.
+        Function that is called with committed parts. It must return immediately.
     pace
-        Speed of the frames relative to the scanner, or None to pass frames on at once. The page
-        gets the points of a frame not before the frame.
+        Speed of the frames relative to the scanner, or None to pass on frames immediately. With a
+        pace, the page receives the points of a frame when the frame is due.
     """
 
     def __init__(
@@ -38,10 +38,10 @@ class Listener:
         self._on_frame = on_frame
         self._on_parts = on_parts
         self._pacer = None if pace is None else Pacer(pace)
-        self._unshown: list[Receipt] = []  # parts whose frames wait for their time
+        self._unshown: list[Receipt] = []  # parts whose frames are not due yet
 
-    def frame(self, frame: ScanFrame) -> None:
-        """Pass a frame on when it is due."""
+    def on_frame(self, frame: ScanFrame) -> None:
+        """Wait until a frame is due, and pass it on."""
         if self._pacer is not None:
             self._pacer.wait(frame.time_ns)
             self._show_parts(frame.scan + 1)
@@ -49,8 +49,8 @@ class Listener:
         if self._on_frame is not None:
             self._on_frame(frame)
 
-    def parts(self, receipts: Sequence[Receipt]) -> None:
-        """Pass committed parts on."""
+    def on_parts(self, receipts: Sequence[Receipt]) -> None:
+        """Pass on committed parts."""
         if self._pacer is None:
             self.page.on_parts(receipts)
         else:
@@ -59,7 +59,7 @@ class Listener:
             self._on_parts(receipts)
 
     def _show_parts(self, stop: int) -> None:
-        """Show the parts up to a scan, whose frames are due."""
+        """Show the pending parts with scans before `stop`, whose frames are due."""
         due = sorted((part for part in self._unshown if part.first < stop), key=lambda p: p.first)
         if due:
             self._unshown = [part for part in self._unshown if part.first >= stop]
@@ -67,22 +67,26 @@ class Listener:
 
 
 class Pacer:
-    """Waits until frames are due, at a speed relative to the scanner.
+    """Timer that delays frames to a speed relative to the scanner.
 
-    The first frame is due at once. A frame that comes late is due at once, and later frames do not
-    catch up: the display is never faster than the scanner.
+    The first frame and frames that arrive late are due immediately. Later frames do not catch up,
+    so that the display is never faster than the scanner.
     """
 
     def __init__(self, speed: float) -> None:
         self._ns_per_s = speed * 1e9
-        self._last: tuple[float, float] | None = None  # time of the survey, ns; when it was due, s
+        # Time in the survey in nanoseconds, and monotonic time at which it was due in seconds.
+        self._last: tuple[float, float] | None = None
 
     def wait(self, time_ns: float) -> None:
-        """Wait until a frame is due, whose scan began at `time_ns` since the survey's start."""
+        """Wait until a frame is due.
+
+        `time_ns` is the start of its scan in nanoseconds since the start of the survey.
+        """
         now_s = time.monotonic()
         if self._last is not None:
             last_ns, last_s = self._last
-            # Scans of a second sensor follow all scans of the first, and begin anew.
+            # The scans of each sensor follow those of the previous sensor, and their time restarts.
             due_s = last_s + max(time_ns - last_ns, 0.0) / self._ns_per_s
             if due_s > now_s:
                 time.sleep(due_s - now_s)

@@ -1,4 +1,4 @@
-"""Options of a run, of the command line and of Python."""
+"""Options of a run on the command line and in Python."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from ..scenario.sections import PoolSection, TaskOptions
 from .cluster_file import ClusterFile
 from .store.database import FILE
 
-# The page in the browser (also True), or a viewer; False for none.
+# Live view of a run: a page in the browser (True or "page"), a viewer, or False for none.
 Live = bool | Literal["page", "foxglove", "rerun"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(TaskOptions):
-    """Options of casting, of the cluster, and of the treatment of an earlier run.
+    """Options for casting, for the cluster, and for the treatment of an earlier run.
 
-    In Python they are the `RunKeywords` of `simulate`, `Campaign.run` and `Campaign.stream`, which
-    describe them; the same are options of commands. The defaults are valid for all.
+    `simulate`, `Campaign.run` and `Campaign.stream` accept most of them as keywords (`RunKeywords`)
+    and document them. Commands have corresponding command-line options.
     """
 
-    # Folder of the run's store until the result is complete; None for a temporary folder that is
-    # deleted with the last user of the points.
+    # Folder of the run store until the result is complete, or None for a temporary folder, which is
+    # deleted when the points are no longer in use.
     folder: str | Path | Storage | None = None
     scratch_dir: str | Path | None = None
     resume: bool = False
@@ -46,17 +46,17 @@ class RunOptions(TaskOptions):
     verify: bool = False
     overwrite: bool = False
     client: Client | None = None
-    scheduler: str | None = None  # address, with certificates for it
-    files: TlsFiles | None = None
-    cluster: ClusterFile | None = None  # cluster to be started
+    scheduler: str | None = None  # address of an existing scheduler
+    files: TlsFiles | None = None  # certificates for this scheduler
+    cluster: ClusterFile | None = None  # cluster to start
     tls: bool = False
     gpu_workers: int | None = None
     other_workers: int | None = None
     startup_timeout_s: Annotated[float, Field(ge=0)] = WAIT_S
     worker_timeout_s: Annotated[float, Field(ge=0)] = PATIENCE_S
     live: Live = False
-    pace: Annotated[float | None, Field(gt=0)] = None  # speed of frames; 1 is that of the scanner
-    stay: bool = True  # False if the live page, or viewer, ends with the run
+    pace: Annotated[float | None, Field(gt=0)] = None  # speed of frames relative to the scanner
+    stay: bool = True  # whether the live page or viewer stays open after the run
 
     __repr__ = one_line
 
@@ -71,21 +71,21 @@ class RunOptions(TaskOptions):
 
     @property
     def may_continue(self) -> bool:
-        """True if the run may continue an earlier run."""
+        """True if the options allow the run to continue an earlier run."""
         return self.resume or self.retry_failed or self.verify
 
     @property
     def continues_run(self) -> bool:
-        """True if the run continues an unfinished run, which is in `folder`."""
+        """True if the run continues an unfinished run in `folder`."""
         folder = self.folder
         return self.may_continue and folder is not None and FILE in Storage.at(folder).sizes()
 
     def with_pool(
         self, pool: PoolSection, overrides: Mapping[str, Any] = MappingProxyType({})
     ) -> RunOptions:
-        """Fill in a scenario's section `pool`.
+        """Return a copy with the values of a scenario's `pool` section.
 
-        Options in `overrides` that are not None stay.
+        Values in `overrides` that are not None take precedence over the section.
         """
         options = declared(pool, TaskOptions)
         options |= {name: overrides[name] for name in options if overrides.get(name) is not None}
@@ -95,15 +95,14 @@ class RunOptions(TaskOptions):
 
     @property
     def starts_workers(self) -> bool:
-        """True if a cluster of this machine is started for the run."""
+        """True if a cluster on this machine is started for the run."""
         return self.client is None and self.scheduler is None and self.cluster is None
 
 
 class RunKeywords(TypedDict, total=False):
-    """`RunOptions` as keywords of Python.
+    """Keywords of Python functions that correspond to `RunOptions`.
 
-    The destination of a result is a parameter there, and a client replaces the options for clusters
-    that commands have.
+    A client replaces the options with which commands connect to a cluster or start one.
     """
 
     collectors: int
@@ -127,13 +126,24 @@ class RunKeywords(TypedDict, total=False):
     pace: float | None
 
 
-def options_of_call(
+def check_keywords(
     call: str, keywords: RunKeywords, without: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Return the keywords of a call that are not None.
+    """Validate the keywords of a call, and return those that are not None.
 
-    TypeError, as Python's, for a keyword that is not an option, or is meaningless in this call:
-    such keywords are in `without`.
+    Parameters
+    ----------
+    call
+        Name of the called function, for the error message.
+    keywords
+        Keywords of the call.
+    without
+        Names of `RunKeywords` that the function does not accept.
+
+    Raises
+    ------
+    TypeError
+        If the function does not accept a keyword.
     """
     accepted = RunKeywords.__annotations__.keys() - set(without)
     for name in keywords:

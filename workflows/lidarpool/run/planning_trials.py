@@ -1,4 +1,4 @@
-"""The driver's side of planning: trials on the OTHER partition, a few at a time."""
+"""Planning trials, which the driver submits to the OTHER partition a few at a time."""
 
 from __future__ import annotations
 
@@ -10,23 +10,24 @@ from collections.abc import Sequence
 from poolpart.task_locations import PartitionSnapshot
 
 from ..plan import Planning, Trial, run_trial
-from .cluster.tasks import Tasks
+from .cluster.tasks import TaskGroup
 from .pipeline.failures import raise_if_failed, was_killed
-from .pipeline.task_records import recorded
+from .pipeline.task_records import call_recorded
 
 TRIAL = "trial"
-MAX_ROUNDS = 3  # submissions of a trial whose workers die
+MAX_ROUNDS = 3  # maximum number of times that a trial is submitted if its workers die
 LOOK_EVERY_S = 1.0
 
 
-class TrialPump:
-    """Runs the trials of a planning, by `step` until `finished`.
+class TrialRunner:
+    """Planning trials of a survey, which run on the workers of a partition.
 
-    `earlier_trials` were finished by an earlier run.
+    Call `step` repeatedly until `finished` is True. Trials in `earlier_trials`, which an earlier
+    run has finished, are not repeated.
     """
 
     def __init__(
-        self, tasks: Tasks[int], planning: Planning, earlier_trials: Sequence[Trial] = ()
+        self, tasks: TaskGroup[int], planning: Planning, earlier_trials: Sequence[Trial] = ()
     ) -> None:
         self.tasks = tasks
         self.planning = planning
@@ -36,33 +37,33 @@ class TrialPump:
         self._waiting = deque(
             n for n in range(planning.trials) if n not in finished_numbers
         )  # numbers
-        self._rounds: Counter[int] = Counter()  # {number: submissions of the trial}
-        self._look()
+        self._rounds: Counter[int] = Counter()  # {number: times that the trial was submitted}
+        self._locate_tasks()
 
     @property
     def finished(self) -> bool:
-        """True if all trials have ended."""
+        """True if all trials have finished."""
         return len(self.trials) == self.planning.trials
 
     def step(self) -> None:
-        """Take results and submit more trials. LidarError if a trial has failed."""
+        """Collect results and submit more trials. Raise LidarError if a trial has failed."""
         running = self.tasks.running
-        if running and time.monotonic() - self._looked_at > LOOK_EVERY_S:
+        if running and time.monotonic() - self._located_at > LOOK_EVERY_S:
             self._leave_silent_workers()
-        for number, future in self.tasks.take_failed():
-            # Dask gives up tasks after several deaths of their workers, whatever the cause.
+        for number, future in self.tasks.pop_failed():
+            # Dask fails a task after several of its workers have died, whatever the cause.
             if was_killed(future) and self._rounds[number] < MAX_ROUNDS:
                 self._waiting.append(number)
             else:
                 raise_if_failed(future, f"Planning trial {number}")
-        self.trials += [trial for _, trial in self.tasks.take_done()]
+        self.trials += [trial for _, trial in self.tasks.pop_finished()]
         for _ in range(min(self._max_running - len(running), len(self._waiting))):
             self._submit(self._waiting.popleft())
 
     def _submit(self, number: int, worker: str | None = None) -> None:
         self.tasks.submit(
             number,
-            recorded,
+            call_recorded,
             TRIAL,
             self.tasks.partition.name,
             run_trial,
@@ -74,11 +75,11 @@ class TrialPump:
         self._rounds[number] += 1
 
     def _leave_silent_workers(self) -> None:
-        """Rerun trials whose workers are silent or have gone."""
-        locations = self._look()
+        """Resubmit trials whose workers do not respond or have left."""
+        locations = self._locate_tasks()
         running = self.tasks.running
         responding = sorted(locations.members - locations.silent)
-        # A trial bound to a worker that has gone waits for ever.
+        # A trial that is restricted to a worker that has left would wait forever.
         waiting = {
             key for key, location in locations.tasks.items() if location.state == "no-worker"
         }
@@ -86,10 +87,10 @@ class TrialPump:
         for index, future in enumerate(lost if responding else []):
             self._submit(running.pop(future), responding[index % len(responding)])
 
-    def _look(self) -> PartitionSnapshot:
-        self._looked_at = time.monotonic()
-        locations = self.tasks.look()
-        # A trial waits behind each running trial: no slot idles, and a dying worker loses few.
-        # Waiting trials make an adaptive partition start workers.
+    def _locate_tasks(self) -> PartitionSnapshot:
+        self._located_at = time.monotonic()
+        locations = self.tasks.locate()
+        # One pending trial per slot prevents idle slots, causes adaptive partitions to grow, and
+        # limits the number of trials that are lost when a worker dies.
         self._max_running = 2 * max(1, locations.max_slots)
         return locations

@@ -1,4 +1,4 @@
-"""Progress of a run, its texts, and its display at a terminal or in a notebook."""
+"""Progress of a run and its display in a terminal or notebook."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lidarsim.environment.notebook import cell_display
 from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.words import plural
 
-# Lines of progress: label, name of the count, and of the total, which is the unit.
+# Label, name of the count, and name of the total for each progress bar. The total is also the unit.
 STAGES: tuple[tuple[str, str, str], ...] = (
     ("1 generate", "generated", "scans"),
     ("2 intersect", "cast", "scans"),
@@ -26,87 +26,93 @@ STAGES: tuple[tuple[str, str, str], ...] = (
     ("jobs", "jobs_done", "jobs"),
 )
 
-# The first items are slow, because workers warm up: the time left is shown after this share of
-# items, or after this time.
+# The first items are slow because workers are warming up, so the remaining time is shown only after
+# this share of the items, or after this time.
 SURE_SHARE = 0.05
 SURE_S = 20.0
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Counts of a run at a moment."""
+    """Snapshot of the progress of a run."""
 
-    seconds: float = 0.0  # since the start
+    seconds: float = 0.0  # time since the start
     scans: int = 0
-    generated: int = 0  # scans that have passed stage 1, and so on to 4
-    cast: int = 0
-    framed: int = 0
-    collected: int = 0
+    generated: int = 0  # scans that have passed stage 1
+    cast: int = 0  # scans that have passed stage 2
+    framed: int = 0  # scans that have passed stage 3
+    collected: int = 0  # scans that have passed stage 4
     points: int = 0
     trials: int = 0
     trials_done: int = 0
-    replayed: int = 0  # batches that were sent or cast once more
-    waits_for: str = ""  # partition whose slots the survey needs and other runs hold
-    jobs: int = 0  # number of jobs of a campaign, whose scans are not counted
+    replayed: int = 0  # batches that were cast or sent more than once
+    waits_for: str = ""  # partition whose required slots are in use by other runs
+    jobs: int = 0  # number of jobs in a campaign, whose scans are not counted
     jobs_done: int = 0
     sweeps: int = 0  # revolutions or frames
     sweeps_done: int = 0  # sweeps whose scans have passed all stages
 
     @property
-    def sweeps_in_words(self) -> str:
-        """Number of sweeps that are done, «12 of 100 sweeps», or no text for a campaign."""
+    def sweeps_text(self) -> str:
+        """Number of finished sweeps, such as "12 of 100 sweeps". Empty for a campaign."""
         return f"{self.sweeps_done:,} of {plural(self.sweeps, 'sweep')}" if self.sweeps else ""
 
 
 Show = Callable[[Progress], None]
 
 
-def in_words(rate: float) -> str:
-    """Return a rate with two significant digits at least: 0.25, 3.1, 52, 1,234."""
+def format_rate(rate: float) -> str:
+    """Format a rate with at least two significant digits, such as 0.25, 3.1, 52 or 1,234."""
     return f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
 
 
-def time_in_words(seconds: float) -> str:
-    """Return a time in words: 8 s, 3 min, 2 h 05 min."""
+def format_duration(seconds: float) -> str:
+    """Format a duration, such as 8 s, 3 min or 2 h 05 min."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
     return f"{minutes} min" if minutes < 100 else f"{minutes // 60:,} h {minutes % 60:02} min"
 
 
-class Pace:
-    """Rate of a count since its first value, and the remaining time."""
+class ProgressRate:
+    """Rate of a count since its first value, from which the remaining time is estimated."""
 
     def __init__(self) -> None:
         self._first: tuple[float, int] | None = None
 
     def rate(self, seconds: float, count: int) -> float:
-        """Return the rate, 1/s, or 0 until the count has grown."""
+        """Return the rate per second, or 0 before any time has passed."""
         start_s, first_count = self._first = self._first or (seconds, count)
         return (count - first_count) / (seconds - start_s) if seconds > start_s else 0.0
 
     def time_left(self, seconds: float, count: int, total: int) -> str:
-        """Return the remaining time in words, or no text before a good estimate and at the end."""
+        """Format the remaining time.
+
+        Return an empty string while no reliable estimate is possible, and at the end.
+        """
         rate = self.rate(seconds, count)
         sure = rate and (count >= SURE_SHARE * total or seconds >= SURE_S) and count < total
-        return time_in_words((total - count) / rate) if sure else ""
+        return format_duration((total - count) / rate) if sure else ""
 
     def text(self, seconds: float, count: int, total: int) -> str:
-        """Return rate and remaining time, or no text until the count has grown."""
+        """Format the rate and the remaining time, or return an empty string if the rate is 0."""
         rate = self.rate(seconds, count)
         time_left = self.time_left(seconds, count, total)
-        return f"{in_words(rate)}/s{f'  {time_left} left' if time_left else ''}" if rate else ""
+        return f"{format_rate(rate)}/s{f'  {time_left} left' if time_left else ''}" if rate else ""
 
 
 def waiting_reason(progress: Progress) -> str:
-    """Return why the run waits, or no text if the run does not wait."""
+    """Return the reason why the run is waiting, or an empty string if it is not."""
     slots = progress.waits_for
     return f"waiting for {slots} slots held by other runs" if slots else ""
 
 
 @contextmanager
 def progress_rows(console: Console) -> Iterator[Callable[..., None]]:
-    """Show progress bars from their first `update(name, count, total, unit)`, which is yielded."""
+    """Show progress bars, and yield a function ``update(label, count, total, unit, pace="")``.
+
+    A bar appears when the function is called with its label for the first time.
+    """
     columns = (
         TextColumn("{task.description:<11}"),
         BarColumn(bar_width=None),
@@ -127,8 +133,8 @@ def progress_rows(console: Console) -> Iterator[Callable[..., None]]:
 
 @contextmanager
 def bars(console: Console) -> Iterator[Show]:
-    """Show progress bars with rates and remaining time, and yield their update function."""
-    paces = {label: Pace() for label, _, _ in STAGES}
+    """Show progress bars with rates and remaining times, and yield their update function."""
+    paces = {label: ProgressRate() for label, _, _ in STAGES}
     with progress_rows(console) as move:
 
         def show(progress: Progress) -> None:
@@ -140,15 +146,18 @@ def bars(console: Console) -> Iterator[Show]:
                     if total_name == "scans" and count < total:
                         pace = waiting_reason(progress) or pace
                     if count_name == "collected":
-                        pace = f"{pace}  {progress.sweeps_in_words}".strip()
+                        pace = f"{pace}  {progress.sweeps_text}".strip()
                     move(label, count, total, total_name, pace)
 
         yield show
 
 
 @contextmanager
-def bars_here() -> Iterator[Show]:
-    """Progress bars in a notebook cell or at a terminal, else a function without effect."""
+def local_progress_bars() -> Iterator[Show]:
+    """Show progress bars in a notebook cell or a terminal, and yield their update function.
+
+    The function has no effect if the output is neither a terminal nor a notebook.
+    """
     console = Console(stderr=cell_display() is None)
     if console.is_jupyter or (console.is_terminal and not console.is_dumb_terminal):
         with bars(console) as show:
@@ -161,9 +170,14 @@ logger = logging.getLogger(__name__)
 
 
 class Screen:
-    """Reports to a caller of Python: notes go to the log, and bars to a terminal or notebook.
+    """Messages and progress of a run that was started from Python.
 
-    `on_progress` is called in place of bars.
+    Messages are logged. Progress bars are shown in a terminal or notebook.
+
+    Parameters
+    ----------
+    on_progress
+        Function that is called with the progress instead of showing bars.
 
     Attributes
     ----------
@@ -176,31 +190,39 @@ class Screen:
         self.warnings: list[str] = []
 
     def tell(self, words: str) -> None:
-        """Log a note for the user."""
+        """Log a message for the user."""
         logger.info(words)
 
     def warn(self, words: str) -> None:
-        """Log a warning about a probable mistake once, and append it to `warnings`."""
+        """Log a warning and append it to `warnings`, unless it was already reported."""
         if words not in self.warnings:
             self.warnings.append(words)
             logger.warning(words)
 
     def status(self, words: str) -> AbstractContextManager[None]:
-        """Return a context that shows the current activity."""
+        """Return a context manager that shows the current activity."""
         return nullcontext()
 
     def writing(self, words: str) -> AbstractContextManager[WritingProgress]:
-        """Return a context that shows the progress of writing, and yields its update function."""
+        """Return a context manager that shows the progress of writing.
+
+        It yields the function that updates the progress.
+        """
         return nullcontext(lambda *_: None)
 
     def progress(self) -> AbstractContextManager[Show]:
-        """Return a context that shows the progress of a run, and yields its update function."""
-        return bars_here() if self._on_progress is None else nullcontext(self._on_progress)
+        """Return a context manager that shows the progress of a run.
+
+        It yields the function that updates the progress.
+        """
+        return (
+            local_progress_bars() if self._on_progress is None else nullcontext(self._on_progress)
+        )
 
     def starting(
         self, cluster: AbstractContextManager[Client], words: str, *, shares_terminal: bool = False
     ) -> AbstractContextManager[Client]:
-        """Return a context that starts a cluster and shows its start.
+        """Return a context manager that starts a cluster and shows this activity.
 
         `shares_terminal` is True if the workers write to the same terminal.
         """

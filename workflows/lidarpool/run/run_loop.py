@@ -1,8 +1,8 @@
-"""The loop of a run: jobs are cast several at a time, committed and written, and paths planned.
+"""Main loop of a run, which casts, commits and writes jobs and runs planning trials.
 
-A survey has a single job, which may have a planning: trials, tasks of the partition OTHER, that
-search for a short path, beside the casting. A campaign has many jobs, which are written into a data
-set.
+A survey has a single job, which may include path planning. The planning trials are tasks on the
+partition OTHER and run in parallel with casting. A campaign has many jobs, several of which are
+cast at the same time, and writes them to a data set.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from ..processes import timeline
 from ..scenario.job import Job
 from .cluster.cluster import Cluster
 from .cluster.watch import Watch
-from .job_source import JobMaker, failed_row
+from .committed import CommittedRun
+from .job_source import JobProducer, failed_row
 from .listener import Listener
 from .pipeline.casting_workers import CastingWorkers
 from .pipeline.failures import JobError
@@ -36,43 +37,42 @@ from .pipeline.pipeline import Pipeline
 from .pipeline.pipeline_job import PipelineJob
 from .pipeline.stage_messages import Summaries
 from .pipeline.stage_names import GPU, LIDAR, OTHER, SORT
-from .pipeline.task_book import StageTotals
-from .planning_trials import TrialPump
+from .planning_trials import TrialRunner
 from .progress import Progress, Show
 from .store.run_store import RunStore
 from .store.stored_job import StoredJob
 from .writer import DataSetWriter, WriteRequest
 
 PROGRESS_EVERY_S = 0.1
-SAVE_EVERY_S = 1.0  # stores the number of frames handed out
-PLANNING_PAUSE_S = 0.02  # between looks at trials, once all jobs have ended
-EXTRA_JOBS = 64  # jobs in flight, at most, in addition to two for each GPU slot
+SAVE_EVERY_S = 1.0  # interval at which the number of delivered frames is stored
+PLANNING_PAUSE_S = 0.02  # interval between checks of the trials after all jobs have ended
+EXTRA_JOBS = 64  # maximum number of jobs in flight in addition to two per GPU slot
 
 
 class RunLoop:
-    """Takes the jobs of a run through the pipeline: the first job, and the jobs of `maker`.
+    """Main loop of a run, which moves its jobs through the pipeline.
 
     Parameters
     ----------
     cluster
         Checked cluster with the partitions GPU, LIDAR and OTHER.
     store
-        Database of the run, and storage of its parts.
+        Store of the run.
     maker
-        Makes the jobs of a campaign after the first; None for the single job of a survey.
+        Source of the jobs of a campaign after the first one, or None for a survey.
     dataset
-        Data set into which the jobs of a campaign are written; None for a survey, whose parts are
-        kept.
+        Data set that the jobs of a campaign are written to, or None for a survey, whose parts stay
+        in the store.
     listener
-        Object that is notified of the parts and frames of a survey, and whose page shows ended
-        jobs.
+        Listener that is notified of the committed parts and frames of a survey. Its page shows the
+        jobs that have ended.
     """
 
     def __init__(
         self,
         cluster: Cluster,
         store: RunStore,
-        maker: JobMaker | None,
+        maker: JobProducer | None,
         dataset: DataSet | None,
         listener: Listener,
     ) -> None:
@@ -100,23 +100,22 @@ class RunLoop:
         self._writer: DataSetWriter | None = None
         if dataset is not None:
             self._writer = DataSetWriter(cluster.tasks(LIDAR), dataset, store, stages.probe)
-        self._trials: TrialPump | None = None
-        # Rows of the job table for jobs that have ended, and are not yet in the run's database.
+        self._trials: TrialRunner | None = None
+        # Table rows of jobs that have ended but have not been committed to the run's database.
         self._rows: list[JobRow] = []
-        self._jobs: dict[int, PipelineJob] = {}  # {number: a job that is being cast or written}
+        self._jobs: dict[int, PipelineJob] = {}  # {number: job that is being cast or written}
         self._scans_begun = 0
         self._jobs_begun = 0
-        self._scans_to_come = 0  # estimated scans of jobs that are not begun yet
+        self._scans_to_come = 0  # estimated number of scans in jobs that have not begun
         self._remover = ThreadPoolExecutor(1, "remove")
         self._only_committed = False  # True once the only job is committed
-        self.times: dict[str, float] = {}  # seconds: {"survey": …, "planning": …}
-        self.stages: tuple[StageTotals, ...] = ()
-        self.replayed = 0  # batches that were cast or sent more than once
+        self._times: dict[str, float] = {}  # duration of "survey" and "planning" in seconds
 
-    def run(self, first: Job, show: Show) -> None:
-        """Cast, write and plan `first` and all other jobs, and call `show` with the progress.
+    def run(self, first: Job, show: Show) -> CommittedRun:
+        """Run all jobs, starting with `first`, and return the committed results.
 
-        On any error, all tasks have been stopped.
+        The function `show` is called with the progress of the run. If an error occurs, all tasks
+        are stopped before it is raised.
         """
         cluster = self._cluster
         pipeline = self._pipeline
@@ -134,14 +133,13 @@ class RunLoop:
         self._store.tidy()
         tasks_beside = [beside.tasks for beside in (self._writer, self._trials) if beside]
         books = [pipeline.book, *(tasks.book for tasks in tasks_beside)]
-        self.stages = tuple(totals for book in books for totals in book.stages.values())
         self._store.notes += pipeline.notes
-        self.replayed = pipeline.dispatcher.replayed
-        # The report of a survey has the number of repeated batches.
+        replayed = pipeline.dispatcher.replayed
+        # The report of a survey already includes the number of repeated batches.
         if self._writer is not None and (lost := sorted(pipeline.dispatcher.lost_workers)):
             self._store.notes.append(
                 f"{plural(len(lost), 'worker')} died, left or stopped responding "
-                f"({listed(lost)}). Batches that were cast or sent again: {self.replayed:,}"
+                f"({listed(lost)}). Batches that were cast or sent again: {replayed:,}"
             )
         if self._writer is not None and self._writer.hidden:
             storage = self._writer.dataset.storage
@@ -150,30 +148,37 @@ class RunLoop:
                 "data set"
             )
             self._store.notes.append(note)
+        return CommittedRun(
+            self._store,
+            stages=tuple(totals for book in books for totals in book.stages.values()),
+            seconds=time.monotonic() - self._store.opened_at,
+            survey_seconds=self._times.get("survey", 0.0),
+            planning_seconds=self._times.get("planning", 0.0),
+            replayed=replayed,
+        )
 
     def _loop(self, first: Job, show: Show) -> None:
-        """Step jobs and planning until all have finished, and show progress meanwhile.
+        """Advance the jobs and the planning until everything has finished, and show the progress.
 
-        Once the last job has ended, the stages of the pipeline are closed, and the loop waits for
-        their end.
+        Once the last job has ended, the pipeline stages are closed, and the loop waits until they
+        have exited.
         """
         pipeline = self._pipeline
         started = time.monotonic()
         self._begin(first)  # and its trials
         timeline.mark(timeline.FIRST_BATCH)
-        # Detects partitions without workers. The stages on LIDAR last as long as the run: workers
-        # that take no more tasks are good enough there.
+        # The stages on LIDAR run until the end, so their workers do not have to accept new tasks.
         watch = self._cluster.watch([GPU, OTHER] if self._trials else [GPU], lasting=[LIDAR])
         shown_at = saved_at = float("-inf")
         tasks_beside = [beside.tasks for beside in (self._writer, self._trials) if beside]
-        while not (pipeline.stages.ended and (self._trials is None or "planning" in self.times)):
+        while not (pipeline.stages.ended and (self._trials is None or "planning" in self._times)):
             self._step_jobs(started, watch)
             self._step_planning(started, watch)
             now_s = time.monotonic()
             if now_s - saved_at >= SAVE_EVERY_S:
                 saved_at = now_s
                 self._save()
-            watch.look()
+            watch.check()
             if now_s - shown_at >= PROGRESS_EVERY_S or self._finished:
                 shown_at = now_s
                 self._show_progress(show, now_s - started)
@@ -190,10 +195,10 @@ class RunLoop:
         return self._maker.ended and not self._store.in_flight
 
     def _step_jobs(self, started: float, watch: Watch) -> None:
-        """Begin, cast, write and commit jobs, until all have ended.
+        """Begin, cast, write and commit jobs as far as possible without waiting.
 
-        `started` is the time when the loop started, by the monotonic clock, seconds. LidarError if
-        a failure concerns all jobs.
+        Raise LidarError if a failure affects all jobs. `started` is the monotonic time in seconds
+        at which the loop started.
         """
         pipeline = self._pipeline
         if pipeline.stages.closed:
@@ -201,7 +206,7 @@ class RunLoop:
         self._admit()
         news = pipeline.step(self._scans_to_come)
         if self._writer is None and news.parts:
-            self._listener.parts(news.parts)
+            self._listener.on_parts(news.parts)
         for job, summaries in news.frames:
             self._hand_out(job, summaries)
         for job, error in news.ended:
@@ -219,29 +224,27 @@ class RunLoop:
             timeline.mark(timeline.FIRST_RECEIPT)
         if self._finished:
             pipeline.close()
-            self.times["survey"] = time.monotonic() - started
+            self._times["survey"] = time.monotonic() - started
             timeline.mark(timeline.LAST_RECEIPT)
             watch.forget([GPU, LIDAR])
 
     def _step_planning(self, started: float, watch: Watch) -> None:
-        """Step the trials until all have finished."""
-        if self._trials is None or "planning" in self.times:
+        if self._trials is None or "planning" in self._times:
             return
         self._trials.step()
         if self._trials.finished:
-            self.times["planning"] = time.monotonic() - started
+            self._times["planning"] = time.monotonic() - started
             timeline.mark(timeline.PLANNED)
             watch.forget([OTHER])
 
     def _save(self) -> None:
-        """Store finished trials, and the number of frames handed out, in the run's database."""
+        """Store finished trials and the number of delivered frames in the run's database."""
         if self._trials is not None and (only_job := self._store.only_job) is not None:
             new_trials = self._trials.trials[len(only_job.trials) :]
             self._store.db.add_trials(only_job.committed, new_trials)
         self._store.save()
 
     def _show_progress(self, show: Show, seconds: float) -> None:
-        """Show the counts of the run and its time so far, at the terminal and on the page."""
         waits_for = LIDAR if self._pipeline.stages.waiting else ""
         progress = replace(self._progress(), seconds=seconds, waits_for=waits_for)
         self._cluster.call(show, progress)
@@ -262,9 +265,9 @@ class RunLoop:
         )
 
     def _states(self) -> list[dict[str, Any]]:
-        """Return the states of the jobs that are being cast, then of the jobs being written.
+        """Return the states of the jobs that are being cast, followed by those being written.
 
-        `RunPage.on_progress` describes the fields of a state.
+        See `RunPage.on_progress` for the fields of a state.
         """
         writing = {row.number for row in self._writer.jobs} if self._writer else set()
         pairs = [(self._store.in_flight[number], job) for number, job in self._jobs.items()]
@@ -283,7 +286,7 @@ class RunLoop:
         return sorted(states, key=itemgetter("writing"))
 
     def _stop(self, reason: str) -> None:
-        """Stop all tasks because of an error, as far as the cluster can be reached."""
+        """Stop all tasks after an error, if the cluster can still be reached."""
         client = self._cluster.client
         pipeline = self._pipeline
         trials = self._trials
@@ -291,29 +294,29 @@ class RunLoop:
         if trials is not None:
             steps.append(trials.tasks.cancel)
         for step in steps:
-            # Dask would try for half a minute to reach a cluster that is gone.
+            # Dask would spend half a minute trying to reach a cluster that no longer exists.
             if client.status != "running":
                 return
-            with suppress(Exception):  # report the first error
+            with suppress(Exception):  # the first error is reported instead
                 step()
 
-    # -- jobs come and go --------------------------------------------------------------------
+    # -- jobs --------------------------------------------------------------------------------
 
     def _hand_out(self, job: PipelineJob, summaries: Summaries) -> None:
-        """Call the user's function with each new frame of a job, in scan order."""
+        """Deliver new frames of a job to the listener, in scan order."""
         stored = self._store.in_flight[job.number]
         for frame in stored.frames(summaries):
             job.trace("frame", SORT, [frame.scan])
-            self._cluster.call(self._listener.frame, frame)
-            # Only now: after an error of the caller the frame is handed out again.
+            self._cluster.call(self._listener.on_frame, frame)
+            # If the user's callback raises an error, a resumed run delivers the frame again.
             stored.committed.advance_frames(frame.scan + 1)
             job.trace("release", SORT, [frame.scan])
 
     def _write(self) -> LidarError | None:
-        """Step the writer once, and return an error that concerns all jobs, if there is any."""
+        """Advance the writer, and return an error if it affects all jobs."""
         if self._writer is None:
             return None
-        # A stage whose worker has died gets its slot first.
+        # Stages whose workers have died take precedence over writing.
         slots = 0 if self._pipeline.stages.lacks_slot else self._cluster.spare
         error_of_all: LidarError | None = None
         for files, outcome in self._writer.step(slots, more_to_come=bool(self._pipeline.jobs)):
@@ -326,15 +329,14 @@ class RunLoop:
         return error_of_all
 
     def _admit(self) -> None:
-        """Begin jobs that are ready, if there is room."""
+        """Begin jobs that are ready if the pipeline has room for them."""
         max_in_flight = EXTRA_JOBS + 2 * self._pipeline.workers.slot_count
-        # Small jobs begin together, as many as have batches in one task, and go on together: then
-        # they share messages and tasks.
+        # Small jobs begin together, so that they can share tasks and messages.
         together = self._pipeline.dispatcher.per_task if self._pipeline.jobs else 1
-        if self._maker is None or not self._maker.has(together):
+        if self._maker is None or not self._maker.has_ready(together):
             return
         while self._pipeline.has_room and len(self._store.in_flight) < max_in_flight:
-            if (entry := self._maker.take()) is None:
+            if (entry := self._maker.pop()) is None:
                 break
             if isinstance(entry, JobRow):
                 self._rows.append(entry)
@@ -342,13 +344,13 @@ class RunLoop:
                 self._begin(entry)
 
     def _begin(self, job: Job) -> None:
-        """Add a job to the pipeline, and begin its planning.
+        """Add a job to the pipeline and begin its planning.
 
-        The job fails if its scans are too large for the workers, or it cannot be pickled.
+        The job fails if its scans are too large for the workers, or if it cannot be pickled.
         """
         stored = self._store.open_job(job)
         try:
-            if self._writer is not None:  # the only job of a run was checked at the start
+            if self._writer is not None:  # the job of a survey was checked at the start
                 self._cluster.check(job)
             elif job.planning is not None:
                 self._begin_planning(job.planning, stored.trials)
@@ -357,15 +359,15 @@ class RunLoop:
             self._fail(job.number, error)
 
     def _begin_planning(self, planning: Planning, earlier_trials: Sequence[Trial]) -> None:
-        self._trials = TrialPump(self._cluster.tasks(OTHER), planning, earlier_trials)
-        self._trials.step()  # before the survey begins, so that no slot of OTHER stays idle
-        # End the request for slots that was made before there were tasks: from now on, waiting
-        # trials let an adaptive partition grow.
+        self._trials = TrialRunner(self._cluster.tasks(OTHER), planning, earlier_trials)
+        self._trials.step()  # before the survey begins, so that no slot of OTHER is idle
+        # Withdraw the initial request for slots, because pending trials now cause an adaptive
+        # partition to grow.
         self._trials.tasks.partition.request_slots(0)
 
     def _cast(self, stored: StoredJob) -> None:
         job = stored.job
-        # Many jobs follow in a campaign, so that batches need not be divided among all slots.
+        # In a campaign, further jobs use the remaining slots, so batches can be larger.
         jobs_left = len(self._store.jobs.numbers) - self._store.db.ended_count
         limit = self._cluster.options.batch_mb * MB
         on_device = self._cluster.backend == "cuda"
@@ -382,7 +384,7 @@ class RunLoop:
         self._scans_to_come = to_come * self._scans_begun // self._jobs_begun
 
     def _write_request(self, casting: PipelineJob) -> WriteRequest:
-        """Return the input of the writer for a job whose scans are all committed."""
+        """Create the write request for a job whose scans are all committed."""
         stored = self._store.in_flight[casting.number]
         job = stored.job
         row = JobRow(
@@ -394,33 +396,33 @@ class RunLoop:
             sweeps=len(job.sweeps),
             rays=job.survey.ray_count,
             hits=stored.parts.hit_count,
-            # The casting times of an earlier run are not stored.
+            # The casting time of scans from an earlier run is not known.
             seconds=None if stored.resumed else casting.seconds,
         )
-        return WriteRequest(row, stored.points(), job.sweeps, job.made_of)
+        return WriteRequest(row, stored.points(), job.sweeps, job.input_files)
 
     def _fail(self, number: int, error: LidarError) -> None:
-        """Record the row of a failed job, or raise the error if the run is a survey's."""
+        """Record the row of a failed job, or raise the error if the run is a survey."""
         if self._store.only_job is not None:
             raise error
         self._rows.append(failed_row(self._store.jobs, number, error))
 
     def _commit(self) -> None:
-        """Commit the rows of ended jobs in the run's database, and remove the jobs' parts."""
+        """Commit the rows of ended jobs to the run's database, and remove the parts of the jobs."""
         rows = self._rows
         self._rows = []
         if not rows:
             return
-        ended = self._store.end(rows)  # without jobs that could not be made
+        ended = self._store.end(rows)  # excludes jobs that could not be created
         for row in rows:
             self._jobs.pop(row.number, None)
             self._page.ended(row)
         self._remover.submit(self._remove, ended)
 
     def _remove(self, ended: Sequence[tuple[JobRow, StoredJob]]) -> None:
-        """Remove the parts of jobs that have ended, after the page has read their points."""
+        """Remove the parts of ended jobs after the page has read their points."""
         for row, job in ended:
-            with suppress(LidarError, OSError):  # remaining files do no harm
+            with suppress(LidarError, OSError):  # leftover files are harmless
                 if row.done:
                     self._page.look(row, job)
             with suppress(LidarError, OSError):

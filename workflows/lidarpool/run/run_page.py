@@ -1,4 +1,4 @@
-"""Interface of a run to its live page (`lidarpool.pages.live_page`)."""
+"""Interface between a run and its live page (`lidarpool.pages.live_page`)."""
 
 from __future__ import annotations
 
@@ -19,54 +19,61 @@ from .store.stored_job import StoredJob
 class RunPage:
     """Live page of a run.
 
-    This base class shows no page.
-
-    Methods are called in the run's thread and must return at once, `look` in a thread that removes
-    the parts of ended jobs.
+    The methods of this base class do nothing. They are called in the thread of the run and must
+    return immediately, except for `look`, which is called in the thread that removes the parts of
+    ended jobs.
     """
 
     def begun(self, job: StoredJob) -> None:
-        """Show the only job of a run, and the results of an earlier run."""
+        """Show the job of a survey, including results from an earlier run."""
 
     def follow(self, partitions: Mapping[str, Partition], dataset: DataSet | None = None) -> None:
-        """Show the work on these partitions from now on.
+        """Start showing the tasks on these partitions.
 
-        Jobs are written to the data set.
+        `dataset` is the data set that the jobs of a campaign are written to.
         """
 
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
-        """Show parts of the only job that were committed."""
+        """Show newly committed parts of a survey."""
 
     def on_frame(self, frame: ScanFrame) -> None:
-        """Show a frame of the only job."""
+        """Show a frame of a survey."""
 
     def on_progress(
         self, progress: Progress, in_flight: Callable[[], Sequence[Mapping[str, Any]]]
     ) -> None:
-        """Show the progress.
+        """Show the progress of the run.
 
-        Raises KeyboardInterrupt if a user of the page has stopped the run.
+        Parameters
+        ----------
+        progress
+            Progress of the run.
+        in_flight
+            Function that returns the states of the jobs that are being cast or written. A state
+            contains the `name` and the `values` of the job, the number of its `scans`, the number
+            of scans that are `stored`, the number of their `points`, the casting time in `seconds`,
+            and whether the files of the job are being written (`writing`).
 
-        `in_flight` returns the states of the jobs that are being cast or written: `name` and
-        `values` of the job, the number of its `scans`, how many of them are `stored` and with how
-        many `points`, the casting time so far in `seconds`, and whether its files are being
-        written (`writing`).
+        Raises
+        ------
+        KeyboardInterrupt
+            If a user of the page has stopped the run.
         """
 
     def ended(self, row: JobRow) -> None:
-        """Show a job that has ended, in this run or an earlier run."""
+        """Show a job that has ended, in this run or in an earlier run."""
 
     def look(self, row: JobRow, job: StoredJob) -> None:
-        """Read points of a finished job, if they are shown, before its parts are removed."""
+        """Read the points to show for a finished job before its parts are removed."""
 
     def finish(self, seconds: float, result: RunResult | None = None) -> None:
-        """Show the end of the run after `seconds`, and the result of a survey.
+        """Show that the run has ended, its duration in seconds, and the result of a survey.
 
         The parts may be removed afterwards.
         """
 
     def stay(self, cloud: Path | None = None) -> None:
-        """Keep the page until its user ends the page.
+        """Keep the page open until the user ends it.
 
-        Points are read from the written `cloud`.
+        Points are read from the written file `cloud`.
         """

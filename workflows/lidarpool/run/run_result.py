@@ -1,4 +1,4 @@
-"""Result of a run: the points of a survey, or the totals of a campaign."""
+"""Results of runs, which are the points of a survey or the totals of a campaign."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lidarsim.survey.survey import Survey
 from ..columns.parts import StoredCloud
 from ..datasets.job_table import JobRow
 from ..plan import Plan, Planning, Trial
-from .job_source import fields_of
+from .job_source import describe_inputs
 from .pipeline.task_book import StageTotals
 from .pipeline.task_records import TaskRecord
 
@@ -94,17 +94,17 @@ class RunResult:
 
     @property
     def fields(self) -> Mapping[str, str]:
-        """Fields of scene, survey and planning, in words."""
-        return fields_of(self.scene, self.survey, self.planning)
+        """Descriptions of the fields of the scene, the survey and the planning."""
+        return describe_inputs(self.scene, self.survey, self.planning)
 
     @cached_property
     def cloud(self) -> Cloud:
-        """The points, which are read into memory on first use."""
+        """Points of the survey, which are read into memory on first use."""
         return self.points.load()
 
     @cached_property
     def hit_counts(self) -> Ints:
-        """Number of hits for each counter of the scene, which are read on first use."""
+        """Number of hits for each hit counter of the scene, which are read on first use."""
         return self._hit_counts()
 
 
@@ -115,11 +115,11 @@ class CampaignRun:
     Parameters
     ----------
     failed
-        Jobs that have failed, with `number`, `name`, `values` and `error`, as in `jobs.csv`.
+        Failed jobs, with `number`, `name`, `values` and `error` as in `jobs.csv`.
     done, points, rays
-        Number of jobs in the data set, number of their points, and number of rays cast for them.
+        Number of jobs in the data set, and the numbers of their points and rays.
     casting_seconds
-        Casting time of all tasks, in seconds, without jobs whose casting time is unknown.
+        Casting time of all tasks, in seconds, excluding jobs whose casting time is unknown.
     resumed
         Number of jobs from an earlier run.
     seconds
@@ -151,7 +151,11 @@ class CampaignRun:
     def from_rows(
         cls, rows: Iterable[JobRow], seconds: float, resumed: int | None = None, **details: Any
     ) -> CampaignRun:
-        """Summarize the job rows of a campaign, which by default all belong to an earlier run."""
+        """Summarize the table rows of the jobs in a campaign.
+
+        By default, all jobs are considered to come from an earlier run. `details` are further
+        fields of the result.
+        """
         failed = []
         job_count = 0
         points = 0

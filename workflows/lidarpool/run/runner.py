@@ -1,26 +1,21 @@
-"""A run: its jobs are cast, and their points are committed to a store.
+"""Cast the jobs of a run and commit their points to a store.
 
-`cast_to_store` below is the shortest kind of run: open a store, cast what is missing, and keep the
-points in the store. `simulate` and the shards of surveys are runs of this kind. `run_survey`
-(`report/output.py`) and `run_campaign` (`report/campaign_output.py`) do the same, and then publish
-a result, such as `cloud.ply`, and remove the store. `merge` (`report/merging.py`) fills a store
-with the points of shards instead of casting, and publishes it.
+`cast_to_store` leaves the points in the store. `run_survey` (`report/output.py`) and `run_campaign`
+(`report/campaign_output.py`) also publish a result, such as `cloud.ply`, and then remove the store.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, nullcontext
 from typing import Any
 
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
-from ..identity.shard import ALL
 from ..scenario.job import Job
 from .cluster.cluster import ClusterConnection
-from .committed import Committed
-from .job_source import JobMaker, Jobs
+from .committed import CommittedRun
+from .job_source import JobProducer, Jobs
 from .listener import Listener
 from .options import RunOptions
 from .pipeline.stage_messages import ScanFrame
@@ -37,13 +32,14 @@ def cast_to_store(
     screen: Screen,
     page: RunPage,
     on_frame: Callable[[ScanFrame], None] | None = None,
-    made_of: Mapping[str, Any] | None = None,
+    scenario_source: Mapping[str, Any] | None = None,
     target: object = None,
 ) -> RunResult:
-    """Cast the only job of a run, and leave its points in the store of the run.
+    """Cast the only job of a run and leave its points in the run store.
 
-    `on_frame` is called with each frame in scan order. `made_of` is stored with the points, so that
-    the shards of a survey can be merged. Messages name `target`, or the store by default.
+    `on_frame` is called with each frame, in scan order. The store records `scenario_source`, the
+    path and settings of the scenario, so that shards can be merged later. Messages refer to the
+    location of the result as `target`, which defaults to the location of the store.
     """
     listener = Listener(page, on_frame, pace=options.pace)
     with (
@@ -52,7 +48,7 @@ def cast_to_store(
     ):
         committed = cast(store, connection, listener)
         result = committed.result(screen)
-        store.keep(made_of, result.notes)
+        store.keep(scenario_source, result.notes)
         page.finish(result.seconds, result)
         return result
 
@@ -61,14 +57,20 @@ def cast_to_store(
 def open_store(
     jobs: Jobs, options: RunOptions, screen: Screen, target: object = None
 ) -> Iterator[RunStore]:
-    """Open the store of a run, which may have points of an earlier run.
+    """Open the store of a run, which may contain points from an earlier run.
 
-    `target` is the location of the result, which messages name; by default, the store.
+    If the body raises an error, a note on the error states which results remain in the store.
 
-    Notes of errors and interrupts in the body name what stays in the store.
+    Parameters
+    ----------
+    target
+        Location of the result for messages. Defaults to the location of the store.
 
-    LidarError if the store belongs to another run, or has an unfinished run that is not to be
-    continued.
+    Raises
+    ------
+    LidarError
+        If the store belongs to a different run, or contains an unfinished run and the options do
+        not request to continue it.
     """
     if options.restart and options.folder is not None:
         remove_run(options.folder)
@@ -82,10 +84,8 @@ def open_store(
             resume=options.may_continue,
             warnings=screen.warnings,
         )
-    # A task of a batch queue resumes its shard whether the shard has begun or not.
-    explained = store.committed_in_words or store.notes or jobs.shard != ALL
-    if options.resume and store.only_job and not explained:
-        store.notes.append(f"{target or options.folder} contained no unfinished run to resume")
+    if options.resume:
+        store.note_nothing_to_resume(target or options.folder)
     with store.kept_on_error():
         yield store
 
@@ -95,62 +95,55 @@ def cast(
     connection: ClusterConnection,
     listener: Listener,
     dataset: DataSet | None = None,
-) -> Committed:
-    """Cast all scans of a run that are not committed.
+) -> CommittedRun:
+    """Cast the scans of a run that have not been committed yet.
 
     Parameters
     ----------
     store
-        Store of the run, which is committed to.
+        Store that the points are committed to.
     connection
-        Connection to the cluster, which is opened if anything is left to be cast.
+        Connection to the cluster. It is opened only if there are scans to cast.
     listener
-        Object that is notified of the parts and frames of a survey.
+        Listener that is notified of the committed parts and frames of a survey.
     dataset
-        Data set that the jobs of a campaign are written to. The parts of a survey stay in the
-        store.
+        Data set that the jobs of a campaign are written to. Pass None for a survey, whose parts
+        stay in the store.
 
     Raises
     ------
     LidarError
-        If the cluster lacks workers or software, or a task fails.
+        If the cluster lacks workers or software, or if a task fails.
     """
     page = listener.page
-    maker: JobMaker | None = None  # makes the jobs of a campaign
+    maker: JobProducer | None = None  # only for campaigns
     if dataset is not None:
         remaining = (number for number in store.jobs.numbers if not store.db.ended(number))
-        maker = JobMaker(store.jobs, remaining, dataset.columns)
+        maker = JobProducer(store.jobs, remaining, dataset.columns)
     if store.only_job is not None:
         page.begun(store.only_job)
     with nullcontext() if maker is None else closing(maker):
         first = _first_job(store, maker, page)
         if first is None:
-            return Committed(store)
+            return CommittedRun(store)
         cluster = connection.open(first, store)
         page.follow(cluster.partitions, dataset)
         loop = RunLoop(cluster, store, maker, dataset, listener)
         with connection.screen.progress() as show:
-            loop.run(first, show)
-    return Committed(
-        store,
-        stages=loop.stages,
-        seconds=time.monotonic() - store.opened_at,
-        survey_seconds=loop.times.get("survey", 0.0),
-        planning_seconds=loop.times.get("planning", 0.0),
-        replayed=loop.replayed,
-    )
+            committed = loop.run(first, show)
+    return committed
 
 
-def _first_job(store: RunStore, maker: JobMaker | None, page: RunPage) -> Job | None:
-    """Return the first job to run, or None if nothing is left to cast, plan or deliver.
+def _first_job(store: RunStore, maker: JobProducer | None, page: RunPage) -> Job | None:
+    """Return the first job to run, or None if the run is already complete.
 
-    Jobs that cannot be made are recorded as failed.
+    Jobs that cannot be created are recorded as failed.
     """
     if maker is None:
         only_job = store.only_job
-        assert only_job is not None, "of a survey"
+        assert only_job is not None, "a run without a job maker is a survey"
         return None if only_job.complete else only_job.job
-    while isinstance(entry := maker.take(wait=True), JobRow):
+    while isinstance(entry := maker.pop(wait=True), JobRow):
         store.end([entry])
         page.ended(entry)
     return entry

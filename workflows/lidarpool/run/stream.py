@@ -1,8 +1,8 @@
-"""Sweeps of a campaign as they are cast: from the workers to the reader, without files.
+"""Streams of sweeps, which a campaign delivers without writing files.
 
-A stream replaces stages 1 and 4: it passes the scans of the next sweeps to a `Dispatcher`, which
-offers them to workers, again if workers die, and it fetches the columns from the workers that cast
-them.
+A stream replaces stages 1 and 4 of the pipeline. It passes the scans of the next sweeps to a
+`Dispatcher`, which offers them to workers and offers them again if workers die. The stream then
+fetches the columns from the workers that cast the scans.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from ..scenario.campaign_sections import Keep
 from ..scenario.empty_cloud import empty_cloud_reason
 from ..scenario.job import Job
 from .cluster.checks import check_workers, find_workers
-from .cluster.cluster import client_of
-from .cluster.watch import Waiting, Watch
-from .job_source import JobMaker
+from .cluster.cluster import open_client
+from .cluster.watch import WaitTimer, Watch
+from .job_source import JobProducer
 from .options import RunOptions
 from .pipeline.casting_workers import CastingWorkers
 from .pipeline.committed_results import CommittedResults
@@ -54,24 +54,24 @@ from .pipeline.stage_messages import CollectOrder, ColumnsLost, Receipt
 from .pipeline.stage_names import GPU
 from .progress import Screen
 
-PAUSE_S = 0.005  # while the next sweep is being cast
-_READER = "reader"  # the stream, as the only collector of the dispatcher
+PAUSE_S = 0.005  # polling interval while the next sweep is being cast
+_READER = "reader"  # name of the stream, which is the only collector of its dispatcher
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class SweepStream:
-    """The sweeps of the jobs of a campaign, which are cast while they are read.
+    """Sweeps of a campaign's jobs, which are cast while they are read.
 
-    Each loop casts all sweeps again, with the same result. When a loop ends, its tasks are canceled
-    and the workers that it has started are stopped. A pickled copy connects to the scheduler of the
-    client. In a task of that cluster, it uses the client of the task's worker.
+    Each iteration casts all sweeps again, with the same result. When an iteration ends, its tasks
+    are canceled, and the workers that it has started are stopped. A pickled copy connects to the
+    scheduler of the client. In a task on that cluster, it uses the client of the task's worker.
     """
 
     campaign: CampaignSpec
     numbers: Sequence[int]  # numbers of the jobs
-    ahead: int  # largest number of sweeps that are being cast or wait to be read
+    ahead: int  # maximum number of sweeps that are being cast or are ready to be read
     options: RunOptions
 
     def __getstate__(self) -> dict[str, Any]:
@@ -90,12 +90,12 @@ class SweepStream:
         screen = Screen()
         if options.starts_workers:
             check_backend_here(options.backend)
-        waiting = Waiting(options.startup_timeout_s, screen.tell)
-        with client_of(options, {GPU: 1}, waiting, screen) as client:
+        waiting = WaitTimer(options.startup_timeout_s, screen.tell)
+        with open_client(options, {GPU: 1}, waiting, screen) as client:
             try:
                 with closing(_Casting(self, client, waiting)) as casting:
                     yield from casting.sweeps()
-            except Exception as error:  # Dask has many kinds where a cluster is gone
+            except Exception as error:  # Dask raises various errors if the cluster is lost
                 if client.status == "running" and not isinstance(error, (PoolError, OSError)):
                     raise
                 raise LidarError(f"The stream lost its cluster: {message_of(error)}") from error
@@ -103,9 +103,9 @@ class SweepStream:
     def torch(self, transform: Callable[[Sweep], Any] | None = None) -> Any:
         """Return a `torch.utils.data.IterableDataset` of the sweeps, in the order of jobs.
 
-        The DataLoader must have ``num_workers=0``, since the cluster works ahead. If
-        torch.distributed is initialized when the loader starts, each rank receives the same number
-        of jobs.
+        The DataLoader must have ``num_workers=0``, because the cluster already prepares sweeps in
+        advance. If torch.distributed is initialized when the loader starts, each rank receives the
+        same number of jobs.
 
         Parameters
         ----------
@@ -115,7 +115,7 @@ class SweepStream:
         Raises
         ------
         LidarError
-            If torch is not installed, or in a worker of a DataLoader.
+            If torch is not installed, or if the method is called in a worker of a DataLoader.
         """
         if find_spec("torch") is None:
             raise LidarError(f"`torch` requires PyTorch. Run {install_command('torch')}.")
@@ -126,20 +126,17 @@ class SweepStream:
 
 @dataclass(eq=False)
 class _StreamedSweeps:
-    """Sweeps of a job that are being cast, with the columns that wait to be read.
-
-    Their points are those of `keep`, the format of the data set that a run of the campaign writes.
-    """
+    """Sweeps of a job that are being cast, and the columns that are ready to be read."""
 
     job: Job
-    keep: Keep
+    keep: Keep  # data set format of the campaign, which determines the points
     casting: PipelineJob
     columns: dict[int, PartColumns] = field(default_factory=dict)  # {first scan: batch}
-    sweeps_begun: int = 0  # sweeps that the dispatcher has or had
+    sweeps_begun: int = 0  # number of sweeps that have been passed to the dispatcher
     points_read: int = 0
 
     def pop(self, number: int) -> Sweep | None:
-        """Remove and return a sweep, or None if scans of the sweep are not yet cast."""
+        """Remove and return a sweep, or return None if some of its scans have not been cast yet."""
         job = self.job
         survey = job.survey
         sweeps = job.sweeps
@@ -153,7 +150,7 @@ class _StreamedSweeps:
         for part in parts:
             del self.columns[part.first]
         origin = job.scene.origin if survey.coordinates == "world" else np.zeros(3)
-        # The columns of a `StoredCloud`.
+        # The table has the same columns as a `StoredCloud`.
         stored = [c for c in survey.stored_columns if c not in AXES and c.name != WAVEFORM]
         table = (SCAN, *stored)
         cloud = Cloud.joined([part.cloud(table, survey.precision_m, origin) for part in parts])
@@ -163,7 +160,7 @@ class _StreamedSweeps:
         positions = sweeps.in_sensor(number, cloud.positions).astype(np.float32)
         in_sensor = sweeps.columns_in_sensor(number, cloud)
         columns = {column.name: np.array(in_sensor[column.name]) for column in table}
-        if self.keep.format == "kitti":  # the intensity of files of this format
+        if self.keep.format == "kitti":  # files in this format have a different intensity
             columns["intensity"] = kitti_intensity(cloud)
         boxes = Boxes.from_points(sweeps, number, cloud) if sweeps.actors else None
         boxes = boxes and boxes.to_sensor_frame(sweeps.pose, number)
@@ -172,9 +169,9 @@ class _StreamedSweeps:
 
 
 class _Casting:
-    """Casts the sweeps of a stream."""
+    """One iteration over a stream, which casts its sweeps."""
 
-    def __init__(self, stream: SweepStream, client: Client, waiting: Waiting) -> None:
+    def __init__(self, stream: SweepStream, client: Client, waiting: WaitTimer) -> None:
         self._stream = stream
         self._client = client
         options = stream.options
@@ -187,11 +184,11 @@ class _Casting:
         self._dispatcher = Dispatcher(self._casting, collector_count=1, mark="")
         self._watch = Watch(client, [GPU], (), options.worker_timeout_s)
         columns = stream.campaign.keep.of_jobs.needs
-        self._maker = JobMaker(stream.campaign, stream.numbers, columns)
-        self._jobs: dict[int, _StreamedSweeps] = {}  # {number of a job: its sweeps}
-        self._next: _StreamedSweeps | None = None  # sweeps that are cast next
+        self._maker = JobProducer(stream.campaign, stream.numbers, columns)
+        self._jobs: dict[int, _StreamedSweeps] = {}  # {job number: sweeps}
+        self._next: _StreamedSweeps | None = None  # job with sweeps that have not been begun yet
         self._in_flight = deque[tuple[_StreamedSweeps, int]]()  # sweeps that are being cast
-        self._warned = False  # True after a warning of a job without points
+        self._warned = False  # True after a warning about a job without points
 
     def sweeps(self) -> Generator[Sweep]:
         """Yield the sweeps in order."""
@@ -208,7 +205,7 @@ class _Casting:
             yield sweep
 
     def close(self) -> None:
-        """Stop casting, and release the workers."""
+        """Stop casting and release the workers."""
         self._maker.close()
         for streamed in [*self._jobs.values()]:
             self._end(streamed)
@@ -217,7 +214,7 @@ class _Casting:
             self._casting.release()
 
     def _step(self) -> None:
-        """Begin, cast and fetch sweeps, as far as possible without waiting."""
+        """Begin, cast and fetch sweeps as far as possible without waiting."""
         self._begin_sweeps()
         self._dispatcher.check()
         if (locations := self._casting.refresh()) is not None:
@@ -233,12 +230,12 @@ class _Casting:
         orders = self._dispatcher.assign({_READER: ""})
         self._fetch(orders.get(_READER, ()))
         self._dispatcher.offer()
-        self._watch.look()
+        self._watch.check()
 
     def _begin_sweeps(self) -> None:
-        """Begin further sweeps, at most `ahead` of the reader."""
+        """Begin further sweeps until `ahead` sweeps are in flight."""
         while len(self._in_flight) < self._stream.ahead and (self._next or self._begin_job()):
-            if (streamed := self._next) is not None:  # else the job has failed
+            if (streamed := self._next) is not None:  # None if the job has failed
                 number = streamed.sweeps_begun
                 sweeps = streamed.job.sweeps
                 self._dispatcher.add_scans(
@@ -250,8 +247,8 @@ class _Casting:
                     self._next = None
 
     def _begin_job(self) -> bool:
-        """Take the next job, which may fail, and return False if no job is ready."""
-        if (entry := self._maker.take()) is None:
+        """Begin the next job, unless it fails. Return False if no job is ready."""
+        if (entry := self._maker.pop()) is None:
             return False
         if isinstance(entry, JobRow):
             self._warn_of_failure(entry.name, entry.error)
@@ -268,7 +265,7 @@ class _Casting:
         on_device = self._backend == "cuda"
         scan_count = job.survey.scan_count
         casting = PipelineJob(
-            committed=CommittedResults(job.number, range(scan_count)),  # stays empty
+            committed=CommittedResults(job.number, range(scan_count)),  # remains empty
             run=self._casting.run,
             scene_name=scene_name,
             scans_per_task=scans_that_fit(job.scene, job.survey, limit, on_device=on_device),
@@ -279,7 +276,7 @@ class _Casting:
         return True
 
     def _fetch(self, orders: Sequence[CollectOrder]) -> None:
-        """Fetch the columns of casting tasks from their workers."""
+        """Fetch the columns of finished casting tasks from their workers."""
         for order in orders:
             results = fetch_available(self._client, [order.key], holder=order.worker)
             if order.key not in results:
@@ -301,7 +298,7 @@ class _Casting:
         self._casting.remove(streamed.job.number)
 
     def _warn_if_empty(self, streamed: _StreamedSweeps) -> None:
-        """Warn of the first job without points, and cast rays here to find the reason."""
+        """Warn about the first job without points, and cast rays locally to find the reason."""
         if streamed.points_read or self._warned:
             return
         self._warned = True

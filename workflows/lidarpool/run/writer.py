@@ -1,4 +1,4 @@
-"""LIDAR workers that write: jobs into a data set, and ranges of multi-file formats."""
+"""Writing on LIDAR workers, which write the jobs of a data set and ranges of multi-file formats."""
 
 from __future__ import annotations
 
@@ -26,61 +26,76 @@ from ..datasets.dataset import DataSet, Listing
 from ..datasets.job_table import JobRow
 from ..identity.software import plugin_versions
 from .cluster.cluster import Cluster
-from .cluster.tasks import Tasks
-from .pipeline.casting_workers import share
+from .cluster.tasks import TaskGroup
+from .pipeline.casting_workers import submit_value
 from .pipeline.failures import JobError, raise_if_failed, was_killed
 from .pipeline.stage_names import EXPORT, LIDAR
 from .pipeline.task_records import Recorder, TaskRecord
 from .run_result import RunResult
 from .store.run_store import RunStore
 
-TASKS_PER_SLOT = 2  # submitted tasks for each free slot of LIDAR
+TASKS_PER_SLOT = 2  # submitted tasks per free slot of LIDAR
 MAX_JOBS_PER_TASK = 32
-MAX_POINTS_PER_TASK = 1_000_000  # points of all jobs of a task
-GATHER_S = 0.25  # time that a job waits for more jobs of its task
-MAX_STALL_S = 10.0  # time without progress, after which the driver writes a job
+MAX_POINTS_PER_TASK = 1_000_000  # maximum total number of points in the jobs of a task
+GATHER_S = 0.25  # time that a job waits for further jobs to share its task
+MAX_STALL_S = 10.0  # time without progress after which the driver writes jobs itself
 
 
 class WriteRequest(NamedTuple):
-    """Input for writing a job, whose `row` lacks the counts of points."""
+    """Request to write the files of a job, with the arguments of `DataSet.write_job`."""
 
-    row: JobRow
+    row: JobRow  # table row without point counts
     cloud: StoredCloud
     sweeps: Sweeps
-    made_of: Sequence[Sequence[str]]
+    input_files: Sequence[Sequence[str]]
 
 
 JobOutcome = JobRow | LidarError
 
 
-Probe = tuple[Storage, str, bytes]  # a storage, and the name and content of a file in it
+Probe = tuple[Storage, str, bytes]  # storage, and the name and content of a file in this storage
 
 
 def write_jobs(
     dataset: DataSet, probes: Sequence[Probe], jobs: Sequence[WriteRequest]
 ) -> tuple[list[JobOutcome] | None, TaskRecord]:
-    """Write the files of jobs on a LIDAR worker, and return a row or an error of each job.
+    """Write the files of jobs on a LIDAR worker.
 
-    `probes` are a file of the data set and a file among the parts. None is returned in place of
-    the rows if the worker does not see both files. The record of the task counts scans.
+    Parameters
+    ----------
+    dataset
+        Data set that the jobs are written to.
+    probes
+        Files in the data set and in the parts folder, which show whether the worker can access
+        these locations.
+    jobs
+        Jobs to write.
+
+    Returns
+    -------
+    The table row or the error of each job, and the record of the task, which counts scans. The rows
+    are None if the worker cannot access both locations.
     """
     recorder = Recorder(EXPORT, LIDAR)
     if not all(storage.sees(name, content) for storage, name, content in probes):
         return None, recorder.finish()
     outcomes = [_write_job(dataset, job) for job in jobs]
-    scan_count = sum(int(job.sweeps.scans[-1]) for job in jobs)  # one past the last scan of each
+    scan_count = sum(int(job.sweeps.scans[-1]) for job in jobs)  # entry -1 is the number of scans
     return outcomes, recorder.finish(scan_count)
 
 
 def _write_job(dataset: DataSet, job: WriteRequest) -> JobOutcome:
-    """Write a job, and return its row, a JobError, or a LidarError due to the storage."""
+    """Write a job and return its table row.
+
+    If this fails, return a LidarError for a storage error, or a JobError for any other error.
+    """
     listing = Listing.from_storage(dataset.storage)
     try:
         return dataset.write_job(*job, listing=listing)
     except Exception as error:
         cause = error if isinstance(error, OSError) else error.__cause__
         message = str(error) if isinstance(error, LidarError) else repr(error)
-        if isinstance(cause, OSError):  # a full disk fails all jobs
+        if isinstance(cause, OSError):  # for example a full disk, which affects all jobs
             name = "" if isinstance(error, LidarError) else f"job {job.row.name}: "
             return LidarError(f"{name}{message}")
         with suppress(OSError):
@@ -89,15 +104,26 @@ def _write_job(dataset: DataSet, job: WriteRequest) -> JobOutcome:
 
 
 class DataSetWriter:
-    """Has LIDAR workers write jobs into a data set.
+    """Writer that has LIDAR workers write jobs to a data set.
 
-    `parts_probe` is a file among the parts of the `store`, name and content: a worker that does not
-    see this file, or a similar file in the data set, writes no job. The driver writes such jobs.
+    Workers that cannot access the parts or the data set write no jobs. The driver writes their jobs
+    instead.
+
+    Parameters
+    ----------
+    tasks
+        Tasks of the LIDAR partition.
+    dataset
+        Data set to write to.
+    store
+        Store of the run.
+    parts_probe
+        Name and content of a file in the parts folder, with which workers check their access.
     """
 
     def __init__(
         self,
-        tasks: Tasks[list[WriteRequest]],
+        tasks: TaskGroup[list[WriteRequest]],
         dataset: DataSet,
         store: RunStore,
         parts_probe: tuple[str, bytes],
@@ -106,7 +132,7 @@ class DataSetWriter:
         storage = dataset.storage
         mark = store.db.meta["mark"]
         self.dataset = replace(dataset, made_with=store.made_with)
-        # The name of a temporary file: later writers remove the file of a killed run.
+        # Later writers remove temporary files, so the file of a killed run does not remain.
         self._probe_name = f"{TEMPORARY}dataset-{mark[:8]}"
         dataset_probe = storage, self._probe_name, mark.encode()
         self._probes: Sequence[Probe] = (dataset_probe, (store.storage, *parts_probe))
@@ -114,15 +140,15 @@ class DataSetWriter:
             storage.prepare()
             storage.write(self._probe_name, mark.encode())
         self._waiting = deque[WriteRequest]()
-        self._due_at = 0.0  # when the waiting jobs are to be written
+        self._due_at = 0.0  # monotonic time at which the waiting jobs are written
         self._driver_writes: dict[Future[JobOutcome], WriteRequest] = {}
         self._thread = ThreadPoolExecutor(1, "write")
         self._moved_at = time.monotonic()
-        self.hidden = False  # True if a worker did not see the data set
+        self.hidden = False  # True if a worker could not access the data set or the parts
 
     @property
     def jobs(self) -> Iterator[JobRow]:
-        """Jobs that wait or are being written."""
+        """Rows of the jobs that are waiting or being written."""
         yield from (job.row for jobs in self.tasks.running.values() for job in jobs)
         yield from (job.row for job in (*self._driver_writes.values(), *self._waiting))
 
@@ -133,10 +159,19 @@ class DataSetWriter:
         self._waiting.append(files)
 
     def step(self, slots: int, *, more_to_come: bool) -> list[tuple[WriteRequest, JobOutcome]]:
-        """Submit waiting jobs to free slots, and return written jobs with their rows or errors.
+        """Submit waiting jobs to free slots, and return the jobs that have ended.
 
-        Jobs wait a moment for others of their task if there are `more_to_come`. Errors of single
-        jobs are JobErrors; other errors are of the storage, or of a worker's software.
+        Parameters
+        ----------
+        slots
+            Number of free slots.
+        more_to_come
+            Whether further jobs will be added. If so, jobs wait a moment to share a task.
+
+        Returns
+        -------
+        Ended jobs with their table rows or errors. A JobError affects a single job. Other errors
+        are caused by the storage or by the software of a worker.
         """
         due = (
             not more_to_come
@@ -148,13 +183,13 @@ class DataSetWriter:
             arguments = self.dataset, self._probes, jobs
             self.tasks.submit(jobs, write_jobs, *arguments, priority=5)
         ended: list[tuple[WriteRequest, JobOutcome]] = []
-        for jobs, outcomes in self.tasks.take_done():
+        for jobs, outcomes in self.tasks.pop_finished():
             if outcomes is None:
                 self.hidden = True
                 self._write_here(jobs)
             else:
                 ended += zip(jobs, outcomes, strict=True)
-        for jobs, future in self.tasks.take_failed():
+        for jobs, future in self.tasks.pop_failed():
             if was_killed(future):
                 self._write_here(jobs)
                 continue
@@ -164,7 +199,7 @@ class DataSetWriter:
                 ended += [(job, error) for job in jobs]
         for write in [write for write in self._driver_writes if write.done()]:
             ended.append((self._driver_writes.pop(write), write.result()))
-        self._relieve(bool(ended))
+        self._write_stalled_jobs(bool(ended))
         return ended
 
     def _next(self) -> list[WriteRequest]:
@@ -178,17 +213,17 @@ class DataSetWriter:
             jobs.append(self._waiting.popleft())
         return jobs
 
-    def _relieve(self, moved: bool) -> None:
-        """Let the driver write jobs if no task has started for long.
+    def _write_stalled_jobs(self, moved: bool) -> None:
+        """Let the driver write jobs if no task has started for a long time.
 
-        All slots of LIDAR may be held, or have gone.
+        This happens if all slots of LIDAR are in use by other runs or have left.
         """
         now_s = time.monotonic()
         if moved or self._driver_writes or not self.tasks.running:
             self._moved_at = now_s
         elif now_s - self._moved_at > MAX_STALL_S:
             self._moved_at = now_s
-            locations = self.tasks.look()
+            locations = self.tasks.locate()
             if any(
                 location.started and not locations.is_unreachable(key)
                 for key, location in locations.tasks.items()
@@ -205,7 +240,7 @@ class DataSetWriter:
 
     def close(self) -> None:
         """Cancel all writing."""
-        with suppress(Exception):  # report the first error
+        with suppress(Exception):  # the first error is reported instead
             self.tasks.cancel()
         self._thread.shutdown(cancel_futures=True)
         with suppress(OSError):
@@ -214,21 +249,30 @@ class DataSetWriter:
 
 LOOK_EVERY_S = 0.01
 FETCH_S = 1.0
-ENDS_S = 10.0  # time for ranges that are being written when the writer is stopped
+ENDS_S = 10.0  # time limit for ranges that are still being written when the writer is stopped
 
 
 class LidarWorkers:
-    """Has the workers of LIDAR write ranges of files."""
+    """LIDAR workers that write ranges of files."""
 
     def __init__(self, cluster: Cluster) -> None:
         self._cluster = cluster
         self._tasks = cluster.tasks(LIDAR)
 
     def __call__(self, writer: RangeWriter, spans: Sequence[PieceRange]) -> dict[PieceRange, Range]:
-        """Write ranges, and return the results of ranges whose workers see the folder.
+        """Write ranges of files on workers.
 
-        The range of a worker that dies is written by another worker. LidarError if a worker cannot
-        write, several workers die of a range, or LIDAR has no worker for too long.
+        If a worker dies, its range is written by another worker.
+
+        Returns
+        -------
+        Results of the ranges, except for those whose workers cannot access the folder.
+
+        Raises
+        ------
+        LidarError
+            If a worker cannot write, if several workers die while writing the same range, or if
+            LIDAR has no workers for too long.
         """
         partition = self._tasks.partition
         running = self._tasks.running
@@ -237,9 +281,9 @@ class LidarWorkers:
         max_tasks = 2 * partition.slots
         written: dict[PieceRange, Range] = {}
         watch = self._cluster.watch([LIDAR])
-        # Workers fetch the writer from the worker that holds it: Dask would send all tasks to that
-        # worker if the writer were their argument.
-        shared = share(partition, writer, priority=10)
+        # Workers fetch the writer from the worker that holds it. If it were an argument of the
+        # tasks, Dask would send all tasks to that worker.
+        shared = submit_value(partition, writer, priority=10)
         try:
             while waiting or running:
                 while waiting and len(running) < max_tasks:
@@ -247,13 +291,13 @@ class LidarWorkers:
                     self._tasks.submit(span, _write_range, shared.key, span)
                 for future in (shared, *running):
                     raise_if_failed(future, f"Writing {writer.storage}")
-                finished = self._tasks.take_done()
+                finished = self._tasks.pop_finished()
                 written |= {
                     span: written_range
                     for span, written_range in finished
                     if written_range is not None
                 }
-                watch.look()
+                watch.check()
                 if not finished:
                     time.sleep(LOOK_EVERY_S)
         except OSError as error:
@@ -268,28 +312,27 @@ class LidarWorkers:
         return written
 
     def recorded(self, result: RunResult) -> RunResult:
-        """Return a result with the tasks that wrote ranges."""
+        """Return a copy of a result that includes the tasks that wrote ranges."""
         return replace(result, stages=(*result.stages, *self._tasks.book.stages.values()))
 
 
 @lru_cache(maxsize=1)
 def _fetch_writer(key: str) -> RangeWriter:
-    """Fetch the writer, cached for all ranges of this process.
+    """Fetch the writer, which is cached for all ranges in this process.
 
-    Dask makes the writer again if its worker has died. If the writer were an argument of the tasks,
-    Dask would run them only on workers that hold it.
+    Dask recreates the writer if the worker that holds it has died.
     """
     deadline = time.monotonic() + FETCH_S
     while not (results := fetch_available(own_client(), [key])):
         if time.monotonic() > deadline:
-            raise Reschedule  # the task that makes the writer again needs a slot
+            raise Reschedule  # the task that recreates the writer requires a slot
         time.sleep(LOOK_EVERY_S)
     writer: RangeWriter = results[key]
     return writer
 
 
 def _write_range(key: str, span: PieceRange) -> tuple[Range | None, TaskRecord]:
-    """Write a range on a worker, and return its result and the record of the task."""
+    """Write a range on a worker and return its result and the record of the task."""
     recorder = Recorder(EXPORT, LIDAR)
     with explained(f"The worker {recorder.finish().worker} cannot write the output"):
         written_range = _fetch_writer(key)(span)

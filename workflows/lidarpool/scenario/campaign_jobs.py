@@ -80,8 +80,8 @@ class JobSource:
         """Prepare the scenario of a job, with the arguments of `job`."""
         scenario = self.scenario(number)
         assert scenario is not None, "of a file"
-        made_of = file_hashes(scenario.files)
-        fields |= {"values": self.values(number), "made_of": made_of}
+        input_files = file_hashes(scenario.files)
+        fields |= {"values": self.values(number), "input_files": input_files}
         return prepare(scenario, plans=False, cache=cache, columns=columns, **fields)
 
     def job(

@@ -49,7 +49,7 @@ class Job:
         Number of the job in its campaign, its name in files, and the name of its split.
     outputs
         Formats of the cloud in addition to PLY.
-    made_of
+    input_files
         Names and SHA-256 hashes of the files that the job was made from.
 
     Raises
@@ -68,7 +68,7 @@ class Job:
     name: str = ""
     split: str = ""
     outputs: Sequence[ExportSpec] = ()
-    made_of: Sequence[tuple[str, str]] = ()
+    input_files: Sequence[tuple[str, str]] = ()
 
     __repr__ = one_line
 

@@ -1,1 +1,1 @@
-"""The cluster of a run: clients, started clusters, checks, and loss of workers."""
+"""Clusters of runs, which are started or connected to, checked and monitored."""

@@ -1,4 +1,4 @@
-"""Checks before a run starts, so that it does not fail in the middle."""
+"""Checks of the cluster before a run starts, so that it does not fail later."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ from ...scenario.job import Job
 from ...scenario.sections import TaskOptions
 from ..pipeline.failures import JobError
 from ..pipeline.stage_names import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
-from .watch import Waiting, queued
+from .watch import WaitTimer, queued_clause
 
 LOOK_EVERY_S = 0.2
 
 
 class TooFewWorkersError(LidarError):
-    """Error for a partition without enough workers or slots, which may still join."""
+    """Error raised if a partition has too few workers or slots. Further workers may still join."""
 
 
 class SurveyWorkers(NamedTuple):
-    """Workers of a run, and the backend and software that the scans are cast with."""
+    """Workers of a run, and the backend and software with which they cast scans."""
 
     pool: Pool  # all workers
-    casting: list[WorkerInfo]  # workers of partition GPU
+    casting: list[WorkerInfo]  # workers in the GPU partition
     backend: str
     software: dict[str, str]  # software of the casting workers
 
 
 def slots_needed(tasks: TaskOptions, *, planning: bool, writing: bool = False) -> dict[str, int]:
-    """Return the slots that a run needs in each partition, {name: slots}."""
+    """Return the number of slots that a run requires in each partition."""
     return {GPU: 1, LIDAR: 2 + tasks.collectors + writing} | ({OTHER: 1} if planning else {})
 
 
@@ -56,33 +56,33 @@ def find_workers(
     requested: str,
     advice: str = AUTO_ADVICE,
     earlier: Mapping[str, str] | None = None,
-    waiting: Waiting | None = None,
+    waiting: WaitTimer | None = None,
     *,
     writing: bool = False,
 ) -> SurveyWorkers:
-    """Wait for the workers of a run, and check that they suffice.
+    """Wait for the workers of a run and check that they are sufficient.
 
     Parameters
     ----------
     client
         Client of the cluster.
     required_slots
-        {partition: slots that the run needs}.
+        Number of slots that the run requires, by partition.
     requested
-        The requested backend.
+        Requested backend.
     advice
-        End of the message if the backend is not available.
+        End of the error message if the backend is not available.
     earlier
-        Software that a resumed run was cast with.
+        Software with which the scans of a resumed run were cast.
     waiting
-        Time to wait for workers that are missing or just died, or whose jobs are in the queue.
+        Time limit for workers that are missing or have just died, or whose jobs are queued.
     writing
-        Whether LIDAR workers write jobs, too.
+        Whether LIDAR workers also write the jobs of a data set.
 
     Raises
     ------
     LidarError
-        If workers, slots or the backend are missing, or versions differ.
+        If workers, slots or the backend are missing, or if versions differ.
     """
     while True:
         start_s = time.monotonic()
@@ -93,30 +93,37 @@ def find_workers(
             casting_software = common_software(client, backend, casting, earlier or {})
             return SurveyWorkers(pool, casting, backend, casting_software)
         except TooFewWorkersError as error:
-            coming = 0  # jobs in a queue, which does not say which jobs have died
+            coming = 0  # number of queued jobs, which may include jobs that have died
             if waiting is not None:
                 coming = sum(take_snapshot(client, name).queued_jobs for name in required_slots)
-            # A worker that has just died takes half a minute not to answer, which does not count
-            # as waiting: the remaining time is taken at the start of this attempt.
+            # The request to a worker that has just died times out after half a minute. This time
+            # does not count, so the remaining time is that at the start of this attempt.
             if waiting is None or not waiting.remaining_s(start_s):
                 if coming:
                     error.add_note(
-                        f"{queued(coming)}. If they are only waiting in the queue, increase "
+                        f"{queued_clause(coming)}. If they are only waiting in the queue, increase "
                         "`--startup-timeout`."
                     )
                 raise
-            # Without the advice to start workers: a user who waits has started some.
+            # The advice to start workers is omitted, because the user has already started some.
             shortage = re.split(r"(?i)[:.] start ", str(error), maxsplit=1)[0]
-            waiting.tell("workers", shortage + (f"; {queued(coming)}" if coming else ""))
+            waiting.tell("workers", shortage + (f"; {queued_clause(coming)}" if coming else ""))
         time.sleep(LOOK_EVERY_S)
 
 
 def check_memory(
     job: Job, tasks: TaskOptions, backend: str, available_bytes: float, worker: str
 ) -> None:
-    """Raise JobError if a worker has too little memory for scans or batches: bytes a slot.
+    """Raise JobError if a worker has too little memory for the scans or batches of a job.
 
-    The error is a JobError because another job may fit.
+    The error is a JobError, because other jobs may require less memory.
+
+    Parameters
+    ----------
+    available_bytes
+        Memory of the worker for each slot, in bytes.
+    worker
+        Description of the worker for the message.
     """
     peak_bytes = partial(cast_bytes, job.scene, job.survey, on_device=backend == "cuda")
     if (all_scans := peak_bytes(job.survey.scan_count)) <= available_bytes:
@@ -141,7 +148,8 @@ def check_workers(
 ) -> None:
     """Raise JobError if a casting worker has too little memory for a job."""
     bytes_per_slot = {w.address: w.memory / max(1, w.resources[GPU]) for w in casting if w.memory}
-    # Only the smallest: a campaign of tiny jobs has no time for hundreds of workers a job.
+    # Only the worker with the least memory is checked. Checking hundreds of workers would take too
+    # long for the small jobs of a campaign.
     if bytes_per_slot:
         address = min(bytes_per_slot, key=bytes_per_slot.__getitem__)
         check_memory(
@@ -150,21 +158,21 @@ def check_workers(
 
 
 def _survey_pool(client: Client, required_slots: Mapping[str, int], writing: bool) -> Pool:
-    """Return all workers of the cluster, after checking that they suffice."""
+    """Return all workers of the cluster after checking that they are sufficient."""
     workers = worker_identities(client)
     if not workers:
         raise TooFewWorkersError(
             f"The cluster at {client.scheduler.address} has no workers. Start workers, for "
             f'example with `dask worker {client.scheduler.address} --resources "GPU=1"`.'
         )
-    # Only workers of this run: a cluster may have other workers, with other packages.
+    # The cluster may have other workers with different packages, which are ignored.
     _check_versions(
         client, [a for a, w in workers.items() if {*required_slots} & {*w["resources"]}]
     )
     try:
         pool = Pool.from_client(client, declaring=set(required_slots))
         pool.require(dict.fromkeys(required_slots, 0))  # no worker may declare two partitions
-    except PoolError as error:  # errors that more workers do not correct
+    except PoolError as error:  # errors that additional workers cannot resolve
         raise LidarError(str(error)) from error
     purpose = {
         GPU: "stage 2 casts the rays",
@@ -180,17 +188,17 @@ def _survey_pool(client: Client, required_slots: Mapping[str, int], writing: boo
 
 
 def _check_versions(client: Client, workers: Sequence[str]) -> None:
-    """Check that the workers at these addresses have the driver's Python and sources."""
+    """Check that workers have the same Python version and sources as the driver."""
     driver_version = platform.python_version()
     for address, python in run_on_workers(client, platform.python_version, workers).items():
-        # Code is sent to workers by value, which needs the same minor version.
+        # Code is sent to workers by value, which requires the same minor version.
         if str(python).split(".")[:2] != driver_version.split(".")[:2]:
             raise LidarError(
                 f"The worker at {address} has Python {python}, but the run requires Python "
                 f"{driver_version}. Install the same version on both machines."
             )
     driver_sources = software()["lidarpool"]
-    for address, answer in _answers(client, software_query(), workers).items():
+    for address, answer in _query_workers(client, software_query(), workers).items():
         if not answer:
             raise LidarError(
                 f"The worker at {address} does not have lidarpool. Install lidarpool "
@@ -205,9 +213,9 @@ def _check_versions(client: Client, workers: Sequence[str]) -> None:
 
 
 def check_formats(client: Client, pool: Pool, formats: Iterable[ExportSpec]) -> None:
-    """Check that the LIDAR workers can write the formats of plug-ins.
+    """Check that the LIDAR workers can write the formats that plug-ins provide.
 
-    LidarError if a worker has another version of a plug-in, or cannot import it.
+    Raise LidarError if a worker has a different version of a plug-in or cannot import it.
     """
     written = [spec for spec in formats if spec.has_many_files and spec.row.plugin is not None]
     if not written:
@@ -215,7 +223,7 @@ def check_formats(client: Client, pool: Pool, formats: Iterable[ExportSpec]) -> 
     plugins = [spec.row.plugin for spec in written if spec.row.plugin is not None]
     required = software(plugins=plugins)
     writing = [worker.address for worker in pool if worker.resources.get(LIDAR)]
-    for address, answer in _answers(client, software_query(plugins=plugins), writing).items():
+    for address, answer in _query_workers(client, software_query(plugins=plugins), writing).items():
         if differs := describe_difference(answer, required):
             raise LidarError(
                 f"The worker at {address} has {differs}. Install the same version on both "
@@ -237,12 +245,15 @@ def _check_installed(formats: Iterable[ExportSpec]) -> None:
 def common_software(
     client: Client, backend: str, workers: Sequence[WorkerInfo], earlier: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the software that scans are cast with: `earlier`, or the most common of the workers.
+    """Return the software with which scans are cast.
 
-    Workers with different software are refused when they are prepared. LidarError if no worker has
-    the `earlier` software.
+    A resumed run uses the `earlier` software. Otherwise, the most common software of the workers is
+    used. Workers with different software are refused when they are checked later. Raise LidarError
+    if no worker has the earlier software.
     """
-    answers = _answers(client, software_query(backend), [worker.address for worker in workers])
+    answers = _query_workers(
+        client, software_query(backend), [worker.address for worker in workers]
+    )
     if earlier and dict(earlier) not in answers.values():
         address, installed = next(iter(answers.items()))
         raise LidarError(
@@ -256,10 +267,10 @@ def common_software(
     return dict(earlier) if earlier else dict(common)
 
 
-def _answers(
+def _query_workers(
     client: Client, question: Callable[[], Any], workers: Sequence[str]
 ) -> Mapping[str, Any]:
-    """Return the answers of workers by address, or raise the first error."""
+    """Call a function on workers and return the results by address, or raise the first error."""
     answers = run_on_workers(client, question, workers)
     if workers and not answers:
         raise TooFewWorkersError(
@@ -272,7 +283,7 @@ def _answers(
 
 
 def gpu_note(pool: Iterable[WorkerInfo], casting: Sequence[WorkerInfo], backend: str) -> str:
-    """Return a note if GPUs of a cluster stay idle, else an empty string."""
+    """Return a note if GPUs of the cluster are not used, or an empty string."""
     if backend == "cuda" or not any(worker.gpus for worker in pool):
         return ""
     if any(worker.gpus for worker in casting):
@@ -289,13 +300,17 @@ def gpu_note(pool: Iterable[WorkerInfo], casting: Sequence[WorkerInfo], backend:
 def common_backend(
     client: Client, requested: str, workers: Sequence[WorkerInfo], advice: str = AUTO_ADVICE
 ) -> str:
-    """Return the name of a ray-casting backend that all these workers have.
+    """Return the name of a ray-casting backend that is available on all workers.
 
-    "auto" is resolved here, once: if each worker chose for itself, a cloud would depend on the
-    distribution of scans to workers. LidarError, which ends with `advice`, if a worker lacks the
-    backend.
+    "auto" is resolved once for all workers. If each worker chose its own backend, the cloud would
+    depend on how scans are distributed among workers.
+
+    Raises
+    ------
+    LidarError
+        If the backend is missing on a worker. The message ends with `advice`.
     """
-    answers = _answers(client, available_backends, [worker.address for worker in workers])
+    answers = _query_workers(client, available_backends, [worker.address for worker in workers])
     if requested == "auto":
         names = next(iter(answers.values()))
         return next(n for n in names if not any(reasons[n] for reasons in answers.values()))

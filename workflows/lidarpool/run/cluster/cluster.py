@@ -1,4 +1,4 @@
-"""A cluster that can run jobs: checked, and watched for its loss."""
+"""Cluster of a run, which is checked before jobs are cast and monitored for its loss."""
 
 from __future__ import annotations
 
@@ -24,26 +24,33 @@ from ..pipeline.stage_names import GPU, LIDAR, OTHER
 from ..progress import Screen
 from ..store.run_store import RunStore
 from .checks import check_formats, check_workers, find_workers, gpu_note, slots_needed
-from .connection import StartedAhead, check_starts_workers, connected, local_client, started_client
-from .tasks import Tasks
-from .watch import Waiting, Watch
+from .connection import (
+    BackgroundClient,
+    check_starts_workers,
+    connect_client,
+    local_client,
+    start_client,
+)
+from .tasks import TaskGroup
+from .watch import WaitTimer, Watch
 
-LOST_S = 0.5  # time until a client notices that its scheduler is gone
+LOST_S = 0.5  # time until a client notices that its scheduler is lost
 
-# Errors that Dask raises once the scheduler is gone; errors of connections are OSErrors.
+# Errors that Dask raises after the scheduler is lost. Connection errors are OSErrors.
 _CLUSTER_LOST = (OSError, FutureCancelledError, PipeClosed, PipeFailed)
 
 
 class ClusterConnection:
-    """Connection of a run to its cluster, which is opened if something is left to be cast.
+    """Connection of a run to its cluster, which is opened only if there are scans to cast.
 
-    Within the context, workers of this machine start in the background, unless an earlier run may
-    have left nothing to cast. The context stops the workers that were started for the run.
+    When the context is entered, workers on this machine start in the background, unless the run may
+    continue an earlier run that is already complete. When the context exits, workers that were
+    started for the run are stopped.
 
     Attributes
     ----------
     cluster
-        The cluster, or None until the connection is opened.
+        Cluster of the run, or None until the connection is opened.
     """
 
     def __init__(self, jobs: Jobs, options: RunOptions, screen: Screen) -> None:
@@ -52,7 +59,7 @@ class ClusterConnection:
         self._jobs = jobs
         self._options = options
         self._stack = ExitStack()
-        self._local: StartedAhead | None = None  # workers of this machine
+        self._local: BackgroundClient | None = None  # workers on this machine
 
     def __enter__(self) -> Self:
         options = self._options
@@ -67,9 +74,9 @@ class ClusterConnection:
         self.close()
 
     def open(self, first: Job, store: RunStore) -> Cluster:
-        """Connect to a cluster with the slots that a job needs, and check the cluster for the job.
+        """Connect to the cluster, and check that it has the slots that the job `first` requires.
 
-        LidarError if workers, memory or software are missing.
+        Raise LidarError if workers, memory or software are missing.
         """
         options = self._options
         if options.starts_workers:
@@ -78,9 +85,9 @@ class ClusterConnection:
         slots = slots_needed(options, planning=first.planning is not None, writing=writing)
         if options.cluster is not None:
             options.cluster.require(slots)
-        waiting = Waiting(options.startup_timeout_s, self.screen.tell)
+        waiting = WaitTimer(options.startup_timeout_s, self.screen.tell)
         client = self._stack.enter_context(
-            client_of(options, slots, waiting, self.screen, self._local)
+            open_client(options, slots, waiting, self.screen, self._local)
         )
         timeline.mark(timeline.WORKERS)
         self.cluster = Cluster(client, first, store, options, self.screen, slots, waiting)
@@ -92,43 +99,62 @@ class ClusterConnection:
         self._stack.close()
 
 
-def client_of(
+def open_client(
     options: RunOptions,
     required_slots: Mapping[str, int],
-    waiting: Waiting,
+    waiting: WaitTimer,
     screen: Screen,
-    local: StartedAhead | None = None,
+    local: BackgroundClient | None = None,
 ) -> AbstractContextManager[Client]:
-    """Return a client of an existing cluster, or of a new cluster with `required_slots`.
+    """Return a client of an existing cluster, or start a cluster with the required slots.
 
-    `local` is the new cluster, if it is on this machine and has been begun.
+    `local` is the new cluster if it is on this machine and is already starting.
     """
     if options.client is not None:
         return nullcontext(options.client)
     if options.scheduler is not None:
-        with suppress(ValueError):  # ValueError outside of tasks, without a worker
+        with suppress(ValueError):  # raised outside of tasks
             if get_worker().scheduler.address == options.scheduler:
                 return nullcontext(own_client())
-        return connected(options.scheduler, options.files, waiting)
+        return connect_client(options.scheduler, options.files, waiting)
     if options.cluster is not None:
-        started = started_client(options.cluster, screen.tell)
+        started = start_client(options.cluster, screen.tell)
         return screen.starting(started, f"starting {options.cluster}")
     local = local or _start_local(options, required_slots)
     return screen.starting(local, "starting the workers", shares_terminal=True)
 
 
-def _start_local(options: RunOptions, slots: Mapping[str, int]) -> StartedAhead:
-    """Begin to start the workers of a run on this machine."""
+def _start_local(options: RunOptions, slots: Mapping[str, int]) -> BackgroundClient:
+    """Start the workers of a run on this machine in the background."""
     check_starts_workers()
     workers = options.gpu_workers, options.other_workers
-    return StartedAhead(local_client(slots, *workers, tls=options.tls))
+    return BackgroundClient(local_client(slots, *workers, tls=options.tls))
 
 
 class Cluster:
-    """The cluster of a run, checked for jobs such as `first`.
+    """Cluster of a run, which has been checked for its jobs.
 
-    `store` lists the remaining jobs, and the software of earlier runs. LidarError if workers,
-    memory or software are missing.
+    Parameters
+    ----------
+    client
+        Client of the cluster.
+    first
+        First job to cast, for which the cluster is checked.
+    store
+        Store of the run, which contains the remaining jobs and the software of an earlier run.
+    options
+        Options of the run.
+    screen
+        Output for messages.
+    required_slots
+        Number of slots that the run requires, by partition.
+    waiting
+        Time limit for missing workers.
+
+    Raises
+    ------
+    LidarError
+        If workers, memory or software are missing.
     """
 
     def __init__(
@@ -139,12 +165,13 @@ class Cluster:
         options: RunOptions,
         screen: Screen,
         required_slots: Mapping[str, int],
-        waiting: Waiting,
+        waiting: WaitTimer,
     ) -> None:
         self.client = client
         self.options = options
         self._screen = screen
-        # For errors about a lost cluster; a client that was never connected is refused below.
+        # The address is stored for messages about a lost cluster. It is empty for a client that was
+        # never connected, which is refused below.
         self.address: str = getattr(client.scheduler, "address", "")
         if client.asynchronous:
             raise LidarError("The client is asynchronous. Create it without `asynchronous=True`.")
@@ -156,28 +183,28 @@ class Cluster:
                 required_slots,
                 store.backend or options.backend,
                 store.advice,
-                store.casting if store.committed_in_words else {},
+                store.casting if store.committed_text else {},
                 waiting,
                 writing=store.only_job is None,
             )
             self.backend = self._workers.backend
             self.software = self._workers.software
             only_job = store.only_job
-            if only_job is not None:  # jobs of campaigns are written in formats of the table
+            if only_job is not None:  # data sets of campaigns only use built-in formats
                 check_formats(client, self._workers.pool, first.outputs)
             store.cast_with(self.backend, self.software)
-            if only_job is not None:  # jobs of a campaign are checked when they begin
+            if only_job is not None:  # the jobs of a campaign are checked when they begin
                 self.check(only_job.job)
         except LidarError:
             self._release_slots()
             raise
-        except Exception as error:  # the kind depends on the request
+        except Exception as error:  # the type of the error depends on the request
             if client.status != "running" or isinstance(error, CommClosedError):
                 raise self._lost_error() from error
             raise
         names = sorted({name for worker in self._workers.pool for name in worker.partitions})
         self.partitions = {name: Partition(name, client) for name in names}
-        # Slots of LIDAR without the long stages, as the slots are at the start.
+        # Number of LIDAR slots at the start that the long stages leave free.
         self.spare = max(1, self.partitions[LIDAR].slots - 2 - options.collectors)
         if note := gpu_note(self._workers.pool, self._workers.casting, self.backend):
             store.notes.append(note)
@@ -187,7 +214,7 @@ class Cluster:
     def _request_slots(
         self, first: Job, store: RunStore, required_slots: Mapping[str, int]
     ) -> None:
-        """Request slots for the remaining scans, as partitions may adapt to their work."""
+        """Request slots for the remaining scans, because partitions may be adaptive."""
         scan_count = first.survey.scan_count * (len(store.jobs.numbers) - store.db.ended_count)
         if store.only_job is not None:
             scan_count = len(store.only_job.scans) - store.only_job.resumed
@@ -195,7 +222,7 @@ class Cluster:
             self.partitions[name].request_slots(max(slots, scan_count) if name == GPU else slots)
 
     def _release_slots(self) -> None:
-        """Let partitions shrink that have grown for the run."""
+        """Let adaptive partitions shrink that have grown for the run."""
         if self.client.status == "running":
             with suppress(PoolError, OSError):
                 for partition in self.partitions.values():
@@ -207,12 +234,12 @@ class Cluster:
             "cancelled by a different client. The run ended without a result."
         )
 
-    def tasks(self, name: str) -> Tasks[Any]:
+    def tasks(self, name: str) -> TaskGroup[Any]:
         """Return an empty group of tasks for a partition."""
-        return Tasks(self.partitions[name], self.software["lidarpool"])
+        return TaskGroup(self.partitions[name], self.software["lidarpool"])
 
     def watch(self, names: Sequence[str], lasting: Sequence[str] = ()) -> Watch:
-        """Watch workers of partitions from now on (`Watch`)."""
+        """Start watching the workers of partitions (see `Watch`)."""
         return Watch(self.client, names, lasting, self.options.worker_timeout_s, self._screen.tell)
 
     def check(self, job: Job) -> None:
@@ -220,7 +247,10 @@ class Cluster:
         check_workers(job, self.options, self.backend, self._workers.casting)
 
     def call(self, callback: Callable[..., None], *arguments: Any) -> None:
-        """Call a callback of the user, whose OSError must not look like an error of the cluster."""
+        """Call a callback of the user.
+
+        Its errors are recorded, so that an OSError is not mistaken for an error of the cluster.
+        """
         try:
             callback(*arguments)
         except BaseException as error:
@@ -229,9 +259,9 @@ class Cluster:
 
     @contextmanager
     def partitions_page(self) -> Iterator[None]:
-        """Show the page of partitions while the body runs, and print its address.
+        """Show the partitions page while the body runs, and print its address.
 
-        Does nothing if the scheduler serves no pages, or the cluster is the run's own.
+        Do nothing if the scheduler serves no pages, or if the cluster was started for this run.
         """
         if self.options.starts_workers:
             yield
@@ -247,15 +277,15 @@ class Cluster:
 
     @contextmanager
     def stopping(self, stop: Callable[[str], None]) -> Iterator[None]:
-        """Call `stop` on any error of the body, and translate errors of a lost cluster.
+        """Call `stop` with the reason if the body raises an error, and convert cluster errors.
 
-        `stop` gets the reason. In the end the partitions may shrink.
+        Finally, the partitions are allowed to shrink.
         """
         try:
             yield
         except BaseException as error:
-            # A client that loses its scheduler cancels all futures, so tasks look cancelled.
-            # After some seconds the client closes, and any of its calls may raise any error.
+            # A client that loses its scheduler cancels all futures, so tasks appear as cancelled.
+            # A few seconds later the client closes, and its methods may then raise any error.
             lost = self._is_lost(error)
             stop(f"the run was stopped: {str(error) or type(error).__name__}")
             if error is self._callers_error:
@@ -269,10 +299,10 @@ class Cluster:
             self._release_slots()
 
     def _is_lost(self, error: BaseException) -> bool:
-        """Return True if the scheduler is gone.
+        """Return True if the connection to the scheduler is lost.
 
-        Calls may fail a moment before the client knows. If `error` suggests a lost scheduler, wait
-        up to `LOST_S` seconds until the client knows.
+        Requests may fail shortly before the client notices the loss. If `error` suggests a lost
+        scheduler, wait up to `LOST_S` seconds for the client to notice.
         """
         deadline = time.monotonic() + LOST_S
         while (

@@ -1,4 +1,4 @@
-"""Clients of a local cluster that is started for the run, or of an existing cluster."""
+"""Clients of local clusters, of clusters that are started for a run, and of existing clusters."""
 
 from __future__ import annotations
 
@@ -36,30 +36,31 @@ from ...processes.fork_server import start_fork_server
 from ..cluster_file import ClusterFile
 from ..pipeline.stage_names import GPU, LIDAR, OTHER
 from .checks import LOOK_EVERY_S, TooFewWorkersError
-from .watch import Waiting
+from .watch import WaitTimer
 
 CONNECT_TIMEOUT_S = 10
-KNOCK_S = 5.0  # longest attempt to connect to a scheduler that may not be up yet
-_UNREACHABLE = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)  # a host that is starting
+KNOCK_S = 5.0  # time limit of one attempt to connect to a scheduler that may not have started yet
+_UNREACHABLE = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)  # host may be starting
 
-# Dask profiles each process many times a second, for a dashboard that a cluster of one run does not
-# have: an idle worker took 3 % of a core, and takes a fifth of that with these settings.
+# By default, Dask profiles each process many times per second for its dashboard, which the cluster
+# of a single run does not have. These settings reduce the load of an idle worker to a fifth of 3 %
+# of a core.
 _QUIET = {
     "distributed.worker.profile.enabled": False,
-    "distributed.scheduler.http.routes": [],  # nobody knows the address of these pages
+    "distributed.scheduler.http.routes": [],  # the address of these pages is not published
     "distributed.worker.http.routes": [],
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.system-monitor.interval": "5s",
-    "distributed.admin.low-level-log-length": 100,  # messages to workers that are kept: 1,000
+    "distributed.admin.low-level-log-length": 100,  # the default is 1,000 messages
 }
 
 
 def default_workers(cores: int, gpus: int) -> dict[str, int]:
-    """Return the number of worker processes of the partitions GPU and OTHER for a machine.
+    """Return the default numbers of GPU and OTHER workers for a machine.
 
-    One worker for each GPU, and OTHER has the remaining cores. Without GPUs the GPU partition has
-    CPU workers for three quarters of the cores. The LIDAR stages mostly wait, so they share one
-    process.
+    The GPU partition has one worker per GPU or, on a machine without GPUs, CPU workers for three
+    quarters of the cores. OTHER has workers for the remaining cores. The LIDAR stages mostly wait,
+    so they share one process.
 
     Examples
     --------
@@ -77,12 +78,17 @@ def local_cluster(
     other_workers: int | None = None,
     **options: Any,
 ) -> SpecCluster:
-    """Start a Dask cluster on this machine, divided into GPU, LIDAR and OTHER.
+    """Start a Dask cluster on this machine with the partitions GPU, LIDAR and OTHER.
 
-    Workers of GPU and OTHER have one thread each; their default numbers are `default_workers` of
-    this machine, and OTHER may have none. The one LIDAR worker has `lidar_slots` threads and slots;
-    with 0 there is none.
-    Further options, and the errors, are as in `poolpart.deploy.local_cluster`.
+    Parameters
+    ----------
+    gpu_workers, other_workers
+        Number of workers in GPU and OTHER, each with one thread. OTHER may have none. Defaults to
+        `default_workers` for this machine.
+    lidar_slots
+        Number of threads and slots of the LIDAR worker. With 0 slots, there is no LIDAR worker.
+    options
+        Further options of `poolpart.deploy.local_cluster`, which also describes the errors.
     """
     defaults = default_workers(CPU_COUNT, len(visible_gpus()))
     gpu_workers = defaults[GPU] if gpu_workers is None else gpu_workers
@@ -95,7 +101,7 @@ def local_cluster(
 
 
 def check_starts_workers() -> None:
-    """Raise LidarError if this process may not start workers: in a task of Dask or a daemon."""
+    """Raise LidarError if this is a Dask task or a daemonic process, which cannot start workers."""
     try:
         get_worker()
         context = "a Dask task"
@@ -117,13 +123,26 @@ def local_client(
     *,
     tls: bool = False,
 ) -> AbstractContextManager[Client]:
-    """Return a context with a client of a cluster on this machine that ends with the context.
+    """Return a context manager that starts a cluster on this machine and yields its client.
 
-    Workers as of `local_cluster`, with the `required_slots` of LIDAR, and by default no worker of
-    OTHER unless it has required slots. `tls` encrypts the traffic, with a new certificate;
-    PoolError if no certificate can be made, or the workers do not start.
+    The cluster is stopped when the context exits.
+
+    Parameters
+    ----------
+    required_slots
+        Number of slots that the run requires, by partition. If OTHER has none, it has no workers by
+        default.
+    gpu_workers, other_workers
+        Number of workers, as in `local_cluster`.
+    tls
+        Whether to encrypt the traffic with a new certificate.
+
+    Raises
+    ------
+    PoolError
+        On entering, if the certificate cannot be created or the workers do not start.
     """
-    forks = start_fork_server()  # here, for it changes the environment of this process
+    forks = start_fork_server()  # called here because it temporarily changes the environment
 
     @contextmanager
     def started() -> Iterator[SpecCluster]:
@@ -136,7 +155,7 @@ def local_client(
                     lidar_slots=required_slots.get(LIDAR, 0),
                     other_workers=other_workers if OTHER in required_slots or other_workers else 0,
                     security=tls,
-                    dashboard_port=None,  # is never printed, and Bokeh takes half a second
+                    dashboard_port=None,  # its address is never shown, and Bokeh takes 0.5 s
                 )
             ) as cluster,
         ):
@@ -145,10 +164,11 @@ def local_client(
     return _client_of(started())
 
 
-class StartedAhead(AbstractContextManager[Client]):
-    """The context of a client, entered by a thread while the caller does something else.
+class BackgroundClient(AbstractContextManager[Client]):
+    """Context of a client that is entered in a background thread as soon as it is created.
 
-    The context can be left before it is entered, and left again.
+    Entering this object waits for the thread. It may be exited without being entered, and more than
+    once.
     """
 
     def __init__(self, context: AbstractContextManager[Client]) -> None:
@@ -169,13 +189,23 @@ class StartedAhead(AbstractContextManager[Client]):
 
 
 @contextmanager
-def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator[Client]:
-    """Start the cluster of a file, yield its client, and stop the cluster after the body.
+def start_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator[Client]:
+    """Start the cluster that a file describes, yield its client, and stop the cluster afterwards.
 
-    `tell` is called when the cluster has started, and with messages about failing workers.
-    LidarError if the cluster does not start.
+    Parameters
+    ----------
+    file
+        Cluster file.
+    tell
+        Function that is called when the cluster has started, and with messages about failing
+        workers.
+
+    Raises
+    ------
+    LidarError
+        If the cluster does not start.
     """
-    with _client_of(file.started(tell)) as client:
+    with _client_of(file.start(tell)) as client:
         tell(f"started {file}")
         try:
             yield client
@@ -186,10 +216,11 @@ def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator
 
 @contextmanager
 def _client_of(cluster: AbstractContextManager[SpecCluster]) -> Iterator[Client]:
-    """Start a cluster, yield its client, and stop the cluster after the body.
+    """Start a cluster, yield its client, and stop the cluster afterwards.
 
-    Half a cluster cannot be stopped in good order: an interrupt waits until all workers are up, or
-    all jobs in the queue, and an interrupt while workers are being stopped waits until they are.
+    A cluster cannot be stopped cleanly while it is starting. An interrupt is therefore deferred
+    until all workers have started or have been queued. An interrupt while workers are being stopped
+    is deferred until they have stopped.
     """
     stack = ExitStack()
     try:
@@ -203,19 +234,28 @@ def _client_of(cluster: AbstractContextManager[SpecCluster]) -> Iterator[Client]
 
 
 @contextmanager
-def connected(
-    scheduler: str, files: TlsFiles | None = None, waiting: Waiting | None = None
+def connect_client(
+    scheduler: str, files: TlsFiles | None = None, waiting: WaitTimer | None = None
 ) -> Iterator[Client]:
-    """Yield a client of a cluster that is running already, or will be soon.
+    """Connect to an existing cluster and yield its client.
 
-    `scheduler` is an address such as ``tcp://host:8786`` or ``tls://host:8786``; certificates for
-    the latter are by default from Dask's configuration. A scheduler that is not up yet is waited
-    for as `waiting` says, by default some seconds. LidarError if no scheduler answers, or the
-    certificates are wrong.
+    Parameters
+    ----------
+    scheduler
+        Address of the scheduler, such as ``tcp://host:8786`` or ``tls://host:8786``.
+    files
+        Certificates for a TLS cluster. Defaults to those in Dask's configuration.
+    waiting
+        Time limit for a scheduler that has not started yet. By default, a single attempt is made.
+
+    Raises
+    ------
+    LidarError
+        If no scheduler responds, or if the certificates are invalid.
     """
     if not scheduler.startswith("inproc"):
         check_address(scheduler)
-    waiting = waiting or Waiting()
+    waiting = waiting or WaitTimer()
     try:
         security = Security()
         if files and any(files):
@@ -223,26 +263,31 @@ def connected(
             security = Security(
                 require_encryption=True, tls_ca_file=ca, tls_client_cert=cert, tls_client_key=key
             )
-        # Not in this thread: an interrupt could be raised in a callback of the loop, and get lost.
-        LoopRunner().run_sync(_reach, scheduler, security, waiting)
+        # The event loop runs in another thread, because an interrupt in one of its callbacks could
+        # be lost.
+        LoopRunner().run_sync(_wait_for_scheduler, scheduler, security, waiting)
         client = Client(
             scheduler, security=security, timeout=CONNECT_TIMEOUT_S, set_as_default=False
         )
     except Exception as error:
-        waited = f" within {waiting.seconds:g} s" if waiting.seconds and _absent(error) else ""
+        waited = (
+            f" within {waiting.seconds:g} s"
+            if waiting.seconds and _may_become_reachable(error)
+            else ""
+        )
         raise LidarError(
-            f"No Dask scheduler responded at {scheduler!r}{waited} ({_reason(error)}). Start one "
-            "with `dask scheduler`, and pass its address, such as tcp://host:8786. For a TLS "
-            "cluster, pass tls://host:8786 with `--tls-ca`, `--tls-cert` and `--tls-key`."
+            f"No Dask scheduler responded at {scheduler!r}{waited} ({_describe_error(error)}). "
+            "Start one with `dask scheduler`, and pass its address, such as tcp://host:8786. For a "
+            "TLS cluster, pass tls://host:8786 with `--tls-ca`, `--tls-cert` and `--tls-key`."
         ) from error
     with client:
         yield client
 
 
-async def _reach(address: str, security: Security, waiting: Waiting) -> None:
-    """Wait until a scheduler answers.
+async def _wait_for_scheduler(address: str, security: Security, waiting: WaitTimer) -> None:
+    """Wait until a scheduler responds.
 
-    A client would wait for ever for a silent scheduler.
+    A client would wait forever for a scheduler that accepts connections but does not respond.
     """
     reason = "no response"
     while True:
@@ -252,34 +297,35 @@ async def _reach(address: str, security: Security, waiting: Waiting) -> None:
         waiting.tell(f"the scheduler at {address}", reason)
         try:
             options = security.get_connection_args("client")
-            # `connect` times out first, with a reason, unless a silent program listens.
+            # Normally, `connect` times out first and reports a reason. It does not time out if a
+            # program accepts the connection without responding.
             answer = connect(address, timeout=timeout, **options)
             comm = await asyncio.wait_for(answer, timeout + 1)
             comm.abort()
             return
         except Exception as error:
-            if not waiting.remaining_s() or not _absent(error):
+            if not waiting.remaining_s() or not _may_become_reachable(error):
                 raise
-            reason = _reason(error)
+            reason = _describe_error(error)
         await asyncio.sleep(LOOK_EVERY_S)
 
 
-def _root(error: BaseException) -> BaseException:
-    """Return the first cause of an error, which may be any error of a foreign program."""
+def _root_cause(error: BaseException) -> BaseException:
+    """Return the root cause of an error."""
     cause = error.__cause__ or error.__context__
-    # An operation that a time-out has cut off says less than the time-out.
+    # A timeout is more informative than the canceled operation that it was raised from.
     if cause is None or isinstance(cause, asyncio.CancelledError):
         return error
-    return _root(cause)
+    return _root_cause(cause)
 
 
-def _absent(error: BaseException) -> bool:
-    """Return True if the address does not resolve or answer yet, so that a retry may help."""
-    root = _root(error)
+def _may_become_reachable(error: BaseException) -> bool:
+    """Return True if the address cannot be resolved or reached yet, so that a retry may help."""
+    root = _root_cause(error)
     absent = (ConnectionRefusedError, TimeoutError, asyncio.CancelledError, socket.gaierror)
     return isinstance(root, absent) or getattr(root, "errno", None) in _UNREACHABLE
 
 
-def _reason(error: BaseException) -> str:
-    root = _root(error)
+def _describe_error(error: BaseException) -> str:
+    root = _root_cause(error)
     return " ".join(f"{type(root).__name__}: {root}".split())[:200].rstrip(": ")

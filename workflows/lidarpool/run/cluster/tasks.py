@@ -1,4 +1,4 @@
-"""Tasks of a partition that the driver submits a few at a time, each with its purpose."""
+"""Groups of tasks that the driver submits to a partition a few at a time."""
 
 from __future__ import annotations
 
@@ -18,10 +18,17 @@ from ..pipeline.task_book import TaskBook
 T = TypeVar("T")
 
 
-class Tasks(Generic[T]):
-    """Submitted tasks of a partition, and a `book` with the records of finished tasks.
+class TaskGroup(Generic[T]):
+    """Group of tasks on a partition, each of which is submitted for a purpose, such as a job.
 
-    Each task returns its result and its record. `sources` is ``lidarpool`` of the run's `software`.
+    Each task returns its result and its record. The records of finished tasks are added to `book`.
+
+    Parameters
+    ----------
+    partition
+        Partition on which the tasks run.
+    sources
+        Value of ``lidarpool`` in the software of the run, which workers must have.
     """
 
     def __init__(self, partition: Partition, sources: str) -> None:
@@ -29,22 +36,22 @@ class Tasks(Generic[T]):
         self.partition = partition
         self._sources = sources
         self.book = TaskBook()
-        self.running: dict[Future, T] = {}  # {future: its purpose}
-        # {plug-in that the tasks use: version that the workers must have}
+        self.running: dict[Future, T] = {}  # {future: purpose of the task}
+        # Versions of the plug-ins that the tasks use, which workers must have.
         self.plugins: Mapping[Plugin, str] = {}
 
     def submit(
         self, purpose: T, function: Callable[..., Any], *arguments: Any, **options: Any
     ) -> None:
-        """Submit a task with its purpose, and `options` as of `Partition.submit`."""
+        """Submit a task with options of `Partition.submit`."""
         call = (call_with_plugins, self.plugins, function) if self.plugins else (function,)
         future = self.partition.submit(
             call_with_same_sources, self._sources, *call, *arguments, **options
         )
         self.running[future] = purpose
 
-    def take_done(self) -> list[tuple[T, Any]]:
-        """Remove the finished tasks, and return their purposes and results."""
+    def pop_finished(self) -> list[tuple[T, Any]]:
+        """Remove the finished tasks and return their purposes and results."""
         finished = {future.key: future for future in self.running if future.status == "finished"}
         results: list[tuple[T, Any]] = []
         if not finished:
@@ -54,17 +61,17 @@ class Tasks(Generic[T]):
             results.append((self.running.pop(finished[key]), result))
         return results
 
-    def take_failed(self) -> list[tuple[T, Future]]:
-        """Remove and return failed and cancelled tasks, which Dask does not repeat."""
+    def pop_failed(self) -> list[tuple[T, Future]]:
+        """Remove the failed and cancelled tasks and return them with their purposes."""
         failed = [future for future in self.running if future.status in ("error", "cancelled")]
         return [(self.running.pop(future), future) for future in failed]
 
-    def look(self) -> PartitionSnapshot:
+    def locate(self) -> PartitionSnapshot:
         """Return the locations of the running tasks."""
         keys = [future.key for future in self.running]
         return take_snapshot(self._client, self.partition.name, keys)
 
     def cancel(self) -> None:
-        """Cancel all tasks, although tasks that have begun run to their end."""
+        """Cancel all tasks. Tasks that are already running are not interrupted."""
         self._client.cancel([*self.running])
         self.running.clear()

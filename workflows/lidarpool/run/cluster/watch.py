@@ -1,4 +1,4 @@
-"""Waiting for a scheduler and workers, at the start and later, with messages and a limit."""
+"""Time limits and messages for a run that waits for its scheduler or its workers."""
 
 from __future__ import annotations
 
@@ -17,13 +17,18 @@ from poolpart.task_locations import take_snapshot
 from poolpart.workers import worker_identities
 
 WATCH_EVERY_S = 1.0
-TELL_EVERY_S = 5.0  # messages about waiting; less often in a long wait
+TELL_EVERY_S = 5.0  # minimum interval between messages, which become less frequent over time
 
 
-class Waiting:
-    """Time limit of a wait, which starts at the first question or message.
+class WaitTimer:
+    """Time limit for waiting, which starts when the object is used for the first time.
 
-    `tell` is called every few seconds with a message about the wait.
+    Parameters
+    ----------
+    seconds
+        Time limit in seconds.
+    tell
+        Function that is called every few seconds with a message.
     """
 
     def __init__(self, seconds: float = 0.0, tell: Callable[[str], None] = lambda words: None):
@@ -36,16 +41,19 @@ class Waiting:
         return time.monotonic()
 
     def restart(self) -> None:
-        """Start the time limit anew, after the wait was over."""
+        """Restart the time limit."""
         self._start_s = time.monotonic()
 
     def remaining_s(self, now_s: float | None = None) -> float:
-        """Return the remaining time in seconds, or 0 after the limit."""
+        """Return the remaining time in seconds, or 0 if the limit has been exceeded.
+
+        `now_s` is the monotonic time, which defaults to the current time.
+        """
         now_s = time.monotonic() if now_s is None else now_s
         return max(0.0, self._start_s + self.seconds - now_s)
 
     def tell(self, awaited: str, reason: str = "") -> None:
-        """Report that `awaited` is waited for, if the last message is old."""
+        """Report that the run is waiting for `awaited`, unless the last message is recent."""
         now_s = time.monotonic()
         if now_s - max(self._told_at, self._start_s) >= max(
             TELL_EVERY_S, (now_s - self._start_s) / 10
@@ -55,18 +63,28 @@ class Waiting:
             self._tell(f"waiting for {awaited} {remaining}{f': {reason}' if reason else ''}")
 
 
-def queued(jobs: int) -> str:
-    """Return a clause about jobs in a queue or starting."""
+def queued_clause(jobs: int) -> str:
+    """Return a clause about jobs that are queued or starting."""
     return f"{plural(jobs, 'job is', 'jobs are')} in the queue or starting"
 
 
 class Watch:
-    """Detects a partition that stays without workers, or whose workers take no tasks.
+    """Watchdog for partitions that have no workers, or whose workers accept no tasks.
 
-    Dask itself would wait for ever. The workers of the partitions `names` get new tasks during the
-    run; tasks of `lasting` partitions last as long as the run, so their workers need not take more.
-    A partition may be empty for `worker_timeout_s`. Meanwhile, `tell` is called every few seconds
-    with a message.
+    Dask itself would wait forever.
+
+    Parameters
+    ----------
+    client
+        Client of the cluster.
+    names
+        Partitions whose workers receive new tasks during the run.
+    lasting
+        Partitions whose tasks run until the end, so that their workers need not accept new tasks.
+    worker_timeout_s
+        Time in seconds that a partition may be without workers.
+    tell
+        Function that is called every few seconds with a message during this time.
     """
 
     def __init__(
@@ -80,24 +98,27 @@ class Watch:
         self.client = client
         self.lasting = frozenset(lasting)
         self._tell = tell
-        # {partition: time that it may be without workers}
-        self._waits = {name: Waiting(worker_timeout_s, tell) for name in (*names, *self.lasting)}
-        self._looked = float("-inf")
-        self.notes: list[str] = []  # notes for the user on workers that Dask has paused
+        # Time limit for each partition without workers.
+        self._waits = {name: WaitTimer(worker_timeout_s, tell) for name in (*names, *self.lasting)}
+        self._checked_at = float("-inf")
+        self.notes: list[str] = []  # notes for the user about workers that Dask has paused
 
     def forget(self, names: Iterable[str]) -> None:
-        """Stop watching these partitions, which have no more work."""
+        """Stop watching partitions that have no more tasks."""
         for name in names:
             self._waits.pop(name, None)
 
-    def look(self) -> None:
-        """Raise LidarError if workers are missing, unless the last check is recent."""
+    def check(self) -> None:
+        """Check the workers, unless the last check is recent.
+
+        Raise LidarError if workers have been missing for too long.
+        """
         now_s = time.monotonic()
-        if now_s - self._looked < WATCH_EVERY_S:
+        if now_s - self._checked_at < WATCH_EVERY_S:
             return
-        self._looked = now_s
-        staffed = set()  # partitions with workers that take tasks
-        paused = set()  # partitions with workers that take no tasks
+        self._checked_at = now_s
+        staffed = set()  # partitions with workers that accept tasks
+        paused = set()  # partitions with workers that accept no tasks
         for worker in worker_identities(self.client).values():
             for name in self._waits.keys() & worker["resources"].keys():
                 if worker["status"] == "running" or name in self.lasting:
@@ -110,13 +131,17 @@ class Watch:
             if name in staffed:
                 waiting.restart()
             elif not waiting.remaining_s():
-                raise LidarError(_lacking(name, name in paused, f"{waiting.seconds:.0f} s"))
+                raise LidarError(
+                    _missing_workers_message(name, name in paused, f"{waiting.seconds:.0f} s")
+                )
             elif name in paused:
                 advice = "their memory is nearly full. Start them with a larger `--memory-limit`"
                 waiting.tell(f"paused workers of partition {name}", advice)
             else:
                 coming = take_snapshot(self.client, name).queued_jobs
-                waiting.tell(f"workers of partition {name}", queued(coming) if coming else "")
+                waiting.tell(
+                    f"workers of partition {name}", queued_clause(coming) if coming else ""
+                )
 
     def _note_paused(self, partition: str, worker: Mapping[str, Any]) -> None:
         note = (
@@ -129,8 +154,8 @@ class Watch:
             self._tell(note)
 
 
-def _lacking(name: str, paused: bool, seconds: str) -> str:
-    """Return a message about a partition that had no workers, or only paused workers."""
+def _missing_workers_message(name: str, paused: bool, seconds: str) -> str:
+    """Return a message about a partition that has no workers, or only paused workers."""
     start = f'start workers with `--resources "{name}=1"` and repeat the run.'
     if paused:
         return (

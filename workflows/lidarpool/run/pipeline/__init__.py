@@ -1,1 +1,1 @@
-"""The pipeline: four stages on the partitions of a cluster, and the rules of the driver."""
+"""Pipeline with four stages on the partitions of a cluster, and the driver that controls it."""

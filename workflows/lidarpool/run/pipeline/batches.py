@@ -1,4 +1,4 @@
-"""Batches: consecutive scans of a job on their way through stages 2 and 4."""
+"""Batches of consecutive scans, which pass through stages 2 and 4 of the pipeline."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from .pipeline_job import PipelineJob
 class BatchState(Enum):
     """State of a batch."""
 
-    WAITING = "waiting"  # the next offer goes to a GPU worker
-    CASTING = "casting"  # offered to one
-    CAST = "cast"  # its columns are on that worker
-    COLLECTING = "collecting"  # assigned to a collector
+    WAITING = "waiting"  # has to be offered to a GPU worker
+    CASTING = "casting"  # has been offered to a GPU worker
+    CAST = "cast"  # its columns are on this worker
+    COLLECTING = "collecting"  # has been assigned to a collector
 
 
 class Outcome(Enum):
-    """State of a casting task, or the reason why its batches are offered again."""
+    """Outcome of a casting task, which may be the reason why its batches are offered again."""
 
     PENDING = "pending"
     DONE = "done"
@@ -34,33 +34,33 @@ class Outcome(Enum):
 
 @dataclass(eq=False)
 class Batch:
-    """Consecutive uncommitted scans of a job on their way to a part."""
+    """Consecutive uncommitted scans of a job, which become a part."""
 
     job: PipelineJob
     first: int
     stop: int
-    number: int  # count of earlier batches of all jobs; limits the span from oldest to newest
-    order: int = 0  # waiting batches are offered in this order
+    number: int  # sequence number over all jobs, which limits the span from oldest to newest
+    order: int = 0  # priority, so that waiting batches are offered in ascending order
     state: BatchState = BatchState.WAITING
-    since: float = 0.0  # monotonic time of the last change of state
-    key: str = ""  # key of the casting task; "" while waiting
+    since: float = 0.0  # monotonic time of the last state change
+    key: str = ""  # key of the casting task, or empty while waiting
     worker: str = ""  # address of the GPU worker
-    collector: str = ""  # name of the task of stage 4
+    collector: str = ""  # name of the collector (stage 4)
     deaths: Counter[str] = field(default_factory=Counter)  # {stage: workers that died with it}
-    single_job: bool = False  # True if it must not be cast with batches of other jobs
+    single_job: bool = False  # True if it must not share a task with batches of other jobs
 
     def __post_init__(self) -> None:
-        self.share = len(self) / self.job.scans_per_task  # share of the memory of a task
+        self.share = len(self) / self.job.scans_per_task  # fraction of the memory of a task
 
     def __len__(self) -> int:
         return self.stop - self.first
 
     @property
     def scans(self) -> range:
-        """Numbers of the scans."""
+        """Numbers of the scans in the batch."""
         return range(self.first, self.stop)
 
     def move(self, state: BatchState) -> None:
-        """Set the state, and the time of the change."""
+        """Change the state and record the current time."""
         self.state = state
         self.since = time.monotonic()

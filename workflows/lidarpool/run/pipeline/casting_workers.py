@@ -1,4 +1,7 @@
-"""The GPU workers and their casting tasks: wanted, checked, refused, paused, silent, gone."""
+"""GPU workers and their casting tasks.
+
+Workers may join, leave, stop responding or be paused at any time, and are checked before they cast.
+"""
 
 from __future__ import annotations
 
@@ -33,28 +36,39 @@ from .stage_names import INTERSECT
 
 REFRESH_EVERY_S = 1.0
 _UNSENT = pickle.PicklingError, TypeError, AttributeError, ValueError, RecursionError
-LOST_DEVICES = 3  # processes that may lose their GPU in a run, and the last ends it
-SETUP_DEATHS = 4  # workers in a row that may die while they are checked
-ANSWER_S = 1.0  # longest wait for a checked worker's answer without a sign of life
-RELEASE_S = 3.0  # time for workers to drop their rigs
-SPARE_SCENES = 2  # scenes without a survey in flight, kept for the next survey
-INLINE_BYTES = 1 << 17  # larger payloads are sent to one worker, and fetched by other workers
+LOST_DEVICES = 3  # number of processes that lose their GPU before the run fails
+SETUP_DEATHS = 4  # number of consecutive workers that die while being checked before the run fails
+ANSWER_S = 1.0  # time limit for fetching the answer of a worker that does not respond
+RELEASE_S = 3.0  # time limit for workers to drop their rigs
+SPARE_SCENES = 2  # number of unused scenes that are kept for the next survey
+INLINE_BYTES = 1 << 17  # larger payloads are not sent with each task
 CHECKING = "Checking the casting workers"
 PREPARING = "Preparing the scene on the casting workers"
 
 
 class CastingWorkers:
-    """The GPU workers that may cast, and their casting tasks, for all jobs of a run.
+    """GPU workers of a run and their casting tasks, for all jobs.
 
-    A worker's software is checked before the worker unpickles anything: a worker with other sources
-    of lidarpool, or whose NumPy or ray caster gives other bits, is refused by name and casts no
-    batch. The first tasks of a job on a worker bring the plan and scene of the worker's rig.
+    The software of a worker is checked before the worker unpickles anything. A worker is refused if
+    it has different sources of lidarpool, or a version of NumPy or of the ray caster that may
+    produce different bits. The first tasks of a job on a worker carry the plan and the scene from
+    which the worker builds its rig.
 
-    Each task is bound to one worker. Dask lets such a task wait for ever when the worker is gone,
-    so `refresh` checks every second which workers exist. In return, Dask never fails a task for the
-    deaths of its neighbors, and the driver knows which batches a dead worker had.
+    Each task is restricted to one worker. If this worker leaves, Dask lets the task wait forever,
+    so `refresh` checks every second which workers exist. The advantage is that Dask never fails a
+    task because of other tasks on a dead worker, and that the driver knows which batches a dead
+    worker had.
 
-    `run` is the run's id; `software` is the software that workers must have (`base.software`).
+    Parameters
+    ----------
+    partition
+        GPU partition.
+    run
+        ID of the run.
+    backend
+        Name of the ray-casting backend.
+    software
+        Software that workers must have, as returned by `identity.software.software`.
     """
 
     def __init__(
@@ -65,25 +79,25 @@ class CastingWorkers:
         self.run = run
         self._backend = backend
         self._software = dict(software)
-        # {job: (plan of its rig, static part of its scene, which other jobs may share)}
+        # {job: (plan of its rig, static part of its scene)}. Several jobs may share a scene.
         self._jobs: dict[int, tuple[_Payload, _Payload]] = {}
-        # {ids of the fields of a scene: its static part}, last used last. The payload holds the
-        # scene, so that the ids stay valid.
+        # {ids of the fields of a scene: static part of the scene}, in order of their last use. The
+        # payload keeps a reference to the scene, so that the ids remain valid.
         self._scenes: dict[tuple[int, ...], _Payload] = {}
         self._workers: dict[str, _Worker] = {}  # {address: worker}
-        self._name_count = 0  # names and keys so far
+        self._name_count = 0  # number of names and keys that have been generated
         self._casts: dict[str, tuple[Future, list[int]]] = {}  # {key: (casting task, its jobs)}
-        self._died: list[str] = []  # workers that died while they were checked, in a row
+        self._died: list[str] = []  # consecutive workers that died while being checked
         self._refreshed_at = float("-inf")
         self.locations = PartitionSnapshot()
-        self._requested_slots = -1  # number that the scheduler knows
-        self._adapts = True  # False once the partition is known not to adapt to requests
+        self._requested_slots = -1  # last number that was sent to the scheduler
+        self._adapts = True  # False once the partition is known not to be adaptive
         self.notes: list[str] = []  # notes for the user
-        self._lost_devices: set[str] = set()  # processes whose GPU answers no more
+        self._lost_devices: set[str] = set()  # processes whose GPU has stopped responding
 
     @property
     def slots(self) -> dict[str, int]:
-        """Workers that were checked and take tasks, {address: tasks at a time}."""
+        """Number of concurrent tasks by address, for checked workers that accept tasks."""
         free = self.locations.free
         return {
             a: worker.slots for a, worker in self._workers.items() if worker.slots and a in free
@@ -91,7 +105,7 @@ class CastingWorkers:
 
     @property
     def slot_count(self) -> int:
-        """Casting tasks that run at a time on all workers, at least 1."""
+        """Total number of concurrent casting tasks on all workers, at least 1."""
         return max(1, sum(self.slots.values()))
 
     @property
@@ -110,7 +124,7 @@ class CastingWorkers:
 
     @property
     def _checks(self) -> dict[str, Future]:
-        """Tasks that are checking workers, {address: task}."""
+        """Unfinished software checks, by worker address."""
         return {a: worker.check for a, worker in self._workers.items() if worker.check is not None}
 
     @property
@@ -119,28 +133,35 @@ class CastingWorkers:
 
     @property
     def pending(self) -> list[str]:
-        """Keys of the tasks that have not ended."""
+        """Keys of the tasks that have not finished."""
         casts = [key for key, (future, _) in self._casts.items() if future.status == "pending"]
         return casts + [check.key for check in self._checks.values()]
 
     # -- jobs ------------------------------------------------------------------------------
 
     def add(self, job: int, scene: Scene, survey: Survey) -> tuple[bytes, str]:
-        """Register a job, and return its pickled survey and a name that jobs of its scene share.
+        """Register a job.
 
-        JobError if the job cannot be pickled.
+        Returns
+        -------
+        The pickled survey of the job, and a name that is the same for all jobs with this scene.
+
+        Raises
+        ------
+        JobError
+            If the job cannot be pickled.
         """
         try:
             packed: bytes = cloudpickle.dumps(survey, protocol=5)
-            # Identifies the static part while the scene exists: its jobs share their trees.
+            # Jobs with the same key have the same static scene, and share its trees.
             key = tuple(id(getattr(scene, f.name)) for f in fields(scene) if f.name != "actors")
             static_scene = self._scenes.pop(key, None)
             if static_scene is None:
                 static_scene = self._payload("scene", lambda: scene.with_actors(()))
-            self._scenes[key] = static_scene  # the last used
+            self._scenes[key] = static_scene  # moves it to the end
             plan = static_scene.name, scene.actors, packed, self._backend
             self._jobs[job] = self._payload(str(job), lambda: plan), static_scene
-        except _UNSENT as error:  # raised by pickling classes of the user
+        except _UNSENT as error:  # raised when pickling user-defined classes
             raise JobError(
                 f"The survey cannot be sent to the workers: {message_of(error)}"
             ) from error
@@ -149,7 +170,7 @@ class CastingWorkers:
     def remove(self, job: int) -> None:
         """Stop casting a job.
 
-        Workers drop its rig, and old unused scenes, with the next task of another job.
+        Workers drop its rig and old unused scenes when they receive their next task.
         """
         if (payloads := self._jobs.pop(job, None)) is None:
             return
@@ -170,9 +191,9 @@ class CastingWorkers:
     # -- casting ---------------------------------------------------------------------------
 
     def submit(self, batches: Iterable[tuple[int, BatchRange]], worker: str) -> str:
-        """Submit batches, each with its job, to a worker as a task, and return the key of the task.
+        """Submit batches to a worker as a single task, and return the key of the task.
 
-        The jobs must share a scene.
+        Each batch is given as its job and its scans. The jobs must share a scene.
         """
         spans: dict[int, list[BatchRange]] = {}
         for job, span in batches:
@@ -184,8 +205,8 @@ class CastingWorkers:
         ]
         payloads = [self._jobs[first][1], *(self._jobs[job][0] for job in spans)]
         arguments = [payload.argument_for(worker) for payload in payloads]
-        # Each offer has a separate key. A task that is released and submitted again under its
-        # key stays with the worker that still runs it, whatever `workers` says (in 4 of 4 tries).
+        # Each offer has a new key. If a task is released and submitted again with the same key,
+        # Dask leaves it on the worker that is still running it, regardless of `workers`.
         self._name_count += 1
         key = f"{INTERSECT}-{self.run}-{first}-{spans[first][0][0]}.{self._name_count}"
         unneeded = []
@@ -199,9 +220,9 @@ class CastingWorkers:
         return key
 
     def outcome(self, key: str, worker: str) -> Outcome:
-        """Return the state of a casting task.
+        """Return the outcome of a casting task.
 
-        JobError if the task has failed and has batches of a single job.
+        Raise JobError if the task has failed and contains batches of a single job.
         """
         future, jobs = self._casts[key]
         status = future.status
@@ -225,15 +246,15 @@ class CastingWorkers:
         if status == "error" and len(jobs) > 1:
             return Outcome.SEPARATE_JOBS
         activity = PREPARING if isinstance(error, RigFailed) else f"Stage {INTERSECT}"
-        raise_if_failed(future, activity, JobError)  # the message names the scans
+        raise_if_failed(future, activity, JobError)  # the message includes the scans
         return Outcome.PENDING
 
     def _count_lost_device(self, error: DeviceLost, worker: str) -> None:
-        """Refuse a worker that has lost its GPU. LidarError if this happens again and again."""
+        """Refuse a worker that has lost its GPU. Raise LidarError if this happens repeatedly."""
         if error.process in self._lost_devices:
             return
         self._lost_devices.add(error.process)
-        # Until its process ends; the next has another address.
+        # When the process has been restarted, it has a new address and is no longer refused.
         self._workers[worker] = _Worker(None)
         self.notes.append(f"the GPU of {worker} stopped responding ({error})")
         if not error.restarts:
@@ -248,21 +269,27 @@ class CastingWorkers:
             )
 
     def forget(self, key: str) -> None:
-        """Cancel a casting task, or drop its result."""
+        """Cancel a casting task or drop its result."""
         if (cast := self._casts.pop(key, None)) is not None:
             cast[0].release()
 
     def memory_clause(self, worker: str) -> str:
-        """Return a clause for a message if a nanny ended a dead worker for its memory, else ""."""
+        """Return a clause for messages if a worker was terminated because of its memory usage."""
         return memory_clause(self._client, [worker])
 
     # -- checking workers --------------------------------------------------------------------
 
     def refresh(self) -> PartitionSnapshot | None:
-        """Handle workers that have joined or left, or take no tasks, if the last check is old.
+        """Update the list of workers, unless the last update is recent.
 
-        Returns the locations of workers and casting tasks, or None if the last check is recent.
-        LidarError if no worker may cast, or several in a row die while they are checked.
+        Returns
+        -------
+        Locations of the workers and casting tasks, or None if the last update is recent.
+
+        Raises
+        ------
+        LidarError
+            If no worker can be used, or if several consecutive workers die while being checked.
         """
         if time.monotonic() - self._refreshed_at <= REFRESH_EVERY_S:
             self._check()
@@ -285,7 +312,7 @@ class CastingWorkers:
         return self.locations
 
     def _check(self) -> None:
-        """Record the workers whose software check has ended."""
+        """Process the software checks that have finished."""
         addresses = {}
         for address, future in self._checks.items():
             if future.status == "finished" and address in self.locations.free:
@@ -294,38 +321,39 @@ class CastingWorkers:
                 raise_if_failed(future, CHECKING)
         if not addresses:
             return
-        # All at a time: one by one, 200 workers on a busy machine took minutes. A worker that has
-        # stopped since is asked again.
+        # All answers are fetched together. Fetching them one by one took minutes with 200 workers.
+        # If a worker has stopped responding, its answer is fetched in a later call.
         answers = fetch_available(self._client, addresses, ANSWER_S)
         identities = worker_identities(self._client)
         for key, software in answers.items():
             address = addresses[key]
-            if address in identities:  # else it has left
+            if address in identities:  # otherwise the worker has left
                 self._accept(address, software, identities[address])
 
     def request_slots(self, slots: int) -> None:
-        """Request a number of slots of an adaptive partition, or 0 when all work is done.
+        """Request a number of slots from an adaptive partition, or 0 when all jobs have ended.
 
-        The driver binds each batch to a worker, so that no batch waits for workers to come.
+        The request is necessary because each batch is restricted to an existing worker, so that no
+        tasks wait for further workers.
         """
         if slots != self._requested_slots and self._adapts:
             self._requested_slots = slots
             self._adapts = self._partition.request_slots(slots)
-        if not slots:  # payloads on workers would keep these workers
+        if not slots:  # workers that hold payloads would not be retired
             for payload in self._payloads:
                 payload.release()
             self._jobs.clear()
             self._scenes.clear()
 
     def release(self) -> None:
-        """Let the workers drop their rigs, as far as they can be reached."""
+        """Let the workers drop their rigs if they can be reached."""
         addresses = [*self._casting & self.locations.members]
         for address in self._casting:
             del self._workers[address]
         if self._client.status == "running":
             self.request_slots(0)
         if addresses and self._client.status == "running":
-            # Dask tries for half a minute to reach a worker that is ending.
+            # Dask would spend half a minute trying to reach a worker that is exiting.
             with suppress(TimeoutError):
                 self._client.run(
                     drop_all,
@@ -338,7 +366,7 @@ class CastingWorkers:
     def _accept(
         self, address: str, software: Mapping[str, str], identity: Mapping[str, Any]
     ) -> None:
-        """Record a worker that has answered the software check, and refuse different software."""
+        """Accept a worker after its software check, or refuse it if its software differs."""
         worker = self._workers[address]
         worker.check = None
         if differs := describe_difference(software, self._software):
@@ -372,42 +400,42 @@ class CastingWorkers:
 
 
 class _Payload:
-    """A value that casting tasks bring to workers without a copy.
+    """Value that casting tasks carry to workers that do not have a copy yet.
 
-    A small value is sent with each task. A large value lies in memory of this process, which
-    workers of this machine map; other workers get a future of its bytes.
+    Small values are sent with the tasks. Large values are stored in shared memory, which workers on
+    this machine can map. Other workers receive a future of the pickled value.
     """
 
     def __init__(self, name: str, make: Callable[[], object], partition: Partition) -> None:
-        self.name = name  # name on the workers
+        self.name = name  # name of the value on the workers
         self.future: Future | None = None  # None until a worker needs it
-        self.recipients: set[str] = set()  # addresses of workers that it was sent to
-        self._make = make  # returns the value, again if the future is lost
+        self.recipients: set[str] = set()  # addresses of workers to which the value was sent
+        self._make = make  # function that creates the value, again if the future is lost
         self._partition = partition
-        self._holders: set[str] = set()  # addresses of workers that have received it
-        self._blind: set[str] = set()  # addresses of workers that do not see `_shared`
-        self._futures = 0  # so far
+        self._holders: set[str] = set()  # addresses of workers that have a copy
+        self._blind: set[str] = set()  # addresses of workers that cannot access `_shared`
+        self._futures = 0  # number of futures that have been created
         self._small: Pickled | None = None
         self._shared: SharedValue | None = None
         pickled = Pickled.from_value(make())
         if pickled.nbytes <= INLINE_BYTES:
             self._small = pickled.copy()
         else:
-            with suppress(OSError):  # this system has no shared memory, or too little
+            with suppress(OSError):  # the system has no shared memory or not enough of it
                 self._shared = SharedValue(pickled)
 
     def argument_for(self, worker: str) -> Pickled | SharedHandle | Future | None:
-        """Return the argument that brings the value to a worker, or None if it has a copy."""
+        """Return the argument that carries the value to a worker, or None if it has a copy."""
         if worker in self._holders:
             return None
         self.recipients.add(worker)
         if self._small is not None:
             return self._small
-        if self._shared is not None and worker not in self._blind and _is_here(worker):
+        if self._shared is not None and worker not in self._blind and _is_local(worker):
             return self._shared.handle
         if self.future is None or self.future.status in ("lost", "cancelled", "error"):
             self._futures += 1
-            self.future = share(
+            self.future = submit_value(
                 self._partition,
                 Pickled.from_value(self._make()).copy(),
                 key=f"{self.name}-packed-{self._futures}",
@@ -416,17 +444,20 @@ class _Payload:
         return self.future
 
     def record_copy(self, worker: str) -> None:
-        """Record that a worker has a copy."""
+        """Record that a worker has a copy of the value."""
         self._holders.add(worker)
 
     def record_loss(self, worker: str, *, unseen: bool = False) -> None:
-        """Record that a worker has no copy, and perhaps does not see the shared memory."""
+        """Record that a worker has no copy of the value.
+
+        `unseen` is True if the worker cannot access the shared memory.
+        """
         self._holders.discard(worker)
         if unseen:
             self._blind.add(worker)
 
     def release(self) -> None:
-        """Release the memory now: the traceback of an error may keep this object for a while."""
+        """Release the memory immediately, because tracebacks may keep this object alive."""
         if self._shared is not None:
             self._shared.close()
         if self.future is not None:
@@ -435,28 +466,31 @@ class _Payload:
 
 @dataclass(eq=False)
 class _Worker:
-    """A worker that the run knows, by its address: it is checked, and then casts or is refused.
+    """Worker of the GPU partition, which is being checked, has been accepted or has been refused.
 
-    A refused worker has different software or has lost its GPU, and gets no tasks of this run. A
-    worker that leaves is forgotten, unless it was refused.
+    A worker is refused if it has different software or has lost its GPU. Refused workers are
+    remembered even if they leave.
     """
 
-    # The task that asks for its software. Its answer is not kept on the worker: a worker with a
-    # result cannot be returned to the queue.
+    # Task that queries the software of the worker. It is released after the check, because an
+    # adaptive cluster does not retire workers that hold results.
     check: Future | None
-    slots: int = 0  # casting tasks at a time; 0 while it is checked, or if it is refused
-    unneeded: list[str] = field(default_factory=list)  # rigs and scenes that it may drop
+    slots: int = 0  # number of concurrent tasks, or 0 for a worker that has not been accepted
+    unneeded: list[str] = field(default_factory=list)  # rigs and scenes that the worker may drop
 
 
-def _is_here(address: str) -> bool:
+def _is_local(address: str) -> bool:
     """Return True if a worker is probably on this machine."""
     return urlsplit(address).hostname in (None, "127.0.0.1", "::1", get_ip())
 
 
-def share(partition: Partition, value: Any, **options: Any) -> Future:
-    """Submit a task that returns `value` for other tasks, again if a worker dies."""
+def submit_value(partition: Partition, value: Any, **options: Any) -> Future:
+    """Submit a task that returns a value for other tasks, so that Dask can recompute it.
+
+    In contrast to scattered data, the value is not lost if the worker that holds it dies.
+    """
     with warnings.catch_warnings():
-        # A large value makes a large graph, which is the only way to have it recomputed.
+        # The value is embedded in the task graph, so Dask warns about the size of the graph.
         warnings.filterwarnings("ignore", message="Sending large graph")
         return partition.submit(_identity, value, **options)
 

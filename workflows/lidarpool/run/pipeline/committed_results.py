@@ -1,4 +1,4 @@
-"""Committed results of a job: its parts in scan order, planning trials, and frames."""
+"""Committed results of a job, which are its parts, its planning trials and its frames."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lidarsim.numerics.arrays import Ints
 from ...plan import Trial
 from .stage_messages import Receipt
 
-_FIRST = attrgetter("first")  # the order of parts
+_FIRST = attrgetter("first")  # sort key of parts
 
 
 class CommittedParts:
@@ -27,7 +27,7 @@ class CommittedParts:
 
     @property
     def cell_box(self) -> Ints | None:
-        """Lowest and highest cell of all points, (2, 3), or None without points."""
+        """Lowest and highest cell of all points, with shape (2, 3), or None without points."""
         boxes = [part.cell_box for part in self.ordered if part.cell_box]
         if not boxes:
             return None
@@ -35,18 +35,18 @@ class CommittedParts:
         return np.stack([table[:, 0].min(axis=0), table[:, 1].max(axis=0)])
 
     def reaching_past(self, scan: int) -> list[Receipt]:
-        """Return the parts that contain a scan or later scans, in order."""
+        """Return the parts that contain the given scan or later scans, in scan order."""
         return [part for part in self.ordered[self._index(scan) :] if part.stop > scan]
 
     def part_of(self, scan: int) -> Receipt:
-        """Return the part of a committed scan, or raise KeyError for other scans."""
+        """Return the part that contains a scan. Raise KeyError if the scan is not committed."""
         for part in self.ordered[self._index(scan) :][:1]:
             if scan in part.scans:
                 return part
         raise KeyError(scan)
 
     def missing(self, first: int, stop: int) -> list[tuple[int, int]]:
-        """Return the scans from `first` to `stop` that are not committed, as half-open ranges."""
+        """Return the uncommitted scans from `first` to `stop` as half-open ranges."""
         absent: list[tuple[int, int]] = []
         index = self._index(first)
         while first < stop and index < len(self.ordered):
@@ -58,7 +58,7 @@ class CommittedParts:
         return [*absent, (first, stop)] if first < stop else absent
 
     def add(self, part: Receipt) -> None:
-        """Add a part, whose scans are missing."""
+        """Add a part whose scans are not committed yet."""
         bare = replace(part, summaries=b"", record=None, held_at="")
         bisect.insort(self.ordered, bare, key=_FIRST)
         self._count(part, 1)
@@ -79,18 +79,18 @@ class CommittedParts:
 
 
 class CommittedResults:
-    """Committed results of a job: parts, planning trials, and the frames that were handed out.
+    """Committed parts and planning trials of a job, and its delivered frames.
 
-    `RunDatabase` changes the parts and trials, `advance_frames` the frames.
+    `RunDatabase` modifies the parts and trials, and `advance_frames` modifies the frames.
 
     Parameters
     ----------
     number
         Number of the job in its run.
     scans
-        Scans that are to be done.
+        Scans that the run casts.
     has_frames
-        True if scans are also handed out as frames.
+        Whether scans are also delivered as frames.
     """
 
     def __init__(self, number: int, scans: range, *, has_frames: bool = False) -> None:
@@ -103,10 +103,10 @@ class CommittedResults:
         """Remove all parts, trials and frames."""
         self.parts = CommittedParts()
         self.trials: list[Trial] = []
-        self.frames = self.scans.start  # one past the last scan that was handed out as a frame
+        self.frames = self.scans.start  # one past the last scan that was delivered as a frame
 
     def advance_frames(self, stop: int) -> None:
-        """Record that the scans before `stop` were handed out as frames."""
+        """Record that the scans before `stop` were delivered as frames."""
         self.frames = stop
 
     @property
@@ -116,6 +116,6 @@ class CommittedResults:
 
     @property
     def scans_complete(self) -> bool:
-        """True if all scans are committed, and were handed out if the job has frames."""
+        """True if all scans are committed and, in a job with frames, delivered."""
         framed = not self.has_frames or self.frames == self.scans.stop
         return framed and not self.missing_count

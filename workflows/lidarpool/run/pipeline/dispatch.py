@@ -1,10 +1,11 @@
-"""Dispatches batches to casting workers and collectors, and offers lost batches again.
+"""Dispatch of batches to casting workers and collectors, including batches that have been lost.
 
-Stage 1 (GENERATE) sends ranges of scans. The dispatcher makes batches of the ranges. Stage 2
-(INTERSECT) casts batches on GPU workers. Stage 4 (COLLECT) writes them as parts. A batch is
-WAITING, CASTING, CAST or COLLECTING (`BatchState`). Amounts of work are weights: a task takes
-`per_task` small batches, each of weight 1, and a batch that fills half of a task's memory has the
-weight of half a task (`policies.weight`).
+Stage 1 (GENERATE) sends ranges of scans, which the dispatcher divides into batches. Stage 2
+(INTERSECT) casts the batches on GPU workers, and stage 4 (COLLECT) writes them as parts.
+
+The amount of work in flight is measured by the weight of batches (`policies.weight`). A small batch
+has a weight of 1, and a task contains `per_task` small batches. A batch that fills half of the
+memory of a task has half the weight of a full task.
 """
 
 from __future__ import annotations
@@ -21,18 +22,16 @@ from .batches import Batch, BatchState, Outcome
 from .casting_workers import CastingWorkers
 from .failures import JobError
 from .pipeline_job import PipelineJob
-from .stage_messages import CollectOrder, ColumnsLost, Receipt, scans_in_words
+from .stage_messages import CollectOrder, ColumnsLost, Receipt, format_scans
 from .stage_names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR
 from .task_records import TaskRecord
 
-MIN_ADVICE_CHANGE = 0.2  # relative change of the advice that is worth a message to stage 1
-PIECES = 16  # batches, at most, that a batch is divided into when its worker has died with it alone
+MIN_ADVICE_CHANGE = 0.2  # minimum relative change of the batch size that is sent to stage 1
+PIECES = 16  # maximum number of pieces into which a batch that kills workers is divided
 
 
 class Dispatcher:
-    """Dispatches the batches of all jobs, and isolates scans that kill their workers.
-
-    Jobs that cannot be cast are in `failed`, until they are dropped.
+    """Dispatcher of the batches of all jobs, which also isolates scans that kill their workers.
 
     Parameters
     ----------
@@ -41,39 +40,39 @@ class Dispatcher:
     collector_count
         Number of collectors, including those that are starting.
     mark
-        Text of the run, which is in the file names of all parts.
+        Mark of the run, which is part of the file names of all parts.
     """
 
     def __init__(self, workers: CastingWorkers, collector_count: int, mark: str) -> None:
         self.batches: dict[tuple[int, int], Batch] = {}  # {(job, first scan): batch}
-        self.failed: dict[PipelineJob, JobError] = {}
-        self.advice = 1  # scans of a batch, which each range from stage 1 should have
+        self.failed: dict[PipelineJob, JobError] = {}  # failed jobs, until they are dropped
+        self.advice = 1  # number of scans that stage 1 should send in each range
         self._workers = workers
         self._collector_count = collector_count
         self._mark = mark
         self._tasks: dict[str, list[Batch]] = {}  # {key of a casting task: uncommitted batches}
-        self._batch_count = 0  # batches so far
-        # Casting time in seconds and number of scans of each of the last committed batches.
+        self._batch_count = 0  # number of batches that have been created
+        # Casting time in seconds and number of scans for each recently committed batch.
         self._recent_casts: deque[tuple[float, int]] = deque(maxlen=64)
         self._cast_seconds = 0.0  # casting time of all committed batches
-        self._cast_scans = 0  # scans of all committed batches
-        self.per_task = 1  # small batches that are cast in one task
-        self.replayed = 0  # batches that were offered again, of all jobs
-        self.lost_workers: set[str] = set()  # addresses of workers whose batches were lost
-        # {job: batches that killed a worker, tried alone before any batch of the job was cast}
+        self._cast_scans = 0  # number of scans in all committed batches
+        self.per_task = 1  # number of small batches in a casting task
+        self.replayed = 0  # number of times that batches were offered again
+        self.lost_workers: set[str] = set()  # addresses of workers that lost their batches
+        # Batches that killed a worker alone before any batch of their job had been cast.
         self._first_deaths: dict[PipelineJob, list[Batch]] = {}
 
     def in_states(self, *states: BatchState) -> list[Batch]:
-        """Return the batches that are in any of the given states."""
+        """Return the batches in any of the given states."""
         return [batch for batch in self.batches.values() if batch.state in states]
 
     def _batches_of(self, job: PipelineJob) -> list[Batch]:
         return [batch for batch in self.batches.values() if batch.job is job]
 
     def _batches_within(self, receipt: Receipt) -> list[Batch]:
-        """Return the uncommitted batches whose scans are all in a part.
+        """Return the uncommitted batches whose scans are contained in a part.
 
-        There are several if the batch was divided after its part was written.
+        There are several batches if a batch was divided after its part had been written.
         """
         first = receipt.first
         stop = receipt.stop
@@ -90,15 +89,15 @@ class Dispatcher:
 
     @property
     def max_weight(self) -> int:
-        """Largest permitted weight of the batches in flight (`policies.weight`)."""
+        """Maximum weight of the batches in flight (`policies.weight`)."""
         slots = self._workers.slot_count
-        return policies.max_under_way(slots, self._collector_count, self.per_task)
+        return policies.max_weight_in_flight(slots, self._collector_count, self.per_task)
 
     def room(self, job: PipelineJob) -> float:
-        """Return the weight of further batches of a job that may be in flight, if positive.
+        """Return the weight of the batches that may still be added for a job.
 
-        The job has no room if many batches of any jobs are younger than the oldest batch of this
-        job: the sorter, and the memory, would have to hold their scans.
+        There is no room if the result is 0 or negative, or if too many batches have been created
+        since the oldest batch of the job, because their scans have to be kept until it is done.
         """
         span = max((self._batch_count - batch.number for batch in self._batches_of(job)), default=0)
         if span >= policies.MAX_SPAN * self.max_weight:
@@ -106,14 +105,14 @@ class Dispatcher:
         return self.max_weight - policies.weight(self.batches.values(), self.per_task)
 
     def slots_wanted(self, scan_count: int) -> int:
-        """Return the number of casting slots that `scan_count` scans are worth, at least 1."""
+        """Return the number of casting slots to request for a number of scans, at least 1."""
         scan_s = self._cast_seconds / self._cast_scans if self._cast_scans else None
         return max(1, policies.slots_wanted(scan_count, scan_s))
 
     def _learn(self, records: list[tuple[PipelineJob, TaskRecord]]) -> None:
-        """Update the sizes of batches and tasks from casting times.
+        """Update the sizes of batches and tasks from the casting times of committed batches.
 
-        Each record is of one batch: its casting time, and in `items` its number of scans.
+        The `items` of each record are the scans in its batch.
         """
         for job, record in records:
             job.seconds += record.seconds
@@ -132,13 +131,13 @@ class Dispatcher:
     # -- casting ---------------------------------------------------------------------------
 
     def add_scans(self, job: PipelineJob, first: int, stop: int) -> None:
-        """Make batches of the uncommitted scans in a range that stage 1 has sent."""
-        first = max(first, job.generated)  # a restarted generator repeats scans
+        """Create batches of the uncommitted scans in a range that stage 1 has sent."""
+        first = max(first, job.generated)  # stage 1 repeats scans after a restart
         if first < stop:
             job.trace("take", GENERATE, range(first, stop))
         job.generated = max(stop, job.generated)
         for missing_start, missing_stop in job.committed.parts.missing(first, stop):
-            # The advised size may exceed the memory of this job's casting tasks.
+            # The advice may be larger than the maximum size of a task for this job.
             for start in range(missing_start, missing_stop, job.scans_per_task):
                 batch_stop = min(start + job.scans_per_task, missing_stop)
                 number = self._batch_count
@@ -146,7 +145,7 @@ class Dispatcher:
                 self._batch_count += 1
 
     def offer(self) -> None:
-        """Offer waiting batches to workers that have room."""
+        """Submit waiting batches to workers that have room for further tasks."""
         waiting = sorted(
             self.in_states(BatchState.WAITING), key=lambda batch: (batch.order, batch.first)
         )
@@ -156,7 +155,9 @@ class Dispatcher:
             *waiting,
             *self.in_states(BatchState.CASTING, BatchState.CAST, BatchState.COLLECTING),
         ]
-        chosen = policies.offers(batches, self._workers.slots, self.max_weight, self.per_task)
+        chosen = policies.choose_offers(
+            batches, self._workers.slots, self.max_weight, self.per_task
+        )
         for task, worker in chosen:
             spans = [(batch.job.number, (batch.first, batch.stop)) for batch in task]
             key = self._workers.submit(spans, worker)
@@ -169,12 +170,11 @@ class Dispatcher:
                 batch.job.trace("submit", INTERSECT, batch.scans)
 
     def check(self) -> None:
-        """Update the batches of casting tasks that have ended.
+        """Update the batches of casting tasks that have finished.
 
-        If the worker died or no longer has the job's scene, the batches are offered again. If
-        casting has failed, and the task had batches of several jobs, they are offered again, too,
-        each in a task with batches of one job only (`Outcome.SEPARATE_JOBS`). With batches of a
-        single job, the job fails.
+        If the worker died or no longer has the scene, the batches are offered again. If casting
+        failed in a task with several jobs, the batches are also offered again, but in a separate
+        task for each job (`Outcome.SEPARATE_JOBS`). In a task with a single job, the job fails.
         """
         for key, task_batches in [*self._tasks.items()]:
             if task_batches[0].state is not BatchState.CASTING:
@@ -195,17 +195,17 @@ class Dispatcher:
                     batch.single_job |= outcome is Outcome.SEPARATE_JOBS
 
     def reclaim_lost(self, locations: PartitionSnapshot) -> None:
-        """Offer batches again whose workers died, are silent or late, or take no tasks."""
+        """Offer batches again whose workers have died, do not respond, are late or are paused."""
         prepared = len(self._workers.slots)
         late_s = policies.late_after_s(self._recent_casts)
         for batch in [*self.batches.values()]:
-            if outcome := policies.loss(batch, locations, prepared, time.monotonic(), late_s):
+            if outcome := policies.find_loss(batch, locations, prepared, time.monotonic(), late_s):
                 self._offer_again(batch, outcome.value)
 
     def _offer_again(
         self, batch: Batch, reason: str, state: BatchState = BatchState.WAITING
     ) -> None:
-        """Queue a batch to be cast again, or only to be collected again."""
+        """Change the state of a batch so that it is cast again, or only collected again."""
         if state is BatchState.WAITING:
             self._forget_task(batch)
         batch.move(state)
@@ -228,7 +228,7 @@ class Dispatcher:
         self.failed.pop(job, None)
 
     def _forget_task(self, batch: Batch) -> None:
-        """Detach a batch from its casting task, and end the task after its last batch."""
+        """Detach a batch from its casting task, and release the task after its last batch."""
         key = batch.key
         batch.key = ""
         if (task_batches := self._tasks.get(key)) is not None:
@@ -237,10 +237,10 @@ class Dispatcher:
                 del self._tasks[key]
                 self._workers.forget(key)
 
-    # -- poison batches ----------------------------------------------------------------------
+    # -- batches that kill workers -----------------------------------------------------------
 
     def _blame(self, batch: Batch, stage: str, worker: str) -> None:
-        """Count the death of a worker against its batch, and divide or condemn the batch."""
+        """Count the death of a worker against its batch, which may be divided or condemned."""
         batch.deaths[stage] += 1
         kills = policies.kills_alone(batch, stage)
         if stage == INTERSECT and not batch.job.cast and kills > 0:
@@ -256,31 +256,31 @@ class Dispatcher:
             partition = GPU if stage == INTERSECT else LIDAR
             batch.job.condemned.append(
                 f"{policies.MAX_KILLS} workers in a row died in stage {stage} while they processed "
-                f"only {scans_in_words(batch.first, batch.stop)}"
+                f"only {format_scans(batch.first, batch.stop)}"
                 f"{self._workers.memory_clause(worker)}. See the logs of the {partition} workers."
             )
             self._remove(batch)
             self._fail_condemned(batch.job)
 
     def _fail_condemned(self, job: PipelineJob) -> None:
-        """Fail a job that has condemned batches, once no batch of the job is left."""
+        """Fail a job with condemned batches once all of its other batches are committed."""
         if job.condemned and not self._batches_of(job):
             self.failed.setdefault(job, JobError("\n".join(job.condemned)))
 
     def _blame_scene(self, batch: Batch, worker: str) -> None:
-        """Count a death with a batch alone before any batch of the job was cast.
+        """Count the death of a worker with a single batch before any batch of the job was cast.
 
-        The scene itself may kill the workers. Another batch is tried next, and the job fails once
-        several batches have killed a worker.
+        The cause may be the scene rather than the batch. A different batch is therefore tried next,
+        and the job fails once several batches have killed a worker.
         """
         killers = self._first_deaths.setdefault(batch.job, [])
-        # Not those that overlap with this batch: it is a piece of them.
+        # This batch may be a piece of an earlier one, which is then replaced.
         killers[:] = [k for k in killers if k.stop <= batch.first or batch.stop <= k.first]
         killers.append(batch)
         batch.order = self._batch_count
         self._batch_count += 1
         if len(killers) >= policies.MAX_KILLS:
-            names = ", ".join(scans_in_words(killer.first, killer.stop) for killer in killers)
+            names = ", ".join(format_scans(killer.first, killer.stop) for killer in killers)
             error = JobError(
                 f"{len(killers)} casting workers in a row died while casting their first batch "
                 f"({names}){self._workers.memory_clause(worker)}. The scene may need more memory "
@@ -291,15 +291,15 @@ class Dispatcher:
     # -- stage 4 -----------------------------------------------------------------------------
 
     def assign(self, collectors: Mapping[str, str]) -> dict[str, list[CollectOrder]]:
-        """Assign batches that were cast to collectors, and return the orders of each collector.
+        """Assign cast batches to collectors, and return the orders for each collector.
 
-        `collectors` maps the name of each running collector to the address of its worker.
+        `collectors` maps the names of running collectors to the addresses of their workers.
         """
         orders: dict[str, list[CollectOrder]] = {}
         if not (cast := self.in_states(BatchState.CAST)):
             return orders
         batches = [*cast, *self.in_states(BatchState.COLLECTING)]
-        for task, name in policies.handovers(batches, collectors):
+        for task, name in policies.choose_handovers(batches, collectors):
             parts = []
             for batch in task:
                 batch.collector = name
@@ -314,24 +314,24 @@ class Dispatcher:
         return orders
 
     def recast_part(self, receipt: Receipt) -> None:
-        """Cast the batches of a part again, which was lost with the worker that held the part."""
+        """Offer the batches of a part again if the worker that held the part was lost."""
         self._recast_uncollected(self._batches_within(receipt), "its part was lost")
 
     def recast_columns(self, message: ColumnsLost) -> None:
-        """Cast batches again whose columns could not be fetched."""
-        # A replaced collector may report a batch that was offered again.
+        """Offer batches again if their columns could not be fetched."""
+        # The message may come from a replaced collector, after the batches were offered again.
         task_batches = self._tasks.get(message.key, ())
         self._recast_uncollected([*task_batches], "its columns could not be fetched")
 
     def _recast_uncollected(self, batches: Iterable[Batch], reason: str) -> None:
-        """Offer the COLLECTING batches again, to be cast, and skip batches in any further state."""
+        """Offer batches again if they are in the state COLLECTING."""
         for batch in batches:
             if batch.state is BatchState.COLLECTING:
                 self._offer_again(batch, reason)
 
     def release(self, committed: Iterable[tuple[PipelineJob, Receipt]]) -> None:
-        """Remove the batches of committed parts, and learn from their casting tasks."""
-        # {collector: the earliest time at which it was assigned one of the committed batches}
+        """Remove the batches of committed parts, and adapt the size of further batches."""
+        # {collector: earliest time at which one of its committed batches was assigned}
         earliest_s: dict[str, float] = {}
         records = []
         for job, receipt in committed:
@@ -344,17 +344,21 @@ class Dispatcher:
                 records.append((job, receipt.record))
         waiting_batches = [*self.in_states(BatchState.COLLECTING)] if earliest_s else []
         for waiting in waiting_batches:
-            # A collector takes its batches in order. Batches behind the committed batches had to
-            # wait: the time after which they are late starts now.
+            # A collector processes its batches in order, so the time limit for its remaining
+            # batches starts now.
             if waiting.collector in earliest_s and waiting.since >= earliest_s[waiting.collector]:
                 waiting.move(BatchState.COLLECTING)
         self._learn(records)
 
     def reclaim_uncollected(self, died: Mapping[str, str], started: Collection[str]) -> None:
-        """Take back the batches of collectors, to be collected by another collector.
+        """Reassign the batches of collectors that died or were restarted.
 
-        `died` are the collectors whose workers died, {name: address of the worker}; `started` are
-        the names of stages that were started now, which do not know earlier orders.
+        Parameters
+        ----------
+        died
+            Addresses of workers that died, by the name of their stage.
+        started
+            Names of the stages that were just started, and have not received earlier orders.
         """
         self.lost_workers.update(died.values())
         for batch in self.in_states(BatchState.COLLECTING):

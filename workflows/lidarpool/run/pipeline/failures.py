@@ -1,4 +1,4 @@
-"""Classifies failed tasks, and names the scans of an error."""
+"""Errors of jobs and scans, and the classification of failed tasks."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from lidarsim.errors import LidarError, explained
 from lidarsim.io.storage import Storage
 from poolpart.task_context import WorkerLeavingError
 
-from .stage_messages import scans_in_words
+from .stage_messages import format_scans
 
-ASK_S = 10.0  # wait for an error's text, which the scheduler has
+ASK_S = 10.0  # time limit for fetching an error from the scheduler
 
 
 class JobError(LidarError):
-    """Error of a single job, after which the run goes on with the next jobs."""
+    """Error that affects a single job. The run continues with the remaining jobs."""
 
 
 class ScanError(RuntimeError):
-    """Error while scans are described, cast or packed. The message names the scans."""
+    """Error raised while scans are described, cast or packed. The message names the scans."""
 
 
-class DeviceLost(RuntimeError):  # noqa: N818 - reads as what happened
-    """Error of a GPU after which it answers no call of the worker's process any more."""
+class DeviceLost(RuntimeError):  # noqa: N818 - the name states what happened
+    """Error after which a GPU no longer responds to the process of the worker."""
 
     def __init__(self, reason: str, process: str, restarts: bool) -> None:
         super().__init__(reason, process, restarts)
         self.reason = reason
         self.process = process  # identifies the process
-        self.restarts = restarts  # whether a nanny starts another process
+        self.restarts = restarts  # whether a nanny restarts the process
 
     def __str__(self) -> str:
         return self.reason
@@ -39,22 +39,22 @@ class DeviceLost(RuntimeError):  # noqa: N818 - reads as what happened
 
 @contextmanager
 def naming_scans(first: int, stop: int) -> Iterator[None]:
-    """Prefix the message of any error with the current scans.
+    """Convert errors in the body to a ScanError whose message names the scans.
 
-    The error becomes a ScanError, because a ScanError can always be sent through Dask. A
-    WorkerLeavingError passes unchanged, since the scans are not its cause.
+    In contrast to arbitrary errors, a ScanError can always be pickled. A WorkerLeavingError is not
+    converted, because it is not caused by the scans.
     """
     try:
         yield
     except WorkerLeavingError:
         raise
     except Exception as error:
-        words = scans_in_words(first, stop)
+        words = format_scans(first, stop)
         raise ScanError(f"{words}: {type(error).__name__}: {error}") from error
 
 
 def storing(storage: Storage) -> AbstractContextManager[None]:
-    """Turn an OSError of the body into a LidarError with advice on storage."""
+    """Convert an OSError in the body to a LidarError with advice on the storage."""
     advice = "Free space there, or choose a different location with `--scratch-dir`"
     return explained(f"The points cannot be stored in {storage.url}", advice)
 
@@ -65,23 +65,41 @@ def error_of(future: Future) -> BaseException | None:
 
 
 def was_killed(future: Future) -> bool:
-    """Return True if a task failed because its workers kept dying or its worker left."""
+    """Return True if a task failed because its worker left or because its workers kept dying."""
     return isinstance(error_of(future), (KilledWorker, WorkerLeavingError))
 
 
 def raise_if_failed(future: Future, activity: str, kind: type[LidarError] = LidarError) -> None:
-    """Raise `kind` if a task has failed, or LidarError if another client cancelled the task."""
+    """Raise an error if a task has failed.
+
+    Parameters
+    ----------
+    future
+        Future of the task.
+    activity
+        Name of the activity for the message.
+    kind
+        Type of the error.
+
+    Raises
+    ------
+    LidarError
+        If the task has failed (of type `kind`), or if a different client has cancelled it.
+    """
     if (error := error_of(future)) is not None:
         error.__traceback__ = future.traceback(timeout=ASK_S)
-        words = str(error) or type(error).__name__  # some of Dask's have no message
+        words = str(error) or type(error).__name__  # some of Dask's errors have no message
         raise kind(f"{activity} failed: {words}") from error
-    if future.status == "cancelled":  # "lost" passes: a worker died and the task runs again
+    if future.status == "cancelled":  # a "lost" task runs again
         raise LidarError(f"{activity} was cancelled by a different client.")
 
 
 def memory_clause(client: Client, workers: Collection[str]) -> str:
-    """Return a clause for a message if nannies ended dead workers for their memory, else ""."""
-    # A nanny logs this as an event, with the address of the worker; other causes are unknown.
+    """Return a clause for messages if any of the workers exceeded its memory limit.
+
+    Return an empty string if the cause of death is unknown.
+    """
+    # A nanny that terminates a worker because of its memory logs an event with the address.
     events = client.get_events("worker-restart-memory")
     ended = {event.get("worker") for _, event in events} & set(workers)
     if not ended:

@@ -1,6 +1,6 @@
-"""Imports of the fork server, which workers of a local cluster inherit.
+"""Modules that the fork server imports, so that the workers of a local cluster inherit them.
 
-Each worker would import the same modules itself while the run waits for it.
+Otherwise, each worker would import these modules itself while the run waits for it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from contextlib import suppress
 
 import distributed.nanny  # noqa: F401
 import distributed.versions
-import numpy.ma  # noqa: F401 - numba asks for it with the first array
+import numpy.ma  # noqa: F401 - numba imports it with the first array
 import tornado.platform.asyncio  # noqa: F401
 
 import poolpart.deploy.local  # noqa: F401
@@ -25,16 +25,16 @@ from ...processes.fork_server import keep_freed_memory
 from . import casting_workers, long_stage_tasks  # noqa: F401
 
 keep_freed_memory()
-# A starting worker removes the folders of ended workers, at the same time as their nannies, and
-# would log each missing folder as an error.
+# Workers that are starting and nannies remove the folders of stopped workers at the same time. The
+# folders that are already missing would be logged as errors.
 logging.getLogger("distributed.diskutils").setLevel(logging.CRITICAL)
-with suppress(ImportError):  # a check says why the module cannot be loaded
+with suppress(ImportError):  # a later check reports why the module cannot be loaded
     from lidarsim.numerics import elementary_loops  # noqa: F401
     from raybeam import moving_loops, tile_casts  # noqa: F401
 
     if tile_casts.COMPILED:
         print("note: the ray caster was compiled for this processor", file=sys.stderr)  # noqa: T201
-# What each worker would read from many files: versions of packages, and a hash of the sources.
+# Cache the versions of packages and the hash of the sources, which are read from many files.
 distributed.versions.get_versions()
 software.source_hash()
-gc.freeze()  # a collection in a worker would copy the memory that it shares with the others
+gc.freeze()  # otherwise, garbage collection in a worker would copy shared memory pages

@@ -1,8 +1,9 @@
-"""Stages 1, 3 and 4: the long-running tasks on LIDAR workers.
+"""Long-running tasks on LIDAR workers for stages 1, 3 and 4.
 
-Each stage takes groups of messages from the driver until a pipe is closed. It secedes at once: it
-frees its thread but keeps its slot, so that a worker with one thread and four LIDAR slots runs all
-four. A failed pipe ends a stage silently, because the driver knows the reason.
+Each stage processes messages from the driver until a pipe is closed. A failed pipe also ends a
+stage silently, because the driver knows the reason. Each stage secedes from the thread pool of its
+worker but keeps its slot, so that a worker with one thread and four LIDAR slots can run four of
+them.
 """
 
 from __future__ import annotations
@@ -40,20 +41,20 @@ from .stage_messages import (
 from .stage_names import COLLECT, GENERATE, LIDAR
 from .task_records import Recorder, TaskRecord
 
-SEND_EVERY_S = 0.05  # messages that follow each other faster are sent together
-LINGER_S = 0.02  # wait of the sorter for more messages
-FETCH_PATIENCE_S = 2.0  # longest wait for a sign of life of a batch's worker
+SEND_EVERY_S = 0.05  # minimum interval between sending messages, which are sent together
+LINGER_S = 0.02  # time that the sorter waits for further messages
+FETCH_PATIENCE_S = 2.0  # time limit for a response from the worker that holds a batch
 
 News = Scans | ColumnsLost | Failed  # message to the driver
 
 
 @translate_leaving_errors()
 def generate(start: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
-    """Stage 1: describe the scans of surveys in order.
+    """Describe the scans of surveys in order (stage 1).
 
-    The driver sends lists of `Description`, and advises the number of scans in each `ScanRange`
-    that it gets: the survey describes the scans equally on every worker. A survey that cannot be
-    described is reported as `Failed`.
+    The driver sends lists of `Description`, and receives `ScanRange` messages with the advised
+    number of scans. The scans themselves are not sent, because workers can derive them from the
+    survey. If a scan cannot be described, the driver receives `Failed`.
     """
     secede()
     recorder = Recorder(start.stage, LIDAR)
@@ -73,36 +74,37 @@ def _describe_scans(
         first = description.first
         try:
             with naming_scans(first, first + 1):
-                survey: Survey = pickle.loads(description.survey)  # noqa: S301 - of the run's own driver
+                survey: Survey = pickle.loads(description.survey)  # noqa: S301 - from the run's driver
             while first < description.stop:
                 item = ScanRange(
                     description.job, first, min(first + get_advice(outlet), description.stop)
                 )
                 with naming_scans(item.first, item.stop):
-                    survey.scan(item.stop - 1)  # raises here if a scan cannot be described
+                    survey.scan(item.stop - 1)  # raises an error if the scan cannot be described
                 start.trace("put", item.scans)
                 yield item
                 first = item.stop
-        except ScanError as error:  # other surveys can be described
+        except ScanError as error:  # must not affect other surveys
             yield Failed(description.job, GENERATE, str(error))
 
 
 @translate_leaving_errors()
 def sort_frames(start: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
-    """Stage 3: put the summaries of the scans of each survey into scan order.
+    """Sort the summaries of each survey in scan order (stage 3).
 
-    The driver sends lists of `Summaries`, and gets each back once all earlier scans were sent back,
-    or had been handed out before (`Summaries.framed`). A survey is forgotten after its last scan.
+    The driver sends lists of `Summaries`. Each of them is returned when all earlier scans have been
+    returned, or had already been delivered (`Summaries.framed`). The state of a survey is discarded
+    after its last scan.
     """
     secede()
     recorder = Recorder(start.stage, LIDAR)
-    orders: dict[int, _ScanOrder] = {}  # {job: its waiting summaries}
+    orders: dict[int, _ScanOrder] = {}  # {job: waiting summaries}
     scan_count = 0
     start.trace("start")
     with suppress(PipeClosed, PipeFailed):
         while True:
             ready: list[Summaries] = []
-            # Each answer wakes the driver, so wait for more messages.
+            # Wait for further messages, because each response wakes the driver.
             for item in chain.from_iterable(inlet.get_all(linger_s=LINGER_S)):
                 start.trace("get", item.scans)
                 order = orders.setdefault(item.job, _ScanOrder())
@@ -126,7 +128,7 @@ class _ScanOrder:
     waiting: dict[int, Summaries] = field(default_factory=dict)  # {first scan: summaries}
 
     def add(self, item: Summaries) -> list[Summaries]:
-        """Add summaries, and return the summaries that are next in scan order, if there are any."""
+        """Add summaries, and return all summaries that are now next in scan order."""
         self.next_scan = max(self.next_scan, item.framed)
         if item.stop > self.next_scan:
             self.waiting[max(item.first, self.next_scan)] = item
@@ -141,21 +143,21 @@ class _ScanOrder:
 def collect(
     start: StageStart, storage: Storage, probe: tuple[str, bytes], inlet: Pipe, outlet: Pipe
 ) -> TaskRecord:
-    """Stage 4: fetch batches from the workers that cast the batches, and write each as a part.
+    """Fetch batches from the workers that cast them, and write each batch as a part (stage 4).
 
-    `probe` is a file in the storage, name and content: a worker that does not see this file holds
-    its parts in memory, and the driver fetches the parts. The driver sends lists of `CollectOrder`,
-    and gets `Receipt`, `ColumnsLost` and `Failed`.
+    The driver sends lists of `CollectOrder`, and receives `Receipt`, `ColumnsLost` and `Failed`
+    messages. The name and content of a file in the storage are given as `probe`. If the worker
+    cannot access this file, it keeps its parts in memory, from where the driver fetches them.
     """
     secede()
     visible_storage = storage if storage.sees(*probe) else None
     recorder = Recorder(start.stage, LIDAR)
-    sender = _Sender(start, outlet)  # the driver limits its orders
+    sender = _Sender(start, outlet)  # needs no limit, because the driver limits its orders
     start.trace("start")
     with suppress(PipeClosed, PipeFailed):
         while True:
             orders = chain.from_iterable(inlet.get_all())
-            # The pipe's client: `own_client` makes a message to the scheduler each time.
+            # `own_client` would send a message to the scheduler each time.
             news = (_write_parts(start, visible_storage, order, inlet.client) for order in orders)
             sender.send(chain.from_iterable(news))
     return recorder.finish(sender.scan_count)
@@ -192,19 +194,20 @@ def _write_parts(
 
 
 class _Sender:
-    """Sends news to the driver: those that follow each other quickly together.
+    """Sender of messages to the driver, which combines messages that follow each other quickly.
 
-    At most `max_items` are sent at a time; without a limit, 0, the pipe may hold any number.
+    At most `max_items` messages are sent at a time. Without a limit (0), the capacity of the pipe
+    is ignored.
     """
 
     def __init__(self, start: StageStart, outlet: Pipe, max_items: int = 0) -> None:
         self._start = start
         self._outlet = outlet
         self._max_items = max_items
-        self.scan_count = 0  # scans that were sent
+        self.scan_count = 0  # number of scans that have been sent
 
     def send(self, news: Iterable[News]) -> None:
-        """Send news while they are made."""
+        """Send messages as they are produced by an iterable."""
         waiting: list[News] = []
         sent_at = time.monotonic()
         for item in news:

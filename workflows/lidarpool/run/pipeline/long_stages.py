@@ -1,8 +1,8 @@
-"""The long-running stages 1, 3 and 4, and the pipes between them and the driver.
+"""Long-running stages 1, 3 and 4, and the pipes that connect them to the driver.
 
 The functions that run on workers are in `long_stage_tasks.py`. A pipe consists of a Dask Queue and
-a Dask Variable, which other clients see by its name. RUN is the id of the run, which the keys of
-its tasks contain as well. N increases each time a stage is started.
+a Dask Variable, which other clients can access by name. In the following names, RUN is the ID of
+the run, and N increases each time a stage is started.
 
 ===============================  ============================================
 lidarpool-RUN-scans              ranges of scans and errors, from stage 1 to the driver
@@ -42,35 +42,52 @@ from .stage_names import COLLECT, GENERATE, SORT
 from .task_records import TaskRecord
 
 REFRESH_EVERY_S = 0.5
-SETTLE_S = 2.0  # time for a submitted task to start
-MAX_DEATHS = 12  # deaths of a stage with nothing committed in between
-ASK_LOCK_S = 0.05  # wait for the lock
-LAST_WORDS_S = 3.0  # time for the stages to end after everything was committed
+SETTLE_S = 2.0  # time limit for a submitted task to start
+MAX_DEATHS = 12  # maximum number of deaths of a stage without any commits in between
+ASK_LOCK_S = 0.05  # time limit for acquiring the lock
+LAST_WORDS_S = 3.0  # time limit for the stages to exit after everything has been committed
 
-Order = Description | CollectOrder | Summaries  # order to a stage
+Order = Description | CollectOrder | Summaries  # message from the driver to a stage
 
 
 @dataclass(eq=False)
 class _StageTask:
     future: Future
-    worker: str  # address of the only worker that may run the task
-    inlet: Pipe  # pipe that the driver fills
-    since: float  # time of submission
-    dead_since: float | None = None  # time of the worker's death, until the stage is restarted
+    worker: str  # address of the worker to which the task is restricted
+    inlet: Pipe  # pipe from the driver to the task
+    since: float  # monotonic time of submission
+    dead_since: float | None = None  # monotonic time at which its worker was found dead
 
 
 class LongStages:
-    """Runs each long stage on a chosen worker, and restarts a stage whose worker has died.
+    """Long-running stages, each of which runs on a chosen worker and is restarted if it dies.
 
-    Dask would do both, but not in a way that suits tasks as long as the run: it may give two stages
-    to one slot, where the second waits for the first for ever; and it counts the deaths of a task's
-    workers, and fails the task at the fourth. All stages are started together, under a lock of the
-    cluster, when there are slots for all: two runs with some of the slots each would wait for each
-    other for ever.
+    Dask's own scheduling does not suit tasks that run as long as the run. It may assign two stages
+    to the same slot, where the second would wait forever, and it fails a task when its fourth
+    worker has died.
 
-    `run` is the run's id, part of the names of tasks and pipes; `sources` is ``lidarpool`` of its
-    `software`. Parts go to `storage`, where files have the run's `mark`. Stage 1 may be
-    `queue_capacity` items ahead, and slots are waited for `patience_s` seconds.
+    All stages are started together while holding a cluster-wide lock, and only if there are slots
+    for all of them. Otherwise, two runs that each have some of the slots would wait for each other
+    forever.
+
+    Parameters
+    ----------
+    partition
+        LIDAR partition.
+    run
+        ID of the run, which is part of the names of tasks and pipes.
+    sources
+        Value of ``lidarpool`` in the software of the run, which workers must have.
+    storage
+        Storage for parts.
+    mark
+        Mark of the run, which is part of the names of its files.
+    queue_capacity
+        Number of items that stage 1 may be ahead.
+    collectors
+        Number of collectors (stage 4).
+    patience_s
+        Time limit for missing slots, in seconds.
     """
 
     def __init__(
@@ -96,23 +113,21 @@ class LongStages:
         self._names = [GENERATE, SORT, *(f"{COLLECT}-{number}" for number in range(collectors))]
         self._tasks: dict[str, _StageTask] = {}
         self._submitted = 0
-        # A file in the storage. Collectors look for the file to find out whether they see the
-        # storage.
+        # Name and content of a file with which workers check whether they can access the storage.
         self.probe = (probe_name(mark, run), secrets.token_bytes(16))
-        # Not pipes that fail with their tasks: `_restart` submits lost stages again.
+        # The pipes must not fail together with a task, because `_restart` restarts lost stages.
         scans, news = f"lidarpool-{run}-scans", f"lidarpool-{run}-news"
         self._scans = Pipe(scans, queue_capacity, self.client, fails_with_tasks=False)
-        # News of stages 3 and 4.
-        self._news = Pipe(news, 64, self.client, fails_with_tasks=False)
+        self._news = Pipe(news, 64, self.client, fails_with_tasks=False)  # from stages 3 and 4
         self._outbox: dict[str, list[Order]] = {}  # {name of a pipe: messages}
-        self._refreshed_at = 0.0  # time of the last `refresh`
+        self._refreshed_at = 0.0  # monotonic time of the last `refresh`
         self._progress = -1  # progress of the driver at the last `refresh`
-        self._deaths: dict[str, list[str]] = {}  # {name: workers that died since any progress}
-        self._enough_at = time.monotonic()  # last time with enough slots, free or not
+        self._deaths: dict[str, list[str]] = {}  # {stage: workers that died since the last commit}
+        self._enough_at = time.monotonic()  # last time at which there were enough slots
         self._waited_from: float | None = None  # start of the wait for slots of other runs
         self.waiting = False  # True while other runs hold the slots
         self._closed_at: float | None = None
-        self._hidden: set[str] = set()  # addresses of workers that do not see the storage
+        self._hidden: set[str] = set()  # addresses of workers that cannot access the storage
         self._notes: list[str] = []
 
     @property
@@ -124,7 +139,7 @@ class LongStages:
         return [*self._notes, *([note] if self._hidden else [])]
 
     def open(self) -> None:
-        """Create the pipes and the probe file. `finish` must be called afterwards."""
+        """Create the pipes and the probe file. Call `finish` to remove them."""
         with storing(self._storage):
             self._storage.prepare()
             self._storage.write(*self.probe)
@@ -138,9 +153,19 @@ class LongStages:
     ) -> list[Message]:
         """Exchange messages with the stages, and return the received messages.
 
-        Waits at most `seconds` for news or a task of `keys` and, after the first message,
-        `linger_s` seconds for more. The same request sends the outbox and takes all messages, from
-        stage 1 only with `scans`: each request costs driver and scheduler a millisecond.
+        A single request sends and receives all messages, because each request takes the driver and
+        the scheduler about one millisecond.
+
+        Parameters
+        ----------
+        seconds
+            Maximum time to wait for a message or for a task in `keys`.
+        keys
+            Keys of tasks. The method also returns when one of them finishes.
+        scans
+            Whether to receive messages from stage 1.
+        linger_s
+            Time to wait for further messages after the first one.
         """
         pipes = [self._news.name, *([self._scans.name] if scans else [])]
         puts = {name: [orders] for name, orders in self._outbox.items()}
@@ -151,19 +176,19 @@ class LongStages:
     def send(self, name: str, messages: Sequence[Order]) -> None:
         """Send messages to a stage with the next `wait`.
 
-        Messages to a stage that is not running, or is being replaced, are lost: the driver sends
-        all orders again when the stage has started.
+        Messages to a stage that is not running or is being replaced are lost. The driver sends all
+        orders again when the stage has started.
         """
         task = self._tasks.get(name)
         if task is not None:
             self._outbox.setdefault(task.inlet.name, []).extend(messages)
 
     def advise(self, scans: int) -> None:
-        """Set the number of scans that stage 1 puts into an item."""
+        """Set the number of scans that stage 1 sends in each message."""
         set_advice(self._scans, scans)
 
     def store_held(self, receipt: Receipt) -> bool:
-        """Store a part that its worker holds in memory, and return False if the part is lost."""
+        """Store a part that is held in the memory of a worker. Return False if the part is lost."""
         self._hidden.add(receipt.held_at)
         data = fetch_held_bytes(self.client, receipt.held_at, receipt.name)
         if data is None:
@@ -174,7 +199,7 @@ class LongStages:
 
     @property
     def collectors(self) -> dict[str, str]:
-        """Running tasks of stage 4, {name: address of the worker}."""
+        """Addresses of the workers on which collectors are running, by collector name."""
         return {
             name: task.worker
             for name, task in self._tasks.items()
@@ -183,16 +208,16 @@ class LongStages:
 
     @property
     def lacks_slot(self) -> bool:
-        """True if a stage whose worker has died waits for a free slot."""
+        """True if a stage whose worker has died is waiting for a free slot."""
         return any(task.dead_since is not None for task in self._tasks.values())
 
     # -- starting --------------------------------------------------------------------------
 
     def _start(self) -> None:
-        """Start all stages, each on a free slot. With too few slots, the next call retries."""
+        """Start all stages if there are enough free slots. Otherwise, the next call tries again."""
         lock = Lock(self._lock_name, scheduler_rpc=self.client.scheduler, loop=self.client.loop)
         acquired = False
-        with suppress(RuntimeError):  # another run has just removed it (`_forget_lock`)
+        with suppress(RuntimeError):  # another run has just removed the lock (`_forget_lock`)
             acquired = lock.acquire(timeout=ASK_LOCK_S)
         if not acquired:
             self.waiting = True
@@ -203,7 +228,6 @@ class LongStages:
             lock.release()
 
     def _start_all(self) -> None:
-        # All or none, and under a lock: two runs might each get slots that the other needs.
         locations = self._locate()
         now_s = time.monotonic()
         slot_count = len(self._names)
@@ -227,7 +251,7 @@ class LongStages:
             )
         for name in self._names:
             self._submit(name, free)
-        # Another run may start once the lock is free: the scheduler must know the tasks by then.
+        # The tasks must be known to the scheduler before another run can acquire the lock.
         while len(self._locate().tasks) < slot_count and time.monotonic() < now_s + SETTLE_S:
             time.sleep(0.005)
 
@@ -244,14 +268,25 @@ class LongStages:
     # -- restarting --------------------------------------------------------------------------
 
     def refresh(self, progress: int) -> tuple[Mapping[str, str], Sequence[str]]:
-        """Start all stages, and restart stages that died or wait for a slot.
+        """Start all stages, or restart stages that have died or are waiting for a slot.
 
-        Does nothing if the last call is recent. `progress` is any number that grows when scans are
-        committed. Returns the stages whose workers have died, {name: address}, and the names of the
-        stages that were started, for the first time or again.
+        Do nothing if the last call is recent.
 
-        LidarError if a stage has failed, or keeps dying with nothing committed in between, or
-        the partition has too few slots for too long.
+        Parameters
+        ----------
+        progress
+            Any number that increases when scans are committed.
+
+        Returns
+        -------
+        Addresses of workers that have died, by the name of their stage, and the names of all stages
+        that were started or restarted.
+
+        Raises
+        ------
+        LidarError
+            If a stage has failed or keeps dying without any commits in between, or if the partition
+            has had too few slots for too long.
         """
         now_s = time.monotonic()
         if now_s - self._refreshed_at < REFRESH_EVERY_S:
@@ -269,7 +304,7 @@ class LongStages:
         return self._restart(now_s)
 
     def _restart(self, now_s: float) -> tuple[dict[str, str], list[str]]:
-        """Restart stages that died or wait for a slot, and return as `refresh` does."""
+        """Restart stages that have died or are waiting for a slot. Return the same as `refresh`."""
         died: dict[str, str] = {}
         started: list[str] = []
         locations = self._locate()
@@ -279,7 +314,7 @@ class LongStages:
                 self._check_end(name)
                 continue
             room = max(free.values(), default=0) > 0
-            # A silent worker may wake up: it keeps its stages while no other slot is free.
+            # A silent worker may respond again, so it keeps its stages if no other slot is free.
             lost = task.future.status == "error" or task.worker not in locations.members
             if task.dead_since is None and (lost or (task.worker in locations.silent and room)):
                 task.dead_since = now_s
@@ -296,7 +331,7 @@ class LongStages:
 
     @staticmethod
     def _is_queued(task: _StageTask, locations: PartitionSnapshot, now_s: float) -> bool:
-        """Return True if a task waits behind another, on a worker with more tasks than slots."""
+        """Return True if a task has not started because its worker has more tasks than slots."""
         return (
             task.dead_since is None
             and now_s - task.since > SETTLE_S
@@ -306,7 +341,7 @@ class LongStages:
 
     def _check_patience(self, name: str, task: _StageTask, now_s: float) -> None:
         """Raise LidarError if a dead stage has waited too long for a free slot."""
-        # A single collector is not needed while others run: they do its work.
+        # A dead collector can be tolerated while others are running.
         spare = name.startswith(COLLECT) and self.collectors
         if task.dead_since and now_s - task.dead_since > self._patience_s and not spare:
             raise self._too_few(
@@ -315,7 +350,10 @@ class LongStages:
             )
 
     def _check_end(self, name: str) -> None:
-        """Raise LidarError if a stage has ended before `close`: another client has ended a pipe."""
+        """Raise LidarError if a stage has exited before `close` was called.
+
+        The cause can only be a different client that has ended a pipe.
+        """
         if self._closed_at is None:
             pipes = ", ".join(repr(pipe.name) for pipe in self._pipes)
             raise LidarError(
@@ -325,7 +363,7 @@ class LongStages:
             )
 
     def _count_death(self, name: str, worker: str) -> None:
-        """Count a death of a stage's worker. LidarError if the stage keeps dying."""
+        """Count the death of a worker. Raise LidarError if the stage keeps dying."""
         died = self._deaths.setdefault(name, [])
         died.append(worker)
         if len(died) > MAX_DEATHS:
@@ -336,10 +374,11 @@ class LongStages:
             )
 
     def _submit(self, name: str, free: dict[str, int]) -> None:
-        """Start a stage, under a new key, on the worker with the most free slots.
+        """Start a stage with a new key on the worker with the most free slots.
 
-        The stage gets a new pipe: a predecessor that was only stopped would take items out of a
-        shared pipe when it wakes up, and keep its slot. Without its pipe the predecessor ends.
+        The stage gets a new pipe, and the pipe of its predecessor is deleted. If the predecessor
+        was only suspended, it would otherwise take items from the pipe after resuming. Without its
+        pipe, it exits and releases its slot.
         """
         worker = max(free, key=lambda address: (free[address], address))
         free[worker] -= 1
@@ -366,13 +405,13 @@ class LongStages:
         )
         self._tasks[name] = _StageTask(future, worker, inlet, time.monotonic())
         if earlier is not None:
-            earlier.future.cancel()  # the result of a task that still runs is dropped
+            earlier.future.cancel()  # discards the result if the task is still running
 
     # -- the end -----------------------------------------------------------------------------
 
     def close(self) -> None:
-        """End the stages, once everything is committed."""
-        # Stage 1 may still describe a survey that has failed.
+        """Shut down the stages after everything has been committed."""
+        # The pipes of stage 1 are closed, too, because it may still describe a failed survey.
         for pipe in self._pipes:
             if pipe is not self._news:
                 pipe.close()
@@ -380,7 +419,7 @@ class LongStages:
 
     @property
     def closed(self) -> bool:
-        """True if the stages were ordered to end."""
+        """True if the stages are shutting down or have exited."""
         return self._closed_at is not None
 
     @property
@@ -396,15 +435,22 @@ class LongStages:
         return late or all(task.future.done() for task in self._tasks.values())
 
     def stop(self, reason: str) -> None:
-        """End all stages at once, because the run has failed."""
+        """Stop all stages immediately because the run has failed."""
         for pipe in self._pipes:
-            with suppress(PipeFailed):  # not made yet, or gone already
+            with suppress(PipeFailed):  # the pipe has not been created or is already deleted
                 pipe.fail(reason)
 
     def finish(self, other_futures: Sequence[Future]) -> list[TaskRecord]:
-        """Wait a moment for the stages to end, clean up the scheduler, and cancel `other_futures`.
+        """Wait a moment for the stages to exit, and remove their state from the scheduler.
 
-        Returns the records of the stages whose workers can be reached.
+        Parameters
+        ----------
+        other_futures
+            Futures of other tasks, which are cancelled as well.
+
+        Returns
+        -------
+        Records of the stages whose workers can be reached.
         """
         futures = [task.future for task in self._tasks.values()]
         try:
@@ -416,9 +462,9 @@ class LongStages:
             return [results[key] for key in ended if key in results]
         finally:
             delete_pipes(self.client, [pipe.name for pipe in self._pipes])
-            # Dask would keep the lock; another run may hold it.
+            # Dask would keep an unused lock forever.
             self.client.run_on_scheduler(_forget_lock, name=self._lock_name)
-            # In one message: the answer to a second one could miss a client that leaves.
+            # All futures are cancelled in one message, because the client may be closed afterwards.
             self.client.cancel([*futures, *other_futures])
             with suppress(OSError):
                 self._storage.remove([self.probe[0]])

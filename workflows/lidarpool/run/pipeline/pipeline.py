@@ -1,22 +1,24 @@
-"""The pipeline: it offers batches of all jobs, commits their parts and sorts their frames.
+"""Driver side of the pipeline, which offers batches, commits their parts and sorts their frames.
 
-The driver and four stages exchange messages (`stage_messages.py`):
+The driver exchanges messages (`stage_messages.py`) with four stages:
 
-1. GENERATE describes scans: it finds out that the survey defines them, and reports ranges of scans,
-   and the driver makes batches of the ranges;
-2. INTERSECT casts batches on GPU workers, in short tasks;
-3. SORT, the sorter, puts summaries of committed scans into scan order, for frames;
-4. COLLECT, several collectors, writes the points of each batch as a part into storage.
+1. GENERATE describes scans. It checks that the survey defines them and sends ranges of scans, which
+   the driver divides into batches.
+2. INTERSECT casts batches on GPU workers in short tasks.
+3. SORT, the sorter, puts the summaries of committed scans in scan order for frames. A summary
+   contains the number of hits and points in a scan, and the end points of a few sample rays.
+4. COLLECT, which consists of several collectors, writes the points of each batch to the storage as
+   a part.
 
-A summary of a scan has its numbers of hits and points, and the ends of a few sample rays.
+Everything happens in `step`, which is called repeatedly from a single thread and never waits for
+long. A step returns the new parts, the next frames and the jobs that have ended.
 
-Everything happens in `step`, called repeatedly from one thread; no call in `step` waits for long.
-A step calls nobody back: it returns the new parts, the next frames and the jobs that have ended.
-There is one rule of recovery: uncommitted batches are offered again, and frames that were not
-handed out are sorted again, whatever was lost. Messages that arrive twice do no harm: a second
-receipt of a scan is ignored, and its part is the same file with the same bytes. The number of
-batches in flight, and the distance of the last to the first, are limited: that bounds every queue,
-and the memory of sorter and workers.
+There is only one recovery rule. Whatever was lost, uncommitted batches are offered again, and
+frames that have not been delivered are sorted again. Duplicate messages are harmless, because a
+second receipt of a scan is ignored, and its part is the same file with the same bytes.
+
+The number of batches in flight is limited, and so is the distance between the oldest and the newest
+batch. This bounds every queue and the memory of the sorter and the workers.
 """
 
 from __future__ import annotations
@@ -40,43 +42,52 @@ from .stage_messages import ColumnsLost, Description, Failed, Message, Receipt, 
 from .stage_names import COLLECT, GENERATE, SORT
 from .task_book import TaskBook
 
-STALL_S = 60.0  # time without frames of the sorter, after which it gets its summaries again
-WAIT_S = 0.05  # wait for news while the driver is idle
-LINGER_S = 0.004  # wait for more news after the first, for each job or batch of a task
-MAX_LINGERS = 25  # jobs or batches that are counted for that wait
-CLOSING_S = 0.001  # wait for news while the stages end
-ANNOUNCED = 2  # jobs that stage 1 should have ahead at least, whatever their size
+STALL_S = 60.0  # time without frames after which the summaries are sent to the sorter again
+WAIT_S = 0.05  # time to wait for messages while the driver is idle
+LINGER_S = 0.004  # time to wait for further messages, per job or per batch in a task
+MAX_LINGERS = 25  # maximum number of jobs or batches that are counted for this time
+CLOSING_S = 0.001  # time to wait for messages while the stages are shutting down
+ANNOUNCED = 2  # minimum number of jobs that stage 1 has orders for
 
 
 class Commits(Protocol):
-    """Interface of the run's database, where parts are committed."""
+    """Interface of the database that parts are committed to."""
 
     def commit(self, receipts: Iterable[tuple[CommittedResults, Receipt]]) -> list[Receipt]:
-        """Commit parts of jobs, and return the parts that were not committed before."""
+        """Commit parts of jobs, and return the parts that had not been committed before."""
         ...
 
     def summaries(self, part: Receipt) -> bytes:
-        """Return the summaries of a committed part's scans, bytes of a `summary_type` array."""
+        """Return the summaries of the scans in a part as the bytes of a `summary_type` array."""
         ...
 
 
 @dataclass
 class PipelineNews:
-    """What a step of the pipeline has achieved, for its caller to use in this order."""
+    """Results of a pipeline step, which its caller must process in this order."""
 
     parts: list[Receipt] = field(default_factory=list)  # newly committed parts
-    # Next scans of jobs with frames, to be handed out. Scans that were handed out may be included.
+    # Next scans to deliver as frames. They may include scans that have already been delivered.
     frames: list[tuple[PipelineJob, Summaries]] = field(default_factory=list)
-    # Jobs that have ended, each with its error or None.
+    # Jobs that have ended, and their errors or None.
     ended: list[tuple[PipelineJob, JobError | None]] = field(default_factory=list)
 
 
 class Pipeline:
-    """The driver's side of the four stages, which jobs pass on the partitions of a cluster.
+    """Driver side of the four stages that jobs pass through.
 
-    `workers` (stage 2) and `stages` (stages 1, 3 and 4) are the only access to Dask, so that tests
-    can replace the cluster. Parts are committed in `commits`. The `mark`, a text of the run, is in
-    the file names of all parts.
+    Only `workers` and `stages` access Dask, so that tests can replace the cluster.
+
+    Parameters
+    ----------
+    workers
+        GPU workers, for stage 2.
+    stages
+        Long-running stages 1, 3 and 4.
+    commits
+        Database that parts are committed to.
+    mark
+        Mark of the run, which is part of the file names of all parts.
     """
 
     def __init__(
@@ -86,14 +97,15 @@ class Pipeline:
         self.stages = stages
         self._commits = commits
         self.dispatcher = Dispatcher(workers, stages.collector_count, mark)
-        self.jobs: dict[int, PipelineJob] = {}  # {number: a job that is being cast}
-        # Times and workers of the batches of stage 2 and, after `finish`, of the long stages.
+        self.jobs: dict[int, PipelineJob] = {}  # {number: job that is being cast}
+        # Records of the casting tasks and, after `finish`, of the long stages.
         self.book = TaskBook()
-        self.progress = 0  # number of scans that were committed, plus scans that were sorted
-        # {job: end of its scans}, in the order of stage 1, until stage 1 has described all
+        self.progress = 0  # number of committed scans plus number of sorted scans
+        # {job: one past its last scan} for jobs that stage 1 has not completely described, in the
+        # order in which stage 1 processes them.
         self._announced: dict[int, int] = {}
-        self._messages: list[Message] = []  # received since the last step
-        self._news = PipelineNews()  # since the last step
+        self._messages: list[Message] = []  # messages received since the last step
+        self._news = PipelineNews()  # results since the last step
 
     # -- jobs --------------------------------------------------------------------------------
 
@@ -106,18 +118,18 @@ class Pipeline:
         scans_per_task: int,
         scans_of_run: int = 0,
     ) -> PipelineJob:
-        """Add a job to the pipeline. Committed scans of the job are not cast again.
+        """Add a job to the pipeline, without the scans that are already committed.
 
         Parameters
         ----------
         committed
-            Scans of the job, and its committed results.
+            Scans of the job and its committed results.
         scene, survey
-            Scene, and the sensors and scans of the survey.
+            Scene and survey of the job.
         scans_per_task
-            Scans that fit into the memory of a casting task.
+            Number of scans that fit in the memory of a casting task.
         scans_of_run
-            Scans of the jobs of the run that have not ended, if all are like this job.
+            Estimated number of scans in all jobs of the run that have not ended.
 
         Raises
         ------
@@ -141,7 +153,7 @@ class Pipeline:
 
     @property
     def has_room(self) -> bool:
-        """True if another job should begin, so that stage 1 always has scans to describe."""
+        """True if a further job should begin, so that stage 1 always has scans to describe."""
         max_weight = self.dispatcher.max_weight
         advice = self.dispatcher.advice
         if len(self.jobs) >= max_weight:
@@ -155,17 +167,17 @@ class Pipeline:
         return len(self.dispatcher.batches) + to_come < max_weight
 
     def _end(self, job: PipelineJob, error: JobError | None = None) -> None:
-        """Remove a job from the pipeline, and record its error or success."""
+        """Remove a job from the pipeline, and report its error or success."""
         self.dispatcher.drop(job)
         self.workers.remove(job.number)
         del self.jobs[job.number]
-        # The sorter forgets a job once the last scan is framed: `until=1, framed=1`.
+        # These values cause the sorter to discard the job, as after its last scan.
         if error is not None and job.committed.has_frames:
             self.stages.send(SORT, [Summaries(job.number, 0, 0, b"", framed=1, until=1)])
         self._news.ended.append((job, error))
 
     def _end_complete(self, jobs: Iterable[PipelineJob]) -> None:
-        """End each job whose scans are all committed and, in a job with frames, sorted."""
+        """End the jobs that are complete."""
         for job in jobs:
             if job.complete and job.number in self.jobs:
                 self._end(job)
@@ -178,16 +190,25 @@ class Pipeline:
     # -- one step ----------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Start the stages. The caller must call `stop` on failure, and `finish` always."""
+        """Start the stages.
+
+        The caller must always call `finish` at the end, and `stop` before it on failure.
+        """
         self.stages.open()
         self._refresh(scans_to_come=0)
 
     def step(self, scans_to_come: int = 0) -> PipelineNews:
-        """Process messages, workers and batches once, and return what has changed.
+        """Process messages, workers and batches once, and return the results.
 
-        `scans_to_come` is the estimated number of scans in jobs that are not begun yet.
+        Parameters
+        ----------
+        scans_to_come
+            Estimated number of scans in jobs that have not begun yet.
 
-        LidarError if a failure concerns all jobs.
+        Raises
+        ------
+        LidarError
+            If a failure affects all jobs.
         """
         messages = self._messages
         self._messages = []
@@ -206,16 +227,16 @@ class Pipeline:
         return news
 
     def wait(self, keys: Iterable[str] = ()) -> None:
-        """Wait a moment for messages, or the end of a casting task or a Dask task of `keys`.
+        """Wait a moment for messages, for casting tasks, or for the tasks in `keys`.
 
-        The next `step` takes the messages.
+        The next `step` processes the messages.
         """
         if self.stages.closed:
             self._messages += self.stages.wait(CLOSING_S, [], scans=False)
             return
-        # Small jobs and batches come in dozens, and while there are many, nobody waits for a single
-        # one. Each step costs a millisecond or two, however few messages came.
-        burst = max(len(self.jobs), self.dispatcher.per_task)  # messages that come together
+        # Each step takes one or two milliseconds, even with few messages. If many small jobs or
+        # batches are in flight, wait for several messages, because none of them is urgent.
+        burst = max(len(self.jobs), self.dispatcher.per_task)  # messages that arrive together
         many_in_flight = 2 * len(self.dispatcher.batches) > self.dispatcher.max_weight
         self._messages += self.stages.wait(
             WAIT_S,
@@ -225,11 +246,11 @@ class Pipeline:
         )
 
     def _handle(self, message: Message) -> None:
-        """Handle a message of a stage, except for receipts (`_commit`)."""
+        """Handle a message from a stage. Receipts are handled in `_commit`."""
         if isinstance(message, ColumnsLost):
             self.dispatcher.recast_columns(message)
             return
-        job = self.jobs.get(message.job)  # None if it has failed
+        job = self.jobs.get(message.job)  # None if the job has failed
         match message:
             case ScanRange():
                 if message.stop == self._announced.get(message.job):
@@ -246,7 +267,7 @@ class Pipeline:
                     self._take_sorted(job, message)
 
     def _take_sorted(self, job: PipelineJob, summaries: Summaries) -> None:
-        """Pass the next scans on as frames, and end a job after its last scan."""
+        """Report the next scans of a job as frames, and end the job after its last scan."""
         job.sorted_at = time.monotonic()
         if summaries.first <= job.sorted < summaries.stop:
             self.progress += summaries.stop - job.sorted
@@ -255,7 +276,7 @@ class Pipeline:
             self._end_complete([job])
 
     def _commit(self, receipts: Sequence[Receipt]) -> None:
-        """Commit the receipts of jobs in flight, and sort, record and report the new parts."""
+        """Commit the receipts of jobs in flight, and sort and report the newly committed parts."""
         stored = [
             (self.jobs[receipt.job].committed, receipt)
             for receipt in receipts
@@ -282,7 +303,7 @@ class Pipeline:
         self._end_complete(parts_of_jobs)
 
     def _is_stored(self, receipt: Receipt) -> bool:
-        """Return True if a part is in storage, and store a part that its worker holds."""
+        """Return whether a part is in the storage, after storing it if a worker holds it."""
         if not receipt.held_at or self.stages.store_held(receipt):
             return True
         self.dispatcher.recast_part(receipt)
@@ -291,9 +312,10 @@ class Pipeline:
     # -- workers and stages ------------------------------------------------------------------
 
     def _refresh(self, scans_to_come: int) -> None:
-        """Handle workers and stages that have joined, died or are silent, if the last check is old.
+        """Handle changes of workers and stages, unless the last check is recent.
 
-        LidarError if a stage has failed, or workers or slots are missing for too long.
+        Raise LidarError if a stage has failed, or if workers or slots have been missing for too
+        long.
         """
         if (locations := self.workers.refresh()) is not None:
             missing = sum(job.committed.missing_count for job in self.jobs.values())
@@ -305,14 +327,14 @@ class Pipeline:
         died, started = self.stages.refresh(self.progress)
         if died or started:
             self.dispatcher.reclaim_uncollected(died, started)
-        if GENERATE in started:  # a new stage 1 has no orders
+        if GENERATE in started:  # stage 1 has lost its orders
             self._announced.clear()
             self._describe(self.jobs.values())
         if SORT in started:
             self._sort_again(self.jobs.values())
 
     def _describe(self, jobs: Iterable[PipelineJob]) -> None:
-        """Order stage 1 to describe the remaining scans of jobs, from `job.generated` on."""
+        """Order stage 1 to describe the remaining scans of jobs, starting at `job.generated`."""
         orders = [
             Description(job.number, job.packed, job.generated, job.scans.stop)
             for job in jobs
@@ -324,23 +346,22 @@ class Pipeline:
 
     @property
     def _wants_scans(self) -> bool:
-        """True if the job that stage 1 describes has room for batches, or has ended.
+        """Whether `wait` should receive ranges of scans from stage 1.
 
-        False if stage 1 has no orders. `wait` takes ranges of scans from stage 1 only if True.
+        True if the job that stage 1 is describing has room for batches or has ended.
         """
-        # Stage 1 describes one job after the other, and `_announced` has the same order. While the
-        # first job has no room, its scans and the scans of later jobs behind it stay in the pipe.
-        # After the last scan the pipe is closed, which ends each wait at once: a driver that still
-        # asked did so 700 times a second.
+        # Stage 1 describes the jobs in the order of `_announced`. While the first job has no room,
+        # its scans and those of later jobs remain in the pipe. The pipe is closed after the last
+        # scan, and waiting for a closed pipe would return immediately, 700 times per second.
         for number in self._announced:
             job = self.jobs.get(number)
             return job is None or bool(job.condemned) or self.dispatcher.room(job) > 0
         return False
 
     def _sort(self, job: PipelineJob, receipts: Sequence[Receipt]) -> None:
-        """Send the summaries of committed parts to the sorter, for jobs with frames.
+        """Send the summaries of committed parts to the sorter if the job has frames.
 
-        `_refresh` sends all again when the sorter starts.
+        When the sorter is restarted, `_refresh` sends all summaries again.
         """
         if receipts and job.committed.has_frames:
             messages = [
@@ -358,7 +379,7 @@ class Pipeline:
             self.stages.send(SORT, messages)
 
     def _sort_again(self, jobs: Iterable[PipelineJob]) -> None:
-        """Send the sorter all summaries of jobs' committed scans that were not handed out."""
+        """Send the summaries of all committed scans that are not sorted yet to the sorter."""
         for job in jobs:
             job.sorted_at = time.monotonic()
             if job.committed.has_frames:
@@ -370,18 +391,18 @@ class Pipeline:
     # -- the end -----------------------------------------------------------------------------
 
     def close(self) -> None:
-        """End the stages, once everything is committed."""
-        self.workers.request_slots(0)  # the partition may shrink
+        """Shut down the stages after everything has been committed."""
+        self.workers.request_slots(0)  # allows an adaptive partition to shrink
         self.stages.close()
 
     def stop(self, reason: str) -> None:
-        """End all stages at once. `finish` must follow."""
+        """Stop all stages immediately. Call `finish` afterwards."""
         for job in self.jobs.values():
             self.dispatcher.drop(job)
         self.stages.stop(reason)
 
     def finish(self) -> None:
-        """Wait a moment for the stages to end, add their records to `book`, and clean up."""
+        """Wait a moment for the stages to exit, add their records to `book`, and clean up."""
         try:
             for record in self.stages.finish(self.workers.futures):
                 self.book.add(record)

@@ -1,6 +1,6 @@
-"""Policies of the driver, as pure functions: sizes of batches, choice of workers, retries.
+"""Driver policies for batch sizes, the choice of workers, and retries.
 
-Nothing here reads a clock, the cluster or the driver.
+They are pure functions, which do not access the clock, the cluster or the driver.
 """
 
 from __future__ import annotations
@@ -17,38 +17,40 @@ from poolpart.task_locations import PartitionSnapshot
 from .batches import Batch, BatchState, Outcome
 from .stage_names import COLLECT, INTERSECT
 
-BATCH_SECONDS = 0.2  # casting time that makes a batch worth its overhead
-SMALL_SECONDS = 0.05  # casting time of a batch that no slot idles for at the end
-MIN_BATCHES_PER_SLOT = 16  # so that no slot idles for long at the end
-MAX_GROWTH = 8  # scans of the next batch, as a multiple of the largest recent batch
-TASK_SECONDS = 0.4  # casting time that makes a task worth its overhead
-SLOT_SECONDS = 0.008  # casting time of a task, for each slot: a driver starts 125 tasks a second
+BATCH_SECONDS = 0.2  # casting time of a batch for which its overhead is negligible
+SMALL_SECONDS = 0.05  # casting time of batches that need not be smaller to balance the load
+MIN_BATCHES_PER_SLOT = 16  # ensures that no slot is idle for long at the end
+MAX_GROWTH = 8  # maximum size of the next batch as a multiple of the largest recent batch
+TASK_SECONDS = 0.4  # casting time of a task for which its overhead is negligible
+SLOT_SECONDS = 0.008  # casting time of a task per slot, because a driver starts 125 tasks per s
 MAX_BATCHES_PER_TASK = 32
-TASKS_PER_SLOT = 2  # offered tasks for each slot of a worker, so that the slot need not wait
-TASKS_PER_COLLECTOR = 3  # tasks whose batches a collector has at a time
-SLOT_WORTH_S = 20.0  # casting time that makes another slot worth its start
-MAX_SPAN = 8  # batches from the oldest to the newest, as a multiple of the batches under way
-SUSPECT_DEATHS = 2  # workers that may die with a batch before the batch is tried alone
-MAX_KILLS = 3  # workers that a single scan may kill while it is tried alone
-LATE_S = 60.0  # a batch is late when it stays longer than this in a state, and
-LATE_FACTOR = 20.0  # longer than this multiple of the median casting time
+TASKS_PER_SLOT = 2  # tasks that are offered per slot, so that slots do not wait for new tasks
+TASKS_PER_COLLECTOR = 3  # tasks whose batches are assigned to a collector at the same time
+SLOT_WORTH_S = 20.0  # casting time for which it is worth starting another slot
+MAX_SPAN = 8  # span from the oldest to the newest batch as a multiple of the batches in flight
+SUSPECT_DEATHS = 2  # number of workers that may die with a batch before it is tried alone
+MAX_KILLS = 3  # number of workers that a single scan may kill while it is tried alone
+LATE_S = 60.0  # a batch is late if it has been in a state longer than this, and longer than
+LATE_FACTOR = 20.0  # this multiple of the median casting time
 
 
-# -- how much is under way -------------------------------------------------------------------
+# -- amount of work in flight ----------------------------------------------------------------
 
 
 def max_scans_per_batch(scans_per_task: int, scan_count: int, slots: int) -> int:
-    """Return the largest number of scans of a batch, at least 1, since a scan is never split.
+    """Return the maximum number of scans in a batch.
+
+    The result is at least 1, because scans are never divided.
 
     Parameters
     ----------
     scans_per_task
-        Scans that fit into the memory of a casting task.
+        Number of scans that fit in the memory of a casting task.
     scan_count
-        Scans that the run is about to cast, of all jobs that have not ended. They are divided so
-        that all slots get some.
+        Number of scans in all jobs of the run that have not ended. They are divided so that all
+        slots receive some of them.
     slots
-        Casting tasks that run at a time.
+        Number of casting tasks that run concurrently.
     """
     return max(1, min(scans_per_task, scan_count // (MIN_BATCHES_PER_SLOT * slots)))
 
@@ -56,21 +58,21 @@ def max_scans_per_batch(scans_per_task: int, scan_count: int, slots: int) -> int
 def scans_per_batch(
     recent_casts: Sequence[tuple[float, int]], scans_per_task: int, scan_count: int, slots: int
 ) -> int:
-    """Choose the number of scans of a batch from the casting times of recent batches.
+    """Choose the number of scans in a batch from the casting times of recent batches.
 
-    Several recent batches, because casting times vary: with the last batch alone, the size went up
-    and down fourfold during a campaign. A small batch is not divided further.
+    Several recent batches are considered, because casting times vary. When only the last batch was
+    considered, the size varied by a factor of four during a campaign.
 
     Parameters
     ----------
     recent_casts
-        Casting time in seconds and number of scans of each recent batch; not empty.
+        Casting time in seconds and number of scans for each recent batch. Must not be empty.
     scans_per_task
-        Scans that fit into the memory of a casting task.
+        Number of scans that fit in the memory of a casting task.
     scan_count
-        Scans that the run is about to cast, as of `max_scans_per_batch`.
+        Number of scans in all jobs of the run that have not ended.
     slots
-        Casting tasks that run at a time.
+        Number of casting tasks that run concurrently.
     """
     scans_per_second = statistics.median(
         scans / max(seconds, 1e-6) for seconds, scans in recent_casts
@@ -86,17 +88,17 @@ def scans_per_batch(
 
 
 def batches_per_task(recent_casts: Sequence[tuple[float, int]], slots: int) -> int:
-    """Choose the number of small batches of a casting task from casting times of recent batches.
+    """Choose the number of small batches in a casting task from recent casting times.
 
-    A task takes the scheduler 0.5 to 1 ms. With a batch a task, a receipt took 2.5 ms of the
-    scheduler's processor time; with several, it takes 0.4 to 0.9 ms.
+    Each task takes the scheduler 0.5 to 1 ms. With one batch per task, a receipt took 2.5 ms of the
+    scheduler's CPU time. With several batches, it takes 0.4 to 0.9 ms.
 
     Parameters
     ----------
     recent_casts
-        Casting time in seconds and number of scans of each recent batch.
+        Casting time in seconds and number of scans for each recent batch.
     slots
-        Casting tasks that run at a time.
+        Number of casting tasks that run concurrently.
     """
     if not recent_casts:
         return 1
@@ -106,25 +108,36 @@ def batches_per_task(recent_casts: Sequence[tuple[float, int]], slots: int) -> i
 
 
 def weight(batches: Iterable[Batch], per_task: int) -> float:
-    """Return the weight of batches, in small batches, if a task has `per_task` small batches.
+    """Return the weight of batches, in units of small batches.
 
-    All batches of a task are in a worker's memory at a time: a batch that fills half the memory of
-    a task (`batch.share` is 0.5) counts as half a task, `per_task / 2`. A batch counts as 1 at
-    least.
+    A full task has the weight `per_task`. All batches of a task are in the memory of a worker at
+    the same time, so a batch that fills half of the memory of a task (`batch.share` is 0.5) has the
+    weight ``per_task / 2``. The minimum weight of a batch is 1.
     """
     return sum(max(1.0, per_task * batch.share) for batch in batches)
 
 
-def max_under_way(slots: int, collectors: int, per_task: int = 1) -> int:
-    """Return the largest `weight` of batches under way, if a task has `per_task` batches."""
+def max_weight_in_flight(slots: int, collectors: int, per_task: int = 1) -> int:
+    """Return the maximum `weight` of the batches in flight.
+
+    Parameters
+    ----------
+    slots
+        Number of casting tasks that run concurrently.
+    collectors
+        Number of collectors.
+    per_task
+        Number of small batches in a task.
+    """
     return (TASKS_PER_SLOT * slots + TASKS_PER_COLLECTOR * collectors + 2) * per_task
 
 
 def slots_wanted(scan_count: int, scan_s: float | None) -> int:
-    """Return the number of casting slots that `scan_count` scans are worth.
+    """Return the number of casting slots to request for a number of scans.
 
-    `scan_s` is the casting time of a scan in seconds. If it is unknown, None, each scan is worth a
-    slot: a job of a batch queue that asks for more slots later waits a second time.
+    The casting time of a scan in seconds is given by `scan_s`. If it is None because it is not
+    known yet, one slot is requested per scan, because slots that are requested later from a batch
+    system would have to wait in the queue again.
     """
     return (
         scan_count
@@ -133,66 +146,68 @@ def slots_wanted(scan_count: int, scan_s: float | None) -> int:
     )
 
 
-# -- where batches go ------------------------------------------------------------------------
+# -- choice of workers and collectors ---------------------------------------------------------
 
 
 def kills_alone(batch: Batch, stage: str) -> int:
-    """Return the number of a stage's workers that died with a batch alone.
+    """Return the number of workers of a stage that died while they processed only this batch.
 
-    The number is negative if the batch is not yet suspect.
+    The number is negative if the batch is not suspect yet.
 
-    After `SUSPECT_DEATHS` deaths a batch is suspect, and tried alone. An innocent batch succeeds
-    then; a batch whose worker dies again is divided, down to single scans. A scan is the cause if
-    `MAX_KILLS` workers in a row die with that scan alone.
+    After `SUSPECT_DEATHS` deaths, a batch is suspect and is tried alone. If it is not the cause, it
+    then succeeds. If its worker dies again, the batch is divided, down to single scans. A scan is
+    considered the cause if `MAX_KILLS` consecutive workers die while processing only this scan.
     """
     return batch.deaths[stage] - SUSPECT_DEATHS
 
 
 def is_suspect(batch: Batch, stage: str) -> bool:
-    """Return True if a batch may be the cause of dying workers of a stage, to be tried alone."""
+    """Return True if a batch may cause workers of a stage to die, and must be tried alone."""
     return bool(batch.deaths) and kills_alone(batch, stage) >= 0
 
 
 class TaskOffer(NamedTuple):
-    """A casting task and the worker that gets the task."""
+    """Batches of a casting task, and the worker to which the task is offered."""
 
     batches: list[Batch]
     worker: str  # address
 
 
-def offers(
+def choose_offers(
     batches: Sequence[Batch], slots: Mapping[str, int], max_weight: int, per_task: int = 1
 ) -> list[TaskOffer]:
     """Group waiting batches into casting tasks, and choose a worker for each task.
 
-    The worker with the least work for its slots gets the next task, of up to `per_task` batches of
-    jobs that share a scene; of fewer only if a slot is idle and stage 4 keeps up. If a worker died
-    with a batch, the batch gets a task for itself, or its neighbors would share the blame for the
-    next death. A suspect batch gets a worker for itself, and later batches wait for the suspect:
-    they must not occupy all workers. Waiting batches are taken in their order.
+    Waiting batches are processed in order. The worker with the lowest load relative to its slots
+    receives the next task. A task contains up to `per_task` batches of jobs with the same scene.
+    Smaller tasks are offered only if a slot is idle and stage 4 keeps up.
+
+    If a worker died with a batch, the batch gets a separate task, so that other batches are not
+    blamed for the next death. A suspect batch even gets a separate worker, and later batches wait
+    until there is one, so that they do not occupy all workers.
 
     Parameters
     ----------
     batches
-        Waiting batches in their order, and all batches under way.
+        Waiting batches in their order, and all batches in flight.
     slots
-        {address of a worker: casting tasks that the worker runs at a time}.
+        Number of concurrent casting tasks, by worker address.
     max_weight
-        Largest `weight` of all batches under way.
+        Maximum `weight` of all batches in flight.
     per_task
-        Small batches of a task.
+        Number of small batches in a task.
     """
     state = _OfferState.from_batches(batches, slots, max_weight, per_task)
     waiting = [batch for batch in batches if batch.state is BatchState.WAITING]
     idle_slots = state.idle_slots()
-    # Weight of a task if the waiting batches are shared by all idle slots, rounded up.
+    # Weight of a task if the waiting batches are divided among all idle slots, rounded up.
     idle_share = -(-weight(waiting, per_task) // max(1, idle_slots))
     task_size = per_task if state.has_backlog else min(per_task, idle_share)
     groups: dict[object, deque[Batch]] = {}  # batches that may share a task
     for batch in waiting:
         groups.setdefault(_group_key(batch), deque()).append(batch)
     chosen: list[TaskOffer] = []
-    passed: set[Batch] = set()  # batches in a chosen task, or left to wait for a larger task
+    passed: set[Batch] = set()  # batches in chosen tasks, or in tasks that may still grow
     for first in waiting:
         if first in passed:
             continue
@@ -202,7 +217,7 @@ def offers(
             break
         group = groups[_group_key(first)]
         if state.may_wait(first, group, worker):
-            passed.update(group)  # a task that has to wait may become larger
+            passed.update(group)  # the task would have to wait anyway, and may still grow
             continue
         task = _take_task(group, min(task_size, state.free_weight), per_task)
         passed.update(task)
@@ -213,20 +228,20 @@ def offers(
 
 @dataclass(eq=False)
 class _OfferState:
-    """Load of the casting workers while tasks are offered."""
+    """Load of the casting workers while tasks are being offered."""
 
-    slots: Mapping[str, int]  # {address: casting tasks at a time}
-    per_task: int  # small batches of a task
-    load: Counter[str]  # {address: tasks that the worker has}
-    reserved: set[str]  # addresses of workers that try a suspect batch
-    free_weight: float  # weight of batches that may still be offered
-    has_backlog: bool  # True if batches that were cast wait for a collector
+    slots: Mapping[str, int]  # {address: number of concurrent casting tasks}
+    per_task: int  # number of small batches in a task
+    load: Counter[str]  # {address: number of tasks on the worker}
+    reserved: set[str]  # addresses of workers that are trying a suspect batch
+    free_weight: float  # weight of the batches that may still be offered
+    has_backlog: bool  # True if cast batches are waiting for a collector
 
     @classmethod
     def from_batches(
         cls, batches: Sequence[Batch], slots: Mapping[str, int], max_weight: int, per_task: int
     ) -> _OfferState:
-        """Return the load by the batches that are under way."""
+        """Compute the load that results from the batches in flight."""
         casting = [b for b in batches if b.state is BatchState.CASTING]
         behind = [b for b in batches if b.state in (BatchState.CAST, BatchState.COLLECTING)]
         counted = [*behind, *(b for b in casting if b.worker in slots)]
@@ -240,7 +255,7 @@ class _OfferState:
         )
 
     def idle_slots(self) -> int:
-        """Return the number of slots without a task, on workers that are not reserved."""
+        """Return the number of slots without a task on workers that are not reserved."""
         return sum(
             max(0, count - self.load[address])
             for address, count in self.slots.items()
@@ -248,9 +263,9 @@ class _OfferState:
         )
 
     def least_loaded(self, *, alone: bool) -> str | None:
-        """Return the worker with the least work for its slots, or None if all are full.
+        """Return the worker with the lowest load relative to its slots, or None if all are full.
 
-        With `alone`, only a worker without any task is not full.
+        If `alone` is True, all workers with tasks are considered full.
         """
         fullness = {
             address: self.load[address] / (1 if alone else TASKS_PER_SLOT * count)
@@ -261,14 +276,14 @@ class _OfferState:
         return address if address and fullness[address] < 1 else None
 
     def may_wait(self, first: Batch, group: Collection[Batch], worker: str) -> bool:
-        """Return True if a task of a group would be small, and has to wait on its worker anyway."""
+        """Return True if a task would not be full, and would have to wait on its worker anyway."""
         busy = self.has_backlog or self.load[worker] >= self.slots[worker]
         if not busy or first.deaths:
             return False
         return min(self.free_weight, weight(group, self.per_task)) < self.per_task
 
     def add(self, task: Collection[Batch], worker: str, *, alone: bool) -> None:
-        """Count a task that is offered to a worker. A task `alone` reserves the worker."""
+        """Count a task that is offered to a worker, and reserve the worker if it runs alone."""
         self.free_weight -= weight(task, self.per_task)
         self.load[worker] += 1
         if alone:
@@ -278,9 +293,9 @@ class _OfferState:
 def _group_key(batch: Batch) -> object:
     """Return a key that is equal for batches that may share a task.
 
-    If a worker died with a batch, the batch shares with none. A batch of a task that has failed,
-    with several jobs in it, shares only with its own job; all others share with jobs of their
-    scene.
+    Normally, batches of all jobs with the same scene may share a task. After a task with several
+    jobs has failed, its batches only share tasks with batches of the same job. If a worker died
+    with a batch, the batch gets a separate task.
     """
     if batch.deaths:
         return batch
@@ -288,10 +303,10 @@ def _group_key(batch: Batch) -> object:
 
 
 def _take_task(group: deque[Batch], max_weight: float, per_task: int) -> list[Batch]:
-    """Remove the batches of a task from a group and return the batches.
+    """Remove the batches of the next task from a group and return them.
 
-    There is at least 1 batch; further batches are added while the `weight` of the task is at most
-    `max_weight`, both in small batches. `per_task` small batches fill a task.
+    The task contains at least one batch. Further batches are added as long as the `weight` of the
+    task does not exceed `max_weight`.
     """
     task = [group.popleft()]
     task_weight = weight(task, per_task)
@@ -301,20 +316,26 @@ def _take_task(group: deque[Batch], max_weight: float, per_task: int) -> list[Ba
 
 
 class Handover(NamedTuple):
-    """Batches from one casting task, and the collector that stores the batches."""
+    """Batches of a casting task, and the collector to which they are assigned."""
 
     batches: list[Batch]
-    collector: str  # name
+    collector: str  # name of the collector
 
 
-def handovers(batches: Sequence[Batch], collectors: Mapping[str, str]) -> list[Handover]:
-    """Choose collectors for batches that were cast.
+def choose_handovers(batches: Sequence[Batch], collectors: Mapping[str, str]) -> list[Handover]:
+    """Choose collectors for batches that have been cast.
 
-    Batches of a task stay together.
+    The batches of a casting task are assigned to the same collector, except for batches with which
+    a collector has died. Collectors on the host that holds the columns are preferred. A suspect
+    batch is assigned only while no other batch is in stage 4, because several collectors may share
+    a process.
 
-    If a collector died with batches, these come alone. A collector on the host of the columns
-    is preferred. A suspect batch is collected while no other batch is in stage 4: several
-    collectors may share a process. `collectors` is {name of a collector: address of its worker}.
+    Parameters
+    ----------
+    batches
+        All batches in flight.
+    collectors
+        Addresses of the workers that run the collectors, by collector name.
     """
     ready = [b for b in batches if b.state is BatchState.CAST]
     busy = [b for b in batches if b.state is BatchState.COLLECTING]
@@ -339,49 +360,48 @@ def handovers(batches: Sequence[Batch], collectors: Mapping[str, str]) -> list[H
 
 
 def _host(address: str) -> str:
-    """Return the host of a worker's address."""
     return address.rpartition("/")[2].rpartition(":")[0]
 
 
-# -- when a batch is tried again -------------------------------------------------------------
+# -- retries ---------------------------------------------------------------------------------
 
 
 def late_after_s(recent_casts: Sequence[tuple[float, int]]) -> float:
-    """Return the age in seconds after which a batch is late.
+    """Return the time in a state, in seconds, after which a batch is late.
 
-    The age is infinite without recent casting times.
+    Without recent casting times, the result is infinity.
     """
     if not recent_casts:
         return float("inf")
     return max(LATE_S, LATE_FACTOR * statistics.median(seconds for seconds, _ in recent_casts))
 
 
-def loss(
+def find_loss(
     batch: Batch, locations: PartitionSnapshot, prepared_workers: int, now_s: float, late_s: float
 ) -> Outcome | None:
-    """Return why a batch should be offered again although its task has not failed, or None.
-
-    The worker died (DIED), or the columns are gone with it or the worker is silent (GONE); the
-    worker is paused and has not started the task (REFUSED); the batch has been cast or collected
-    for too long (LATE).
-
-    A worker that Dask has paused starts no task until memory is free, perhaps never: its tasks
-    that have not started are offered elsewhere.
+    """Return why a batch should be offered again although its task has not failed.
 
     Parameters
     ----------
     batch
-        A batch under way.
+        Batch in flight.
     locations
-        Workers of the partition (`members`), those without a recent heartbeat (`silent`), those
+        Workers of the partition (`members`), workers without a recent heartbeat (`silent`), workers
         that are not paused (keys of `free`), and the states of their tasks.
     prepared_workers
-        Workers that can cast. Without another worker, a silent or late worker is waited
-        for.
+        Number of workers that can cast. If there is no alternative, the batch stays with a worker
+        that is silent or late.
     now_s
-        Current time, by the clock of `Batch.since`.
+        Current time on the clock of `Batch.since`.
     late_s
-        Age in seconds after which a batch is late.
+        Time in seconds after which a batch is late.
+
+    Returns
+    -------
+    DIED if the worker died while casting, GONE if the worker does not respond or has left with the
+    columns, REFUSED if the worker is paused and has not started the task, LATE if casting or
+    collecting takes too long, or None if the batch should not be offered again. A paused worker may
+    never start its tasks, because it waits until its memory usage decreases.
     """
     if batch.state in (BatchState.CASTING, BatchState.CAST):
         if batch.worker not in locations.members:
@@ -391,7 +411,7 @@ def loss(
                 return Outcome.GONE
         elif batch.worker not in locations.free and batch.state is BatchState.CASTING:
             task = locations.tasks.get(batch.key)
-            # "no-worker": not even sent there, as the worker was paused before.
+            # The state is "no-worker" if the worker was already paused when the task was submitted.
             if task and task.state in ("no-worker", "processing") and not task.started:
                 return Outcome.REFUSED
     late = (

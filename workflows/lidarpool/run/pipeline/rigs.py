@@ -1,9 +1,10 @@
-"""Stage 2: casts batches on GPU workers, with rigs that each worker process builds once.
+"""Casting of batches on GPU workers (stage 2), with rigs that each worker process builds once.
 
-A casting task names the rig of its job. The first task of a job on a worker contains the plan of
-the rig and the scene. The worker keeps the rig in `cached_rigs`, and the scene with its trees for
-other jobs of the same scene. Rigs are not results of Dask tasks, because Dask drops a copy as soon
-as no task needs it, and each new copy would have to build its tree again.
+A casting task refers to the rig of its job by a handle. The first task of a job on a worker also
+contains the plan of the rig and the scene. The worker keeps the rig in `cached_rigs`, together with
+the scene and its trees for other jobs with the same scene. Rigs are not results of Dask tasks,
+because Dask drops a result when no task needs it, and each new copy would have to build its trees
+again.
 """
 
 from __future__ import annotations
@@ -42,19 +43,19 @@ from .task_records import Recorder, TaskRecord
 
 logger = logging.getLogger(__name__)
 
-Packed = Pickled | SharedHandle  # a plan or a scene, as it comes from the driver
+Packed = Pickled | SharedHandle  # plan or scene as received from the driver
 
-LEAVE_S = 2.0  # a process ends so long after the error of a GPU: the driver knows it by then
-UNUSED_S = 600.0  # rigs unused for longer, as of a killed driver, are dropped when one is built
+LEAVE_S = 2.0  # delay before a process with a lost GPU exits, so that the driver gets the error
+UNUSED_S = 600.0  # rigs that have been unused for longer are dropped when a new rig is built
 
 
 @dataclass(frozen=True, slots=True)
 class CastWork:
-    """Batches of a job that a casting task casts with the job's rig."""
+    """Batches of a job in a casting task."""
 
     job: int
     handle: str  # handle of the rig
-    spans: Sequence[BatchRange]  # the first scan and the end of each batch
+    spans: Sequence[BatchRange]  # first scan and stop of each batch
 
 
 @dataclass(frozen=True)
@@ -72,14 +73,25 @@ def intersect(
     scene: Packed | None = None,
     *plans: Packed | None,
 ) -> list[CastBatch]:
-    """Cast the rays of batches and make their columns, on a GPU worker.
+    """Cast the rays of batches on a GPU worker and compute their columns.
 
-    The jobs share the static part of a scene. If the worker has no copy, the static part is
-    unpickled from `scene`, and the rig of each job from its plan; rigs and scenes in `unneeded` are
-    dropped before.
+    Parameters
+    ----------
+    works
+        Batches of each job. All jobs share the static part of a scene.
+    unneeded
+        Handles of rigs and scenes to drop first.
+    scene
+        Static part of the scene, or None if the worker already has it.
+    plans
+        Plan of the rig of each job, or None if the worker already has the rig.
 
-    Raises RigMissing and RigFailed as `rig_of` does, and ScanError, which names the scans, if
-    casting or a column fails.
+    Raises
+    ------
+    RigMissing, RigFailed
+        See `rig_of`.
+    ScanError
+        If casting or a column fails. The message names the scans.
     """
     drop(unneeded)
     results = []
@@ -90,16 +102,16 @@ def intersect(
 
 
 def cast_batch(rig: Rig, work: CastWork, first: int, stop: int) -> CastBatch:
-    """Cast the scans from `first` to `stop` with a rig, and make the columns of their points.
+    """Cast the scans from `first` to `stop` with a rig, and compute the columns of their points.
 
-    All points of a run come from this function: a benchmark that replaces it on casting workers
-    measures what comes after. ScanError if casting or a column fails, naming the scans.
+    All points of a run come from this function, so that a benchmark can replace it to measure
+    everything else. Raise ScanError, which names the scans, if casting or a column fails.
     """
     recorder = Recorder(INTERSECT, GPU)
     fields = {"run": work.handle.partition(".")[0], "stage": INTERSECT, "job": work.job}
     scans = list(range(first, stop))
     trace("intersect.start", **fields, scans=scans)
-    with leaving_with_device(rig), naming_scans(first, stop):
+    with exit_on_lost_device(rig), naming_scans(first, stop):
         batches = list(rig.cast(first, stop))
         trace("intersect.cast", **fields, scans=scans)
         part = replace(
@@ -113,11 +125,11 @@ def cast_batch(rig: Rig, work: CastWork, first: int, stop: int) -> CastBatch:
 
 
 @contextmanager
-def leaving_with_device(rig: Rig) -> Iterator[None]:
-    """Raise DeviceLost for an error after which the rig's GPU does not answer, and end the process.
+def exit_on_lost_device(rig: Rig) -> Iterator[None]:
+    """Raise DeviceLost and exit the process if the GPU stops responding in the body.
 
-    A nanny starts another process, whose calls the GPU answers. Without a nanny the process stays,
-    since it may be the user's process.
+    A nanny then restarts the process, for which the GPU works again. Without a nanny, the process
+    does not exit, because it may be the user's own process.
     """
     try:
         yield
@@ -127,13 +139,16 @@ def leaving_with_device(rig: Rig) -> Iterator[None]:
         worker = get_worker()
         restarts = worker.nanny is not None
         logger.error("The GPU no longer responds to calls of this process: %s", error)
-        if restarts:  # when the error has been sent
+        if restarts:  # exit after the error has been sent
             threading.Timer(LEAVE_S, os._exit, [1]).start()
         raise DeviceLost(str(error), f"{worker.address} {os.getpid()}", restarts) from None
 
 
 def _samples(returns: BatchPoints | DevicePoints) -> Floats32:
-    """Return sample points of each scan in meters, (scans, samples, 3), with NaN if missing."""
+    """Return sample points of each scan in meters, as an array of shape (scans, samples, 3).
+
+    Missing samples are NaN.
+    """
     sample_count = samples_of_scan(returns.survey.scan_count)
     starts = np.cumsum(returns.counts) - returns.counts
     steps = np.arange(sample_count) / max(sample_count - 1, 1)
@@ -149,38 +164,42 @@ def _samples(returns: BatchPoints | DevicePoints) -> Floats32:
 # -- the rigs of this process -----------------------------------------------------------------
 
 
-class RigMissing(RuntimeError):  # noqa: N818 - reads as what happened
-    """Error for a rig or scene that a worker lacks, after a restart or because it was dropped."""
+class RigMissing(RuntimeError):  # noqa: N818 - the name states what happened
+    """Error raised if a worker no longer has a rig or scene, for example after a restart."""
 
 
 class MemoryUnseen(RigMissing):
-    """Error for a scene in memory of the driver that a worker cannot map."""
+    """Error raised if a worker cannot access the shared memory of the driver."""
 
 
 class RigFailed(RuntimeError):  # noqa: N818
-    """Error for a survey whose rig cannot be built."""
+    """Error raised if the rig of a survey cannot be built."""
 
 
 @dataclass(eq=False)
 class _CachedRig:
-    """A rig for a job, or for its scene, with the time of its last use."""
+    """Rig of a job, or any rig of a scene, with the time of its last use."""
 
     rig: Rig
-    scene: str  # handle
+    scene: str  # handle of the scene
     used_at: float  # monotonic time
 
 
-# {handle of a rig, or of a scene: a rig of it in this process}
+# Rigs in this process by the handle of the rig. The handle of a scene maps to any of its rigs.
 cached_rigs: dict[str, _CachedRig] = {}
-_ended_runs: deque[str] = deque(maxlen=64)  # tasks that still cast for them cache no rig
+_ended_runs: deque[str] = deque(maxlen=64)  # runs whose remaining tasks must not cache rigs
 _lock = threading.Lock()
 
 
 def rig_of(handle: str, plan: Packed | None = None, scene: Packed | None = None) -> Rig:
-    """Return a rig of this process, built from a plan and scene if the rig is not cached.
+    """Return a cached rig, or build it from a plan and a scene.
 
-    Raises RigMissing if the rig is not cached and has no plan, or if its scene is not cached
-    either, and RigFailed if the rig cannot be built.
+    Raises
+    ------
+    RigMissing
+        If the rig is not cached and no plan is given, or if its scene is neither cached nor given.
+    RigFailed
+        If the rig cannot be built.
     """
     cached = cached_rigs.get(handle)
     if cached is None:
@@ -196,18 +215,24 @@ def rig_of(handle: str, plan: Packed | None = None, scene: Packed | None = None)
 
 
 def _build(handle: str, plan: Packed | None, scene: Packed | None) -> _CachedRig:
-    """Build the rig of a job, and cache it for other jobs of its scene.
+    """Build the rig of a job, and cache it for other jobs with the same scene.
 
-    `plan` has the handle of the scene, the actors, the survey, pickled, and the name of the
-    backend; `scene` is the scene without actors. If a rig of the scene is cached, the new rig
-    shares its trees. Rigs that were unused for long are dropped before.
+    Rigs that have been unused for a long time are dropped first. If a rig of the same scene is
+    cached, the new rig shares its trees. The errors are those of `rig_of`.
 
-    Raises RigMissing and RigFailed as `rig_of` does.
+    Parameters
+    ----------
+    handle
+        Handle of the rig.
+    plan
+        Handle of the scene, actors, pickled survey, and name of the backend.
+    scene
+        Scene without actors.
     """
     if plan is None:
         raise RigMissing(f"This worker has no rig {handle!r}.")
     try:
-        scene_handle, actors, pickled_survey, backend = _unpickled(plan)
+        scene_handle, actors, pickled_survey, backend = _unpickle(plan)
         survey: Survey = pickle.loads(pickled_survey)  # noqa: S301
         now_s = time.monotonic()
         unused = {h for h, cached in [*cached_rigs.items()] if now_s - cached.used_at > UNUSED_S}
@@ -215,7 +240,7 @@ def _build(handle: str, plan: Packed | None, scene: Packed | None) -> _CachedRig
         if (of_scene := cached_rigs.get(scene_handle)) is not None:
             rig = of_scene.rig.with_survey(of_scene.rig.scene.with_actors(actors), survey)
         elif scene is not None:
-            static_scene: Scene = _unpickled(scene)
+            static_scene: Scene = _unpickle(scene)
             threads = get_worker().state.nthreads
             device = own_device()
             if device is not None:
@@ -233,7 +258,7 @@ def _build(handle: str, plan: Packed | None, scene: Packed | None) -> _CachedRig
 
 
 def drop(handles: Collection[str]) -> None:
-    """Drop cached rigs and scenes by their handles, and ignore unknown handles."""
+    """Drop cached rigs and scenes by their handles. Unknown handles are ignored."""
     for handle in handles:
         cached_rigs.pop(handle, None)
 
@@ -241,12 +266,13 @@ def drop(handles: Collection[str]) -> None:
 def drop_all(run: str) -> None:
     """Drop the rigs and scenes of a run that has ended."""
     _ended_runs.append(run)
-    # Without the lock: this runs in the worker's event loop, and a tree takes long to build.
+    # The lock is not acquired, because this runs in the event loop of the worker, and building a
+    # tree while holding the lock takes a long time.
     drop([handle for handle in [*cached_rigs] if handle.partition(".")[0] == run])
 
 
-def _unpickled(data: Packed) -> Any:
-    """Return a value of the run's own driver, or raise MemoryUnseen if it is out of reach."""
+def _unpickle(data: Packed) -> Any:
+    """Unpickle a value from the driver. Raise MemoryUnseen if its memory is not accessible."""
     if isinstance(data, SharedHandle):
         try:
             return data.load()

@@ -1,7 +1,7 @@
-"""Messages between the four stages and the driver: descriptions, summaries and receipts.
+"""Messages between the driver and the four stages of the pipeline.
 
-Their size does not depend on the number of points. Messages about scans have the number of the
-`job` in the run.
+Their size does not depend on the number of points. In messages about scans, `job` is the number of
+the job in the run.
 """
 
 from __future__ import annotations
@@ -22,51 +22,62 @@ from lidarsim.survey.survey import Survey
 from ...processes.tracing import trace
 from .task_records import TaskRecord
 
-BatchRange = tuple[int, int]  # the first scan of a batch, and its end
+BatchRange = tuple[int, int]  # first scan and stop of a batch
 
-MAX_SAMPLES_PER_SCAN = 4  # sample rays
-SAMPLES_PER_SURVEY = 400  # sample rays, about
+MAX_SAMPLES_PER_SCAN = 4  # maximum number of sample rays in a scan
+SAMPLES_PER_SURVEY = 400  # approximate number of sample rays in a survey
 
 
 def samples_of_scan(scan_count: int) -> int:
-    """Return the number of sample rays of each scan: fewer for many scans, as all are sent."""
+    """Return the number of sample rays per scan, which is lower for surveys with many scans."""
     return max(1, min(MAX_SAMPLES_PER_SCAN, -(-SAMPLES_PER_SURVEY // scan_count)))
 
 
 def summary_type(samples: int) -> np.dtype[np.void]:
-    """Return the dtype of the summary of a scan with a number of sample rays.
+    """Return the dtype of a scan summary.
 
-    A summary has the number of hits and of points kept, and the ends of the sample rays, meters,
-    local coordinates. Missing samples are NaN.
+    A summary contains the number of hits, the number of points, and the end points of sample rays
+    in meters in local coordinates. Missing samples are NaN.
+
+    Parameters
+    ----------
+    samples
+        Number of sample rays per scan.
     """
     return np.dtype([("hits", "<u4"), ("points", "<u4"), ("samples", "<f4", (samples, 3))])
 
 
-def scans_in_words(first: int, stop: int) -> str:
-    """Name the scans from `first` to `stop`, half-open, for messages."""
+def format_scans(first: int, stop: int) -> str:
+    """Format a half-open range of scans for messages.
+
+    Examples
+    --------
+    >>> format_scans(3, 4), format_scans(3, 6)
+    ('scan 3', 'scans 3 to 5')
+    """
     last = stop - 1
     return f"scan {last}" if first == last else f"scans {first} to {last}"
 
 
 @dataclass(frozen=True, slots=True)
 class StageStart:
-    """One start of a stage, for its traces."""
+    """Identification of a started stage in traces."""
 
-    run: str  # id of the run
+    run: str  # ID of the run
     stage: str
-    attempt: int  # starts of stages before this one
+    attempt: int  # number of stages that were started before, including restarts
 
     def trace(self, event: str, scans: Iterable[int] = ()) -> None:
-        """Emit a trace event of this start of the stage about scans."""
+        """Trace an event of this stage."""
         trace(f"{self.stage}.{event}", **asdict(self), scans=list(scans))
 
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """To stage 1: describe the scans of a survey from `first` to `stop`."""
+    """Order to stage 1 to describe the scans of a survey from `first` to `stop`."""
 
     job: int
-    survey: bytes  # pickled: if a worker cannot unpickle it, others can be described
+    survey: bytes  # pickled separately, so that an error does not affect other surveys
     first: int
     stop: int
 
@@ -81,59 +92,59 @@ class Scans:
 
     @property
     def scans(self) -> range:
-        """Numbers of the scans."""
+        """Range of the scan numbers."""
         return range(self.first, self.stop)
 
 
 class ScanRange(Scans):
-    """From stage 1: scans that can be described, and may be cast."""
+    """Message from stage 1 about scans that can be described and may be cast."""
 
     __slots__ = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Summaries(Scans):
-    """To stage 3, and back in scan order: the summaries of the scans of a committed part."""
+    """Summaries of the scans in a committed part, which stage 3 returns in scan order."""
 
-    data: bytes  # bytes of an array of `summary_type`
-    framed: int  # one past the last scan that stage 3 need not wait for
+    data: bytes  # bytes of a `summary_type` array
+    framed: int  # one past the last scan that stage 3 does not have to wait for
     until: int  # one past the last scan of the job
 
 
 @dataclass(frozen=True, slots=True)
 class CollectOrder:
-    """To stage 4: fetch the columns of the batches of a casting task, and write each as a part."""
+    """Order to stage 4 to fetch the batches of a casting task and write each of them as a part."""
 
     key: str  # key of the casting task
-    worker: str  # address of the worker that has its result
-    parts: tuple[tuple[int, BatchRange, str], ...]  # job, scans and name of each
+    worker: str  # address of the worker that holds the result of the task
+    parts: tuple[tuple[int, BatchRange, str], ...]  # job, scans and name of each part
 
 
 @dataclass(frozen=True, slots=True)
 class ColumnsLost:
-    """From stage 4: the result of casting task `key` could not be fetched."""
+    """Message from stage 4 that the result of a casting task could not be fetched."""
 
-    key: str
+    key: str  # key of the casting task
 
 
 @dataclass(frozen=True, slots=True)
 class Receipt(Scans):
-    """From stage 4: a part is complete in storage, or in the memory of the worker `held_at`."""
+    """Message from stage 4 that a part is complete."""
 
     name: str  # name of the part
     point_count: int
     size: int  # bytes
-    hit_count: int  # hits of its scans, before thinning out
-    cell_box: tuple[int, ...]  # lowest and highest cell as six numbers; empty without points
-    summaries: bytes  # summaries of its scans, of `summary_type`
-    record: TaskRecord | None = None  # the casting task; None for a receipt from the database
-    held_at: str = ""  # address of a worker that cannot access the storage, and holds the part
+    hit_count: int  # number of hits before points are thinned out
+    cell_box: tuple[int, ...]  # lowest and highest cell as six numbers, or empty without points
+    summaries: bytes  # bytes of a `summary_type` array
+    record: TaskRecord | None = None  # record of casting, or None if read from the database
+    held_at: str = ""  # address of the worker that holds the part if it cannot access the storage
 
     @classmethod
     def from_part(
         cls, part: PartColumns, job: int, name: str, size: int, record: TaskRecord | None = None
     ) -> Receipt:
-        """Return the receipt of a part of `size` bytes, with totals from the part's columns."""
+        """Create the receipt of a part, with totals that are computed from its columns."""
         summaries = np.zeros(len(part.counts), summary_type(part.samples.shape[1]))
         summaries["hits"] = part.scan_hits
         summaries["points"] = part.counts
@@ -156,14 +167,14 @@ class Receipt(Scans):
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """From stages 1 and 4: the scans of a survey cannot be described or stored."""
+    """Message from stages 1 and 4 that scans of a survey cannot be described or stored."""
 
     job: int
     stage: str
     reason: str
 
 
-# To the driver.
+# Messages from the stages to the driver.
 Message = ScanRange | Summaries | ColumnsLost | Receipt | Failed
 
 
@@ -189,7 +200,8 @@ class ScanFrame:
     hit_count: int
     count: int
     samples: Floats32
-    _triangles: int = field(repr=False, compare=False)  # of the scene, with instances and actors
+    # Number of triangles in the scene, including instances and actors.
+    _triangles: int = field(repr=False, compare=False)
     _survey: Survey = field(repr=False, compare=False)
     _read: Callable[[int], Cloud] = field(repr=False, compare=False)
     __repr__ = one_line

@@ -4,8 +4,8 @@ GPU = "GPU"
 LIDAR = "LIDAR"
 OTHER = "OTHER"
 
-GENERATE = "generate"  # 1, on LIDAR: one long task
-INTERSECT = "intersect"  # 2, on GPU: a short task for each batch
-SORT = "sort"  # 3, on LIDAR: one long task
-COLLECT = "collect"  # 4, on LIDAR: `collectors` long tasks, two by default
-EXPORT = "export"  # on LIDAR: short tasks that write jobs, or ranges of the files of a survey
+GENERATE = "generate"  # stage 1, a long-running task on LIDAR
+INTERSECT = "intersect"  # stage 2, short tasks on GPU that cast batches
+SORT = "sort"  # stage 3, a long-running task on LIDAR
+COLLECT = "collect"  # stage 4, several long-running tasks on LIDAR (`collectors`)
+EXPORT = "export"  # short tasks on LIDAR that write jobs or ranges of files

@@ -1,4 +1,4 @@
-"""The tasks of a run in bounded memory: totals, and some thousand records."""
+"""Totals and sampled records of the tasks in a run, which require a bounded amount of memory."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 from .task_records import TaskRecord
 
-MAX_RECORDS = 4096  # limit for a stage; beyond that every second record is dropped, repeatedly
-MAX_MISPLACED = 20  # records of a stage; all are counted
-MAX_SPANS = 2048  # busy spans of a stage
+MAX_RECORDS = 4096  # maximum number of records per stage, beyond which half of them are dropped
+MAX_MISPLACED = 20  # maximum number of records of misplaced tasks per stage
+MAX_SPANS = 2048  # maximum number of busy spans per stage
 
 
 @dataclass(eq=False)
@@ -21,20 +21,21 @@ class StageTotals:
     partition: str
     tasks: int = 0
     items: int = 0
-    seconds: float = 0.0  # seconds of all tasks
-    start: float = float("inf")  # start of the first task, seconds since the epoch
-    stop: float = float("-inf")  # end of the last task
-    workers: set[str] = field(default_factory=set)  # names
-    # {resource: tasks that ran on workers with it}; "none" for workers without.
+    seconds: float = 0.0  # total duration of all tasks
+    start: float = float("inf")  # start of the first task in seconds since the epoch
+    stop: float = float("-inf")  # end of the last task in seconds since the epoch
+    workers: set[str] = field(default_factory=set)  # names of the workers
+    # Number of tasks by the resources of their workers, or "none" for workers without resources.
     resources: Counter[str] = field(default_factory=Counter)
-    violations: int = 0  # tasks outside their partition
-    misplaced: list[TaskRecord] = field(default_factory=list)  # the first of the violations
-    # Times when at least one task was running, as far as known: (start, stop), in order.
+    violations: int = 0  # number of tasks that ran outside their partition
+    misplaced: list[TaskRecord] = field(default_factory=list)  # records of the first violations
+    # Start and stop of the spans in which at least one task was running. Spans that are close to
+    # each other may be merged.
     busy: list[tuple[float, float]] = field(default_factory=list)
-    # Of the tasks, or of every n-th if there are thousands.
+    # Records of all tasks, or of every n-th task if there are thousands.
     records: list[TaskRecord] = field(default_factory=list, repr=False)
-    _every: int = 1  # every n-th record is kept
-    _gap: float = 1e-4  # seconds between spans that are joined
+    _every: int = 1  # interval n at which records are kept
+    _gap: float = 1e-4  # maximum gap between spans that are merged, in seconds
 
     def add(self, record: TaskRecord) -> None:
         """Count a task."""
@@ -57,14 +58,14 @@ class StageTotals:
         self.busy.append((record.start, record.stop))
         while len(self.busy) > MAX_SPANS:
             self.busy = union(self.busy, self._gap)
-            # Coarser until the number halves, so that this is not repeated for each record.
+            # Halve the number of spans, so that this is not repeated for each record.
             if len(self.busy) > MAX_SPANS // 2:
                 self._gap *= 2
                 self.busy = union(self.busy, self._gap)
 
 
 class TaskBook:
-    """Records the tasks of a run in bounded memory."""
+    """Totals of the tasks in a run, by stage."""
 
     def __init__(self) -> None:
         self.stages: dict[str, StageTotals] = {}
@@ -76,7 +77,7 @@ class TaskBook:
 
 
 def union(spans: Iterable[tuple[float, float]], gap: float = 0.0) -> list[tuple[float, float]]:
-    """Return spans in order, merging spans that overlap or are at most `gap` apart."""
+    """Sort spans, and merge those that overlap or are at most `gap` apart."""
     merged: list[tuple[float, float]] = []
     for start, stop in sorted(spans):
         if merged and start <= merged[-1][1] + gap:

@@ -1,4 +1,4 @@
-"""Where tasks ran, reported by the tasks themselves."""
+"""Records of where and when tasks ran, which are created by the tasks themselves."""
 
 from __future__ import annotations
 
@@ -16,23 +16,19 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class TaskRecord:
-    """One task that ran: its worker, the worker's resources, and when.
-
-    `start` and `stop` are seconds since the epoch by the worker's clock; `items` is the task's own
-    count.
-    """
+    """Record of a finished task."""
 
     stage: str
     partition: str
-    worker: str
-    resources: tuple[str, ...]
-    start: float
+    worker: str  # name of the worker
+    resources: tuple[str, ...]  # resources of the worker
+    start: float  # seconds since the epoch on the clock of the worker
     stop: float
-    items: int = 1
+    items: int = 1  # number of items that the task processed, such as scans
 
     @property
     def seconds(self) -> float:
-        """Time from start to stop, seconds."""
+        """Duration of the task in seconds."""
         return self.stop - self.start
 
     @property
@@ -42,17 +38,17 @@ class TaskRecord:
 
 
 class Recorder:
-    """Records time and worker of the current task."""
+    """Recorder of the duration and the worker of the current task."""
 
     def __init__(self, stage: str, partition: str) -> None:
         self.stage = stage
         self.partition = partition
         self.start = time.time()
-        # The clock may be set while the task runs; its time must not become hours, or negative.
+        # The duration must remain correct if the system clock is changed while the task is running.
         self._start_s = time.perf_counter()
 
     def finish(self, items: int = 1) -> TaskRecord:
-        """Return the record of the task until now, with a number of items."""
+        """Return the record of the task up to now, with the number of processed items."""
         worker = get_worker()
         return TaskRecord(
             stage=self.stage,
@@ -65,15 +61,15 @@ class Recorder:
         )
 
 
-def recorded(
+def call_recorded(
     stage: str, partition: str, function: Callable[..., T], /, *args: Any, **kwargs: Any
 ) -> tuple[T, TaskRecord]:
-    """Run `function` on a worker and return its result with the record of the run."""
+    """Call a function in a task and return its result and the record of the task."""
     recorder = Recorder(stage, partition)
     result = function(*args, **kwargs)
     return result, recorder.finish()
 
 
 def placement_violations(records: Iterable[TaskRecord]) -> list[TaskRecord]:
-    """Select the records of tasks that ran outside their partition."""
+    """Return the records of tasks that ran outside their partition."""
     return [record for record in records if record.misplaced]

@@ -1,1 +1,1 @@
-"""The store of a run: its database, its parts, and its jobs in flight."""
+"""Stores of runs, which contain the database, the parts and the jobs in flight."""

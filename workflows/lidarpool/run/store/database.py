@@ -1,8 +1,9 @@
-"""The database of a run: which parts and trials of its jobs belong to the result.
+"""Database of a run, which records the parts and trials that belong to the result.
 
-One SQLite file. A batch belongs to the result once its receipt is in this database; before that,
-work may be lost or repeated, after that a second receipt is ignored. Recovery and resuming offer
-all other batches again. A job that has ended leaves a row, and its receipts are deleted.
+The database is a single SQLite file. A batch belongs to the result once its receipt has been
+committed to the database. Before that, work may be lost or repeated. Afterwards, a second receipt
+is ignored. Recovering or resuming a run offers all uncommitted batches again. When a job ends, its
+row is added to the database and its receipts are deleted.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from ...plan import Trial
 from ..pipeline.committed_results import CommittedResults
 from ..pipeline.stage_messages import Receipt
 
-FORMAT = 9
+FORMAT = 10
 FILE = "run.db"
 
 _TABLES = """
@@ -43,38 +44,49 @@ CREATE TABLE trials (
     job INTEGER, trial INTEGER, data TEXT NOT NULL, crc INTEGER NOT NULL, PRIMARY KEY (job, trial)
 );
 CREATE TABLE frames (job INTEGER PRIMARY KEY, count INTEGER NOT NULL, crc INTEGER NOT NULL);
-CREATE TABLE made_of (job INTEGER PRIMARY KEY, hash TEXT NOT NULL, crc INTEGER NOT NULL);
+CREATE TABLE input_hashes (job INTEGER PRIMARY KEY, hash TEXT NOT NULL, crc INTEGER NOT NULL);
 CREATE TABLE jobs (
     number INTEGER PRIMARY KEY, failed INTEGER NOT NULL, data TEXT NOT NULL, crc INTEGER NOT NULL
 );
 """
-# Columns of each table without `crc`, which is the CRC-32 of the other columns' values.
+# Columns of each table except `crc`, which is the CRC-32 of the other columns.
 _COLUMNS = {
     "meta": ("name", "value"),
     "parts": ("job", "first", "stop", "rows", "size", "hits", "cells", "summaries"),
     "trials": ("job", "trial", "data"),
     "frames": ("job", "count"),
-    "made_of": ("job", "hash"),
+    "input_hashes": ("job", "hash"),
     "jobs": ("number", "failed", "data"),
 }
 _DISK_ERRORS = ("locked", "full", "disk i/o", "unable to open", "readonly", "out of memory")
-_JOB_TABLES = ("parts", "trials", "frames", "made_of")  # tables about jobs in flight
-PARTS_FOLDER = re.compile("run-[0-9a-f]{16}")  # names of `parts_folder`
+_JOB_TABLES = ("parts", "trials", "frames", "input_hashes")  # tables for jobs in flight
+PARTS_FOLDER = re.compile("run-[0-9a-f]{16}")  # pattern of the names that `parts_folder` returns
 
 
 class DamagedError(LidarError):
-    """Error for a database that cannot be read."""
+    """Error raised for a database that cannot be read."""
 
 
 class RunDatabase:
-    """Committed parts and trials of the jobs of a run, and the jobs that have ended.
+    """Database of the committed parts and trials of a run, and of the jobs that have ended.
 
-    Jobs in flight have a copy of their committed results in memory. A file that does not exist is
-    created with the first `values`. Commits survive a power failure if they are `durable`. All
-    methods that write raise LidarError if the disk is full or fails.
+    Jobs in flight also keep their committed results in memory. All methods that write raise
+    LidarError if the disk is full or fails.
 
-    LidarError if the database is damaged, of another version, in use by another run, or cannot be
-    written.
+    Parameters
+    ----------
+    path
+        Path of the database, which is created if it does not exist.
+    durable
+        Whether commits survive a power failure.
+    values
+        Initial values of the `meta` table in a new database.
+
+    Raises
+    ------
+    LidarError
+        If the database is damaged, has a different format, is in use by another run, or cannot be
+        written.
     """
 
     def __init__(self, path: Path, *, durable: bool = True, **values: str) -> None:
@@ -82,9 +94,9 @@ class RunDatabase:
         self._durable = durable
         self.meta: dict[str, str] = {}
         self.begun: set[int] = set()  # jobs in flight with committed parts, trials or frames
-        self.ended_count = 0  # jobs that have ended
-        self._ended = bytearray()  # a byte for each job: 1 if the job has ended
-        self._frames: dict[int, int] = {}  # {job: stored number of frames}
+        self.ended_count = 0  # number of jobs that have ended
+        self._ended = bytearray()  # one byte per job, which is 1 if the job has ended
+        self._frames: dict[int, int] = {}  # {job: number of frames in the database}
         with _explained(self.path):
             self._sql = sqlite3.connect(
                 path, isolation_level=None, timeout=1.0, check_same_thread=False
@@ -96,8 +108,8 @@ class RunDatabase:
                 raise
 
     def _open(self, values: Mapping[str, str]) -> None:
-        # The lock is held while the database is open, so that no second run writes to it. No
-        # write-ahead log: it does not work on network disks.
+        # The lock is held while the database is open, so that no other run writes to it. A
+        # write-ahead log is not used, because it does not work on network file systems.
         self._sql.execute("PRAGMA locking_mode = EXCLUSIVE")
         self._sql.execute(f"PRAGMA synchronous = {'FULL' if self._durable else 'OFF'}")
         self._sql.execute("BEGIN IMMEDIATE")
@@ -111,11 +123,11 @@ class RunDatabase:
             raise sqlite3.DatabaseError(
                 f"its format is {version}, but this version reads only format {FORMAT}"
             )
-        _checked_location(self.meta)
-        (state,) = self._sql.execute("PRAGMA integrity_check(1)").fetchone()  # pages, indices
+        _validate_location(self.meta)
+        (state,) = self._sql.execute("PRAGMA integrity_check(1)").fetchone()  # pages and indices
         if state != "ok":
             raise sqlite3.DatabaseError(" ".join(state.split()))
-        # From Python 3.12 on, an unfinished cursor in a traceback keeps a closed file locked.
+        # Since Python 3.12, an unfinished cursor in a traceback keeps a closed file locked.
         for table, columns in _COLUMNS.items():
             query = f"SELECT {', '.join(columns)}, crc FROM {table}"
             with closing(self._sql.execute(query)) as rows:
@@ -137,7 +149,7 @@ class RunDatabase:
     # -- reading -------------------------------------------------------------------------
 
     def read(self, job: CommittedResults) -> None:
-        """Read the committed results of a job that has none in memory."""
+        """Load the committed results of a job into memory."""
         if job.number in self.begun:
             with _explained(self.path):
                 self._read(job)
@@ -177,7 +189,7 @@ class RunDatabase:
 
     @property
     def used(self) -> bool:
-        """True if any result is or was committed."""
+        """True if any results are or were committed."""
         return "forgot" in self.meta or bool(self.ended_count or self.begun)
 
     def ended(self, number: int) -> bool:
@@ -185,17 +197,17 @@ class RunDatabase:
         return number < len(self._ended) and self._ended[number] != 0
 
     def failed(self) -> list[int]:
-        """Return the numbers of the jobs that have failed, in order."""
+        """Return the numbers of the failed jobs, in ascending order."""
         query = "SELECT number FROM jobs WHERE failed ORDER BY number"
         return [number for (number,) in self._rows(query)]
 
-    def hash_of(self, number: int) -> str:
-        """Return the hash of the inputs of a job in flight, or no text if no hash was stored."""
-        rows = self._rows("SELECT hash FROM made_of WHERE job = ?", number)
+    def input_hash(self, number: int) -> str:
+        """Return the input hash of a job in flight, or an empty string if none is stored."""
+        rows = self._rows("SELECT hash FROM input_hashes WHERE job = ?", number)
         return "".join(text for (text,) in rows)
 
     def job_rows(self) -> Iterator[dict[str, Any]]:
-        """Yield the stored rows of the jobs that have ended, by number, a row at a time."""
+        """Yield the stored rows of the jobs that have ended, in order of their numbers."""
         with (
             _explained(self.path),
             closing(self._sql.execute("SELECT data FROM jobs ORDER BY number")) as rows,
@@ -204,7 +216,7 @@ class RunDatabase:
                 yield json.loads(data)
 
     def summaries(self, part: Receipt) -> bytes:
-        """Return the summaries of the scans of a committed part."""
+        """Return the summaries of the scans in a committed part."""
         query = "SELECT summaries FROM parts WHERE job = ? AND first = ?"
         with _explained(self.path):
             ((data,),) = self._rows(query, part.job, part.first)
@@ -213,16 +225,16 @@ class RunDatabase:
     # -- writing -------------------------------------------------------------------------
 
     def set(self, **values: str) -> None:
-        """Store values of the `meta` table."""
+        """Store values in the `meta` table."""
         with self._transaction():
             self._insert("meta", values.items(), "OR REPLACE")
         self.meta |= values
 
     def commit(self, receipts: Iterable[tuple[CommittedResults, Receipt]]) -> list[Receipt]:
-        """Commit parts of jobs in a transaction, and return the newly committed parts.
+        """Commit parts in one transaction, and return the newly committed parts.
 
-        A part with a scan that is committed already is left out. The number of frames that were
-        handed out of these jobs is committed as well.
+        Parts that contain a scan that has already been committed are skipped. The number of
+        delivered frames in these jobs is also committed.
         """
         new: list[tuple[CommittedResults, Receipt]] = []
         for job, part in receipts:
@@ -256,13 +268,13 @@ class RunDatabase:
         self.begun.update(job.number for job, _ in new)
         return [part for _, part in new]
 
-    def set_hash(self, number: int, text: str) -> None:
-        """Store the hash of the inputs of a job in flight."""
+    def set_input_hash(self, number: int, text: str) -> None:
+        """Store the input hash of a job in flight."""
         with self._transaction():
-            self._insert("made_of", [(number, text)], "OR REPLACE")
+            self._insert("input_hashes", [(number, text)], "OR REPLACE")
 
     def drop(self, job: CommittedResults, receipts: Sequence[Receipt]) -> None:
-        """Remove parts that are missing in storage, so that their scans are offered again."""
+        """Remove parts that are missing from the storage, so that their scans are cast again."""
         with self._transaction():
             self._sql.executemany(
                 "DELETE FROM parts WHERE job = ? AND first = ?",
@@ -274,7 +286,7 @@ class RunDatabase:
     def add_trials(self, job: CommittedResults, trials: Sequence[Trial]) -> None:
         """Commit planning trials of a job."""
         with self._transaction():
-            # To the bit: a float is written with the digits that identify it.
+            # JSON preserves floats exactly.
             rows = [
                 (job.number, trial.trial, json.dumps(vars(trial), default=np.ndarray.tolist))
                 for trial in trials
@@ -284,9 +296,10 @@ class RunDatabase:
         job.trials += trials
 
     def end_jobs(self, jobs: Iterable[tuple[int, bool, Mapping[str, Any]]]) -> None:
-        """Store ended jobs, (number, failed, row), and delete their parts, trials and frames.
+        """Store the rows of ended jobs, and delete their parts, trials and frames.
 
-        A job may have ended before.
+        Each job is given as its number, whether it failed, and its row. The row of a job that has
+        already ended is replaced.
         """
         ended = {number: (int(failed), json.dumps(data)) for number, failed, data in jobs}
         rows = [(number, *row) for number, row in ended.items()]
@@ -298,7 +311,11 @@ class RunDatabase:
             self._mark_ended(number)
 
     def forget_jobs(self, numbers: Iterable[int]) -> None:
-        """Reset jobs that have ended. Their output files exist, even if the database is empty."""
+        """Reset ended jobs, so that they are cast again.
+
+        The database still counts as used, even if it becomes empty, because the output files of the
+        jobs exist.
+        """
         self.set(forgot="jobs")
         forgotten = [(number,) for number in numbers]
         with self._transaction():
@@ -307,21 +324,21 @@ class RunDatabase:
             self._mark_ended(number, False)
 
     def restart(self, job: CommittedResults) -> None:
-        """Drop all committed results of a job that has not ended."""
+        """Delete all committed results of a job in flight."""
         with self._transaction():
             self._delete([job.number])
         self.begun.discard(job.number)
         job.reset()
 
     def save_frames(self, jobs: Iterable[CommittedResults]) -> None:
-        """Commit the number of frames handed out of jobs, as each commit of a part does too."""
+        """Commit the number of delivered frames in each job if it has changed."""
         unsaved = [job for job in jobs if self._has_unsaved_frames(job)]
         if unsaved:
             with self._transaction():
                 self._write_frames(unsaved)
 
     def copy(self) -> bytes:
-        """Return the content of the file after the last transaction."""
+        """Return the content of the database file after the last transaction."""
         with _explained(self.path):
             return self._sql.serialize()
 
@@ -355,8 +372,9 @@ class RunDatabase:
         return job.frames != self._frames.get(job.number, job.scans.start)
 
     def _insert(self, table: str, rows: Iterable[Sequence[Any]], conflict: str = "") -> None:
-        """Insert rows with their CRC-32, under a clause `conflict` such as ``OR REPLACE``."""
-        # Not by a function that SQLite calls: an interrupt in it would look like damage.
+        """Insert rows with their CRC-32, with a conflict clause such as ``OR REPLACE``."""
+        # The checksum is not computed in a function that SQLite calls, because an interrupt in that
+        # function would look like damage.
         sealed_rows = [(*row, _crc32(*row)) for row in rows]
         placeholders = ", ".join("?" * (len(_COLUMNS[table]) + 1))
         self._sql.executemany(
@@ -378,14 +396,14 @@ class RunDatabase:
 
 @contextmanager
 def _explained(path: Path) -> Iterator[None]:
-    """Translate an error of SQLite about the database at a path."""
+    """Convert SQLite errors in the body to a LidarError that names the database."""
     try:
         yield
     except (sqlite3.Error, ValueError, LookupError, TypeError, OverflowError) as error:
         words = str(error)
-        # Other operational errors, such as a missing column or text that is not UTF-8, are damage.
-        of_disk = any(phrase in words.lower() for phrase in _DISK_ERRORS)
-        if not isinstance(error, sqlite3.OperationalError) or not of_disk:
+        # Other operational errors, such as a missing column or invalid UTF-8, indicate damage.
+        is_disk_error = any(phrase in words.lower() for phrase in _DISK_ERRORS)
+        if not isinstance(error, sqlite3.OperationalError) or not is_disk_error:
             raise DamagedError(
                 f"{path} is damaged ({words}). Remove the run with `--restart`, or choose a "
                 "different folder."
@@ -398,7 +416,7 @@ def _explained(path: Path) -> Iterator[None]:
 
 
 def _crc32(*values: Any) -> int:
-    """Return the CRC-32 of the values of a row, as read back from SQLite."""
+    """Return the CRC-32 of the values in a row, which must be as read from SQLite."""
     crc = 0
     for value in values:
         crc = zlib.crc32(value if isinstance(value, bytes) else f"{value!r},".encode(), crc)
@@ -406,12 +424,15 @@ def _crc32(*values: Any) -> int:
 
 
 def parts_folder(mark: str) -> str:
-    """Return the name of a run's folder of parts in a location that runs share."""
+    """Return the name of a run's parts folder in a location that several runs share."""
     return f"run-{mark}"
 
 
-def _checked_location(meta: Mapping[str, str]) -> tuple[str, str]:
-    """Return mark and location of parts from a database's values. ValueError if invalid."""
+def _validate_location(meta: Mapping[str, str]) -> tuple[str, str]:
+    """Return the mark and the parts location in a `meta` table.
+
+    Raise ValueError if they are invalid.
+    """
     mark = meta["mark"]
     location = meta.get("parts", "")
     if not re.fullmatch("[0-9a-f]{16}", mark):
@@ -422,15 +443,22 @@ def _checked_location(meta: Mapping[str, str]) -> tuple[str, str]:
 
 
 def read_parts_location(path: Path) -> tuple[str, str] | None:
-    """Return the mark of a run and the location of its parts, "" by default, from a database.
+    """Read the mark of a run and the location of its parts from a database.
 
-    None if the database is missing or damaged; LidarError if a run is using the database, or if
-    it is another program's.
+    Returns
+    -------
+    The mark and the location, which is empty if the parts are in the run folder. None if the
+    database is missing or damaged.
+
+    Raises
+    ------
+    LidarError
+        If a run is using the database, or if it belongs to a different program.
     """
     if not path.exists():
         return None
     try:
-        # Not read-only: then SQLite could not undo a transaction that was interrupted.
+        # In read-only mode, SQLite could not roll back an interrupted transaction.
         with closing(
             sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True, timeout=1.0)
         ) as sql:
@@ -443,7 +471,7 @@ def read_parts_location(path: Path) -> tuple[str, str] | None:
             rows = sql.execute("SELECT name, value, crc FROM meta").fetchall()
             if any(_crc32(name, value) != crc for name, value, crc in rows):
                 return None
-            return _checked_location({name: value for name, value, _ in rows})
+            return _validate_location({name: value for name, value, _ in rows})
     except sqlite3.Error as error:
         if "locked" in str(error):
             raise LidarError(f"Another run is using {path.parent}.") from error

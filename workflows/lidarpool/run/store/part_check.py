@@ -1,4 +1,4 @@
-"""Checks the parts that an earlier run has left, before a run relies on them."""
+"""Checks of the parts from an earlier run before they are reused."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ from operator import attrgetter
 
 from lidarsim.words import listed
 
-from ..pipeline.stage_messages import Receipt, scans_in_words
+from ..pipeline.stage_messages import Receipt, format_scans
 from .database import RunDatabase
 from .stored_job import StoredJob
 
-CHECKERS = 4  # threads that check parts; each has two copies of a part in memory
-# values of a receipt that the part has as well
+CHECKERS = 4  # threads that check parts, each of which has two copies of a part in memory
+# Values of a receipt that can also be read from the part.
 _IN_PART = attrgetter("first", "stop", "point_count")
 
 
 def check_parts(
     job: StoredJob, db: RunDatabase, sizes: Mapping[str, int], strays: Sequence[str]
 ) -> list[str]:
-    """Drop missing and damaged parts of a job, and commit parts that the database does not know.
+    """Drop missing and damaged parts of a job, and commit parts that are not in the database.
 
     Parameters
     ----------
     job
-        A job in flight, with its committed results.
+        Job in flight with its committed results.
     db
-        The database; it may be new because it was lost, or an older copy.
+        Database of the run. It may be an older copy, or new because the original was lost.
     sizes
-        {name of a file in storage: bytes}.
+        Sizes of the files in the storage in bytes, by name.
     strays
-        Names of the parts of the job in storage, including committed parts.
+        Names of all parts of the job in the storage, including committed parts.
 
     Returns
     -------
-    Notes for the user: which scans are cast again, and why.
+    Notes for the user that state which scans are cast again, and why.
     """
     lost: dict[str, list[Receipt]] = {"missing": [], "damaged": []}
     committed = {part.name for part in job.parts.ordered}
@@ -60,7 +60,10 @@ def check_parts(
 
 
 def _state(job: StoredJob, part: Receipt, sizes: Mapping[str, int]) -> str:
-    """Return "missing", "damaged" by the checksum of any column, or "" for a valid part."""
+    """Return "missing", "damaged", or an empty string if the part is valid.
+
+    Reading the part verifies the checksums of its columns.
+    """
     if part.name not in sizes:
         return "missing"
     if sizes[part.name] != part.size:
@@ -70,8 +73,7 @@ def _state(job: StoredJob, part: Receipt, sizes: Mapping[str, int]) -> str:
 
 
 def _note(job: StoredJob, receipts: Sequence[Receipt], state: str) -> str:
-    """Return a note that scans are repeated because their parts were missing or damaged."""
     names = listed([part.name for part in receipts])
-    scans = listed([scans_in_words(part.first, part.stop) for part in receipts])
+    scans = listed([format_scans(part.first, part.stop) for part in receipts])
     verb = "was" if len(receipts) == 1 else "were"
     return f"repeated {scans}, because {names} {verb} {state} in {job.storage.url}"

@@ -1,8 +1,8 @@
-"""The database of a run in storage that is not a disk, such as an object store.
+"""Runs in remote storage, such as an object store.
 
-SQLite writes to disks only, so the database is in a temporary folder of the driver, and a copy is
-put into the storage every few seconds. A survey resumed from a copy finds later commits by its
-parts, a campaign finds ended jobs by their manifests.
+SQLite requires a local disk. The database is therefore kept in a temporary folder of the driver and
+copied to the storage every few seconds. When a run is resumed, results that were committed after
+the last copy are recovered from the parts of a survey, or from the manifests of a campaign's jobs.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from lidarsim.io.storage import Storage
 
 from .database import FILE, RunDatabase
 
-OWNER = "run.owner"  # the mark of the run that may write the copy
+OWNER = "run.owner"  # file with the mark of the run that may write copies
 COPY_EVERY_S = 5.0
-COPY_REST = 20  # pause after a copy, as a multiple of the time that the copy took
+COPY_REST = 20  # minimum pause after a copy as a multiple of the time that the copy took
 
 
 class RemoteRun:
-    """A run in storage: copies of its database, and the mark of the run that may write copies.
+    """Copies of a run's database in remote storage, and the mark of the run that owns them.
 
     A resumed run takes over the files of an earlier run. If the earlier run is still alive, it
-    detects this before its next copy, and ends.
+    detects this before its next copy and then exits.
 
-    All methods raise LidarError if the storage fails or cannot be written.
+    All methods raise LidarError if the storage fails or is not writable.
     """
 
     def __init__(self, storage: Storage) -> None:
@@ -39,15 +39,15 @@ class RemoteRun:
         self._due = float("-inf")
 
     def claim(self, db: RunDatabase) -> None:
-        """Take the run over, and write a first copy of the database."""
+        """Take over the run and write a first copy of the database."""
         with self._explained():
             self.storage.write(OWNER, self._mark)
         self.save(db)
 
     def save(self, db: RunDatabase, *, force: bool = False) -> None:
-        """Copy the database to the storage, if a copy is due or with `force`.
+        """Copy the database to the storage if a copy is due, or if `force` is True.
 
-        LidarError if another run has taken over.
+        Raise LidarError if another run has taken over.
         """
         start_s = time.monotonic()
         if start_s < self._due and not force:
@@ -63,7 +63,7 @@ class RemoteRun:
         with self._explained():
             try:
                 self.lost = self.storage.read(OWNER) != self._mark
-            except FileNotFoundError:  # a later run has finished and deleted it
+            except FileNotFoundError:  # a later run has finished and deleted the file
                 self.lost = True
         if self.lost:
             raise LidarError(
@@ -76,7 +76,7 @@ class RemoteRun:
 
 
 def fetch_database(storage: Storage, path: Path) -> None:
-    """Copy the database of a run in storage, if there is a database, to a local path."""
+    """Copy the database of a run from remote storage to a local path, if it exists."""
     with explained(f"The run in {storage} cannot be read"):
         if FILE in storage.sizes():
             storage.get(FILE, path)

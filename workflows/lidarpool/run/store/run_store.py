@@ -1,4 +1,4 @@
-"""Store of a run, in a folder or storage: database and parts, so that a later run can resume."""
+"""Stores of runs, each with a database and parts, which allow runs to be resumed."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from ...columns.parts import deletable_files, mark_name, parse_part_name
 from ...datasets.job_table import JobRow
 from ...identity.field_words import describe_changes
 from ...identity.fingerprint import fingerprint
-from ...identity.shard import describe_shard
+from ...identity.shard import ALL, describe_shard
 from ...identity.software import software
 from ...scenario.job import Job
-from ..job_source import CONTENT, Jobs, identity_of
+from ..job_source import CONTENT, Jobs, input_fingerprints
 from ..pipeline.committed_results import CommittedResults
 from ..pipeline.failures import storing
 from .database import (
@@ -42,54 +42,54 @@ from .part_check import check_parts
 from .remote import OWNER, RemoteRun, fetch_database
 from .stored_job import StoredJob
 
-PARTS = "parts"  # folder of the parts, in the run's folder
-RUN_FOLDER = "run"  # the run's folder in the output folder, until the result is complete
-MAX_SENSOR_KINDS = 8  # kinds of a sensor that are named in full
+PARTS = "parts"  # subfolder of the run folder that contains the parts
+RUN_FOLDER = "run"  # subfolder of the output folder that contains the run until it is complete
+MAX_SENSOR_KINDS = 8  # maximum number of sensor models that are listed
 _AND_OTHERS = "and others"
 
-# On the command line, and in Python.
+# Options for the command line and for Python.
 _RESUME = "`--resume` (`resume=True` in Python)"
 _DROP = "`--restart` (`remove_run` in Python)"
 
 
 class _EarlierDatabase(NamedTuple):
-    """Database that an earlier run has left."""
+    """Database of an earlier run in the same location."""
 
-    db: RunDatabase | None = None  # open; None if no result is committed
+    db: RunDatabase | None = None  # open database, or None if no result is committed
     mark: str = ""  # mark of a run without committed results
-    parts_location: str = ""  # location of its parts; empty for the folder of the run
-    damage: DamagedError | None = None  # why the database cannot be read
+    parts_location: str = ""  # location of its parts, or empty for the run folder
+    damage: DamagedError | None = None  # error if the database cannot be read
 
 
 class RunStore:
-    """Database of a run, and the folder of the parts of its jobs.
+    """Database of a run and folder with the parts of its jobs.
 
-    The mark file in the folder of the parts has the first values of the database, and each part has
-    its receipt: if the database is missing or damaged, it is made again.
+    If the database is missing or damaged, it is rebuilt. The mark file in the parts folder contains
+    the initial values of the database, and each part contains the data of its receipt.
 
     Parameters
     ----------
     jobs
-        Jobs of the run. Their identity must be the same for a run to be resumed.
+        Jobs of the run. A run can only be resumed if their identity is unchanged.
     backend
-        The requested backend.
+        Requested ray-casting backend.
     location
-        Folder or URL of the run; None for a temporary folder that is deleted with the last user of
-        the points.
+        Folder or URL of the run, or None for a temporary folder, which is deleted when its points
+        are no longer in use.
     parts_location
-        Another location for the parts, a path or URL, where they get a separate folder. A resumed
-        run uses the earlier location of its parts.
+        Path or URL of a different location for the parts, in which they get a separate folder. A
+        resumed run continues to use the previous location of its parts.
     resume
-        Whether to continue an existing run; otherwise there must be none.
+        Whether to continue an existing run. If False, the location must not contain a run.
     warnings
         Warnings about the scenario, which precede the notes of the run.
 
     Raises
     ------
     LidarError
-        If there is an unfinished run and `resume` is False, or the run cannot be resumed: it is of
-        other jobs, in use, or cast with another backend than requested. Also if a `parts_location`
-        comes without a `location`, whose database lists the parts.
+        If `location` contains an unfinished run and `resume` is False, if the run cannot be resumed
+        because it has different jobs, a different backend or is in use, or if `parts_location` is
+        given without `location`.
     """
 
     def __init__(
@@ -111,8 +111,8 @@ class RunStore:
         self._requested_backend = backend
         self.lasting = location is not None
         self.warnings = (*warnings,)
-        self.notes: list[str] = []  # remarks for the user
-        self.begun = False  # True if it continues an earlier run
+        self.notes: list[str] = []  # notes for the user
+        self.begun = False  # True if this run continues an earlier run
         self._removed = False
         self.identity = software() | dict(jobs.identity)
         self._run_identity = self.identity | {"shard": str(jobs.shard)}
@@ -130,20 +130,20 @@ class RunStore:
         advice = "Create its parent folder first, or choose a different folder"
         with explained(f"The run folder {folder} cannot be created", advice):
             folder.mkdir(exist_ok=True)
-        self.in_flight: dict[int, StoredJob] = {}  # {number: a job that has not ended}
-        # Jobs in flight whose inputs can be recognized by a later run.
+        self.in_flight: dict[int, StoredJob] = {}  # {number: job that has not ended}
+        # Jobs in flight whose input hashes are stored, so that a later run can recognize them.
         self._identified: set[int] = set()
-        self.only_job: StoredJob | None = None  # the only job, of a survey; None for a campaign
+        self.only_job: StoredJob | None = None  # job of a survey, or None for a campaign
         with ExitStack() as undo:
             undo.callback(self._folder.remove, [], folder=True)
             self.db = self._open(parts_location, resume)
             undo.callback(self.close)
             self._claim(resume)
             undo.pop_all()
-        self.resumed = self.db.ended_count  # jobs of an earlier run
+        self.resumed = self.db.ended_count  # number of jobs from an earlier run
 
     def _open(self, parts_location: str | Path | Storage | None, resume: bool) -> RunDatabase:
-        """Open the run's database, or create a new database if the existing is empty or lost."""
+        """Open the run's database, or create it if it is missing or has no results."""
         path = _database_path(self._folder)
         durable = self.lasting and self._remote is None
         earlier = self._open_earlier(path, durable)
@@ -173,7 +173,7 @@ class RunStore:
             raise
 
     def _open_earlier(self, path: Path, durable: bool) -> _EarlierDatabase:
-        """Open the database that an earlier run may have left."""
+        """Open the database of an earlier run, if one exists."""
         try:
             if self._remote:
                 fetch_database(self._remote.storage, path)
@@ -186,21 +186,22 @@ class RunStore:
             return _EarlierDatabase(mark=db.meta["mark"], parts_location=db.meta.get("parts", ""))
         except DamagedError as error:
             return _EarlierDatabase(damage=error)
-        except LidarError as error:  # the user does not know the local copy of a database
+        except LidarError as error:  # the local copy of the database is unknown to the user
             raise LidarError(str(error).replace(self._folder.url, self.location.url)) from error
 
     def _recover_meta(
         self, path: Path, earlier_mark: str, parts_location: str | Path | Storage | None
     ) -> dict[str, str] | None:
-        """Return the first values of a lost database from the folder of its parts, or None.
+        """Recover the initial values of a lost database from the mark file in the parts folder.
 
-        `earlier_mark` is the mark of an existing empty database, or "". LidarError if the database
-        is another program's, or the earlier run differs from this one.
+        Return None if there is no mark file. `earlier_mark` is the mark of an existing database
+        without results, or an empty string. Raise LidarError if the database belongs to a different
+        program, or if the earlier run differs from this run.
         """
         meta = self._read_mark(parts_location)
         if meta is None or (earlier_mark and self._difference(meta)):
             return None
-        read_parts_location(path)  # raises if the database is another program's
+        read_parts_location(path)  # raises if the database belongs to a different program
         self._check_same(meta)
         self.begun = True
         if not earlier_mark:
@@ -208,7 +209,7 @@ class RunStore:
         return meta
 
     def _discard(self, earlier: _EarlierDatabase) -> None:
-        """Remove an earlier run without committed results. LidarError for a damaged database."""
+        """Remove an earlier run without results. Raise LidarError if its database is damaged."""
         if earlier.damage is not None:
             reason = str(earlier.damage).replace(self._folder.url, self.location.url)
             raise LidarError(reason) from earlier.damage
@@ -216,7 +217,7 @@ class RunStore:
             _remove(self.location, parts_of(self.location, earlier.parts_location), earlier.mark)
 
     def _read_mark(self, parts_location: str | Path | Storage | None) -> dict[str, str] | None:
-        """Return the first values of this run's database, from the folder of its parts."""
+        """Read the initial values of this run's database from the mark file."""
         locations = [self.location.below(PARTS)]
         if parts_location is not None:
             shared = Storage.at(parts_location)
@@ -233,11 +234,11 @@ class RunStore:
         return None
 
     def _claim(self, resume: bool) -> None:
-        """Find the parts, and mark their folder as this run's."""
+        """Find existing parts, check the earlier run, and write the mark file."""
         self.storage = replace(parts_of(self.location, self.db.meta["parts"]), durable=self.lasting)
         with explained(f"{self.storage.url} cannot be listed"):
-            self._sizes = self.storage.sizes()  # also an error if the place cannot be opened
-        self._strays: dict[int, list[str]] = {}  # {job: names of parts that a run has left}
+            self._sizes = self.storage.sizes()  # fails if the location is not accessible
+        self._strays: dict[int, list[str]] = {}  # {job: names of existing parts}
         for name in self._sizes:
             if resume and (scans := parse_part_name(name, self.db.meta["mark"])) is not None:
                 self._strays.setdefault(scans[0], []).append(name)
@@ -254,7 +255,7 @@ class RunStore:
             with storing(self.storage):
                 self.storage.prepare()
                 self._write_mark()
-        if self.only_job is not None:  # not before the run is known to be the same
+        if self.only_job is not None:  # after it is certain that the run is the same
             strays = self._strays.get(self.only_job.job.number, ())
             self.only_job = self._check(self.only_job, strays)
 
@@ -265,10 +266,10 @@ class RunStore:
         self.storage.write(mark_name(values["mark"]), json.dumps(values).encode())
 
     def _check_resumable(self, resume: bool) -> None:
-        """Raise LidarError if the existing run of the same jobs may not be continued."""
+        """Raise LidarError if the options do not allow the existing run to be continued."""
         if not resume:
             raise LidarError(
-                f"{self.location} contains an unfinished run with {self.committed_in_words}. "
+                f"{self.location} contains an unfinished run with {self.committed_text}. "
                 f"Continue it with {_RESUME}, or remove it with {_DROP}."
             )
         if self.backend and self._requested_backend not in ("auto", self.backend):
@@ -279,7 +280,10 @@ class RunStore:
             )
 
     def _difference(self, meta: Mapping[str, str]) -> str:
-        """Return how the run of a database differs, in words with a period, or no text."""
+        """Describe how the run of a database differs from this run, as a sentence.
+
+        Return an empty string if it does not differ.
+        """
         earlier = json.loads(meta["identity"])
         for name, value in self._run_identity.items():
             if earlier.get(name) != value:
@@ -312,16 +316,16 @@ class RunStore:
 
     @property
     def backend(self) -> str:
-        """Backend of the scans, or no text until the backend is known."""
+        """Backend that the scans are cast with, or an empty string if it is not known yet."""
         return self.db.meta.get("backend", "")
 
     @property
     def casting(self) -> dict[str, str]:
-        """Software of the workers that cast the scans, or no text until it is known."""
+        """Software of the workers that cast the scans, or an empty dictionary if not known yet."""
         return dict(json.loads(self.db.meta.get("casting", "{}")))
 
     def cast_with(self, backend: str, casting: Mapping[str, str]) -> None:
-        """Store the backend and software that all scans are cast with."""
+        """Store the backend and the software that all scans are cast with."""
         if backend != self.backend or casting != self.casting:
             self.db.set(backend=backend, casting=json.dumps(casting))
             with storing(self.storage):
@@ -329,26 +333,26 @@ class RunStore:
 
     @property
     def fields(self) -> Mapping[str, str]:
-        """Fields that the results depend on, in words."""
+        """Descriptions of the fields that the results depend on, by field path."""
         return dict(json.loads(self.db.meta.get("fields", "{}")))
 
     @property
     def made_with(self) -> dict[str, Any]:
-        """Identity, backend and software that determine the bytes of all jobs, for manifests."""
+        """Identity, backend and software of the run, which are recorded in manifests."""
         identity = fingerprint(dict(self.identity))
         return {"identity": identity, "backend": self.backend, "casting": self.casting}
 
     @property
-    def committed_in_words(self) -> str:
-        """Number of committed scans, trials or jobs in words, or no text without any."""
+    def committed_text(self) -> str:
+        """Number of committed scans, trials or jobs as text, or an empty string for none."""
         if self.only_job is not None:
-            return self.only_job.committed_in_words
+            return self.only_job.committed_text
         return f"{self.db.ended_count:,} of {len(self.jobs.numbers):,} jobs" if self.db.used else ""
 
     @property
     def advice(self) -> str:
-        """Advice if the backend is not available, for the end of a message."""
-        if not self.committed_in_words:
+        """Advice at the end of a message that the backend is not available."""
+        if not self.committed_text:
             return AUTO_ADVICE
         return (
             f"The scans in {self.location} were cast with this backend. Continue the run where "
@@ -356,19 +360,29 @@ class RunStore:
         )
 
     def rows(self) -> Iterator[JobRow]:
-        """Yield the rows of the jobs that have ended, by number."""
+        """Yield the table rows of the jobs that have ended, in order of their numbers."""
         for row in self.db.job_rows():
             yield JobRow.from_json(row)
 
     @property
     def sensors(self) -> dict[str, str]:
-        """Sensors of the jobs that are done, {name: models and rates}."""
+        """Models and rates of the sensors in finished jobs, by sensor name."""
         return dict(json.loads(self.db.meta.get("sensors", "{}")))
+
+    def note_nothing_to_resume(self, target: object) -> None:
+        """Add a note if a survey should be resumed, but had no unfinished run.
+
+        The note names `target`, the location of the result.
+        """
+        # Tasks in a job array resume their shards even if the shards have not been started yet.
+        is_explained = self.committed_text or self.notes or self.jobs.shard != ALL
+        if self.only_job is not None and not is_explained:
+            self.notes.append(f"{target} contained no unfinished run to resume")
 
     # -- jobs --------------------------------------------------------------------------------
 
     def open_job(self, job: Job) -> StoredJob:
-        """Return a job in flight, after a check of the parts of an earlier run."""
+        """Return the stored job for a job in flight, after checking parts from an earlier run."""
         number = job.number
         if number in self.in_flight:
             return self.in_flight[number]
@@ -376,17 +390,17 @@ class RunStore:
         strays = self._strays.pop(number, ())
         if number not in self.db.begun and not strays:
             return stored
-        earlier_hash = self.db.hash_of(number)
-        if earlier_hash and earlier_hash == _hash_of(job):
+        earlier_hash = self.db.input_hash(number)
+        if earlier_hash and earlier_hash == _hash_inputs(job):
             self._identified.add(number)
             return self._check(stored, strays)
-        # Input files of the job have changed, or a run died before it stored the hash.
+        # The input files have changed, or the earlier run died before it stored the hash.
         self.db.restart(stored.committed)
         self.storage.remove(strays)
         return self._add(replace(stored, resumed=0))
 
     def _load(self, job: Job) -> StoredJob:
-        """Add a job in flight with its committed results."""
+        """Add a job in flight, and read its committed results from the database."""
         is_only = self.jobs.only_job is not None
         count = job.survey.scan_count
         scans = self.jobs.shard.scans(count) if is_only else range(count)
@@ -396,7 +410,7 @@ class RunStore:
         return self._add(StoredJob(job, committed, self.storage, self.db, resumed, keeper=self))
 
     def _check(self, stored: StoredJob, strays: Sequence[str]) -> StoredJob:
-        """Check the parts of an earlier run, and update the number of resumed scans."""
+        """Check parts from an earlier run, and update the number of resumed scans."""
         self.notes += check_parts(stored, self.db, self._sizes, strays)
         return self._add(replace(stored, resumed=stored.parts.scans_done))
 
@@ -404,25 +418,25 @@ class RunStore:
         self.in_flight[stored.job.number] = stored
         return stored
 
-    def take_over(self, job: Job) -> None:
-        """Make the committed points those of `job`, as if this run had cast all of them."""
-        assert self.only_job is not None, "of a survey"
+    def reassign_points(self, job: Job) -> None:
+        """Assign the committed points to `job`, as if this run had cast all of them."""
+        assert self.only_job is not None, "the run is a survey"
         self.only_job.committed.advance_frames(self.only_job.scans.stop)
         self.only_job = self._add(replace(self.only_job, job=job, resumed=0))
 
     def end(self, rows: Sequence[JobRow]) -> list[tuple[JobRow, StoredJob]]:
-        """Commit that jobs have ended, and return those that were in flight with their rows.
+        """Commit the rows of ended jobs, and return the jobs that were in flight with their rows.
 
-        The models and rates of their sensors are stored for the card of the data set.
+        The models and rates of their sensors are also stored, for the data set card.
         """
         ended = [(row, self.in_flight[row.number]) for row in rows if row.number in self.in_flight]
         named = (
-            (mounted.name or "lidar", _kind_in_words(mounted.sensor))
+            (mounted.name or "lidar", _describe_model(mounted.sensor))
             for row, stored in ended
             if row.done
             for mounted in stored.job.survey.carried
         )
-        sensors = with_sensors(self.sensors, named)
+        sensors = add_sensors(self.sensors, named)
         if sensors != self.sensors:
             self.db.set(sensors=json.dumps(sensors))
         self.db.end_jobs((row.number, bool(row.error), asdict(row)) for row in rows)
@@ -432,13 +446,13 @@ class RunStore:
         return ended
 
     def forget(self, numbers: Iterable[int]) -> None:
-        """Reset jobs that have ended, so that they are cast again."""
+        """Reset ended jobs, so that they are cast again."""
         if forgotten := [*numbers]:
             self.db.forget_jobs(forgotten)
             self.resumed = self.db.ended_count
 
-    def adopt(self, rows: Iterable[JobRow], **meta: str) -> None:
-        """Take over jobs that are done in the data set, and store values of `meta`."""
+    def add_finished(self, rows: Iterable[JobRow], **meta: str) -> None:
+        """Add jobs that are already finished in the data set, and store values of `meta`."""
         if meta:
             self.db.set(**meta)
         self.end([row for row in rows if not self.db.ended(row.number)])
@@ -447,29 +461,32 @@ class RunStore:
     # -- the end -----------------------------------------------------------------------------
 
     def save(self, *, force: bool = False) -> None:
-        """Store the number of frames handed out, and hashes of the inputs of partly cast jobs.
+        """Store the number of delivered frames, and the input hashes of partly cast jobs.
 
-        If a copy of the database is due, or with `force`, the database is copied. LidarError if the
-        copy fails, or another run has taken over.
+        If the run is in remote storage, the database is also copied there if a copy is due or if
+        `force` is True. Raise LidarError if this fails, or if another run has taken over.
         """
         for number, stored in self.in_flight.items():
             begun = stored.parts.scans_done and not stored.complete
             if begun and number not in self._identified:
                 self._identified.add(number)
-                self.db.set_hash(number, _hash_of(stored.job))
+                self.db.set_input_hash(number, _hash_inputs(stored.job))
         self.db.save_frames(stored.committed for stored in self.in_flight.values())
         if self._remote:
             self._remote.save(self.db, force=force)
 
-    def keep(self, made_of: Mapping[str, Any] | None, notes: Sequence[str]) -> None:
-        """Close the store, whose points stay, and store notes and `made_of` with them if given."""
-        if made_of is not None:
-            self.db.set(made_of=json.dumps(made_of), notes=json.dumps(notes))
+    def keep(self, scenario_source: Mapping[str, Any] | None, notes: Sequence[str]) -> None:
+        """Close the store and keep its points.
+
+        If `scenario_source` is given, it is stored together with the notes.
+        """
+        if scenario_source is not None:
+            self.db.set(scenario_source=json.dumps(scenario_source), notes=json.dumps(notes))
             self.save(force=True)
         self.db.close()
 
     def tidy(self) -> None:
-        """Remove parts that are in no job in flight, of dead or superseded collectors."""
+        """Remove parts from dead or replaced collectors, which belong to no job in flight."""
         mark = self.db.meta["mark"]
         part_names = [part.name for job in self.in_flight.values() for part in job.parts.ordered]
         needed_names = {mark_name(mark), *part_names}
@@ -479,7 +496,7 @@ class RunStore:
             )
 
     def remove(self) -> None:
-        """Remove the store after the result is in place, but not files of other runs."""
+        """Remove the store, but no files of other runs, after the result has been published."""
         if self._remote:
             self._remote.check()
         self._removed = True
@@ -488,18 +505,18 @@ class RunStore:
 
     @contextmanager
     def kept_on_error(self) -> Iterator[None]:
-        """Add a note on resuming to an error of the body, and remove an empty store."""
+        """If the body raises an error, add a note on how to resume, or remove an empty store."""
         try:
             yield
         except BaseException as error:
             if self._removed or not self.lasting:
                 raise
-            with suppress(LidarError):  # report the first error
+            with suppress(LidarError):  # the first error is reported instead
                 self.save(force=True)
             if self._remote and self._remote.lost:
                 self.db.close()
                 raise
-            committed = self.committed_in_words
+            committed = self.committed_text
             self.close()
             if committed and self._folder.local(FILE).exists():
                 error.add_note(
@@ -508,17 +525,27 @@ class RunStore:
             raise
 
     def close(self) -> None:
-        """Close the database of an unfinished run, and remove an empty store."""
+        """Close the database of an unfinished run, and remove the store if it is empty."""
         used = self.db.used or self.begun
         self.db.close()
         if not used:
             with suppress(OSError, LidarError):
                 _remove(self.location, self.storage, self.db.meta["mark"])
-            self._folder.remove([FILE])  # removed even if the storage of the parts has failed
+            self._folder.remove([FILE])  # remove it even if the parts storage has failed
 
 
-def with_sensors(sensors: Mapping[str, str], added: Iterable[tuple[str, str]]) -> dict[str, str]:
-    """Return {name of a sensor: its kinds in words} with more sensors, in any order of addition."""
+def add_sensors(sensors: Mapping[str, str], added: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """Add sensors to descriptions of sensor models.
+
+    The result does not depend on the order in which sensors are added.
+
+    Parameters
+    ----------
+    sensors
+        Descriptions of the models by sensor name, separated by semicolons.
+    added
+        Names of further sensors and descriptions of their models.
+    """
     merged = dict(sensors)
     for name, words in added:
         kinds = {*merged.get(name, words).split("; "), *words.split("; ")}
@@ -528,26 +555,35 @@ def with_sensors(sensors: Mapping[str, str], added: Iterable[tuple[str, str]]) -
     return dict(sorted(merged.items()))
 
 
-def _kind_in_words(sensor: Sensor) -> str:
+def _describe_model(sensor: Sensor) -> str:
     return f"{sensor.model}, {rounded(1e9 / sensor.revolution_start_ns(1))} Hz"
 
 
-def _hash_of(job: Job) -> str:
-    """Return the hash of a job's inputs, or no text if it has none, and is not resumed."""
+def _hash_inputs(job: Job) -> str:
+    """Return the hash of a job's inputs, or an empty string if they cannot be hashed.
+
+    A job without a hash cannot be resumed.
+    """
     try:
-        return fingerprint(identity_of(job))
+        return fingerprint(input_fingerprints(job))
     except LidarError:
         return ""
 
 
 def _database_path(folder: Storage) -> Path:
-    """Return the path of the database in a local folder. LidarError if the file is a link."""
-    folder.local(f"{FILE}-journal")  # SQLite would follow a link here, too
+    """Return the path of the database in a local folder.
+
+    Raise LidarError if the file is a symbolic link.
+    """
+    folder.local(f"{FILE}-journal")  # SQLite would follow a link to the journal, too
     return folder.local(FILE)
 
 
 def parts_of(location: Storage, parts_location: str) -> Storage:
-    """Return the storage of the parts: `parts_location`, or below the run's location if empty."""
+    """Return the storage of a run's parts.
+
+    If `parts_location` is empty, the parts are stored in a subfolder of the run's location.
+    """
     folder, _, name = parts_location.rpartition("/")
     return Storage.at(folder or "/").below(name) if parts_location else location.below(PARTS)
 
@@ -583,12 +619,12 @@ def remove_run(folder: str | Path | Storage) -> None:
 
 
 def _remove(location: Storage, part_storage: Storage, mark: str | None) -> None:
-    """Remove the database of a run, and the parts that have its mark.
+    """Remove the database of a run and the parts with its mark.
 
-    If `mark` is None, because the database could not be read, the mark file in the folder of the
-    parts counts.
+    If `mark` is None because the database cannot be read, the parts of all mark files in the parts
+    folder are removed.
     """
     with explained(f"The run in {location} cannot be removed"):
-        names = deletable_files(part_storage, mark)  # an error if they are behind a link
+        names = deletable_files(part_storage, mark)  # fails if the folder is a symbolic link
         part_storage.remove(names, folder=True)
         location.remove([FILE, f"{FILE}-journal", OWNER], folder=True)

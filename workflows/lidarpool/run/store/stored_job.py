@@ -1,4 +1,4 @@
-"""Reads the committed results of a job from the store of its run."""
+"""Committed results of a job, read from the run store."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ from .database import RunDatabase
 
 @dataclass(frozen=True, eq=False)
 class StoredJob:
-    """A job whose committed results are in the store of a run.
+    """Job whose committed results are in a run store.
 
     Parameters
     ----------
     job
-        The job.
+        Job of the run.
     committed
-        Its committed results, which grow during the run.
+        Committed results of the job, which grow during the run.
     storage
         Storage of the job's parts.
     db
@@ -48,8 +48,8 @@ class StoredJob:
     resumed
         Number of scans whose points come from an earlier run.
     keeper
-        Object that must live as long as the points are in use, because the parts are deleted with
-        it.
+        Object that must exist as long as the points are in use, because the parts may be deleted
+        when it is garbage collected.
     """
 
     job: Job
@@ -61,36 +61,36 @@ class StoredJob:
 
     @property
     def scans(self) -> range:
-        """Scans of the job that are to be cast."""
+        """Scans of the job that this run casts."""
         return self.committed.scans
 
     @property
     def parts(self) -> CommittedParts:
-        """Committed parts."""
+        """Committed parts of the job."""
         return self.committed.parts
 
     @property
     def trials(self) -> list[Trial]:
-        """Committed planning trials."""
+        """Committed planning trials of the job."""
         return self.committed.trials
 
     def receipt(self, name: str) -> Receipt | None:
-        """Return the receipt of a part in storage, or None if the part is damaged."""
+        """Create the receipt of a part in the storage, or return None if the part is damaged."""
         try:
             data = self.storage.read(name)
             return Receipt.from_part(unpack(data), self.job.number, name, len(data))
         except LidarError:
             return None
         except OSError as error:
-            if error.errno in (errno.EIO, errno.ENOENT):  # a bad disk, or the part was just removed
+            if error.errno in (errno.EIO, errno.ENOENT):  # disk error, or the part was removed
                 return None
             raise LidarError(
                 f"The part {self.storage.path(name)} cannot be read: {error.strerror or error}."
             ) from error
 
     @property
-    def committed_in_words(self) -> str:
-        """Number of committed scans or trials in words, or no text if nothing is committed."""
+    def committed_text(self) -> str:
+        """Number of committed scans or trials as text, or an empty string for none."""
         if self.parts.scans_done:
             return f"{self.parts.scans_done:,} of {len(self.scans):,} scans"
         if self.trials:
@@ -99,11 +99,11 @@ class StoredJob:
 
     @property
     def complete(self) -> bool:
-        """True if all scans and planning trials are committed, and all frames were handed out."""
+        """True if all scans and planning trials are committed and all frames were delivered."""
         return self.committed.scans_complete and len(self.trials) == self.job.trials
 
     def progress(self) -> Progress:
-        """Return the progress of a resumed run at its start."""
+        """Return the progress of the job according to its committed results."""
         start = self.scans.start
         stop = self.scans.stop
         frames = self.committed.frames
@@ -122,7 +122,7 @@ class StoredJob:
         )
 
     def points(self) -> StoredCloud:
-        """Return the points that are committed so far."""
+        """Return the points that have been committed so far."""
         parts = self.parts.ordered
         job = self.job
         world = job.survey.coordinates == "world"
@@ -139,7 +139,7 @@ class StoredJob:
             sweeps=partial(Sweeps.from_survey, job.survey, job.scene),
         )
 
-    def points_of_scan(self, scan: int) -> Cloud:
+    def read_scan(self, scan: int) -> Cloud:
         """Return the points of a committed scan."""
         part = self.parts.part_of(scan)
         columns = read_part(self.storage, part.name)
@@ -149,7 +149,7 @@ class StoredJob:
         return self.points().cloud_of(columns, rows)
 
     def frames(self, summaries: Summaries) -> Iterator[ScanFrame]:
-        """Yield the scans in `summaries` that were not handed out yet as frames."""
+        """Yield a frame for each scan in `summaries` that has not been delivered yet."""
         survey = self.job.survey
         dtype = summary_type(samples_of_scan(survey.scan_count))
         for scan, summary in zip(
@@ -168,14 +168,16 @@ class StoredJob:
                 samples=samples[~np.isnan(samples[:, 0])],
                 _triangles=self.job.scene.triangles,
                 _survey=survey,
-                _read=self.points_of_scan,
+                _read=self.read_scan,
             )
 
     def hit_counts(self) -> Ints:
-        """Return the committed hits by hit counters of the scene: (counters,).
+        """Return the number of committed hits for each hit counter of the scene.
 
-        A face of the scene, an instance, and a triangle of an actor have a counter each
-        (`Scene.counters`).
+        Returns
+        -------
+        int64 array of shape (counters,). Each face of the scene, each instance, and each triangle
+        of an actor has a counter (`Scene.counters`).
         """
         counts = np.zeros(self.job.scene.counters, np.int64)
         for part in self.parts.ordered:
@@ -184,7 +186,12 @@ class StoredJob:
         return counts
 
     def sample_rays(self) -> Floats32:
-        """Return starts and ends of sample rays, (k, 2, 3), meters, local coordinates."""
+        """Return the start and end points of sample rays, in meters in local coordinates.
+
+        Returns
+        -------
+        float32 array of shape (k, 2, 3).
+        """
         survey = self.job.survey
         samples = samples_of_scan(survey.scan_count)
         dtype = summary_type(samples)
