@@ -225,7 +225,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - inherits the docstring
         chosen = options_of_call("run", options, without=_UNUSED_BY_CAMPAIGNS)
         folder = Storage.at(target).below(RUN_FOLDER)
         run_options = RunOptions(folder=folder, **chosen).with_pool(self.pool, chosen)
-        jobs = self.of_shard(Shard(*shard))
+        jobs = self.for_shard(Shard(*shard))
         with page_of(jobs, run_options.live) as page:
             return run_campaign(target, jobs, run_options, Screen(on_progress), page)
 

@@ -87,7 +87,7 @@ def forecast_scenario(
         figures["warnings"] += implausibilities(prepared)
         figures["sources"] = dict(prepared.findings.sources)
         if campaign is not None:
-            file_format = campaign.keep.of_jobs
+            file_format = campaign.keep.export_spec
             figures["notes"] += file_format.frame_notes(scenario.cloud.coordinates)
             figures["notes"] += file_format.cloud_format.renaming_notes([*scenario.sensors])
             if "class" in file_format.needs:

@@ -129,7 +129,7 @@ def run_campaign(
             "`--pace` can only be used with a single survey, not with a campaign."
         )
     options = options.with_pool(campaign.pool, {"backend": backend})
-    campaign.keep.of_jobs.check_installed()
+    campaign.keep.export_spec.check_installed()
     for warning in _first_job_warnings(campaign, terminal):
         terminal.warn(warning)
     with page_of(campaign, options.live) as page:

@@ -186,7 +186,7 @@ class _Casting:
         self._casting = CastingWorkers(partition, run, workers.backend, workers.software)
         self._dispatcher = Dispatcher(self._casting, collector_count=1, mark="")
         self._watch = Watch(client, [GPU], (), options.worker_timeout_s)
-        columns = stream.campaign.keep.of_jobs.needs
+        columns = stream.campaign.keep.export_spec.needs
         self._maker = JobMaker(stream.campaign, stream.numbers, columns)
         self._jobs: dict[int, _StreamedSweeps] = {}  # {number of a job: its sweeps}
         self._next: _StreamedSweeps | None = None  # sweeps that are cast next
