@@ -40,10 +40,10 @@ from .static_scene import Findings, SceneCache, Shapes, StaticScene, read_static
 from .traffic import (
     TrafficContent,
     TrafficSection,
-    TravellerChoice,
+    TravelerFilter,
     VehicleSection,
-    actors_of,
-    carrier_of,
+    build_traffic_actors,
+    platform_track,
     read_fcd,
 )
 
@@ -215,12 +215,12 @@ def _carrier_track(shapes: Shapes, standing: StandingSurfaces) -> Track | None:
         )
     section = scenario.traffic
     assert section is not None, "checked with the scenario"
-    content = _traffic_content(scenario, -np.inf, np.inf, TravellerChoice(only=entry.vehicle))
-    return carrier_of(entry, section, content, shapes.mesh_of, standing)
+    content = _traffic_content(scenario, -np.inf, np.inf, TravelerFilter(only=entry.vehicle))
+    return platform_track(entry, section, content, shapes.load_mesh, standing)
 
 
 def _traffic_content(
-    scenario: Scenario, first_s: float, last_s: float, choice: TravellerChoice
+    scenario: Scenario, first_s: float, last_s: float, choice: TravelerFilter
 ) -> TrafficContent:
     """Read the traffic of a scenario between two times, by the clock of its file."""
     section = scenario.traffic
@@ -243,8 +243,8 @@ def _placing(scenario: Scenario, scene: Scene, findings: Findings, sensor: Mount
         scene,
         sensor,
         landscape=bool(findings.landscapes),
-        buildings=findings.named(BUILDING),
-        roads=findings.named(ROAD_SURFACE),
+        buildings=findings.class_patterns(BUILDING),
+        roads=findings.class_patterns(ROAD_SURFACE),
         narrow=is_unmounted and scenario.sensor.model_fields_set <= {"unseen"},
     )
 
@@ -339,7 +339,7 @@ def _mount_pose(section: SensorSection, shapes: Shapes) -> Pose:
     if mount is None or mount.link is None:
         return CENTER if mount is None else mount.pose()
     carriers = [
-        (entry, shapes.robot(entry.robot))
+        (entry, shapes.load_robot(entry.robot))
         for entry in scenario.actors
         if entry.is_carrier and entry.robot
     ]
@@ -390,10 +390,10 @@ def _build_actors(shapes: Shapes, standing: StandingSurfaces, track: Track | Non
     for entry, trajectory in zip(scenario.actors, trajectories, strict=True):
         if entry.robot:
             with prefixed(f"{scenario.source}: actor {entry.name!r}"):
-                actors += _robot_actors(entry, shapes.robot(entry.robot), trajectory, shapes)
+                actors += _robot_actors(entry, shapes.load_robot(entry.robot), trajectory, shapes)
         else:
             offset_s = 0.0 if entry.animation is None else entry.animation.offset_s
-            mesh = replace(shapes.mesh_of(entry), name=entry.name)
+            mesh = replace(shapes.load_mesh(entry), name=entry.name)
             actors.append(Actor(mesh, trajectory, offset_s, entry.spray))
     return actors
 
@@ -431,10 +431,10 @@ def _traffic_actors(
     scenario = shapes.scenario
     file_stop_s = file_start_s + duration_s
     carrier = None if scenario.trajectory is None else scenario.trajectory.vehicle
-    choice = TravellerChoice(without=carrier)
+    choice = TravelerFilter(without=carrier)
     content = _traffic_content(scenario, file_start_s, file_stop_s, choice)
     findings.notes += content.notes
-    actors = actors_of(section, content.passages, shapes.mesh_of, standing, start_s)
+    actors = build_traffic_actors(section, content.passages, shapes.load_mesh, standing, start_s)
     if not actors:
         findings.notes.append(
             f"{section.file} has no vehicle or person in the scene from {file_start_s:g} to "
@@ -478,7 +478,9 @@ def _materials(
         )
         materials = with_class(materials or [default_material], semantic_class, vehicle_rows, kinds)
     if findings.classes:
-        class_patterns = {number: findings.named(number) for number in findings.class_names}
+        class_patterns = {
+            number: findings.class_patterns(number) for number in findings.class_names
+        }
         materials = with_classes(materials or [default_material], class_patterns, kinds)
     return materials
 
