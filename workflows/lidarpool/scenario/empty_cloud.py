@@ -13,7 +13,7 @@ from lidarsim.survey.survey import Survey
 from lidarsim.words import joined, plural, rounded
 
 from ..datasets.job_table import JobRow
-from .default_poses import seen_from
+from .default_poses import outside_view_hint
 
 EMPTY = "the cloud has no points"
 NO_POINTS = "no points: "  # before the names of jobs
@@ -39,7 +39,7 @@ def empty_cloud_reason(scene: Scene, survey: Survey, scans: range | None = None)
     if not len(ranges):
         faults = "faults, " * bool(survey.faults)
         unseen = "unseen, " * any(carried.unseen for carried in survey.carried)
-        poses_note = seen_from(scene, survey.carried[0])
+        poses_note = outside_view_hint(scene, survey.carried[0])
         return (
             f"no ray hits a surface at any distance. Check {unseen}{faults}poses and units. "
             f"{_start(scene, survey)}. {poses_note}"

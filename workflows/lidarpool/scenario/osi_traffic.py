@@ -92,9 +92,7 @@ class _PassageCollector:
     Of the messages before the first time, only the last is kept.
     """
 
-    def __init__(
-        self, section: TrafficSection, first_s: float, travelers: TravelerFilter
-    ) -> None:
+    def __init__(self, section: TrafficSection, first_s: float, travelers: TravelerFilter) -> None:
         self.passages: list[ObjectPassage] = []
         self.travelers: dict[int, tuple[int, ObjectPassage]] = {}  # {ID: (last message, passage)}
         self.shapeless: dict[int, str] = {}  # {ID: type} of objects without a size and an entry

@@ -20,7 +20,7 @@ from lidarsim.simulator.casting.visibility import static_key, unseen_objects, wi
 from lidarsim.survey.survey import Survey
 from lidarsim.words import as_scenario, printable, rounded
 
-from .default_poses import free_above, on_one_line, seen_from, surroundings_of
+from .default_poses import find_free_position_above, on_one_line, outside_view_hint, surroundings_of
 from .prepare import Prepared
 
 GROUND_SPEED_M_S = 150.0  # faster than trains, except on test tracks
@@ -139,7 +139,9 @@ def _position_warnings(
             first = samples[int(under.argmax())]
             seen = seen_by[first.sensor]
             assert seen is not None  # it is below objects of these
-            free = None if survey.path.moves else free_above(scene, seen, first.position)
+            free = (
+                None if survey.path.moves else find_free_position_above(scene, seen, first.position)
+            )
             yield (
                 f"the sensor is below the scene{where(under)}. Check z, the heights and `up_axis`"
                 f"{_moved_pose(scene, survey, first, free)}"
@@ -179,7 +181,7 @@ def _way_out(
         if (free := seen.find_free_position(first.position)) is not None:
             return _moved_pose(scene, survey, first, free)
         if body.is_whole_scene:
-            return f". {seen_from(scene, survey.carried[0])}"
+            return f". {outside_view_hint(scene, survey.carried[0])}"
     lower, upper = (", ".join(f"{x:,.2f}" for x in corner) for corner in body.bounds + scene.origin)
     return f". The body extends from ({lower}) to ({upper})"
 
