@@ -19,7 +19,7 @@ from lidarpool import Mounted, Scene, SceneInstance, SceneMesh, Sensor, Survey, 
 from lidarpool.cli.commands import cli
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.default_poses import place_sensor, poses_around
-from lidarpool.scenario.plausibility import implausibilities
+from lidarpool.scenario.plausibility import plausibility_warnings
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
@@ -223,11 +223,11 @@ def test_poses_within_a_closed_body_are_told_of_with_some_that_see_it(tmp_path):
     (tmp_path / "b.stl").write_bytes(creation.icosphere(3, 5.0).export(file_type="stl"))
     data = {"scene": {"files": ["b.stl"]}, "poses": [[0, 0, 0]]}
     given = Scenario.from_data(data, folder=tmp_path)
-    [warning] = implausibilities(prepare(given))
+    [warning] = plausibility_warnings(prepare(given))
     assert "only the back faces of surfaces" in warning
     assert "To view the scene from outside, use poses: [{position: [" in warning
     data["poses"] = [[0, 0, 9]]
-    assert implausibilities(prepare(Scenario.from_data(data, folder=tmp_path))) == []
+    assert plausibility_warnings(prepare(Scenario.from_data(data, folder=tmp_path))) == []
 
 
 @pytest.mark.parametrize("far", [0.2, 5.0])

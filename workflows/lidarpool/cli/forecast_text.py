@@ -26,7 +26,7 @@ from ..scenario.advice import advice, unlabeled
 from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_sections import is_campaign
 from ..scenario.job import Job
-from ..scenario.plausibility import implausibilities
+from ..scenario.plausibility import plausibility_warnings
 from ..scenario.prepare import prepare
 from ..scenario.scenario import Scenario
 from .shared_options import world_lines
@@ -84,7 +84,7 @@ def forecast_scenario(
                 refuse=None if has_jobs else lambda: output.check_existing(OneJob(job)),
             )
         figures["notes"] += advice(prepared)
-        figures["warnings"] += implausibilities(prepared)
+        figures["warnings"] += plausibility_warnings(prepared)
         figures["sources"] = dict(prepared.findings.sources)
         if campaign is not None:
             file_format = campaign.keep.export_spec

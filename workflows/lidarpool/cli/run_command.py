@@ -37,7 +37,7 @@ from ..run.store.run_store import RUN_FOLDER
 from ..scenario.advice import advice
 from ..scenario.campaign import CampaignSpec
 from ..scenario.job import Job
-from ..scenario.plausibility import implausibilities
+from ..scenario.plausibility import plausibility_warnings
 from ..scenario.prepare import Prepared, prepare
 from ..scenario.scenario import Scenario
 from .shared_options import show
@@ -68,7 +68,7 @@ def run_scenario(
     with terminal.status("reading the scene", logged=False):
         prepared = prepare(scenario)
     timeline.mark(timeline.SCENE)
-    for warning in implausibilities(prepared):
+    for warning in plausibility_warnings(prepared):
         terminal.warn(warning)
     if shard is None:
         _run_survey(prepared, out, options, terminal, extent)
@@ -162,7 +162,7 @@ def _first_job_warnings(campaign: CampaignSpec, terminal: Terminal) -> list[str]
     number = campaign.numbers[0]
     with suppress(LidarError), terminal.status("reading the scene", logged=False):
         if (scenario := campaign.scenario(number)) is not None:  # else a function makes the jobs
-            warnings = implausibilities(prepare(scenario, plans=False))
+            warnings = plausibility_warnings(prepare(scenario, plans=False))
             return [f"job {campaign.name(number)}: {warning}" for warning in warnings]
     return []
 
@@ -193,7 +193,7 @@ def run_job(
         options = replace(options, folder=Storage.at(out).below(RUN_FOLDER))
         compare = partial(_compare_with_dataset, target, number, name)
     prepared = campaign.prepare(number, dataset.columns)
-    for warning in implausibilities(prepared):
+    for warning in plausibility_warnings(prepared):
         terminal.warn(warning)
     prepared = replace(prepared, job=prepared.job.with_fields(number=0))
     options = options.with_pool(prepared.scenario.pool, {"backend": backend})

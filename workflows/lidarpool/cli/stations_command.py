@@ -357,7 +357,7 @@ def _prepared_with_notes(scenario: Scenario, terminal: Terminal) -> tuple[Prepar
     notes = advice(replace(prepared, placing=Placing(())))
     for note in notes:
         terminal.tell(note)
-    if problem := prepared.job.place_problem:
+    if problem := prepared.job.location_warning:
         terminal.warn(problem)
     return prepared, [*notes, *terminal.warnings]
 

@@ -40,8 +40,8 @@ class Committed:
     def notes(self) -> tuple[str, ...]:
         """Notes of the run, after the warnings about its scenario."""
         only_job = self.store.only_job
-        place_problem = "" if only_job is None else only_job.job.place_problem
-        notes = (*self.store.warnings, place_problem, *self.store.notes)
+        location_warning = "" if only_job is None else only_job.job.location_warning
+        notes = (*self.store.warnings, location_warning, *self.store.notes)
         return tuple(dict.fromkeys(filter(None, notes)))
 
     def result(self, screen: Screen) -> RunResult:

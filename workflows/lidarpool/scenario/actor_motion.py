@@ -263,7 +263,7 @@ class TrajectorySection(Section):
         if self.surfaces is None:
             return track
         # The trajectory is split where it leaves the surfaces, so a piece may be too short.
-        pieces = follow_surfaces(replace(track, beyond="hold"), standing.of_objects(self.surfaces))
+        pieces = follow_surfaces(replace(track, beyond="hold"), standing.select(self.surfaces))
         if len(pieces) == 1 and self.beyond == "absent":
             return replace(pieces[0], beyond="absent")
         assert track.start_s is not None  # set by Track.__post_init__

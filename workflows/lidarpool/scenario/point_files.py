@@ -1,4 +1,4 @@
-"""Reads the points of files from which scenes are created, with their quantities."""
+"""Reader of point cloud files from which scenes are created."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from lidarsim.words import plural, printable
 from ..clouds.format_table import format_of_path, point_suffixes
 from ..clouds.recording import METERS, Recording, RecordingSource
 
-MIN_POINTS = 12  # minimum for a scene, because each surfel is fitted to as many points
+MIN_POINTS = 12  # number of points to which each surfel is fitted
 POINT_BYTES = 700  # peak memory per point while surfels are computed and written
 NO_CLASS = np.iinfo(np.int64).min  # class of a point without a class
 _SAMPLE = 1000  # points at which the lengths in another coordinate system are checked
@@ -46,8 +46,8 @@ def read_points(
 ) -> tuple[Sweep, int | None]:
     """Read the finite points of a file in true meters, and their EPSG code if it is known.
 
-    Scans are joined in the frame of the file. The sweep contains those of the following columns
-    that the file has:
+    Scans are merged in the frame of the file. The sweep contains the following columns if the file
+    has them:
 
     - `class`: int64, `NO_CLASS` for points without a class.
     - `intensity`: float64, not negative, on the scale of the file.
@@ -113,7 +113,10 @@ def read_points(
 
 
 def vectors(points: Sweep, names: Sequence[str]) -> AnyArray | None:
-    """Return columns as the components of vectors (n, k), or None if the first is missing."""
+    """Return columns as an array of vectors, or None if the first column is missing.
+
+    The result has shape (n, k), where k is the number of columns.
+    """
     if names[0] not in points.columns:
         return None
     return np.stack([points.columns[name] for name in names], axis=1)
@@ -135,17 +138,17 @@ def _check_points(path: Path, points: Sweep, omitted: OmittedPoints) -> None:
 
 
 class _Content(NamedTuple):
-    """Content of a file."""
+    """Content of a point cloud file."""
 
-    # Points in the units and the frame of the file. Columns that are used have the names of the
-    # file, and `skipped` lists all columns with values other than zero.
+    # Points in the units and the frame of the file. The columns have the same names as in the file,
+    # and `skipped` lists all columns with values other than zero.
     points: Sweep
     omitted: OmittedPoints  # withheld points and noise
     no_returns: int  # number of points at the origin that were skipped
 
 
 def _read(recording: Recording, keep_noise: bool) -> _Content:
-    """Read the scans or parts of a file, and join them in the frame of the file.
+    """Read the scans or parts of a file, and merge them in the frame of the file.
 
     Raises LidarError if there is not enough memory for the points.
     """
@@ -250,10 +253,10 @@ def _to_meters(
     epsg: int | None,
     tell: Callable[[str], None],
 ) -> tuple[Callable[[Floats], Floats], int | None]:
-    """Return a function that converts positions (n, 3) to true meters, and their EPSG code.
+    """Return a function that converts positions to true meters, and the resulting EPSG code.
 
     The code is None if the coordinate system of the converted positions is unknown. `tell` is
-    called with notes on the conversion.
+    called with notes on the conversion. Positions have shape (n, 3).
     """
     finite = points.points[np.isfinite(points.points).all(axis=1)]
     if epsg is not None:
@@ -348,7 +351,7 @@ def _first(columns: Columns, *quantities: Sequence[str]) -> Columns:
 
 
 def _stacked(group: Columns) -> AnyArray:
-    """Return columns as the components of vectors (n, k)."""
+    """Return columns as an array of vectors. Shape (n, k)."""
     return np.stack([*group.values()], axis=1)
 
 
@@ -371,7 +374,7 @@ def _as_integers(classes: AnyArray) -> Ints:
 
 
 def _as_srgb(colors: AnyArray) -> Floats32:
-    """Return colors (n, 3) from 0 to 255.
+    """Convert colors to the range from 0 to 255. Shape (n, 3).
 
     The input has 8 or 16 bits, or consists of floats from 0 to 1 or from 0 to 255.
     """

@@ -641,7 +641,7 @@ def _scatter_positions(scatter: Scatter, seeds: list[int], standing: StandingSur
     -------
     Array of shape (count, 3).
     """
-    surfaces = standing.of_objects(scatter.surfaces)
+    surfaces = standing.select(scatter.surfaces)
     x0, y0, x1, y1 = surfaces.rectangle if scatter.within is None else scatter.within
     rng = np.random.Generator(np.random.PCG64([0, *seeds]))
     occupied = _OccupiedPositions(scatter.spacing_m)

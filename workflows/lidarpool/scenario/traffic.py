@@ -544,7 +544,7 @@ def _passage_tracks(
     """
     track = passage.track(section, mesh, standing.origin, start_s)
     if section.surfaces:
-        return follow_surfaces(track, standing.of_objects(section.surfaces))
+        return follow_surfaces(track, standing.select(section.surfaces))
     return [track]
 
 
