@@ -408,7 +408,7 @@ class ActorSection(DeformingSection):
         return self
 
     @property
-    def is_carrier(self) -> bool:
+    def is_platform(self) -> bool:
         """Whether the actor is the platform, which follows the trajectory of the survey."""
         return self.trajectory is None and self.at is None
 

@@ -26,7 +26,7 @@ from lidarsim.words import as_scenario, listed, plural, rounded
 
 from .georeference import missing_epsg_note
 from .prepare import Prepared
-from .scenario import Scenario, survey_of
+from .scenario import Scenario, mesh_survey_name
 
 # Plausible lengths of scenes. Larger or smaller scenes probably have a wrong unit.
 LARGE_M = 500.0
@@ -109,7 +109,7 @@ def unlabeled(scene: Scene, survey: Survey) -> list[str]:
 def _is_of_mesh(scenario: Scenario) -> bool:
     """Return whether a mesh file was passed in place of a scenario."""
     files = [scenario.path(entry.file) for entry in scenario.scene.files]
-    return scenario.source in map(survey_of, files)
+    return scenario.source in map(mesh_survey_name, files)
 
 
 def _for_mesh(remark: str) -> str:
@@ -146,9 +146,8 @@ def _size_note(prepared: Prepared, side: float) -> str:
     scenario = prepared.scenario
     placing = prepared.placing
     files = [entry.file for entry in scenario.scene.files if entry.unit is None]
-    files = [
-        file for file in files if file not in prepared.findings.classes
-    ]  # city models are large
+    # City models, whose files assign classes, are large.
+    files = [file for file in files if file not in prepared.findings.classes]
     unitless = [file for file in files if _lacks_unit(scenario.path(file))]
     has_stl = any(file.lower().endswith(".stl") for file in unitless)
     min_m = SMALL_M
