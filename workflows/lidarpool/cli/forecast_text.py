@@ -22,7 +22,7 @@ from ..run.forecast import forecast
 from ..run.job_source import OneJob
 from ..run.options import RunOptions
 from ..run.pipeline.stage_names import GPU
-from ..scenario.advice import advice, unlabeled
+from ..scenario.advice import advice, unlabeled_notes
 from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_sections import is_campaign
 from ..scenario.job import Job
@@ -91,7 +91,7 @@ def forecast_scenario(
             figures["notes"] += file_format.frame_notes(scenario.cloud.coordinates)
             figures["notes"] += file_format.cloud_format.renaming_notes([*scenario.sensors])
             if "class" in file_format.needs:
-                figures["notes"] += unlabeled(job.scene, job.survey)
+                figures["notes"] += unlabeled_notes(job.scene, job.survey)
             figures["job"] = _job_figures(campaign, job_number, figures)
         return job, figures
 

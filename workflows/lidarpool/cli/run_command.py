@@ -38,7 +38,7 @@ from ..scenario.advice import advice
 from ..scenario.campaign import CampaignSpec
 from ..scenario.job import Job
 from ..scenario.plausibility import plausibility_warnings
-from ..scenario.prepare import Prepared, prepare
+from ..scenario.prepare import PreparedScenario, prepare
 from ..scenario.scenario import Scenario
 from .shared_options import show
 from .terminal import Terminal
@@ -87,7 +87,7 @@ def run_scenario(
 
 
 def _run_survey(
-    prepared: Prepared,
+    prepared: PreparedScenario,
     out: Path | Storage,
     options: RunOptions,
     terminal: Terminal,

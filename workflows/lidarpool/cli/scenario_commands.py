@@ -78,7 +78,7 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
         scenario = Scenario.from_data(content, source=str(target))
         prepared = prepare(scenario, plans=False)
         notes = advice(prepared)
-        if (placing := prepared.placing) is not None:
+        if (placing := prepared.placement) is not None:
             note = placing.note
             data["poses"] = placing.entries
             data |= {"sensor": dict(placing.grid)} if placing.grid else {}

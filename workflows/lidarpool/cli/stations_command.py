@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from lidarsim.numerics.arrays import Floats
 
     from ..plan.stations import StationPlan, SurveyCoverage
-    from ..scenario.prepare import Prepared
+    from ..scenario.prepare import PreparedScenario
     from ..scenario.scenario import Scenario
     from .terminal import Terminal
 
@@ -312,7 +312,7 @@ def _show_coverage(
     options.show(figures, chain([head], table, note_lines), as_json)
 
 
-def _station_positions(prepared: Prepared) -> Floats:
+def _station_positions(prepared: PreparedScenario) -> Floats:
     """Return the positions (s, 3) of the sensor at all stations, world meters."""
     path = prepared.survey.path
     mount = prepared.survey.carried[0].mount
@@ -320,7 +320,7 @@ def _station_positions(prepared: Prepared) -> Floats:
     return prepared.scene.georeferenced((0, 0, 0)).origin + [pose.position for pose in poses]
 
 
-def _coverage_figures(coverage: SurveyCoverage, prepared: Prepared) -> dict[str, Any]:
+def _coverage_figures(coverage: SurveyCoverage, prepared: PreparedScenario) -> dict[str, Any]:
     """Return the figures of what a cloud covers for --json."""
     names = prepared.scene.names
     reachable_m2 = float(coverage.reachable_m2.sum())
@@ -343,18 +343,20 @@ def _object_figures(
     }
 
 
-def _prepared_with_notes(scenario: Scenario, terminal: Terminal) -> tuple[Prepared, list[str]]:
+def _prepared_with_notes(
+    scenario: Scenario, terminal: Terminal
+) -> tuple[PreparedScenario, list[str]]:
     """Prepare a scenario whose poses do not matter.
 
     Returns its notes and warnings, which are printed at once.
     """
     from ..scenario.advice import advice
-    from ..scenario.default_poses import Placing
+    from ..scenario.default_poses import SensorPlacement
     from ..scenario.prepare import prepare
 
     with terminal.status("reading the scene", logged=False):
         prepared = prepare(scenario, plans=False)
-    notes = advice(replace(prepared, placing=Placing(())))
+    notes = advice(replace(prepared, placement=SensorPlacement(())))
     for note in notes:
         terminal.tell(note)
     if problem := prepared.job.location_warning:
@@ -367,7 +369,7 @@ def _of_targets(targets: Sequence[str]) -> str:
     return f" of {joined(targets)}" if targets else ""
 
 
-def _target_notes(plan: StationPlan, prepared: Prepared) -> Iterator[str]:
+def _target_notes(plan: StationPlan, prepared: PreparedScenario) -> Iterator[str]:
     """Yield a note if all objects are covered, and one of them has most of the area."""
     reachable_m2 = plan.reachable_m2
     largest = int(reachable_m2.argmax())
@@ -458,7 +460,7 @@ def _stations_scenario(
 
 
 def _plan_figures(
-    plan: StationPlan, prepared: Prepared, sensor: str, notes: list[str]
+    plan: StationPlan, prepared: PreparedScenario, sensor: str, notes: list[str]
 ) -> dict[str, Any]:
     """Return the figures of a plan for --json."""
     names = prepared.scene.names
@@ -477,7 +479,9 @@ def _plan_figures(
     }
 
 
-def _plan_lines(plan: StationPlan, prepared: Prepared, targets: Sequence[str]) -> Iterator[str]:
+def _plan_lines(
+    plan: StationPlan, prepared: PreparedScenario, targets: Sequence[str]
+) -> Iterator[str]:
     """Yield a plan as lines of text: stations, then objects, the largest uncovered area first."""
     names = prepared.scene.names
     yield (

@@ -37,7 +37,7 @@ from ..clouds.kitti import kitti_intensity
 from ..datasets.job_table import JobRow
 from ..datasets.sweep_data import sweep_of_job
 from ..scenario.campaign import CampaignSpec
-from ..scenario.campaign_sections import Keep
+from ..scenario.campaign_sections import DatasetFormat
 from ..scenario.empty_cloud import empty_cloud_reason
 from ..scenario.job import Job
 from .cluster.checks import check_workers, find_workers
@@ -132,7 +132,7 @@ class _StreamedSweeps:
     """
 
     job: Job
-    keep: Keep
+    keep: DatasetFormat
     casting: PipelineJob
     columns: dict[int, PartColumns] = field(default_factory=dict)  # {first scan: batch}
     sweeps_begun: int = 0  # sweeps that the dispatcher has or had

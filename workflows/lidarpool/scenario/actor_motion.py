@@ -26,15 +26,15 @@ from lidarsim.numerics.arrays import Floats
 from lidarsim.schema.declared import Several, Text, TextOrTexts, about, by_text, declared, one_of
 from lidarsim.survey.survey import Mounted, StepCount
 
-from .ground import StandingSurfaces, follow_surfaces
+from .ground import SupportSurfaces, follow_surfaces
 from .sections import (
     DeformingSection,
     IgnoredColumns,
     MeshEntry,
     MeshFile,
     NoiseSection,
-    PathOf,
     PoseEntry,
+    ResolvePath,
     ReturnsSection,
     Section,
     SensorSection,
@@ -70,7 +70,7 @@ class MountSection(Section, InstrumentPose):
 MountEntry = Annotated[MountSection, by_position(MountSection)]
 
 
-class CarriedSection(SensorSection):
+class MountedSensorSection(SensorSection):
     """A sensor on a platform, with its mount, start and time steps.
 
     In YAML, the model alone is sufficient.
@@ -92,7 +92,7 @@ class CarriedSection(SensorSection):
 
     def mounted(
         self,
-        path: PathOf,
+        path: ResolvePath,
         mount: Pose,
         noise: NoiseSection,
         returns: ReturnsSection,
@@ -110,7 +110,7 @@ class CarriedSection(SensorSection):
         return replace(mounted, sensor=sensor, steps=self.steps)
 
 
-CarriedEntry = Annotated[CarriedSection, by_text("model", CarriedSection)]
+MountedSensorEntry = Annotated[MountedSensorSection, by_text("model", MountedSensorSection)]
 
 
 class TimedPose(Section, Pose):
@@ -229,8 +229,8 @@ class TrajectorySection(Section):
 
     def track(
         self,
-        path: PathOf,
-        standing: StandingSurfaces,
+        path: ResolvePath,
+        support: SupportSurfaces,
         start_s: float | None = None,
         *,
         name: str,
@@ -242,7 +242,7 @@ class TrajectorySection(Section):
         ----------
         path
             Function that returns the path of a file in the scenario.
-        standing
+        support
             Surfaces of the scene, which the trajectory may follow.
         start_s
             Start of the survey in seconds, relative to the clock of its trajectory.
@@ -257,13 +257,13 @@ class TrajectorySection(Section):
         LidarError
             If a file cannot be read, or if the trajectory leaves its surfaces.
         """
-        track = self._track_without_surfaces(path, standing.origin, start_s)
+        track = self._track_without_surfaces(path, support.origin, start_s)
         if track.quaternions is None:
             without_angles[name] = len(track.with_turns.times_s) > len(track.times_s)
         if self.surfaces is None:
             return track
         # The trajectory is split where it leaves the surfaces, so a piece may be too short.
-        pieces = follow_surfaces(replace(track, beyond="hold"), standing.select(self.surfaces))
+        pieces = follow_surfaces(replace(track, beyond="hold"), support.select(self.surfaces))
         if len(pieces) == 1 and self.beyond == "absent":
             return replace(pieces[0], beyond="absent")
         assert track.start_s is not None  # set by Track.__post_init__
@@ -277,7 +277,7 @@ class TrajectorySection(Section):
             "Shorten it so that it ends on these surfaces."
         )
 
-    def footprint(self, path: PathOf) -> Floats:
+    def footprint(self, path: ResolvePath) -> Floats:
         """Return horizontal positions on the trajectory during the survey.
 
         The positions are in world coordinates, in meters, and have shape (n, 2). If the trajectory
@@ -293,7 +293,9 @@ class TrajectorySection(Section):
         ends, _ = track.poses(0, np.array([0.0, track.duration_ns]))
         return np.concatenate([ends, track.positions[within]])[:, :2]
 
-    def _track_without_surfaces(self, path: PathOf, origin: Floats, start_s: float | None) -> Track:
+    def _track_without_surfaces(
+        self, path: ResolvePath, origin: Floats, start_s: float | None
+    ) -> Track:
         """Return the trajectory in local coordinates, with heights as in the file or points."""
         options: dict[str, Any] = {
             "smooth": self.interpolation == "smooth",
@@ -419,8 +421,8 @@ class ActorSection(DeformingSection):
 
     def track(
         self,
-        path: PathOf,
-        standing: StandingSurfaces,
+        path: ResolvePath,
+        support: SupportSurfaces,
         carrier: Track | None,
         without_angles: dict[str, bool],
     ) -> Track:
@@ -428,7 +430,7 @@ class ActorSection(DeformingSection):
 
         Parameters
         ----------
-        path, standing, without_angles
+        path, support, without_angles
             As for `TrajectorySection.track`.
         carrier
             Trajectory of the survey, or None if the survey has poses.
@@ -436,7 +438,7 @@ class ActorSection(DeformingSection):
         start_s = 0.0 if carrier is None else carrier.start_s or 0.0
         if self.at is not None:
             # Two poses define a clock, which the joints of a robot use.
-            positions = np.array([self.at.position] * 2) - standing.origin
+            positions = np.array([self.at.position] * 2) - support.origin
             rotations = quaternions_of(np.array([self.at.rotation_matrix] * 2))
             times = start_s + np.arange(2.0)
             return Track(times, positions, rotations, start_s=start_s, beyond="hold")
@@ -445,5 +447,5 @@ class ActorSection(DeformingSection):
             return carrier
         with prefixed(f"actor {self.name!r}"):
             return self.trajectory.track(
-                path, standing, start_s, name=self.name, without_angles=without_angles
+                path, support, start_s, name=self.name, without_angles=without_angles
             )

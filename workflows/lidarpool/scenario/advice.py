@@ -25,7 +25,7 @@ from lidarsim.survey.survey import START_FROM, Survey
 from lidarsim.words import as_scenario, listed, plural, rounded
 
 from .georeference import missing_epsg_note
-from .prepare import Prepared
+from .prepare import PreparedScenario
 from .scenario import Scenario, mesh_survey_name
 
 # Plausible lengths of scenes. Larger or smaller scenes probably have a wrong unit.
@@ -39,7 +39,7 @@ HAZE_KM = 10.0  # lidars cannot detect backscatter if the visibility is better
 MIN_STEPS = 100  # minimum length of a scene in units of the precision
 
 
-def advice(prepared: Prepared) -> list[str]:
+def advice(prepared: PreparedScenario) -> list[str]:
     """Return notes about likely mistakes, such as a size that suggests a wrong unit.
 
     The notes also cover skipped objects, files whose up axis was assumed, default poses, and
@@ -48,13 +48,14 @@ def advice(prepared: Prepared) -> list[str]:
     notes = prepared.findings.notes
     remarks = prepared.findings.remarks
     axes = [
-        _for_mesh(remark) if _is_of_mesh(prepared.scenario) else remark for remark in remarks[:1]
+        _with_command_option(remark) if _is_mesh_survey(prepared.scenario) else remark
+        for remark in remarks[:1]
     ]
     if others := len(remarks[1:]):
         axes = [f"{axes[0]}. The same applies to {plural(others, 'other file')}"]
     side = float(np.ptp(prepared.scene.bounds, axis=0).max())
     step = prepared.survey.precision_m
-    placed = () if prepared.placing is None else prepared.placing.notes
+    placed = () if prepared.placement is None else prepared.placement.notes
     system = missing_epsg_note(prepared.scene, prepared.survey.epsg)
     likely = filter(None, (_size_note(prepared, side), system, *placed, _color_note(prepared)))
     coarse = [
@@ -63,7 +64,7 @@ def advice(prepared: Prepared) -> list[str]:
     ] * (side < MIN_STEPS * step)
     labels = _unnamed_classes(prepared.survey)
     if any(column.name == "class" for column in prepared.survey.stored_columns):
-        labels = chain(unlabeled(prepared.scene, prepared.survey), labels)
+        labels = chain(unlabeled_notes(prepared.scene, prepared.survey), labels)
     settings = (*coarse, *_format_notes(prepared), *labels, *_without_effect(prepared.scenario))
     light = (*_single_returns(prepared), *_dark_fog(prepared.survey))
     groups = (
@@ -73,7 +74,7 @@ def advice(prepared: Prepared) -> list[str]:
     return [as_scenario(line) for line in chain.from_iterable(groups)]
 
 
-def unlabeled(scene: Scene, survey: Survey) -> list[str]:
+def unlabeled_notes(scene: Scene, survey: Survey) -> list[str]:
     """Return a note if static objects have no class, for clouds that contain the class column.
 
     The list is empty if the survey assigns a name to class 0, for example "background".
@@ -106,13 +107,13 @@ def unlabeled(scene: Scene, survey: Survey) -> list[str]:
     ]
 
 
-def _is_of_mesh(scenario: Scenario) -> bool:
+def _is_mesh_survey(scenario: Scenario) -> bool:
     """Return whether a mesh file was passed in place of a scenario."""
     files = [scenario.path(entry.file) for entry in scenario.scene.files]
     return scenario.source in map(mesh_survey_name, files)
 
 
-def _for_mesh(remark: str) -> str:
+def _with_command_option(remark: str) -> str:
     """Return a remark about axes with the command-line option instead of the field."""
     return re.sub(r'<file\.up_axis="(\w)">', r"`--up-axis \1`", remark).replace(
         "set up_axis explicitly", "pass `--up-axis` explicitly"
@@ -131,20 +132,20 @@ def _unnamed_classes(survey: Survey) -> Iterator[str]:
         )
 
 
-def _format_notes(prepared: Prepared) -> list[str]:
+def _format_notes(prepared: PreparedScenario) -> list[str]:
     """Return notes about data that the output formats cannot store."""
     specs = prepared.scenario.output.write
     notes = (note for spec in specs for note in spec.cloud_format.survey_notes(prepared.survey))
     return [*dict.fromkeys(notes)]
 
 
-def _size_note(prepared: Prepared, side: float) -> str:
+def _size_note(prepared: PreparedScenario, side: float) -> str:
     """Return a note if the length of the scene suggests a wrong unit, otherwise an empty string.
 
     `side` is the length of the longest side in meters.
     """
     scenario = prepared.scenario
-    placing = prepared.placing
+    placement = prepared.placement
     files = [entry.file for entry in scenario.scene.files if entry.unit is None]
     # City models, whose files assign classes, are large.
     files = [file for file in files if file not in prepared.findings.classes]
@@ -152,7 +153,7 @@ def _size_note(prepared: Prepared, side: float) -> str:
     has_stl = any(file.lower().endswith(".stl") for file in unitless)
     min_m = SMALL_M
     max_m = LARGE_STL_M if has_stl else LARGE_M
-    if surrounded := placing is not None and placing.surrounds_object:
+    if surrounded := placement is not None and placement.surrounds_object:
         min_m = 0.0
         max_m = LARGE_OBJECT_M if unitless else LARGE_STATED_M
     if not (unitless or (surrounded and files)) or min_m <= side <= max_m:
@@ -176,10 +177,10 @@ def _lacks_unit(path: Path) -> bool:
     return row is not None and row.unitless and not written_by_lidarpool(path)
 
 
-def _color_note(prepared: Prepared) -> str:
+def _color_note(prepared: PreparedScenario) -> str:
     """Return a note about objects without colors that settings require, or an empty string."""
     scene = prepared.scene
-    if not prepared.scenario.colored:
+    if not prepared.scenario.needs_colors:
         return ""
     if not scene.colored:
         return (
@@ -233,7 +234,7 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
         )
 
 
-def _single_returns(prepared: Prepared) -> Iterator[str]:
+def _single_returns(prepared: PreparedScenario) -> Iterator[str]:
     """Yield a note if sensors report several returns, but no pulse can have a second return.
 
     False alarms are ignored, although they are also returns.
@@ -312,7 +313,7 @@ def _heading_notes(without_angles: Mapping[str, bool]) -> Iterator[str]:
     yield note
 
 
-def _timing_notes(prepared: Prepared) -> Iterator[str]:
+def _timing_notes(prepared: PreparedScenario) -> Iterator[str]:
     """Yield notes about times.
 
     The notes concern dates that are not stored, faults during which no sweep starts, actors that

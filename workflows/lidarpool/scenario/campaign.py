@@ -27,9 +27,9 @@ from ..identity.field_words import describe_fields
 from ..identity.fingerprint import fingerprint
 from ..identity.shard import ALL, Shard
 from .campaign_jobs import FunctionJobs, JobSource, SampledJobs, ScenarioJobs
-from .campaign_sections import MAX_JOBS, CampaignSection, Keep, Splits
+from .campaign_sections import MAX_JOBS, CampaignSection, DatasetFormat, Splits
 from .job import Job
-from .prepare import Prepared
+from .prepare import PreparedScenario
 from .scenario import Scenario
 from .sections import PoolSection
 from .static_scene import SceneCache
@@ -75,7 +75,7 @@ class CampaignSpec:
 
     count: int
     seed: int
-    keep: Keep
+    keep: DatasetFormat
     splits: Mapping[str, float]
     license: str
     title: str
@@ -93,7 +93,7 @@ class CampaignSpec:
         count: int,
         *,
         seed: int = 0,
-        keep: str | Keep | Mapping[str, Any] = "kitti",
+        keep: str | DatasetFormat | Mapping[str, Any] = "kitti",
         splits: Mapping[str, float] = MappingProxyType({}),
         license: str = "",  # noqa: A002 - same name as in campaign files
         title: str = "",
@@ -142,7 +142,7 @@ class CampaignSpec:
         cls,
         paths: Iterable[str | Path],
         *,
-        keep: str | Keep | Mapping[str, Any] = "folder",
+        keep: str | DatasetFormat | Mapping[str, Any] = "folder",
         splits: Mapping[str, float] = MappingProxyType({}),
         seed: int = 0,
         license: str = "",  # noqa: A002 - same name as in campaign files
@@ -253,7 +253,7 @@ class CampaignSpec:
         number = self._checked_number(number)
         return self._for_dataset(self._jobs.job(number, cache, columns, self._fields(number)))
 
-    def prepare(self, number: int, columns: Sequence[str] = ()) -> Prepared:
+    def prepare(self, number: int, columns: Sequence[str] = ()) -> PreparedScenario:
         """Create a job like `job` does, and return it with its prepared scenario.
 
         This method must not be called if a function creates the jobs, because such jobs have no
@@ -280,7 +280,7 @@ class CampaignSpec:
         survey = with_format_columns(job.survey, [self.keep.export_spec])
         return job if survey is job.survey else job.with_fields(survey=survey)
 
-    def without_folders(self, message: str) -> str:
+    def strip_folders(self, message: str) -> str:
         """Return a message without the paths of the campaign's folders on this machine.
 
         The messages of failed jobs are written to the data set, which must not depend on the

@@ -34,10 +34,17 @@ from ..datasets.job_table import Value
 from ..identity.field_words import describe_fields
 from ..identity.fingerprint import fingerprint
 from ..identity.software import plugin_versions
-from .campaign_sections import MAX_JOBS, CampaignSection, Choice, JobRandom, is_campaign, read_rows
+from .campaign_sections import (
+    MAX_JOBS,
+    CampaignSection,
+    JobRandom,
+    ValueRule,
+    is_campaign,
+    read_rows,
+)
 from .field_paths import FieldSteps, find_field, replace_value
 from .job import Job
-from .prepare import Prepared, prepare
+from .prepare import PreparedScenario, prepare
 from .scenario import Scenario
 from .sections import file_states
 from .static_scene import SceneCache
@@ -88,7 +95,7 @@ class JobSource:
 
     def prepare(
         self, number: int, cache: SceneCache | None, columns: Sequence[str], fields: Any
-    ) -> Prepared:
+    ) -> PreparedScenario:
         """Prepare the scenario of a job. The arguments are those of `job`."""
         scenario = self.scenario(number)
         assert scenario is not None, "only jobs with a scenario can be prepared"
@@ -212,7 +219,7 @@ class ScenarioJobs(JobSource):
     def fields(self) -> dict[str, str]:
         """Fields of the first scenarios, as text."""
         paths = self.paths[:_MAX_DESCRIBED]
-        return _fields_of({path.name: Scenario.load(path) for path in paths})
+        return _describe_scenarios({path.name: Scenario.load(path) for path in paths})
 
     def name(self, number: int) -> str:
         """Return the name of a job, which is the name of its file without the suffix."""
@@ -283,7 +290,7 @@ class SampledJobs(JobSource):
         self.count = section.count or grid
         self.choices = {text: choice.words for text, choice in section.vary.items()}
         if len(self._bases) > 1:
-            bases = Choice(each=tuple(base.name for base in self._bases))
+            bases = ValueRule(each=tuple(base.name for base in self._bases))
             self.choices = {"base": bases.words, **self.choices}
         self.names = tuple(self.choices)
 
@@ -302,7 +309,7 @@ class SampledJobs(JobSource):
         bases = self._bases[:_MAX_DESCRIBED]
         tables = {f"rows of {text}": rows for base in bases for text, rows in base.tables.items()}
         words = describe_fields({name: to_json(rows).decode() for name, rows in tables.items()})
-        return _fields_of({base.name: base.scenario for base in bases}) | dict(words)
+        return _describe_scenarios({base.name: base.scenario for base in bases}) | dict(words)
 
     def named_in(self, file: Path) -> str:
         """Return a message prefix with the field that names a file.
@@ -362,7 +369,7 @@ class _Base:
     """A base scenario and the fields that a campaign varies in it."""
 
     def __init__(
-        self, path: Path, vary: Mapping[str, Choice], tables: dict[Any, list[Any]], label: str
+        self, path: Path, vary: Mapping[str, ValueRule], tables: dict[Any, list[Any]], label: str
     ) -> None:
         self._label = label  # used in messages
         self.scenario = Scenario.load(path)
@@ -501,7 +508,7 @@ def _with_seed(noise: Any, seed: int) -> Any:
     return noise if noise is None or noise.seed else replace(noise, seed=seed)
 
 
-def _fields_of(scenarios: Mapping[str, Scenario]) -> dict[str, str]:
+def _describe_scenarios(scenarios: Mapping[str, Scenario]) -> dict[str, str]:
     """Return the fields of scenarios as text, without the `pool` sections.
 
     `scenarios` is a mapping from scenario names to scenarios.

@@ -208,7 +208,7 @@ Options = Annotated[
 Weight = Annotated[float, Field(ge=0, le=1e9)]
 
 
-class Normal(Section):
+class NormalDistribution(Section):
     """A normal distribution, optionally truncated.
 
     Numbers outside `limits` are drawn again.
@@ -224,7 +224,7 @@ class Normal(Section):
     ] = None
 
     @model_validator(mode="after")
-    def _check_limits(self) -> Normal:
+    def _check_limits(self) -> NormalDistribution:
         """Raise ValueError if the limits exclude nearly all numbers, or if numbers overflow."""
         if self.limits is not None:
             lower_share, upper_share = map(NormalDist(self.mean, self.std).cdf, self.limits)
@@ -243,7 +243,7 @@ class Normal(Section):
         return self.limits or (self.mean - reach, self.mean + reach)
 
 
-class Sample(Section):
+class RowSample(Section):
     """Random rows of a table, which are appended to a list such as `actors`."""
 
     file: Annotated[
@@ -265,7 +265,7 @@ class Sample(Section):
 _KINDS = ("uniform", "log_uniform", "normal", "integer", "choice", "each", "sample")
 
 
-class Choice(Section):
+class ValueRule(Section):
     """Rule that chooses a value for each job.
 
     Exactly one field other than `weights` must be set.
@@ -280,7 +280,7 @@ class Choice(Section):
         about("number whose logarithm is uniformly distributed between two limits", [0.2, 20]),
     ] = None
     normal: Annotated[
-        Normal | None, about("normally distributed number", {"mean": 0, "std": 1})
+        NormalDistribution | None, about("normally distributed number", {"mean": 0, "std": 1})
     ] = None
     integer: Annotated[
         MinMax[int] | None, about("random integer from a minimum to a maximum, inclusive", [1, 6])
@@ -303,7 +303,7 @@ class Choice(Section):
         ),
     ] = None
     sample: Annotated[
-        Sample | None,
+        RowSample | None,
         about(
             "random rows of a table that are added to a list",
             {"from": "parked.csv", "count": [0, 40]},
@@ -313,7 +313,7 @@ class Choice(Section):
     _one_kind = one_of(*_KINDS)
 
     @model_validator(mode="after")
-    def _check_weights(self) -> Choice:
+    def _check_weights(self) -> ValueRule:
         """Raise ValueError if the weights do not match the values of `choice`."""
         if self.weights is not None:
             if self.choice is None or len(self.weights) != len(self.choice):
@@ -391,16 +391,18 @@ class Choice(Section):
         return f"chosen from {listed}{', with these weights' * (self.weights is not None)}"
 
 
-def _check_choice(value: Any) -> Any:
+def _check_rule(value: Any) -> Any:
     """Return an entry of `vary`. Raise an error if the entry is not a choice."""
-    if not isinstance(value, (dict, Choice)):
+    if not isinstance(value, (dict, ValueRule)):
         raise must_be(
             "a mapping that defines the choice, such as {uniform: [0, 1]} or {choice: [1, 4]}"
         )
     return value
 
 
-ChoiceEntry = Annotated[Choice, BeforeValidator(_check_choice, json_schema_input_type=Choice)]
+ValueRuleEntry = Annotated[
+    ValueRule, BeforeValidator(_check_rule, json_schema_input_type=ValueRule)
+]
 
 
 def _table_label(value: Any, index: int) -> Value | None:
@@ -417,7 +419,7 @@ def _table_label(value: Any, index: int) -> Value | None:
 
 
 @dataclass(frozen=True)
-class Keep(FileSection):
+class DatasetFormat(FileSection):
     """Format of a data set.
 
     The constructor raises LidarError if the format or layout is unknown.
@@ -477,12 +479,12 @@ class Keep(FileSection):
         )
 
 
-KeepEntry = Annotated[
-    Keep,
+DatasetFormatEntry = Annotated[
+    DatasetFormat,
     short(
         lambda v: v is None or is_text(v),
         lambda v: {"format": v} if v else {},
-        Text | Keep | None,
+        Text | DatasetFormat | None,
     ),
 ]
 
@@ -510,8 +512,8 @@ class CampaignSection(Section):
     ] = None
     seed: Annotated[Seed, about("random seed; the same seed results in the same values")] = 0
     vary: Annotated[
-        dict[Text, ChoiceEntry],
-        may_be_empty(dict[Text, Choice]),
+        dict[Text, ValueRuleEntry],
+        may_be_empty(dict[Text, ValueRule]),
         about(
             "mapping from the path of a field to the rule that chooses its value; a path consists "
             "of keys, and of the indices or names of list entries",
@@ -519,7 +521,7 @@ class CampaignSection(Section):
             {"sensors.roof.model": {"choice": ["velodyne/vlp16", "ouster/os1-64"]}},
         ),
     ] = {}  # noqa: RUF012 - the model is frozen
-    keep: Annotated[KeepEntry, about("format of the data set")] = Keep()
+    keep: Annotated[DatasetFormatEntry, about("format of the data set")] = DatasetFormat()
     splits: Annotated[
         dict[str, UnitShare],
         may_be_empty(dict[str, UnitShare]),

@@ -51,7 +51,7 @@ _MAX_SHEET_TRIANGLES = 200_000
 
 
 @dataclass(frozen=True)
-class Placing:
+class SensorPlacement:
     """Default poses of a sensor in a scene."""
 
     poses: tuple[Pose, ...]  # in world coordinates
@@ -81,7 +81,7 @@ class Placing:
             return [self.note]
         return [
             self.note,
-            f"no poses are set, so the default poses are {on_one_line(self.entries)}",
+            f"no poses are set, so the default poses are {as_yaml_line(self.entries)}",
         ]
 
 
@@ -93,7 +93,7 @@ def place_sensor(
     buildings: Sequence[str] = (),
     roads: Sequence[str] = (),
     narrow: bool = False,
-) -> Placing:
+) -> SensorPlacement:
     """Choose poses of a sensor in a scene from mesh files.
 
     In a room or landscape, the poses are at the center, or beside an object at the center, such as
@@ -126,7 +126,7 @@ def place_sensor(
         ground = ground_scene.vertices[ground_scene.faces].mean(axis=1) + drawn.origin
         middle = ground[np.argmin(np.hypot(*(ground - middle)[:, :2].T))]
     standing = _poses_above_floor(drawn, middle)
-    surroundings = None if landscape else _surroundings(drawn)
+    surroundings = None if landscape else _build_placement_checker(drawn)
     building_scene = _select_objects(drawn, buildings)
     if building_scene and len(surface_heights(building_scene, middle[0], middle[1])):
         standing = _poses_beside(drawn, middle, buildings)
@@ -139,10 +139,12 @@ def place_sensor(
         if is_obstructed(drawn, _local_positions(standing, scene)):
             standing = _poses_beside(drawn, middle, buildings) or standing
         positions = _local_positions(standing, scene)
-        return Placing(standing, _inside_note(surroundings, positions, scene, carried))
+        return SensorPlacement(standing, _inside_note(surroundings, positions, scene, carried))
     poses = poses_around(scene, carried)
     grid = _narrow_grid(drawn, surroundings, poses) if narrow and surroundings else {}
-    return Placing(poses, _object_note(scene, poses, grid), surrounds_object=True, grid=grid)
+    return SensorPlacement(
+        poses, _object_note(scene, poses, grid), surrounds_object=True, grid=grid
+    )
 
 
 def _object_note(scene: Scene, poses: Sequence[Pose], grid: Mapping[str, Any]) -> str:
@@ -258,12 +260,12 @@ def _local_positions(poses: Sequence[Pose], scene: Scene) -> Floats:
     return np.array([pose.position for pose in poses]) - scene.origin
 
 
-def surroundings_of(scene: Scene, positions: ArrayLike) -> PlacementChecker | None:
+def build_placement_checker(scene: Scene, positions: ArrayLike) -> PlacementChecker | None:
     """Return the surroundings of positions, or None if the scene has too many triangles.
 
     `positions` has shape (k, 3) and is in local coordinates.
     """
-    return _surroundings(_instances_to_meshes(scene, positions))
+    return _build_placement_checker(_instances_to_meshes(scene, positions))
 
 
 def _inside_note(
@@ -301,10 +303,10 @@ def find_free_position_above(
 def outside_view_hint(scene: Scene, carried: Mounted) -> str:
     """Return a sentence that suggests two poses outside a scene, without the final period."""
     poses = [pose_entry(pose) for pose in poses_around(scene, carried)[0:4:2]]
-    return f"To view the scene from outside, use poses: {on_one_line(poses)}"
+    return f"To view the scene from outside, use poses: {as_yaml_line(poses)}"
 
 
-def on_one_line(value: Any) -> str:
+def as_yaml_line(value: Any) -> str:
     """Return a value as YAML on a single line."""
     text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10_000)
     return text.removesuffix("\n").removesuffix("...").removesuffix("\n")
@@ -384,7 +386,7 @@ def _instances_to_meshes(scene: Scene, positions: ArrayLike) -> Scene:
     ).scene
 
 
-def _surroundings(scene: Scene) -> PlacementChecker | None:
+def _build_placement_checker(scene: Scene) -> PlacementChecker | None:
     """Return the surroundings of a scene, or None if the scene has too many triangles."""
     count = len(scene.faces)
     if count > _MAX_TRIANGLES or (count > _MAX_SHEET_TRIANGLES and is_open(scene)):

@@ -22,7 +22,7 @@ STEP_M = 0.5  # maximum distance between the poses of a trajectory that follows 
 MAX_STEPS = 1_000_000
 
 
-class StandingSurfaces:
+class SupportSurfaces:
     """Upward-facing triangles of all or some objects in a scene.
 
     If there are several surfaces at a position, the highest is used. `scene` is None if the scene
@@ -32,14 +32,14 @@ class StandingSurfaces:
     def __init__(self, scene: Scene | None, objects: Indices | None = None) -> None:
         self._scene = scene
         self._objects = objects
-        self._selections: dict[tuple[str, ...], StandingSurfaces] = {}  # {name patterns: surfaces}
+        self._selections: dict[tuple[str, ...], SupportSurfaces] = {}  # {name patterns: surfaces}
 
     @property
     def origin(self) -> Floats:
         """Scene origin in world coordinates, in meters. Shape (3,)."""
         return np.zeros(3) if self._scene is None else self._scene.origin
 
-    def select(self, names: Sequence[str]) -> StandingSurfaces:
+    def select(self, names: Sequence[str]) -> SupportSurfaces:
         """Return the surfaces of the objects whose names match one of the patterns.
 
         Raise LidarError if no object matches a pattern, or if none of the triangles faces up.
@@ -61,7 +61,7 @@ class StandingSurfaces:
                     f"{name_hint(name, scene.names)}"
                 )
         matches = np.unique(np.concatenate(rows))
-        selected = self if len(matches) == len(scene.names) else StandingSurfaces(scene, matches)
+        selected = self if len(matches) == len(scene.names) else SupportSurfaces(scene, matches)
         if not len(selected._tops[0]):
             raise LidarError(
                 f"{', '.join(map(repr, names))} cannot be used as surfaces, because none of their "
@@ -142,7 +142,7 @@ class StandingSurfaces:
         return heights, objects
 
 
-def follow_surfaces(track: Track, standing: StandingSurfaces) -> list[Track]:
+def follow_surfaces(track: Track, support: SupportSurfaces) -> list[Track]:
     """Return the parts of a trajectory that are on surfaces.
 
     Poses are at most 0.5 m apart. Their z axes are perpendicular to the mean slope of the surface
@@ -152,7 +152,7 @@ def follow_surfaces(track: Track, standing: StandingSurfaces) -> list[Track]:
     ----------
     track
         Trajectory in the local coordinates of a scene, with heights relative to the surfaces.
-    standing
+    support
         Surfaces that the trajectory follows.
 
     Returns
@@ -172,7 +172,7 @@ def follow_surfaces(track: Track, standing: StandingSurfaces) -> list[Track]:
     positions, rotations = moved.poses(0, (times - times[0]) * 1e9)
     positions = positions.copy()
     forward = rotations[:, :2, 0] / np.linalg.norm(rotations[:, :2, 0], axis=1)[:, None]
-    heights, axes = _surface_poses(positions[:, :2], forward, standing)
+    heights, axes = _surface_poses(positions[:, :2], forward, support)
     # `heights` are world coordinates. The heights of the trajectory are relative to the surface,
     # but the origin has been subtracted from them, so the sum is in local coordinates.
     positions[:, 2] += heights
@@ -210,7 +210,7 @@ def _step_times(track: Track) -> Floats:
 
 
 def _surface_poses(
-    positions: Floats, forward: Floats, standing: StandingSurfaces
+    positions: Floats, forward: Floats, support: SupportSurfaces
 ) -> tuple[Floats, Floats]:
     """Return the height of the surface at each position, and the axes of a pose on its slope.
 
@@ -220,7 +220,7 @@ def _surface_poses(
         Horizontal positions in local coordinates, in meters. Shape (n, 2).
     forward
         Directions of travel as unit vectors. Shape (n, 2).
-    standing
+    support
         The surfaces.
 
     Returns
@@ -235,8 +235,8 @@ def _surface_poses(
         positions + STEP_M * direction
         for direction in (0 * forward, forward, -forward, leftward, -leftward)
     ]
-    origin = standing.origin
-    heights = [standing.heights_below(probe + origin[:2])[0] for probe in probes]
+    origin = support.origin
+    heights = [support.heights_below(probe + origin[:2])[0] for probe in probes]
     center, front, back, left, right = (np.where(np.isnan(h), heights[0], h) for h in heights)
     x = np.column_stack([2 * STEP_M * forward, front - back])
     y = np.column_stack([2 * STEP_M * leftward, left - right])

@@ -38,7 +38,7 @@ _ROW = 6
 
 
 @dataclass(frozen=True, eq=False)
-class ObjectPassage:
+class OsiPassage:
     """Consecutive messages in a trace that contain a moving object."""
 
     name: str  # ID of the object
@@ -93,8 +93,8 @@ class _PassageCollector:
     """
 
     def __init__(self, section: TrafficSection, first_s: float, travelers: TravelerFilter) -> None:
-        self.passages: list[ObjectPassage] = []
-        self.travelers: dict[int, tuple[int, ObjectPassage]] = {}  # {ID: (last message, passage)}
+        self.passages: list[OsiPassage] = []
+        self.travelers: dict[int, tuple[int, OsiPassage]] = {}  # {ID: (last message, passage)}
         self.shapeless: dict[int, str] = {}  # {ID: type} of objects without a size and an entry
         self.time_s = -np.inf
         self.message = -1
@@ -140,20 +140,20 @@ class _PassageCollector:
         passage.times_s.append(self.time_s)
         passage.rows.extend(row)
 
-    def _passage(self, identity: int, moving: Any) -> ObjectPassage | None:
+    def _passage(self, identity: int, moving: Any) -> OsiPassage | None:
         """Return the passage that an object continues, or a new passage.
 
         Return None if the object has no shape, unless it is the only object to read.
         """
         last_message, passage = self.travelers.get(identity, (-2, None))
         if passage is None or last_message < self.message - 1:
-            kind = _kind_of(moving)
-            size = _size_of(moving)
+            kind = _object_type(moving)
+            size = _object_size(moving)
             is_shapeless = size is None and self._section.find_entry(kind) is None
             if is_shapeless and self._filter.only is None:
                 self.shapeless[identity] = kind
                 return None
-            passage = ObjectPassage(str(identity), kind, size)
+            passage = OsiPassage(str(identity), kind, size)
             self.passages.append(passage)
         self.travelers[identity] = self.message, passage
         return passage
@@ -263,7 +263,7 @@ def _message_type(osi: Any, path: Path) -> str | None:
 
 
 def _pose_row(moving: Any) -> list[float]:
-    """Return the pose of a moving object as a row of `ObjectPassage.rows`.
+    """Return the pose of a moving object as a row of `OsiPassage.rows`.
 
     If the object has no position, all values are NaN.
     """
@@ -276,7 +276,7 @@ def _pose_row(moving: Any) -> list[float]:
     return [position.x, position.y, position.z, *rotation]
 
 
-def _size_of(moving: Any) -> tuple[float, float, float] | None:
+def _object_size(moving: Any) -> tuple[float, float, float] | None:
     """Return the length, width and height of a moving object, or None if they are unknown.
 
     Raise ValueError if a dimension is implausible.
@@ -292,7 +292,7 @@ def _size_of(moving: Any) -> tuple[float, float, float] | None:
     return sides
 
 
-def _kind_of(moving: Any) -> str:
+def _object_type(moving: Any) -> str:
     """Return the type of a moving object in lower case.
 
     The type of a vehicle is taken from its classification, if that is known.

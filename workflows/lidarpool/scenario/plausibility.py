@@ -20,8 +20,13 @@ from lidarsim.simulator.casting.visibility import static_key, unseen_objects, wi
 from lidarsim.survey.survey import Survey
 from lidarsim.words import as_scenario, printable, rounded
 
-from .default_poses import find_free_position_above, on_one_line, outside_view_hint, surroundings_of
-from .prepare import Prepared
+from .default_poses import (
+    as_yaml_line,
+    build_placement_checker,
+    find_free_position_above,
+    outside_view_hint,
+)
+from .prepare import PreparedScenario
 
 GROUND_SPEED_M_S = 150.0  # faster than trains, except on test tracks
 AIR_SPEED_M_S = 350.0  # faster than the aircraft that carry lidars
@@ -77,7 +82,7 @@ class _SensorPosition(NamedTuple):
     station: int
 
 
-def plausibility_warnings(prepared: Prepared) -> list[str]:
+def plausibility_warnings(prepared: PreparedScenario) -> list[str]:
     """Return warnings about poses, motions, noise and coordinates that are implausible.
 
     Default poses are not checked. Unless the scene has too many triangles, a few thousand rays are
@@ -88,7 +93,7 @@ def plausibility_warnings(prepared: Prepared) -> list[str]:
     chosen = prepared.scenario.poses is None and prepared.scenario.trajectory is None
     samples = [] if chosen else _sample_positions(survey)
     positions = np.array([sample.position for sample in samples]).reshape(-1, 3)
-    surroundings = surroundings_of(scene, positions) if samples else None
+    surroundings = build_placement_checker(scene, positions) if samples else None
     warnings = [*filter(None, [prepared.job.location_warning])]
     visible_range_m = _visible_range_m(scene, surroundings, positions)
     warnings += [*_noise_warnings(survey, visible_range_m)]
@@ -208,7 +213,9 @@ def _free_pose_hint(
         return ""
     pose = survey.path.pose(sample.station).position + scene.origin + free - sample.position
     number = f" for pose {sample.station + 1}" * (survey.path.stations > 1)
-    return f". The nearest free position found{number} is {on_one_line(np.round(pose, 2).tolist())}"
+    return (
+        f". The nearest free position found{number} is {as_yaml_line(np.round(pose, 2).tolist())}"
+    )
 
 
 def _surroundings_of_sensors(
@@ -228,7 +235,7 @@ def _surroundings_of_sensors(
         if mask is not None and key not in known:
             seen = without_objects(scene, mask)
             positions = np.array([sample.position for sample in samples])
-            known[key] = None if seen is None else surroundings_of(seen, positions)
+            known[key] = None if seen is None else build_placement_checker(seen, positions)
     return [known[key] for key in keys]
 
 

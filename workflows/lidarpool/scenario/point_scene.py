@@ -50,7 +50,7 @@ _MEASURED_LOSS = "4 to 40 % in scenes from one to three scans of a city"
 _WHITE_QUANTILE = 0.99  # quantile of the intensities that is white, because mirrors return more
 
 
-def scene_of_points(
+def scene_from_points(
     path: str | Path,
     *,
     voxel_m: float | None = None,
@@ -183,7 +183,7 @@ def points_to_scene(
 ) -> PointScene:
     """Convert a point cloud to a scene, and estimate the share of lost returns.
 
-    The parameters are those of `scene_of_points`.
+    The parameters are those of `scene_from_points`.
     """
     for name, value in (("voxel_m", voxel_m), ("size", size)):
         if value is not None and not 0 < value < np.inf:

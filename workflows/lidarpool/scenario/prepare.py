@@ -33,14 +33,14 @@ from ..clouds.writing import with_format_columns
 from ..plan import Planning
 from ..plan.planning import Search
 from .actor_motion import ActorSection, MountSection
-from .default_poses import Placing, place_sensor
+from .default_poses import SensorPlacement, place_sensor
 from .georeference import check_epsg
-from .ground import StandingSurfaces
+from .ground import SupportSurfaces
 from .job import Job
 from .osi_traffic import OSI_SUFFIXES, read_osi
 from .scenario import Scenario
 from .sections import CopiesSection, SensorSection
-from .static_scene import Findings, SceneCache, Shapes, StaticScene, read_static_scene
+from .static_scene import Findings, SceneCache, ShapeLoader, StaticScene, read_static_scene
 from .traffic import (
     TrafficContent,
     TrafficSection,
@@ -68,7 +68,7 @@ MESH_PRECISION_M = 0.001
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared:
+class PreparedScenario:
     """A scenario whose files have been read and validated.
 
     Attributes
@@ -77,7 +77,7 @@ class Prepared:
         The scenario.
     job
         Scene, survey and planning of the scenario. `world.origin` has been added to the scene.
-    placing
+    placement
         Default poses that `place_sensor` chose. It is None if the scenario defines poses or a
         trajectory, or contains the objects of the demo.
     findings
@@ -86,7 +86,7 @@ class Prepared:
 
     scenario: Scenario
     job: Job
-    placing: Placing | None
+    placement: SensorPlacement | None
     findings: Findings
 
     @property
@@ -107,7 +107,7 @@ def prepare(
     cache: SceneCache | None = None,
     columns: Sequence[str] = (),
     **fields: Any,
-) -> Prepared:
+) -> PreparedScenario:
     """Read the files of a scenario, and create a job from its scene, survey and planning.
 
     Parameters
@@ -140,15 +140,15 @@ def _prepare(
     plans: bool,
     columns: Sequence[str],
     fields: Mapping[str, Any],
-) -> Prepared:
+) -> PreparedScenario:
     """Prepare a scenario whose static scene has been read."""
     findings = static.findings.copy()
-    shapes = Shapes(scenario, findings)
+    shapes = ShapeLoader(scenario, findings)
     survey_parts = _survey_parts(shapes, static)
     track_or_poses = survey_parts.track_or_poses
     track = track_or_poses if isinstance(track_or_poses, Track) else None
-    actors = _build_actors(shapes, static.standing, track)
-    vehicles = _build_traffic(survey_parts, shapes, static.standing)
+    actors = _build_actors(shapes, static.support, track)
+    vehicles = _build_traffic(survey_parts, shapes, static.support)
     scene = static.scene
     if actors or vehicles:
         scene = scene.with_actors([*scene.actors, *actors, *(actor for actor, _ in vehicles)])
@@ -168,7 +168,7 @@ def _prepare(
             **fields,
         )
     mistakes.tell()
-    return Prepared(scenario, job, survey_parts.placing, findings)
+    return PreparedScenario(scenario, job, survey_parts.placement, findings)
 
 
 class _SurveyParts(NamedTuple):
@@ -182,10 +182,10 @@ class _SurveyParts(NamedTuple):
     track_or_poses: Track | Sequence[Pose]
     origin: Floats  # (3,), scene origin in world coordinates, meters
     epsg: int | None  # EPSG code that the files of the scene state
-    placing: Placing | None  # default poses, if they are used
+    placement: SensorPlacement | None  # default poses, if they are used
 
 
-def _survey_parts(shapes: Shapes, static: StaticScene) -> _SurveyParts:
+def _survey_parts(shapes: ShapeLoader, static: StaticScene) -> _SurveyParts:
     """Return the sensors of a scenario, and their trajectory, poses or default poses."""
     scenario = shapes.scenario
     scene = static.scene
@@ -194,18 +194,18 @@ def _survey_parts(shapes: Shapes, static: StaticScene) -> _SurveyParts:
     with prefixed(scenario.source):
         if scenario.world.epsg is not None:  # fail before files of moving objects are read
             check_epsg(scenario.world.epsg, scene.georeferenced(scenario.world.origin))
-        track = _platform_track(shapes, static.standing)
+        track = _platform_track(shapes, static.support)
         sensors = _mounted_sensors(shapes)
-    placing: Placing | None = None
+    placement: SensorPlacement | None = None
     if scenario.poses is None and track is None and not scenario.scene.has_seed:
-        placing = _place_sensor(scenario, scene, findings, sensors[0])
-        if placing.grid:  # no sensor is set, and the scene is a single object
-            sensors = [replace(sensors[0], sensor=Sensor.grid(**placing.grid))]
-    track_or_poses = track or scenario.poses or (placing.poses if placing else SEED_POSES)
-    return _SurveyParts(scenario, findings, sensors, track_or_poses, scene.origin, epsg, placing)
+        placement = _place_sensor(scenario, scene, findings, sensors[0])
+        if placement.grid:  # no sensor is set, and the scene is a single object
+            sensors = [replace(sensors[0], sensor=Sensor.grid(**placement.grid))]
+    track_or_poses = track or scenario.poses or (placement.poses if placement else SEED_POSES)
+    return _SurveyParts(scenario, findings, sensors, track_or_poses, scene.origin, epsg, placement)
 
 
-def _platform_track(shapes: Shapes, standing: StandingSurfaces) -> Track | None:
+def _platform_track(shapes: ShapeLoader, support: SupportSurfaces) -> Track | None:
     """Return the trajectory of the platform in local coordinates, or None if there is none."""
     scenario = shapes.scenario
     entry = scenario.trajectory
@@ -214,14 +214,14 @@ def _platform_track(shapes: Shapes, standing: StandingSurfaces) -> Track | None:
     if entry.vehicle is None:
         return entry.track(
             scenario.path,
-            standing,
+            support,
             name="the platform",
             without_angles=shapes.findings.without_angles,
         )
     section = scenario.traffic
     assert section is not None, "guaranteed by the validation of the scenario"
     content = _read_traffic(scenario, -np.inf, np.inf, TravelerFilter(only=entry.vehicle))
-    return platform_track(entry, section, content, shapes.load_mesh, standing)
+    return platform_track(entry, section, content, shapes.load_mesh, support)
 
 
 def _read_traffic(
@@ -236,7 +236,9 @@ def _read_traffic(
     return read_fcd(file, section, first_s, last_s, travelers)
 
 
-def _place_sensor(scenario: Scenario, scene: Scene, findings: Findings, sensor: Mounted) -> Placing:
+def _place_sensor(
+    scenario: Scenario, scene: Scene, findings: Findings, sensor: Mounted
+) -> SensorPlacement:
     """Choose poses for a scenario that defines neither poses nor a trajectory.
 
     Scenes with rasters or road networks are landscapes. If the scenario does not specify the
@@ -254,7 +256,7 @@ def _place_sensor(scenario: Scenario, scene: Scene, findings: Findings, sensor: 
 
 
 def _build_traffic(
-    survey_parts: _SurveyParts, shapes: Shapes, standing: StandingSurfaces
+    survey_parts: _SurveyParts, shapes: ShapeLoader, support: SupportSurfaces
 ) -> list[tuple[Actor, VehicleSection]]:
     """Build the actors of the traffic during the survey.
 
@@ -270,7 +272,7 @@ def _build_traffic(
         track_or_poses = survey_parts.track_or_poses
         # The start of the survey uses the clock of the platform's trajectory.
         start_s = track_or_poses.start_s or 0.0 if isinstance(track_or_poses, Track) else 0.0
-        return _traffic_actors(scenario.traffic, shapes, standing, start_s, duration_s)
+        return _traffic_actors(scenario.traffic, shapes, support, start_s, duration_s)
 
 
 def _common_epsg(scenario: Scenario, findings: Findings) -> int | None:
@@ -320,7 +322,7 @@ def _check_sensors(scenario: Scenario) -> None:
             section.mounted(scenario.path, CENTER, scenario.noise, scenario.returns, name)
 
 
-def _mounted_sensors(shapes: Shapes) -> list[Mounted]:
+def _mounted_sensors(shapes: ShapeLoader) -> list[Mounted]:
     scenario = shapes.scenario
     sections: Mapping[str, SensorSection] = scenario.sensors or {"": scenario.sensor}
     path = scenario.path
@@ -332,7 +334,7 @@ def _mounted_sensors(shapes: Shapes) -> list[Mounted]:
     ]
 
 
-def _mount_pose(section: SensorSection, shapes: Shapes) -> Pose:
+def _mount_pose(section: SensorSection, shapes: ShapeLoader) -> Pose:
     """Return the pose of a sensor in the platform frame.
 
     If the mount has a link, its pose is relative to that link of a robot on the platform. Raise
@@ -378,7 +380,9 @@ def _joint_arguments(entry: ActorSection, scenario: Scenario) -> dict[str, Any]:
     }
 
 
-def _build_actors(shapes: Shapes, standing: StandingSurfaces, track: Track | None) -> list[Actor]:
+def _build_actors(
+    shapes: ShapeLoader, support: SupportSurfaces, track: Track | None
+) -> list[Actor]:
     """Build the actors of a scenario, without traffic.
 
     `track` is the trajectory of the platform, or None. It is also the trajectory of actors that
@@ -389,7 +393,7 @@ def _build_actors(shapes: Shapes, standing: StandingSurfaces, track: Track | Non
     with prefixed(scenario.source):
         without_angles = shapes.findings.without_angles
         trajectories = [
-            entry.track(scenario.path, standing, track, without_angles) for entry in scenario.actors
+            entry.track(scenario.path, support, track, without_angles) for entry in scenario.actors
         ]
     for entry, trajectory in zip(scenario.actors, trajectories, strict=True):
         if entry.robot:
@@ -403,7 +407,7 @@ def _build_actors(shapes: Shapes, standing: StandingSurfaces, track: Track | Non
 
 
 def _robot_actors(
-    entry: ActorSection, robot: Robot, trajectory: Track, shapes: Shapes
+    entry: ActorSection, robot: Robot, trajectory: Track, shapes: ShapeLoader
 ) -> Sequence[Actor]:
     """Return the actors of a robot, one per link.
 
@@ -423,8 +427,8 @@ def _robot_actors(
 
 def _traffic_actors(
     section: TrafficSection,
-    shapes: Shapes,
-    standing: StandingSurfaces,
+    shapes: ShapeLoader,
+    support: SupportSurfaces,
     start_s: float,
     duration_s: float,
 ) -> list[tuple[Actor, VehicleSection]]:
@@ -441,7 +445,7 @@ def _traffic_actors(
     travelers = TravelerFilter(without=platform)
     content = _read_traffic(scenario, file_start_s, file_stop_s, travelers)
     findings.notes += content.notes
-    actors = build_traffic_actors(section, content.passages, shapes.load_mesh, standing, start_s)
+    actors = build_traffic_actors(section, content.passages, shapes.load_mesh, support, start_s)
     if not actors:
         findings.notes.append(
             f"{section.file} has no vehicle or person in the scene from {file_start_s:g} to "

@@ -29,7 +29,7 @@ from lidarsim.sensor.models import plugin_model_file
 from lidarsim.survey.faults import Fault
 from lidarsim.survey.survey import MAX_SENSORS, CloudOptions, StepCount
 
-from .actor_motion import ActorSection, CarriedEntry, MountEntry, TrajectoryEntry
+from .actor_motion import ActorSection, MountedSensorEntry, MountEntry, TrajectoryEntry
 from .sections import (
     CopiesSection,
     NoiseSection,
@@ -170,7 +170,7 @@ class Scenario(Section):
         ),
     ] = None
     sensors: Annotated[
-        dict[Text, CarriedEntry],
+        dict[Text, MountedSensorEntry],
         about(
             "sensors on one platform, by name, each with its mount; replaces sensor",
             {"roof": {"model": "ouster/os1-64", "mount": [0, 0, 2]}, "front": "velodyne/vlp16"},
@@ -479,13 +479,13 @@ class Scenario(Section):
         return {mount.link for mount in mounts if mount is not None and mount.link is not None}
 
     @property
-    def colored(self) -> bool:
+    def needs_colors(self) -> bool:
         """Whether a column or `reflectance: texture` requires the colors of meshes."""
         columns = {*self.cloud.columns, *self.output.needs}
         return bool(columns & {*COLORS}) or any(m.reflectance == "texture" for m in self.materials)
 
     @property
-    def names_materials(self) -> bool:
+    def needs_material_names(self) -> bool:
         """Whether a column or an entry of `materials` requires the material names of meshes."""
         columns = {*self.cloud.columns, *self.output.needs}
         return "material" in columns or any(m.material is not None for m in self.materials)

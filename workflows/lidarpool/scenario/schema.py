@@ -14,7 +14,7 @@ from pydantic.json_schema import GenerateJsonSchema, JsonRef
 from lidarsim.schema.section_fields import fields_of, is_section, kinds_of
 
 from .campaign_sections import CampaignSection
-from .default_poses import on_one_line
+from .default_poses import as_yaml_line
 from .scenario import Scenario
 from .sections import Section
 
@@ -129,7 +129,7 @@ def short_scenario(data: Mapping[str, Any], note: str) -> str:
     data = {"scene": "seed"} | dict(data)
     for name, (example, words) in _SECTIONS.items():
         has_data = name in data
-        code = f"{name}: {on_one_line(data[name])}" if has_data else f"# {name}: {example}"
+        code = f"{name}: {as_yaml_line(data[name])}" if has_data else f"# {name}: {example}"
         placed = name == "poses" and has_data
         lines += _pose_lines(data[name], note) if placed else _commented(code, words, "")
     return "\n".join([*lines, ""])
@@ -182,7 +182,7 @@ def _pose_lines(poses: Sequence[Any], note: str) -> Iterator[str]:
         if mark:
             yield f"# poses: {poses_text.removesuffix('.')}"
     yield from _commented("poses:", _SECTIONS["poses"][1], "")
-    yield from (f"  - {on_one_line(pose)}" for pose in poses)
+    yield from (f"  - {as_yaml_line(pose)}" for pose in poses)
 
 
 def _field_lines(name: str, field: FieldInfo, indent: str, values: dict[str, Any]) -> Iterator[str]:
@@ -192,13 +192,13 @@ def _field_lines(name: str, field: FieldInfo, indent: str, values: dict[str, Any
     """
     text = field.description or ""
     if name in values or not field.examples:
-        value = on_one_line(values.get(name, field.default))
+        value = as_yaml_line(values.get(name, field.default))
         yield from _commented(f"{name}: {value}", text, indent)
         return
     first, *further_examples = field.examples
-    yield from _commented(f"# {name}: {on_one_line(first)}", text, indent)
+    yield from _commented(f"# {name}: {as_yaml_line(first)}", text, indent)
     for example in further_examples:
-        yield f"{indent}# {name}: {on_one_line(example)}"
+        yield f"{indent}# {name}: {as_yaml_line(example)}"
 
 
 def _commented(code: str, comment: str, indent: str) -> Iterator[str]:

@@ -58,7 +58,7 @@ from ..clouds.writing import ExportSpec
 from ..plan.planning import Search
 
 MAX_COPIES = 1_000_000  # maximum number of copies of an entry
-PathOf = Callable[[str], Path]  # returns the path of a file that is named in a scenario
+ResolvePath = Callable[[str], Path]  # returns the path of a file that is named in a scenario
 
 IgnoredColumns = Annotated[
     TextOrTexts, about("names of columns to ignore; may contain * and ?", "remarks")
@@ -618,7 +618,7 @@ class SensorSection(Section):
 
     def mounted(
         self,
-        path: PathOf,
+        path: ResolvePath,
         mount: Pose,
         noise: NoiseSection,
         returns: ReturnsSection,

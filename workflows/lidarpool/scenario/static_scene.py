@@ -35,14 +35,14 @@ from lidarsim.scene.transform import Transform, affine
 from lidarsim.scene.wheels import rolling
 from lidarsim.words import joined, plural
 
-from .ground import StandingSurfaces
+from .ground import SupportSurfaces
 from .scenario import Scenario
 from .sections import (
     MAX_COPIES,
     CopiesSection,
     CopyTable,
     MeshFile,
-    PathOf,
+    ResolvePath,
     Scatter,
     SceneSection,
     ShapeSection,
@@ -56,7 +56,7 @@ _ROBOT_FIELDS = {"file", "opacity", "assets", "translation", "rotation_deg", "sc
 Value = TypeVar("Value")
 
 
-class FileSystem(NamedTuple):
+class FileCrs(NamedTuple):
     """Coordinate system of a file whose x and y coordinates are not transformed."""
 
     file: str
@@ -72,7 +72,7 @@ class Findings:
     notes: list[str] = field(default_factory=list)  # notes for the user, such as skipped objects
     remarks: list[str] = field(default_factory=list)  # remarks on the up axes of files
     sources: dict[str, str] = field(default_factory=dict)  # {file: description of its content}
-    systems: list[FileSystem] = field(default_factory=list)  # coordinate systems of the files
+    systems: list[FileCrs] = field(default_factory=list)  # coordinate systems of the files
     landscapes: list[str] = field(default_factory=list)  # files that contain terrain or roads
     # {file: {class number: class}} for files whose format assigns classes to objects
     classes: dict[str, Mapping[int, ObjectClass]] = field(default_factory=dict)
@@ -108,7 +108,7 @@ class StaticScene(NamedTuple):
     """The scene of a scenario without its actors and traffic, with the findings from its files."""
 
     scene: Scene
-    standing: StandingSurfaces
+    support: SupportSurfaces
     findings: Findings
 
 
@@ -171,8 +171,8 @@ def _key(scenario: Scenario) -> object:
     states = file_states(map(scenario.path, files))
     reading_options = (
         scenario.path(""),
-        scenario.colored,
-        scenario.names_materials,
+        scenario.needs_colors,
+        scenario.needs_material_names,
         scenario.world.epsg,
     )
     return section.model_dump_json(), *reading_options, states
@@ -203,7 +203,7 @@ def _static_scene(static: _StaticObjects, ground: SceneMesh | None) -> StaticSce
     if ground is not None:
         objects = objects._replace(static=(*objects.static, ground))
     scene = Scene.from_objects(objects, findings.notes.append)
-    return StaticScene(scene, StandingSurfaces(scene), findings)
+    return StaticScene(scene, SupportSurfaces(scene), findings)
 
 
 def _read_objects(scenario: Scenario) -> _StaticObjects:
@@ -211,7 +211,7 @@ def _read_objects(scenario: Scenario) -> _StaticObjects:
     section = scenario.scene
     _check_not_empty(scenario)
     findings = Findings()
-    shapes = Shapes(scenario, findings)
+    shapes = ShapeLoader(scenario, findings)
     meshes: list[SceneMesh | SceneInstance] = list(seed_objects()) if section.has_seed else []
     moving: list[Actor] = []
     mistakes = Mistakes()
@@ -222,7 +222,7 @@ def _read_objects(scenario: Scenario) -> _StaticObjects:
             moving += objects.actors
             if objects.classes:
                 findings.classes[entry.file] = objects.classes
-            if system := _system_of(entry, objects):
+            if system := _file_crs(entry, objects):
                 findings.systems.append(system)
     mistakes.tell()
     meshes = resolve_same_names(meshes, section.same_names, findings.notes.append)
@@ -235,7 +235,7 @@ def _read_objects(scenario: Scenario) -> _StaticObjects:
     return _StaticObjects(objects, findings, corners)
 
 
-def _system_of(entry: MeshFile, objects: Objects) -> FileSystem | None:
+def _file_crs(entry: MeshFile, objects: Objects) -> FileCrs | None:
     """Return the coordinate system that a file states for its x and y coordinates.
 
     Return None if the file states no coordinate system, or if x and y are transformed.
@@ -244,10 +244,10 @@ def _system_of(entry: MeshFile, objects: Objects) -> FileSystem | None:
         return None
     if objects.raster is not None:
         raster = objects.raster
-        return FileSystem(entry.file, raster.crs, raster.epsg, True) if raster.crs else None
+        return FileCrs(entry.file, raster.crs, raster.epsg, True) if raster.crs else None
     if objects.epsg is None:
         return None
-    return FileSystem(entry.file, f"EPSG:{objects.epsg}", objects.epsg, False)
+    return FileCrs(entry.file, f"EPSG:{objects.epsg}", objects.epsg, False)
 
 
 def _check_not_empty(scenario: Scenario) -> None:
@@ -266,7 +266,7 @@ def _check_not_empty(scenario: Scenario) -> None:
     )
 
 
-class Shapes:
+class ShapeLoader:
     """Reader of the meshes and robots of a scenario.
 
     Shapes are cached, so that entries with the same shape share it. Notes are added to `findings`.
@@ -317,8 +317,8 @@ class Shapes:
         if entry not in self._robots:
             path = self.scenario.path(entry.file)
             tell = self.findings.notes.append
-            colors = self.scenario.colored
-            name_materials = self.scenario.names_materials
+            colors = self.scenario.needs_colors
+            name_materials = self.scenario.needs_material_names
             robot = load_robot(
                 path,
                 opacity=entry.opacity,
@@ -356,8 +356,8 @@ class Shapes:
             **entry.reading_options,
             **world_options,
             transform=transform,
-            colors=scenario.colored,
-            materials=scenario.names_materials,
+            colors=scenario.needs_colors,
+            materials=scenario.needs_material_names,
             assets=self._assets_folder(entry),
             animation=animation,
             tell=findings.notes.append,
@@ -387,7 +387,7 @@ class Shapes:
 
 
 def _place_copies(
-    shapes: Shapes, static_objects: list[SceneMesh | SceneInstance]
+    shapes: ShapeLoader, static_objects: list[SceneMesh | SceneInstance]
 ) -> list[SceneInstance]:
     """Place the copies of a scenario on its static objects and ground, but not on other copies.
 
@@ -400,14 +400,14 @@ def _place_copies(
         corners = [] if scene is None else [_corners(scene)]
         ground = _ground_mesh(section, [*corners, *_copy_extents(section)])
         scene = Scene.from_meshes([*static_objects, ground])
-    standing = StandingSurfaces(scene)
+    support = SupportSurfaces(scene)
     copies: list[SceneInstance] = []
     mistakes = Mistakes()
     for number, entry in enumerate(section.copies):
         with mistakes.noted():
             mesh = shapes.load_mesh(entry)
             with prefixed(f"{scenario.source}: scene.copies[{number}]"):
-                instances = place_copies(entry, mesh, standing, scenario.path)
+                instances = place_copies(entry, mesh, support, scenario.path)
             if entry.file is not None:
                 words = f", {plural(len(instances), 'copy', 'copies')}"
                 shapes.findings.sources[entry.file.file] += words
@@ -504,7 +504,7 @@ _COPY_COLUMNS = (
 
 
 def place_copies(
-    entry: CopiesSection, mesh: SceneMesh, standing: StandingSurfaces, path: PathOf
+    entry: CopiesSection, mesh: SceneMesh, support: SupportSurfaces, path: ResolvePath
 ) -> list[SceneInstance]:
     """Place the copies of an entry.
 
@@ -514,7 +514,7 @@ def place_copies(
         Section that defines the copies.
     mesh
         Mesh that all copies share.
-    standing
+    support
         Surfaces on which copies without a height are placed.
     path
         Function that returns the path of a file in the scenario.
@@ -526,7 +526,7 @@ def place_copies(
         not enough space for randomly placed copies.
     """
     if entry.scatter is not None:
-        poses = _scatter_copies(entry.scatter, entry.name, standing)
+        poses = _scatter_copies(entry.scatter, entry.name, support)
     else:
         if entry.table is not None:
             poses = _read_copies(path(entry.table.file), entry.table)
@@ -536,7 +536,7 @@ def place_copies(
                 np.array([[getattr(copy, name) for name in _ANGLE_NAMES] for copy in entry.at]),
                 np.array([copy.scale for copy in entry.at]),
             )
-        poses.set_missing_heights(standing)
+        poses.set_missing_heights(support)
         poses.check_scales()
     matrices = affine(rotations_of(poses.angles_deg) * poses.scales[:, None], poses.positions)
     return SceneInstance.from_matrices(mesh, matrices, entry.name)
@@ -549,7 +549,7 @@ class _CopyPoses(NamedTuple):
     angles_deg: Floats  # (n, 3), yaw, pitch and roll
     scales: Floats  # (n, 3)
 
-    def set_missing_heights(self, standing: StandingSurfaces) -> None:
+    def set_missing_heights(self, support: SupportSurfaces) -> None:
         """Place copies without a z coordinate on the highest surface at their x and y.
 
         Raise LidarError if there is no such surface.
@@ -557,7 +557,7 @@ class _CopyPoses(NamedTuple):
         positions = self.positions
         rows = np.flatnonzero(np.isnan(positions[:, 2]))
         if len(rows):
-            positions[rows, 2], _ = standing.heights_below(positions[rows, :2])
+            positions[rows, 2], _ = support.heights_below(positions[rows, :2])
         if len(rows := np.flatnonzero(np.isnan(positions[:, 2]))):
             x, y = positions[rows[0], :2].tolist()
             raise LidarError(
@@ -607,7 +607,7 @@ def _read_copies(path: Path, table: CopyTable) -> _CopyPoses:
     return _CopyPoses(columns_of(_POSITION_NAMES, np.nan), angles_of(columns, count), scales)
 
 
-def _scatter_copies(scatter: Scatter, name: str, standing: StandingSurfaces) -> _CopyPoses:
+def _scatter_copies(scatter: Scatter, name: str, support: SupportSurfaces) -> _CopyPoses:
     """Draw random poses and scales of copies.
 
     Positions are drawn in a rectangle, and rejected where the highest surface is not one of
@@ -616,7 +616,7 @@ def _scatter_copies(scatter: Scatter, name: str, standing: StandingSurfaces) -> 
     """
     # The seed includes the name, so that trees and rocks with the same seed do not coincide.
     seeds = [scatter.seed, *name.encode()]
-    positions = _scatter_positions(scatter, seeds, standing)
+    positions = _scatter_positions(scatter, seeds, support)
     count = scatter.count
     yaw_and_scale_draws = np.random.Generator(np.random.PCG64([1, *seeds])).random((count, 2))
     yaw = (
@@ -630,10 +630,10 @@ def _scatter_copies(scatter: Scatter, name: str, standing: StandingSurfaces) -> 
     return _CopyPoses(positions, angles, np.repeat(scales[:, None], 3, axis=1))
 
 
-def _scatter_positions(scatter: Scatter, seeds: list[int], standing: StandingSurfaces) -> Floats:
+def _scatter_positions(scatter: Scatter, seeds: list[int], support: SupportSurfaces) -> Floats:
     """Draw random positions on surfaces, in world coordinates in meters.
 
-    `standing` contains the surfaces of all objects. If none of the first positions is on a surface
+    `support` contains the surfaces of all objects. If none of the first positions is on a surface
     in `scatter.surfaces`, for example because these surfaces are under a roof, all other surfaces
     are ignored. Raise LidarError if there is not enough space.
 
@@ -641,7 +641,7 @@ def _scatter_positions(scatter: Scatter, seeds: list[int], standing: StandingSur
     -------
     Array of shape (count, 3).
     """
-    surfaces = standing.select(scatter.surfaces)
+    surfaces = support.select(scatter.surfaces)
     x0, y0, x1, y1 = surfaces.rectangle if scatter.within is None else scatter.within
     rng = np.random.Generator(np.random.PCG64([0, *seeds]))
     occupied = _OccupiedPositions(scatter.spacing_m)
@@ -655,11 +655,11 @@ def _scatter_positions(scatter: Scatter, seeds: list[int], standing: StandingSur
                 f"{y1:.6g}. Reduce `count` or `spacing_m`, or choose other `surfaces`."
             )
         draws = rng.random((DRAW_SIZE, 2)) * [x1 - x0, y1 - y0] + [x0, y0]
-        heights, objects = standing.heights_below(draws)
+        heights, objects = support.heights_below(draws)
         on_surfaces = np.flatnonzero(np.isin(objects, surfaces.owners))
         if not drawn_count and not len(on_surfaces):  # the surfaces are probably under a roof
-            standing = surfaces
-            heights, objects = standing.heights_below(draws)
+            support = surfaces
+            heights, objects = support.heights_below(draws)
             on_surfaces = np.flatnonzero(objects >= 0)
         drawn_count += DRAW_SIZE
         for row in on_surfaces:

@@ -35,7 +35,7 @@ from lidarsim.schema.declared import Several, Text, TextOrTexts, Triple, about
 from lidarsim.words import fits, in_yaml, name_hint, plural, printable
 
 from .actor_motion import TimeUnitEntry, TrajectorySection
-from .ground import StandingSurfaces, follow_surfaces
+from .ground import SupportSurfaces, follow_surfaces
 from .sections import DeformingSection, Section
 
 HOST = "host"  # alias for the ID of the host vehicle in an OSI trace
@@ -192,7 +192,7 @@ class TrafficContent(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Passage:
+class SumoPassage:
     """Consecutive time steps with a vehicle or person in SUMO."""
 
     name: str
@@ -287,10 +287,10 @@ class _PassageCollector:
         travelers: TravelerFilter,
         allowance: Allowance,
     ) -> None:
-        self.passages: list[Passage] = []
+        self.passages: list[SumoPassage] = []
         self.left_out: set[str] = set()  # IDs that the filter excludes
         # {(tag, ID): (last time step, passage)}
-        self.travelers: dict[tuple[str, str], tuple[int, Passage]] = {}
+        self.travelers: dict[tuple[str, str], tuple[int, SumoPassage]] = {}
         self.step = -1
         self.time_s = -math.inf
         self._first_s = first_s
@@ -370,14 +370,14 @@ class _PassageCollector:
         passage.times_s.append(self.time_s)
         passage.rows.extend(row)
 
-    def _passage(self, tag: str, attributes: Mapping[str, str]) -> Passage:
+    def _passage(self, tag: str, attributes: Mapping[str, str]) -> SumoPassage:
         """Return the passage that an element continues, or a new passage."""
         traveler = tag, attributes["id"]
         last_step, passage = self.travelers.get(traveler, (-2, None))
         # SUMO omits vehicles while they are teleported.
         if passage is None or last_step < self.step - 1:
             self._allowance.take(_TRAVELER_BYTES + len(attributes["id"]))
-            passage = Passage(attributes["id"], attributes.get("type") or tag)
+            passage = SumoPassage(attributes["id"], attributes.get("type") or tag)
             self.passages.append(passage)
         self.travelers[traveler] = self.step, passage
         return passage
@@ -480,7 +480,7 @@ def platform_track(
     section: TrafficSection,
     content: TrafficContent,
     load_mesh: Callable[[VehicleSection], SceneMesh],
-    standing: StandingSurfaces,
+    support: SupportSurfaces,
 ) -> Track:
     """Return the local trajectory of the vehicle in the traffic that carries the sensors.
 
@@ -490,7 +490,7 @@ def platform_track(
     ----------
     entry
         Section `trajectory` of the scenario, which names the vehicle.
-    section, load_mesh, standing
+    section, load_mesh, support
         As for `build_traffic_actors`.
     content
         Traffic with the passages of that vehicle only.
@@ -505,7 +505,7 @@ def platform_track(
     for passage in content.passages:
         shape = passage.entry(section)
         mesh = None if shape is None else load_mesh(shape)
-        tracks += _passage_tracks(passage, section, mesh, standing, 0.0)
+        tracks += _passage_tracks(passage, section, mesh, support, 0.0)
     if not tracks:
         known = sorted(content.left_out)
         hint = name_hint(entry.vehicle or "", known) if known else ""
@@ -535,16 +535,16 @@ def _passage_tracks(
     passage: TrafficPassage,
     section: TrafficSection,
     mesh: SceneMesh | None,
-    standing: StandingSurfaces,
+    support: SupportSurfaces,
     start_s: float,
 ) -> Sequence[Track]:
     """Return the local trajectories of a passage.
 
     If the passage leaves `section.surfaces`, there is one trajectory for each part on the surfaces.
     """
-    track = passage.track(section, mesh, standing.origin, start_s)
+    track = passage.track(section, mesh, support.origin, start_s)
     if section.surfaces:
-        return follow_surfaces(track, standing.select(section.surfaces))
+        return follow_surfaces(track, support.select(section.surfaces))
     return [track]
 
 
@@ -552,7 +552,7 @@ def build_traffic_actors(
     section: TrafficSection,
     passages: Sequence[TrafficPassage],
     load_mesh: Callable[[VehicleSection], SceneMesh],
-    standing: StandingSurfaces,
+    support: SupportSurfaces,
     start_s: float,
 ) -> list[tuple[Actor, VehicleSection]]:
     """Create actors from passages, in the local coordinates of a scene.
@@ -565,7 +565,7 @@ def build_traffic_actors(
         Passages of the vehicles and persons.
     load_mesh
         Function that returns the mesh of an entry.
-    standing
+    support
         Surfaces of the scene. If `section.surfaces` is set, vehicles are not in the scene while
         they are not on these surfaces.
     start_s
@@ -586,7 +586,7 @@ def build_traffic_actors(
         entry = passage.entry(section)
         assert entry is not None, "objects without a shape are skipped when the file is read"
         mesh = load_mesh(entry)
-        tracks = _passage_tracks(passage, section, mesh, standing, start_s)
+        tracks = _passage_tracks(passage, section, mesh, support, start_s)
         named = replace(mesh, name=f"{entry.name or passage.kind} ({passage.name})")
         # Different animation offsets keep the actors of an entry from walking in step.
         share = zlib.crc32(passage.name.encode()) / 2**32
