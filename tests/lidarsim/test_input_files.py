@@ -14,7 +14,7 @@ import trimesh
 from lidarpool import compare, load_robot, load_sensor, load_trajectory, read_cloud
 from lidarpool.clouds.format_table import point_suffixes
 from lidarpool.scenario.campaign import CampaignSpec
-from lidarpool.scenario.point_scene import scene_from_points, surfels
+from lidarpool.scenario.point_scene import scene_from_points, surfel_mesh
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.helios import import_survey
@@ -67,7 +67,7 @@ READERS = {
     "traffic.xml.gz": traffic,
     "copies.csv": copies,
     "survey.xml": lambda path: import_survey(
-        path, path.with_name("out"), check=Scenario.load, surfels=surfels
+        path, path.with_name("out"), check=Scenario.load, surfels=surfel_mesh
     ),
 }
 

@@ -28,7 +28,7 @@ from ..run.run_result import CampaignRun, RunResult
 from ..run.runner import cast_to_store
 from ..run.store.run_store import RUN_FOLDER
 from ..run.stream import SweepStream
-from ..scenario import campaign as described
+from ..scenario.campaign import CampaignSpec
 from ..scenario.job import Job
 from .result import Result
 
@@ -153,8 +153,8 @@ def simulate(
     return Result(**declared(result, RunResult))
 
 
-class Campaign(described.CampaignSpec):  # noqa: D101 - inherits the docstring
-    __doc__ = described.CampaignSpec.__doc__
+class Campaign(CampaignSpec):  # noqa: D101 - inherits the docstring
+    __doc__ = CampaignSpec.__doc__
 
     def run(
         self,

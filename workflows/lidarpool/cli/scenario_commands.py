@@ -140,7 +140,7 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     from lidarscenes.mujoco.import_model import import_model
     from lidarscenes.sensors.import_sensor import ENDINGS, import_sensor
 
-    from ..scenario.point_scene import surfels
+    from ..scenario.point_scene import surfel_mesh
     from ..scenario.prepare import prepare
     from ..scenario.scenario import Scenario
     from ..scenario.sections import SensorSection
@@ -161,7 +161,9 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     elif survey.suffix.lower() in ENDINGS:
         left_out = import_whole(import_sensor, survey, folder, assets, check)
     else:
-        left_out = import_survey(survey, folder, assets, check=check, surfels=surfels).unsupported
+        left_out = import_survey(
+            survey, folder, assets, check=check, surfels=surfel_mesh
+        ).unsupported
     file = folder / SCENARIO_FILE
     scenario = Scenario.load(file)
     own_sensors = len(scenario.sensors) or int(scenario.sensor != SensorSection())

@@ -191,7 +191,7 @@ def stations(
 def _scenario_model(scenario: Scenario) -> str | None:
     """Return the sensor model of a scenario; a sensor file is relative to the scenario's folder."""
     model = scenario.sensor.model
-    if model is not None and scenario.sensor.has_own_model:
+    if model is not None and scenario.sensor.has_custom_model:
         return str(scenario.path(model))
     return model
 

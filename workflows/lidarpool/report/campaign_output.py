@@ -263,7 +263,7 @@ class DataSetOutput:
             "backend": store.backend,
             "sensors": sums.sensors,
             "files": file_hashes(self.campaign.files),
-            "campaign": self.campaign.described,
+            "campaign": self.campaign.card_content,
             "shards": [str(self.campaign.shard)],
         }
         write_record(self.dataset.storage, record)  # before the files that it assigns to a campaign

@@ -63,7 +63,7 @@ def write_card(
     storage
         Folder of the data set, which must exist.
     campaign, run
-        The campaign as in `CampaignSpec.described`, and the sums of its run.
+        The campaign as in `CampaignSpec.card_content`, and the sums of its run.
     jobs
         Rows in order, such as `lidarpool.datasets.job_table.read_table` gives.
     versions

@@ -55,9 +55,11 @@ def advice(prepared: PreparedScenario) -> list[str]:
         axes = [f"{axes[0]}. The same applies to {plural(others, 'other file')}"]
     side = float(np.ptp(prepared.scene.bounds, axis=0).max())
     step = prepared.survey.precision_m
-    placed = () if prepared.placement is None else prepared.placement.notes
+    placement_notes = () if prepared.placement is None else prepared.placement.notes
     system = missing_epsg_note(prepared.scene, prepared.survey.epsg)
-    likely = filter(None, (_size_note(prepared, side), system, *placed, _color_note(prepared)))
+    likely = filter(
+        None, (_size_note(prepared, side), system, *placement_notes, _color_note(prepared))
+    )
     coarse = [
         f"points are rounded to {step:g} m, but the scene is only {side:.3g} m long. Set a smaller "
         "`cloud.precision_m` in a scenario"

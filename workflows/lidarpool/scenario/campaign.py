@@ -173,8 +173,8 @@ class CampaignSpec:
         return campaign
 
     @property
-    def described(self) -> dict[str, Any]:
-        """Description of the campaign in the data set card, which can be serialized as JSON."""
+    def card_content(self) -> dict[str, Any]:
+        """Content of the data set card, which can be serialized as JSON."""
         names = ("title", "license", "command", "description", "seed", "count", "names")
         return {name: getattr(self, name) for name in names} | {"keep": asdict(self.keep)}
 
@@ -254,7 +254,7 @@ class CampaignSpec:
         return self._for_dataset(self._jobs.job(number, cache, columns, self._fields(number)))
 
     def prepare(self, number: int, columns: Sequence[str] = ()) -> PreparedScenario:
-        """Create a job like `job` does, and return it with its prepared scenario.
+        """Create a job as `job` does, and return it with its prepared scenario.
 
         This method must not be called if a function creates the jobs, because such jobs have no
         scenario.
@@ -305,7 +305,7 @@ class CampaignSpec:
         # `Path.exists` raises an error for names that are not valid file names.
         missing = [path for path in self.files if not os.path.exists(path)]  # noqa: PTH110
         mistakes.lines += [
-            f"{self._jobs.named_in(path) or f'{self.command}: '}{not_found(path)}"
+            f"{self._jobs.message_prefix(path) or f'{self.command}: '}{not_found(path)}"
             for path in missing
         ]
         mistakes.tell()

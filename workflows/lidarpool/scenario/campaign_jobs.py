@@ -74,7 +74,7 @@ class JobSource:
         return f"{number:04}"
 
     def values(self, number: int) -> dict[str, Value | None]:
-        """Return the values of a job that differ between jobs."""
+        """Return those values of a job that differ between jobs."""
         return {}
 
     def scenario(self, number: int) -> Scenario | None:
@@ -86,7 +86,7 @@ class JobSource:
         """Fields of the scenarios that jobs are created from, as text."""
         return {}
 
-    def named_in(self, file: Path) -> str:
+    def message_prefix(self, file: Path) -> str:
         """Return a message prefix that states where a file name is set, or an empty string.
 
         The prefix names, for example, a scenario and one of its fields.
@@ -225,9 +225,11 @@ class ScenarioJobs(JobSource):
         """Return the name of a job, which is the name of its file without the suffix."""
         return self._names[number]
 
-    def named_in(self, file: Path) -> str:
+    def message_prefix(self, file: Path) -> str:
         """Return a message prefix with the scenario and the field that name a file."""
-        return next(filter(None, (Scenario.load(path).named_in(file) for path in self.paths)), "")
+        return next(
+            filter(None, (Scenario.load(path).message_prefix(file) for path in self.paths)), ""
+        )
 
     def scenario(self, number: int) -> Scenario:
         """Read the scenario of a job."""
@@ -311,7 +313,7 @@ class SampledJobs(JobSource):
         words = describe_fields({name: to_json(rows).decode() for name, rows in tables.items()})
         return _describe_scenarios({base.name: base.scenario for base in bases}) | dict(words)
 
-    def named_in(self, file: Path) -> str:
+    def message_prefix(self, file: Path) -> str:
         """Return a message prefix with the field that names a file.
 
         If the file is named in a table, the prefix also contains the table and the line.
@@ -323,7 +325,7 @@ class SampledJobs(JobSource):
                     return f"{self._source}: {text}: {table}, line {number}: "
         scenarios = [base.scenario for base in self._bases]
         scenarios += [base.files[file] for base in self._bases if file in base.files]
-        return next(filter(None, (scenario.named_in(file) for scenario in scenarios)), "")
+        return next(filter(None, (scenario.message_prefix(file) for scenario in scenarios)), "")
 
     def values(self, number: int) -> dict[str, Value | None]:
         """Return the values of a job for the job table."""

@@ -58,7 +58,7 @@ from lidarsim.words import did_you_mean_each, in_yaml, joined, printable
 from ..clouds.format_table import DATA_SETS, LAYOUTS
 from ..clouds.writing import ExportSpec
 from ..datasets.job_table import Value
-from .sections import IgnoredColumns, Section, may_be_empty
+from .sections import IgnoredColumns, Section, allow_empty
 
 # Normally distributed numbers are limited to this many standard deviations from the mean. Numbers
 # outside the limit, 2 in a billion, are drawn again.
@@ -513,7 +513,7 @@ class CampaignSection(Section):
     seed: Annotated[Seed, about("random seed; the same seed results in the same values")] = 0
     vary: Annotated[
         dict[Text, ValueRuleEntry],
-        may_be_empty(dict[Text, ValueRule]),
+        allow_empty(dict[Text, ValueRule]),
         about(
             "mapping from the path of a field to the rule that chooses its value; a path consists "
             "of keys, and of the indices or names of list entries",
@@ -524,7 +524,7 @@ class CampaignSection(Section):
     keep: Annotated[DatasetFormatEntry, about("format of the data set")] = DatasetFormat()
     splits: Annotated[
         dict[str, UnitShare],
-        may_be_empty(dict[str, UnitShare]),
+        allow_empty(dict[str, UnitShare]),
         about(
             "mapping from the name of a split to its share of the jobs; the shares add up to 1",
             {"train": 0.8, "val": 0.1, "test": 0.1},

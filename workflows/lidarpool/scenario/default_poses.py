@@ -87,7 +87,7 @@ class SensorPlacement:
 
 def place_sensor(
     scene: Scene,
-    carried: Mounted,
+    mounted: Mounted,
     *,
     landscape: bool = False,
     buildings: Sequence[str] = (),
@@ -105,7 +105,7 @@ def place_sensor(
     ----------
     scene
         Scene of the survey.
-    carried
+    mounted
         The sensor with its mount.
     landscape
         Whether the scene is a landscape, which is never treated as a single object. If it has a
@@ -119,28 +119,28 @@ def place_sensor(
         Whether to replace the sensor by a grid that is as wide as the object.
     """
     lower_m, upper_m = scene.bounds + scene.origin
-    middle = (lower_m + upper_m) / 2
-    drawn = _instances_to_meshes(scene, middle - scene.origin)
-    if landscape and not len(surface_heights(drawn, middle[0], middle[1])):  # there is a hole
+    center = (lower_m + upper_m) / 2
+    drawn = _instances_to_meshes(scene, center - scene.origin)
+    if landscape and not len(surface_heights(drawn, center[0], center[1])):  # there is a hole
         ground_scene = _select_objects(drawn, roads) or drawn
         ground = ground_scene.vertices[ground_scene.faces].mean(axis=1) + drawn.origin
-        middle = ground[np.argmin(np.hypot(*(ground - middle)[:, :2].T))]
-    standing = _poses_above_floor(drawn, middle)
+        center = ground[np.argmin(np.hypot(*(ground - center)[:, :2].T))]
+    floor_poses = _poses_above_floor(drawn, center)
     surroundings = None if landscape else _build_placement_checker(drawn)
     building_scene = _select_objects(drawn, buildings)
-    if building_scene and len(surface_heights(building_scene, middle[0], middle[1])):
-        standing = _poses_beside(drawn, middle, buildings)
-        is_object = not standing
+    if building_scene and len(surface_heights(building_scene, center[0], center[1])):
+        floor_poses = _poses_beside(drawn, center, buildings)
+        is_object = not floor_poses
     else:
         is_object = surroundings is not None and surroundings.is_object(
-            surroundings.cast_around(_local_positions(standing, scene))
+            surroundings.cast_around(_local_positions(floor_poses, scene))
         )
     if not is_object:
-        if is_obstructed(drawn, _local_positions(standing, scene)):
-            standing = _poses_beside(drawn, middle, buildings) or standing
-        positions = _local_positions(standing, scene)
-        return SensorPlacement(standing, _inside_note(surroundings, positions, scene, carried))
-    poses = poses_around(scene, carried)
+        if is_obstructed(drawn, _local_positions(floor_poses, scene)):
+            floor_poses = _poses_beside(drawn, center, buildings) or floor_poses
+        positions = _local_positions(floor_poses, scene)
+        return SensorPlacement(floor_poses, _inside_note(surroundings, positions, scene, mounted))
+    poses = poses_around(scene, mounted)
     grid = _narrow_grid(drawn, surroundings, poses) if narrow and surroundings else {}
     return SensorPlacement(
         poses, _object_note(scene, poses, grid), surrounds_object=True, grid=grid
@@ -224,16 +224,16 @@ def _select_objects(scene: Scene, patterns: Sequence[str]) -> Scene | None:
     return replace(scene, faces=scene.faces[selected], face_object=scene.face_object[selected])
 
 
-def _poses_beside(scene: Scene, middle: Floats, buildings: Sequence[str] = ()) -> tuple[Pose, ...]:
+def _poses_beside(scene: Scene, center: Floats, buildings: Sequence[str] = ()) -> tuple[Pose, ...]:
     """Return unobstructed poses beside the center of a scene, or an empty tuple.
 
-    `middle` is the center and has shape (3,). The center and the poses are in world coordinates.
-    If objects match the name patterns in `buildings`, the poses are outdoors, which means above a
-    surface and neither inside nor on top of a building.
+    The center, which has shape (3,), and the poses are in world coordinates. If objects match the
+    name patterns in `buildings`, the poses are outdoors, which means above a surface and neither
+    inside nor on top of a building.
     """
     half = np.ptp(scene.bounds, axis=0) / 2
     reach = np.minimum(half, [max(_OFFSETS_M) + 1.0] * 2 + [np.inf])
-    local = middle - scene.origin
+    local = center - scene.origin
     in_reach = triangles_in_box(scene, local - reach, local + reach)
     surroundings = replace(
         scene, faces=scene.faces[in_reach], face_object=scene.face_object[in_reach]
@@ -243,13 +243,13 @@ def _poses_beside(scene: Scene, middle: Floats, buildings: Sequence[str] = ()) -
         for angle in np.arange(8) * np.pi / 4:
             step = distance_m * np.array([np.cos(angle), np.sin(angle), 0.0])
             if (np.abs(step[:2]) < half[:2]).all():
-                x, y, _ = middle + step
+                x, y, _ = center + step
                 if building_scene and (
                     len(surface_heights(building_scene, x, y))
                     or not len(surface_heights(surroundings, x, y))
                 ):
                     continue
-                poses = _poses_above_floor(surroundings, middle + step)
+                poses = _poses_above_floor(surroundings, center + step)
                 if not is_obstructed(surroundings, _local_positions(poses, scene)):
                     return poses
     return ()
@@ -269,7 +269,7 @@ def build_placement_checker(scene: Scene, positions: ArrayLike) -> PlacementChec
 
 
 def _inside_note(
-    surroundings: PlacementChecker | None, positions: ArrayLike, scene: Scene, carried: Mounted
+    surroundings: PlacementChecker | None, positions: ArrayLike, scene: Scene, mounted: Mounted
 ) -> str:
     """Return a note if a position is inside a closed body, otherwise an empty string.
 
@@ -279,7 +279,7 @@ def _inside_note(
         return ""
     return (
         "the sensor is inside a closed body. It hits only the back faces of surfaces. "
-        f"{outside_view_hint(scene, carried)}"
+        f"{outside_view_hint(scene, mounted)}"
     )
 
 
@@ -300,9 +300,9 @@ def find_free_position_above(
     return None
 
 
-def outside_view_hint(scene: Scene, carried: Mounted) -> str:
+def outside_view_hint(scene: Scene, mounted: Mounted) -> str:
     """Return a sentence that suggests two poses outside a scene, without the final period."""
-    poses = [pose_entry(pose) for pose in poses_around(scene, carried)[0:4:2]]
+    poses = [pose_entry(pose) for pose in poses_around(scene, mounted)[0:4:2]]
     return f"To view the scene from outside, use poses: {as_yaml_line(poses)}"
 
 
@@ -322,7 +322,7 @@ def pose_entry(pose: Pose) -> list[float] | dict[str, object]:
     return {"position": [*pose.position], "yaw_deg": pose.yaw_deg, "pitch_deg": pose.pitch_deg}
 
 
-def poses_around(scene: Scene, carried: Mounted) -> tuple[Pose, ...]:
+def poses_around(scene: Scene, mounted: Mounted) -> tuple[Pose, ...]:
     """Return poses on four sides of a scene and above it, facing its center.
 
     The distance from the center is 1.5 times the diagonal of the scene. The poses are farther away
@@ -330,17 +330,17 @@ def poses_around(scene: Scene, carried: Mounted) -> tuple[Pose, ...]:
     of its range. The poses are in world coordinates.
     """
     lower_m, upper_m = scene.bounds + scene.origin
-    middle = (lower_m + upper_m) / 2
+    center = (lower_m + upper_m) / 2
     extent_m = upper_m - lower_m
     diagonal_m = float(np.linalg.norm(extent_m))
-    down_deg, up_deg = _forward_elevations_deg(carried)
-    distance_m = _viewing_distance_m(carried, diagonal_m, up_deg - down_deg)
+    down_deg, up_deg = _forward_elevations_deg(mounted)
+    distance_m = _viewing_distance_m(mounted, diagonal_m, up_deg - down_deg)
     digits = max(0, 3 - int(np.floor(np.log10(diagonal_m))))
     # From above, the azimuth of the sensor runs along the longer side of the scene.
     azimuth_above = 270 if extent_m[0] > extent_m[1] else 180
     poses = []
     for azimuth, above in (*((a, _ELEVATION_DEG) for a in _AZIMUTHS_DEG), (azimuth_above, 90.0)):
-        position = np.round(middle + distance_m * _direction(azimuth, above), digits) + 0.0
+        position = np.round(center + distance_m * _direction(azimuth, above), digits) + 0.0
         pitch = round(above + (down_deg + up_deg) / 2, 1)
         poses.append(Pose(tuple(position.tolist()), (azimuth + 180.0) % 360.0, pitch))
     return tuple(poses)
@@ -354,21 +354,21 @@ def _direction(azimuth_deg: float, elevation_deg: float) -> Floats:
     return np.array([cosines[0] * cosines[1], sines[0] * cosines[1], sines[1]])
 
 
-def _viewing_distance_m(carried: Mounted, diagonal_m: float, field_deg: float) -> float:
+def _viewing_distance_m(mounted: Mounted, diagonal_m: float, field_deg: float) -> float:
     """Return the distance at which an object with the given diagonal fills the field of view."""
-    sensor = carried.sensor
+    sensor = mounted.sensor
     half = np.radians(max(field_deg, 1e-3) / 2)
     diagonals = float(np.clip(0.5 / np.sin(half), *_DIAGONALS))
     distance_m = max(diagonal_m * diagonals, sensor.min_range_m + diagonal_m)
     return min(distance_m, max(0.9 * sensor.max_range_m, 0.6 * diagonal_m))  # outside and in range
 
 
-def _forward_elevations_deg(carried: Mounted) -> tuple[float, float]:
+def _forward_elevations_deg(mounted: Mounted) -> tuple[float, float]:
     """Return the minimum and maximum elevation of the forward rays in the platform frame."""
-    sensor = carried.sensor
+    sensor = mounted.sensor
     count = min(sensor.period or _MAX_FIRINGS, _MAX_FIRINGS)
     firings = np.linspace(0, sensor.period or count, count, endpoint=False).astype(np.int64)
-    rays: Floats = sensor.directions(firings).reshape(-1, 3) @ carried.mount.rotation_matrix.T
+    rays: Floats = sensor.directions(firings).reshape(-1, 3) @ mounted.mount.rotation_matrix.T
     facing = np.abs(np.degrees(np.arctan2(rays[:, 1], rays[:, 0]))) <= _FORWARD_DEG
     if not facing.any():
         return -90.0, -90.0  # airborne scanners look down

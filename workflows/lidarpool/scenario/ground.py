@@ -145,8 +145,8 @@ class SupportSurfaces:
 def follow_surfaces(track: Track, support: SupportSurfaces) -> list[Track]:
     """Return the parts of a trajectory that are on surfaces.
 
-    Poses are at most 0.5 m apart. Their z axes are perpendicular to the mean slope of the surface
-    within a meter, and their headings are preserved.
+    Poses are at most `STEP_M` apart. Their z axes are perpendicular to the mean slope of the
+    surface within a meter, and their headings are preserved.
 
     Parameters
     ----------

@@ -199,7 +199,7 @@ def points_to_scene(
     return PointScene(scene, surfels.voxel_m, loss)
 
 
-def surfels(path: Path, points: Floats, voxel_m: float | None, size: float = 1.0) -> SceneMesh:
+def surfel_mesh(path: Path, points: Floats, voxel_m: float | None, size: float = 1.0) -> SceneMesh:
     """Return the surfels of points as a mesh.
 
     `path` is the file of the points, which is used for the name of the mesh and in messages.

@@ -414,7 +414,7 @@ def _robot_actors(
     If the robot is on the platform, links on which sensors are mounted are omitted.
     """
     add_note = shapes.findings.notes.append
-    links = shapes.scenario.links
+    links = shapes.scenario.mount_links
     sensor_links = links.intersection(robot.meshes) if entry.is_platform else ()
     for link in sorted(sensor_links):
         add_note(
@@ -510,7 +510,7 @@ def _classed_objects(scenario: Scenario, scene: Scene) -> list[_ClassedObject]:
     All copies of an entry are treated as one object, and each link of a robot as a separate object.
     """
     classed: list[_ClassedObject] = []
-    for entry in scenario.placed:
+    for entry in scenario.object_entries:
         if entry.semantic_class is None:
             continue
         patterns = {entry.name: [escape(entry.name)]}
@@ -604,7 +604,7 @@ def _class_names(
     of the cloud.
     """
     scenario = survey_parts.scenario
-    entries = (*scenario.placed, *(scenario.traffic.vehicles if scenario.traffic else ()))
+    entries = (*scenario.object_entries, *(scenario.traffic.vehicles if scenario.traffic else ()))
     scenario_classes = {entry.semantic_class for entry in (*scenario.materials, *entries)}
     file_classes = {material.semantic_class for material in materials} - scenario_classes
     numbers: dict[str, int] = {}  # {class name: number}

@@ -42,8 +42,8 @@ from .sections import (
     Section,
     SensorSection,
     WorldSection,
-    may_be_empty,
-    scene_in_short,
+    allow_empty,
+    allow_scene_short_form,
 )
 from .traffic import TrafficSection
 
@@ -145,10 +145,10 @@ class Scenario(Section):
         If a value is invalid. `load` and `from_data` raise LidarError instead.
     """
 
-    scene: Annotated[SceneSection, scene_in_short] = SceneSection()
-    world: Annotated[WorldSection, may_be_empty(WorldSection)] = WorldSection()
+    scene: Annotated[SceneSection, allow_scene_short_form] = SceneSection()
+    world: Annotated[WorldSection, allow_empty(WorldSection)] = WorldSection()
     sensor: Annotated[
-        SensorSection, may_be_empty(SensorSection), by_text("model", SensorSection | None)
+        SensorSection, allow_empty(SensorSection), by_text("model", SensorSection | None)
     ] = SensorSection()
     poses: Annotated[
         Several[PoseEntry] | None,
@@ -227,9 +227,9 @@ class Scenario(Section):
             {40: "road"},
         ),
     ] = {}  # noqa: RUF012 - the model is frozen
-    returns: Annotated[ReturnsSection, may_be_empty(ReturnsSection)] = ReturnsSection()
-    noise: Annotated[NoiseSection, may_be_empty(NoiseSection)] = NoiseSection()
-    weather: Annotated[Weather, may_be_empty(Weather)] = Weather()
+    returns: Annotated[ReturnsSection, allow_empty(ReturnsSection)] = ReturnsSection()
+    noise: Annotated[NoiseSection, allow_empty(NoiseSection)] = NoiseSection()
+    weather: Annotated[Weather, allow_empty(Weather)] = Weather()
     navigation: Annotated[
         Navigation | None,
         about(
@@ -241,10 +241,10 @@ class Scenario(Section):
         Several[Fault],
         about("faults of the sensors", [{"kind": "dirt", "transmission": 0.3}], max_length=256),
     ] = ()
-    cloud: Annotated[CloudOptions, may_be_empty(CloudOptions)] = CloudOptions()
-    output: Annotated[OutputSection, may_be_empty(OutputSection)] = OutputSection()
-    planning: Annotated[PlanningSection, may_be_empty(PlanningSection)] = PlanningSection()
-    pool: Annotated[PoolSection, may_be_empty(PoolSection)] = PoolSection()
+    cloud: Annotated[CloudOptions, allow_empty(CloudOptions)] = CloudOptions()
+    output: Annotated[OutputSection, allow_empty(OutputSection)] = OutputSection()
+    planning: Annotated[PlanningSection, allow_empty(PlanningSection)] = PlanningSection()
+    pool: Annotated[PoolSection, allow_empty(PoolSection)] = PoolSection()
 
     _folder: Path = PrivateAttr(default=Path())  # folder of relative file names
     _source: str = PrivateAttr(default="the scenario")  # name of the scenario in messages
@@ -391,7 +391,7 @@ class Scenario(Section):
                 "`at: [x, y, z]` if it is stationary. If it is the platform, replace `poses` with "
                 "a `trajectory` of the survey."
             )
-        if self.links and not any(entry.robot for entry in platforms):
+        if self.mount_links and not any(entry.robot for entry in platforms):
             yield (
                 "`mount.link` requires a robot as the platform. Add an actor with a .urdf file "
                 "and without a trajectory."
@@ -403,7 +403,7 @@ class Scenario(Section):
 
         They include meshes, tables, trajectories, traffic, and sensor models and calibrations.
         """
-        shaped = (*self.placed, *(self.traffic.vehicles if self.traffic else ()))
+        shaped = (*self.object_entries, *(self.traffic.vehicles if self.traffic else ()))
         entries = [*self.scene.files, *(entry.file for entry in shaped if entry.file)]
         files: list[str | None] = [entry.file for entry in entries]
         files += [self.traffic.file] if self.traffic else []
@@ -413,7 +413,7 @@ class Scenario(Section):
         files += [trajectory.times for trajectory in trajectories if trajectory]
         for section in (self.sensor, *self.sensors.values()):
             files += [section.calibration]
-            files += [section.model] if section.has_own_model else []
+            files += [section.model] if section.has_custom_model else []
         paths = [self.path(file) for file in files if file]
         models = (section.model for section in (self.sensor, *self.sensors.values()))
         paths += filter(None, map(plugin_model_file, models))
@@ -422,7 +422,7 @@ class Scenario(Section):
                 paths += files_of_trajectory(self.path(trajectory.file))
         return tuple(dict.fromkeys(paths))
 
-    def named_in(self, file: Path) -> str:
+    def message_prefix(self, file: Path) -> str:
         """Return a message prefix with the scenario and the field that name a file.
 
         The prefix is empty if no field names the file, or for the mesh file of a survey without a
@@ -449,7 +449,7 @@ class Scenario(Section):
             mistakes = Mistakes()
             for path in missing:
                 likely = endings() if format_of(path) else ()
-                mistakes.lines.append(f"{self.named_in(path)}{not_found(path, likely)}")
+                mistakes.lines.append(f"{self.message_prefix(path)}{not_found(path, likely)}")
             mistakes.lines += [
                 line
                 for line in str(error).splitlines()
@@ -458,7 +458,7 @@ class Scenario(Section):
             mistakes.tell()
 
     @property
-    def placed(self) -> tuple[CopiesSection | ActorSection, ...]:
+    def object_entries(self) -> tuple[CopiesSection | ActorSection, ...]:
         """Entries of `scene.copies` and `actors`."""
         return *self.scene.copies, *self.actors
 
@@ -473,7 +473,7 @@ class Scenario(Section):
         return self._folder / os.path.expanduser(file)  # noqa: PTH111
 
     @property
-    def links(self) -> set[str]:
+    def mount_links(self) -> set[str]:
         """Names of the robot links on which sensors are mounted."""
         mounts = [self.mount, *(section.mount for section in self.sensors.values())]
         return {mount.link for mount in mounts if mount is not None and mount.link is not None}

@@ -70,8 +70,8 @@ def scenario_schema() -> dict[str, Any]:
 def campaign_schema() -> dict[str, Any]:
     """Return the JSON Schema of campaign files.
 
-    The schema does not check that paths refer to fields, and that values are valid for these
-    fields. `Campaign.load` checks both.
+    The schema does not check that paths refer to fields, or that values are valid for these fields.
+    `Campaign.load` checks both.
     """
     return _section_schema(CampaignSection, "lidarpool campaign")
 

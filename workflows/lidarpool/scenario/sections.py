@@ -612,7 +612,7 @@ class SensorSection(Section):
         return self
 
     @property
-    def has_own_model(self) -> bool:
+    def has_custom_model(self) -> bool:
         """Whether the model is a file that the user provides."""
         return self.model is not None and self.model.endswith(MODEL_FILES)
 
@@ -648,7 +648,7 @@ class SensorSection(Section):
         """
         limit_names = {"rate_hz", "min_range_m", "max_range_m"}
         limits = self.model_dump(include=limit_names, exclude_none=True)
-        model = path(self.model) if self.model and self.has_own_model else self.model
+        model = path(self.model) if self.model and self.has_custom_model else self.model
         calibration = None if self.calibration is None else path(self.calibration)
         if model is None and calibration is None:
             grid = {"layers", "vertical_fov_deg", "horizontal_fov_deg", "step_deg"}
@@ -824,7 +824,7 @@ class TaskOptions:
     ] = "auto"
 
 
-class _Workers:
+class _WorkerCounts:
     """Fields of `PoolSection` that precede the fields of `TaskOptions`."""
 
     gpu: Annotated[
@@ -842,7 +842,7 @@ class _Workers:
     ] = None
 
 
-class PoolSection(Section, TaskOptions, _Workers):
+class PoolSection(Section, TaskOptions, _WorkerCounts):
     """The worker partitions and their tasks.
 
     `gpu` and `other` set the number of workers in a local cluster, which depends on the machine by
@@ -851,7 +851,7 @@ class PoolSection(Section, TaskOptions, _Workers):
     """
 
 
-def may_be_empty(kind: Any) -> Any:
+def allow_empty(kind: Any) -> Any:
     """Return a validator that accepts an empty section or mapping.
 
     In YAML, the value of a section is null if all of its lines are commented out.
@@ -861,7 +861,7 @@ def may_be_empty(kind: Any) -> Any:
 
 # Accepts the short forms of a scene, which are the name of a mesh file or preset, or a list of
 # files.
-scene_in_short = short(
+allow_scene_short_form = short(
     lambda v: v is None or isinstance(v, (str, list)),
     lambda v: {"preset" if v == "seed" else "files": v} if v else {},
     Text | MeshEntries | SceneSection | None,

@@ -62,7 +62,7 @@ class FileCrs(NamedTuple):
     file: str
     crs: str  # as "EPSG:25832" or WKT
     epsg: int | None
-    is_raster: bool  # whether `world.epsg` transforms the file
+    is_raster: bool  # whether the file is reprojected to `world.epsg`
 
 
 @dataclass
@@ -84,7 +84,7 @@ class Findings:
         return Findings(*(values.copy() for values in vars(self).values()))
 
     def class_patterns(self, number: int) -> tuple[str, ...]:
-        """Return name patterns of the objects to which their files assign a class."""
+        """Return name patterns of the objects to which files assign the class `number`."""
         patterns = dict.fromkeys(
             pattern
             for classes in self.classes.values()
@@ -133,11 +133,11 @@ class SceneCache:
 
     def find(self, scenario: Scenario) -> StaticScene:
         """Return the static scene of a scenario, from the cache or read from its files."""
-        key = _key(scenario)
+        key = _cache_key(scenario)
         if scenario.scene.ground is None:
             return self._scenes.find(key, lambda: read_static_scene(scenario))
         static = self._objects.find(key, lambda: _read_objects(scenario))
-        ground = _ground(scenario, static)
+        ground = _build_ground(scenario, static)
         rectangle = ground.vertices.tobytes()
         return self._scenes.find((key, rectangle), lambda: _static_scene(static, ground))
 
@@ -158,7 +158,7 @@ class _LeastRecentlyUsedCache(Generic[Value]):
         return value
 
 
-def _key(scenario: Scenario) -> object:
+def _cache_key(scenario: Scenario) -> object:
     """Return a key that is equal for scenarios that can share their static objects.
 
     The key consists of the scene section, the reading options, and the sizes and modification times
@@ -193,7 +193,7 @@ def read_static_scene(scenario: Scenario) -> StaticScene:
     """
     static = _read_objects(scenario)
     has_ground = scenario.scene.ground is not None
-    return _static_scene(static, _ground(scenario, static) if has_ground else None)
+    return _static_scene(static, _build_ground(scenario, static) if has_ground else None)
 
 
 def _static_scene(static: _StaticObjects, ground: SceneMesh | None) -> StaticScene:
@@ -231,7 +231,7 @@ def _read_objects(scenario: Scenario) -> _StaticObjects:
     objects = Objects(tuple(meshes), tuple(moving))
     corners = np.zeros((0, 2))
     if section.ground is not None and (meshes or moving):
-        corners = _corners(Scene.from_meshes(meshes or objects.at_start(lambda _: None)))
+        corners = _horizontal_bounds(Scene.from_meshes(meshes or objects.at_start(lambda _: None)))
     return _StaticObjects(objects, findings, corners)
 
 
@@ -397,8 +397,8 @@ def _place_copies(
     section = shapes.scenario.scene
     scene = Scene.from_meshes(static_objects) if static_objects else None
     if section.ground is not None and (static_objects or _copy_extents(section)):
-        corners = [] if scene is None else [_corners(scene)]
-        ground = _ground_mesh(section, [*corners, *_copy_extents(section)])
+        corners = [] if scene is None else [_horizontal_bounds(scene)]
+        ground = _build_ground_mesh(section, [*corners, *_copy_extents(section)])
         scene = Scene.from_meshes([*static_objects, ground])
     support = SupportSurfaces(scene)
     copies: list[SceneInstance] = []
@@ -449,7 +449,7 @@ def _footprints(scenario: Scenario) -> list[Floats]:
     return footprints
 
 
-def _corners(scene: Scene) -> Floats:
+def _horizontal_bounds(scene: Scene) -> Floats:
     """Return the minimum and maximum x and y of a scene in world coordinates, in meters.
 
     The result has shape (2, 2).
@@ -457,7 +457,7 @@ def _corners(scene: Scene) -> Floats:
     return (scene.bounds + scene.origin)[:, :2]
 
 
-def _ground(scenario: Scenario, static: _StaticObjects) -> SceneMesh:
+def _build_ground(scenario: Scenario, static: _StaticObjects) -> SceneMesh:
     """Return the ground of a scenario.
 
     Raise LidarError if the scenario has nothing that determines the extent of the ground.
@@ -469,10 +469,10 @@ def _ground(scenario: Scenario, static: _StaticObjects) -> SceneMesh:
             "scenario has no objects, poses, trajectories or actors. Add `poses`, or mesh files "
             "as `scene.files`."
         )
-    return _ground_mesh(scenario.scene, footprints)
+    return _build_ground_mesh(scenario.scene, footprints)
 
 
-def _ground_mesh(section: SceneSection, footprints: Sequence[Floats]) -> SceneMesh:
+def _build_ground_mesh(section: SceneSection, footprints: Sequence[Floats]) -> SceneMesh:
     """Return the ground in world coordinates.
 
     The ground consists of two triangles. It covers all points in `footprints` with a margin.
@@ -639,7 +639,8 @@ def _scatter_positions(scatter: Scatter, seeds: list[int], support: SupportSurfa
 
     Returns
     -------
-    Array of shape (count, 3).
+    positions
+        Shape (count, 3).
     """
     surfaces = support.select(scatter.surfaces)
     x0, y0, x1, y1 = surfaces.rectangle if scatter.within is None else scatter.within

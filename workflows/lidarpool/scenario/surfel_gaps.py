@@ -108,17 +108,17 @@ def _rays_between(points: Floats, count: int, rng: np.random.Generator) -> Itera
     # firing.
     sampled = rng.permutation(directions)[:count]
     for start in range(0, len(sampled), _BLOCK):
-        middles = sampled[start : start + _BLOCK]
-        neighbors = _nearest(tree, middles, _NEIGHBORS)
-        offsets = directions[neighbors] - middles[:, None]
+        centers = sampled[start : start + _BLOCK]
+        neighbors = _nearest(tree, centers, _NEIGHBORS)
+        offsets = directions[neighbors] - centers[:, None]
         radii = np.sqrt(_dot(offsets, offsets).max(axis=1))
         mean = offsets.mean(axis=1)
         inside = np.flatnonzero(np.sqrt(_dot(mean, mean)) <= _CENTERED * radii)
         # Rays within half of the radius have neighbors on all sides.
         steps = rng.normal(size=(len(inside), _RAYS, 3))
-        steps -= _dot(steps, middles[inside, None])[..., None] * middles[inside, None]
+        steps -= _dot(steps, centers[inside, None])[..., None] * centers[inside, None]
         steps *= np.sqrt(rng.random((len(inside), _RAYS)) / _dot(steps, steps))[..., None]
-        rays = middles[inside, None] + radii[inside, None, None] / 2 * steps
+        rays = centers[inside, None] + radii[inside, None, None] / 2 * steps
         around = ranges[neighbors[inside]]
         yield _Rays(_normalize(rays), around.min(axis=1), around.max(axis=1))
 

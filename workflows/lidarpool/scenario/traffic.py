@@ -237,7 +237,7 @@ class SumoPassage:
 
 
 class TrafficClock:
-    """Converter of the times in a traffic file, which are passed one by one, to seconds."""
+    """Converter from the times in a traffic file, which are passed one by one, to seconds."""
 
     def __init__(self, time_unit: TimeUnit | None) -> None:
         self._time_unit = time_unit
@@ -300,7 +300,7 @@ class _PassageCollector:
         self._filter = travelers
         self._allowance = allowance
         self._known_attributes = set(_KNOWN)
-        self._vehicle_xy: tuple[str, str] | None = None  # last vehicle in the time step
+        self._vehicle_xy: tuple[str, str] | None = None  # of the last vehicle in the time step
 
     def collect(self, elements: Iterable[tuple[str, Mapping[str, str]]], last_s: float) -> None:
         """Collect the passages up to a time, including the first time step after that time.
