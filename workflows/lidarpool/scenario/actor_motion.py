@@ -423,7 +423,7 @@ class ActorSection(DeformingSection):
         self,
         path: ResolvePath,
         support: SupportSurfaces,
-        carrier: Track | None,
+        platform_track: Track | None,
         without_angles: dict[str, bool],
     ) -> Track:
         """Return the trajectory of the actor from the start of the survey, in local coordinates.
@@ -432,10 +432,10 @@ class ActorSection(DeformingSection):
         ----------
         path, support, without_angles
             As for `TrajectorySection.track`.
-        carrier
+        platform_track
             Trajectory of the survey, or None if the survey has poses.
         """
-        start_s = 0.0 if carrier is None else carrier.start_s or 0.0
+        start_s = 0.0 if platform_track is None else platform_track.start_s or 0.0
         if self.at is not None:
             # Two poses define a clock, which the joints of a robot use.
             positions = np.array([self.at.position] * 2) - support.origin
@@ -443,8 +443,8 @@ class ActorSection(DeformingSection):
             times = start_s + np.arange(2.0)
             return Track(times, positions, rotations, start_s=start_s, beyond="hold")
         if self.trajectory is None:
-            assert carrier is not None, "guaranteed by the validation of the scenario"
-            return carrier
+            assert platform_track is not None, "guaranteed by the validation of the scenario"
+            return platform_track
         with prefixed(f"actor {self.name!r}"):
             return self.trajectory.track(
                 path, support, start_s, name=self.name, without_angles=without_angles

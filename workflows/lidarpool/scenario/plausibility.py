@@ -391,23 +391,23 @@ def _up_axis_warnings(motion: _Motion, lowest_m: float) -> Iterator[str]:
 
 def _orientation_warnings(motion: _Motion) -> Iterator[str]:
     """Yield a warning if the platform lies on its side or does not face its direction of travel."""
-    as_given = _MeanOrientation.measure(motion, motion.rotations)
+    as_read = _MeanOrientation.measure(motion, motion.rotations)
     # If the quaternions in the file have the order w, x, y, z, then w was read as x, x as y, and so
     # on.
     quaternions = quaternions_of(motion.rotations)
     w_first = _MeanOrientation.measure(motion, matrices(quaternions[:, [1, 2, 3, 0]]))
-    tilted = as_given.level <= _TILTED
-    is_w_first = as_given.level <= _LEVEL < w_first.level and not w_first.askew
-    if not (tilted or as_given.askew or is_w_first):
+    tilted = as_read.level <= _TILTED
+    is_w_first = as_read.level <= _LEVEL < w_first.level and not w_first.askew
+    if not (tilted or as_read.askew or is_w_first):
         return
     faults = []
     if tilted or is_w_first:
-        tilt = np.degrees(np.arccos(np.clip(as_given.level, -1, 1)))
+        tilt = np.degrees(np.arccos(np.clip(as_read.level, -1, 1)))
         faults.append(f"the z axis of the platform is tilted by {tilt:.0f} degrees from vertical")
-    if as_given.askew:
+    if as_read.askew:
         faults.append(
-            f"the platform constantly faces {abs(as_given.angle_deg):.0f} degrees to the "
-            f"{'left' if as_given.angle_deg > 0 else 'right'} of its direction of travel"
+            f"the platform constantly faces {abs(as_read.angle_deg):.0f} degrees to the "
+            f"{'left' if as_read.angle_deg > 0 else 'right'} of its direction of travel"
         )
     advice = "Check the order of quaternions (x, y, z, w) and the units and axes of angles"
     if is_w_first:
