@@ -200,7 +200,7 @@ class CampaignSpec:
         return self._jobs.values(self._checked_number(number))
 
     def name(self, number: int) -> str:
-        """Return the name of a job for file names.
+        """Return the name of a job, which is used in file names.
 
         The name is that of the scenario file, or a number such as 0017.
         """

@@ -67,7 +67,7 @@ class JobSource:
     identity: Mapping[str, str]
 
     def name(self, number: int) -> str:
-        """Return the name of a job for file names.
+        """Return the name of a job, which is used in file names.
 
         By default, the name is the number of the job with at least four digits.
         """
@@ -444,7 +444,7 @@ class _Base:
             self.files |= dict.fromkeys(scenario.files, scenario)
 
     def _trials(self, text: str) -> list[Any]:
-        """Return the values of a path to validate in place of all values that jobs may have.
+        """Return representative values of a path, which are validated instead of all values.
 
         The rows of a table are divided into groups that are as large as the largest sample.
         """

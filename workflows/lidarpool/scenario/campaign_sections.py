@@ -337,7 +337,7 @@ class ValueRule(Section):
 
     @property
     def limit_values(self) -> list[Any]:
-        """Values to validate in place of all values that can be drawn.
+        """Representative values, which are validated instead of all possible values.
 
         For a range, these are its limits. For a list, these are all of its values.
         """

@@ -46,7 +46,7 @@ class Job:
         strings or booleans, or None for an empty cell. All jobs of a campaign have the same names,
         which are the columns of the job table.
     number, name, split
-        Number of the job in its campaign, its name for file names, and the name of its split.
+        Number of the job in its campaign, its name in file names, and the name of its split.
     outputs
         Formats of the cloud in addition to PLY.
     made_of

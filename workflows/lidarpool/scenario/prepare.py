@@ -40,7 +40,7 @@ from .job import Job
 from .osi_traffic import OSI_SUFFIXES, read_osi
 from .scenario import Scenario
 from .sections import CopiesSection, SensorSection
-from .static_scene import Findings, SceneCache, ShapeLoader, StaticScene, read_static_scene
+from .static_scene import FileFindings, SceneCache, ShapeLoader, StaticScene, read_static_scene
 from .traffic import (
     TrafficContent,
     TrafficSection,
@@ -87,7 +87,7 @@ class PreparedScenario:
     scenario: Scenario
     job: Job
     placement: SensorPlacement | None
-    findings: Findings
+    findings: FileFindings
 
     @property
     def scene(self) -> Scene:
@@ -175,7 +175,7 @@ class _SurveyParts(NamedTuple):
     """Parts of a survey that do not depend on the materials."""
 
     scenario: Scenario
-    findings: Findings
+    findings: FileFindings
     sensors: Sequence[Mounted]
     # Trajectory of the platform in local coordinates, or poses in world coordinates. Default poses
     # are used if the scenario defines neither.
@@ -227,7 +227,7 @@ def _platform_track(shapes: ShapeLoader, support: SupportSurfaces) -> Track | No
 def _read_traffic(
     scenario: Scenario, first_s: float, last_s: float, travelers: TravelerFilter
 ) -> TrafficContent:
-    """Read the traffic of a scenario between two times, which use the clock of the file."""
+    """Read the traffic of a scenario between two times, which refer to the clock of the file."""
     section = scenario.traffic
     assert section is not None
     file = scenario.path(section.file)
@@ -237,7 +237,7 @@ def _read_traffic(
 
 
 def _place_sensor(
-    scenario: Scenario, scene: Scene, findings: Findings, sensor: Mounted
+    scenario: Scenario, scene: Scene, findings: FileFindings, sensor: Mounted
 ) -> SensorPlacement:
     """Choose poses for a scenario that defines neither poses nor a trajectory.
 
@@ -270,12 +270,12 @@ def _build_traffic(
         # The duration does not depend on the materials.
         duration_s = _build_survey(survey_parts, []).duration_ns / 1e9
         track_or_poses = survey_parts.track_or_poses
-        # The start of the survey uses the clock of the platform's trajectory.
+        # The start of the survey refers to the clock of the platform's trajectory.
         start_s = track_or_poses.start_s or 0.0 if isinstance(track_or_poses, Track) else 0.0
         return _traffic_actors(scenario.traffic, shapes, support, start_s, duration_s)
 
 
-def _common_epsg(scenario: Scenario, findings: Findings) -> int | None:
+def _common_epsg(scenario: Scenario, findings: FileFindings) -> int | None:
     """Return the EPSG code that the files of a scene state, or None.
 
     Return None if `world.epsg` is set. In this case, add a note for each file that states a
@@ -434,8 +434,8 @@ def _traffic_actors(
 ) -> list[tuple[Actor, VehicleSection]]:
     """Return the vehicles and persons in the traffic during the survey, with their entries.
 
-    `start_s` and `duration_s` are the start and duration of the survey in seconds. The start uses
-    the clock of the trajectory of the platform.
+    `start_s` and `duration_s` are the start and duration of the survey in seconds. The start refers
+    to the clock of the platform's trajectory.
     """
     file_start_s = start_s - section.offset_s
     findings = shapes.findings
@@ -459,7 +459,7 @@ def _traffic_actors(
 
 def _materials(
     scenario: Scenario,
-    findings: Findings,
+    findings: FileFindings,
     scene: Scene,
     vehicles: Sequence[tuple[Actor, VehicleSection]],
 ) -> list[Material]:

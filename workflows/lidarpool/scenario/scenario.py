@@ -115,7 +115,7 @@ def _with_sensor(path: Path, data: Any, options: Mapping[str, Any]) -> Any:
 
 
 def mesh_survey_name(mesh_file: Path) -> str:
-    """Return the name, for messages, of the survey of a mesh file without a scenario."""
+    """Return the survey name for messages if a mesh file is simulated without a scenario."""
     return f"survey of {mesh_file}"
 
 

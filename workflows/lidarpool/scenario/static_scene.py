@@ -66,7 +66,7 @@ class FileCrs(NamedTuple):
 
 
 @dataclass
-class Findings:
+class FileFindings:
     """Notes and metadata that are collected while the files of a scene are read."""
 
     notes: list[str] = field(default_factory=list)  # notes for the user, such as skipped objects
@@ -79,9 +79,9 @@ class Findings:
     # {name of the platform or actor: whether its path has corners} for trajectories without angles
     without_angles: dict[str, bool] = field(default_factory=dict)
 
-    def copy(self) -> Findings:
+    def copy(self) -> FileFindings:
         """Return a copy whose lists and dictionaries can be extended separately."""
-        return Findings(*(values.copy() for values in vars(self).values()))
+        return FileFindings(*(values.copy() for values in vars(self).values()))
 
     def class_patterns(self, number: int) -> tuple[str, ...]:
         """Return name patterns of the objects to which files assign the class `number`."""
@@ -109,14 +109,14 @@ class StaticScene(NamedTuple):
 
     scene: Scene
     support: SupportSurfaces
-    findings: Findings
+    findings: FileFindings
 
 
 class _StaticObjects(NamedTuple):
     """Objects of a static scene, without the ground."""
 
     objects: Objects
-    findings: Findings
+    findings: FileFindings
     corners: Floats  # (n, 2), corners of the horizontal extent in world coordinates, in meters
 
 
@@ -210,7 +210,7 @@ def _read_objects(scenario: Scenario) -> _StaticObjects:
     """Read the mesh files of a scenario, and place its copies."""
     section = scenario.scene
     _check_not_empty(scenario)
-    findings = Findings()
+    findings = FileFindings()
     shapes = ShapeLoader(scenario, findings)
     meshes: list[SceneMesh | SceneInstance] = list(seed_objects()) if section.has_seed else []
     moving: list[Actor] = []
@@ -272,7 +272,7 @@ class ShapeLoader:
     Shapes are cached, so that entries with the same shape share it. Notes are added to `findings`.
     """
 
-    def __init__(self, scenario: Scenario, findings: Findings) -> None:
+    def __init__(self, scenario: Scenario, findings: FileFindings) -> None:
         self.scenario = scenario
         self.findings = findings
         self._meshes: dict[Any, SceneMesh] = {}  # {(file or box, animation, wheels): mesh}
