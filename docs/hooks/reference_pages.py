@@ -33,7 +33,7 @@ _SECTIONS = {
     "poses": "Pose",
     "trajectory": "TrajectorySection",
     "trajectory: points": "TimedPose",
-    "sensors": "CarriedSection",
+    "sensors": "MountedSensorSection",
     "mount": "MountSection",
     "actors": "ActorSection",
     "actors: animation": "AnimationSection",
@@ -58,10 +58,10 @@ _SECTIONS = {
 }
 
 _OF_CAMPAIGNS = {
-    "vary": "Choice",
-    "vary: normal": "Normal",
-    "vary: sample": "Sample",
-    "keep": "Keep",
+    "vary": "ValueRule",
+    "vary: normal": "NormalDistribution",
+    "vary: sample": "RowSample",
+    "keep": "DatasetFormat",
 }
 
 # What a reader of a package looks for first; the rest follows by the alphabet.

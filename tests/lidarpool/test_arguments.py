@@ -106,7 +106,10 @@ WRONG = {
     ],
     to_dask: [(Cloud(POINTS, {}), "points must be a StoredCloud")],
     # A text, or a single object, where a list is expected.
-    Campaign.of_scenarios: [("a.yaml", "paths must be a list, but is 'a.yaml'"), ([], "at least")],
+    Campaign.from_scenarios: [
+        ("a.yaml", "paths must be a list, but is 'a.yaml'"),
+        ([], "at least"),
+    ],
     Scene.from_meshes: [("a.glb", "meshes must be a list"), ([GRID], "contains a Sensor")],
     Follower: [
         (3, GRID, "bodies must be a list, but is 3"),

@@ -150,7 +150,7 @@ def test_numbers_are_distributed_as_they_say():
     cut = np.array([draw.normal(0, 1, (1, 2)) for _ in range(500)])
     assert cut.min() >= 1 and cut.max() <= 2
     assert Counter(draw.integer(-1, 1) for _ in range(3000)).keys() == {-1, 0, 1}
-    weighted = Counter(draw.position(3, (1, 0, 3)) for _ in range(count))
+    weighted = Counter(draw.index(3, (1, 0, 3)) for _ in range(count))
     assert weighted[1] == 0 and weighted[2] / count == pytest.approx(0.75, abs=0.03)
     subsets = Counter(tuple(draw.subset(4, 2)) for _ in range(count))
     assert len(subsets) == 6 and min(subsets.values()) > count / 6 * 0.8
@@ -161,8 +161,8 @@ def test_the_values_are_those_of_always():
     draw = JobRandom(7, 417, "weather.visibility_km")
     drawn = [
         *(draw.uniform(0.2, 20), draw.log_uniform(0.2, 20), draw.normal(1, 0.5)),
-        *(draw.integer(-(10**12), 10**12), draw.position(5, (1, 2, 3, 4, 5))),
-        *(draw.subset(100, 4), draw.order(6), draw.bits(63)),
+        *(draw.integer(-(10**12), 10**12), draw.index(5, (1, 2, 3, 4, 5))),
+        *(draw.subset(100, 4), draw.permutation(6), draw.bits(63)),
     ]
     assert drawn == ALWAYS
     found = Campaign.load(EXAMPLES / "campaign.yaml")
@@ -396,7 +396,7 @@ def test_scenarios_as_they_are(folder):
     for name in ("a/base.yaml", "my hall.yaml"):
         (folder / name).write_text("noise: {range_m: 0.1}\n")
     paths = [folder / name for name in ("base.yaml", "a/base.yaml", "my hall.yaml", "hall.glb")]
-    found = Campaign.of_scenarios(paths, keep="folder", splits={"a": 0.5, "b": 0.5})
+    found = Campaign.from_scenarios(paths, keep="folder", splits={"a": 0.5, "b": 0.5})
     every = range(found.count)
     assert [found.name(number) for number in every] == ["base", "base-2", "my_hall", "hall"]
     assert {found.split(number) for number in every} == {"a", "b"}
@@ -631,7 +631,7 @@ def test_given_files_that_cannot_be_used(folder):
     (folder / "campaign.yaml").write_text("base: base.yaml\n")
     names = ("none.yaml", "wrong.yaml", "none.glb", "campaign.yaml", "base.yaml")
     with pytest.raises(LidarError) as raised:
-        Campaign.of_scenarios([folder / name for name in names])
+        Campaign.from_scenarios([folder / name for name in names])
     lines = str(raised.value).splitlines()
     says = (
         "none.yaml does not exist",
@@ -640,7 +640,7 @@ def test_given_files_that_cannot_be_used(folder):
     )
     assert len(lines) == 3 and all(map(str.__contains__, lines, says))
     with pytest.raises(LidarError, match=r"none\.glb does not exist"):
-        Campaign.of_scenarios([folder / "none.glb", folder / "base.yaml"]).check_files()
+        Campaign.from_scenarios([folder / "none.glb", folder / "base.yaml"]).check_files()
 
 
 def test_which_files_are_campaigns(folder):

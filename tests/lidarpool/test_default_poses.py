@@ -19,7 +19,7 @@ from lidarpool import Mounted, Scene, SceneInstance, SceneMesh, Sensor, Survey, 
 from lidarpool.cli.commands import cli
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.default_poses import place_sensor, poses_around
-from lidarpool.scenario.plausibility import implausibilities
+from lidarpool.scenario.plausibility import plausibility_warnings
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
@@ -114,9 +114,9 @@ def test_the_default_grid_is_narrowed_to_an_object(tmp_path, mesh, points, rays)
     assert sum(hits) == pytest.approx(points, rel=0.2)
     note, poses = advice(built)[-2:]
     assert "The default sensor is a grid of" in note
-    assert yaml.safe_load(poses.partition("default poses are ")[2]) == built.placing.entries
+    assert yaml.safe_load(poses.partition("default poses are ")[2]) == built.placement.entries
     # The whole object is seen: no pose sees more of it without the narrow field of view.
-    grid = built.placing.grid
+    grid = built.placement.grid
     wide = {"vertical_fov_deg": 90, "horizontal_fov_deg": 90}
     share = {name: 90 / grid[name] for name in wide}
     counts = {
@@ -133,7 +133,7 @@ def test_a_sensor_of_the_users_stays_as_it_is(tmp_path):
     for data in ({"sensor": {"layers": 40}}, {"mount": {"pitch_deg": 5}}):
         scenario = Scenario.from_data({"scene": "a.stl", **data}, folder=tmp_path)
         built = prepare(scenario)
-        assert built.placing.surrounds_object and not built.placing.grid
+        assert built.placement.surrounds_object and not built.placement.grid
         assert built.survey.ray_count == 200_000
 
 
@@ -223,11 +223,11 @@ def test_poses_within_a_closed_body_are_told_of_with_some_that_see_it(tmp_path):
     (tmp_path / "b.stl").write_bytes(creation.icosphere(3, 5.0).export(file_type="stl"))
     data = {"scene": {"files": ["b.stl"]}, "poses": [[0, 0, 0]]}
     given = Scenario.from_data(data, folder=tmp_path)
-    [warning] = implausibilities(prepare(given))
+    [warning] = plausibility_warnings(prepare(given))
     assert "only the back faces of surfaces" in warning
     assert "To view the scene from outside, use poses: [{position: [" in warning
     data["poses"] = [[0, 0, 9]]
-    assert implausibilities(prepare(Scenario.from_data(data, folder=tmp_path))) == []
+    assert plausibility_warnings(prepare(Scenario.from_data(data, folder=tmp_path))) == []
 
 
 @pytest.mark.parametrize("far", [0.2, 5.0])
@@ -273,7 +273,7 @@ def test_default_poses_are_listed_to_the_millimeter(tmp_path):
     poses = [[0.333, 0.0, 0.893], [0.333, 0.0, 1.643], [0.333, 0.0, 2.393]]
     built = prepare(scenario)
     assert advice(built)[-1] == f"no poses are set, so the default poses are {poses}"
-    assert built.placing.entries == poses
+    assert built.placement.entries == poses
     assert init_poses(tmp_path) == poses
 
 

@@ -6,7 +6,7 @@ import pytest
 from lidarpool import LidarError
 from lidarpool.pages.opened import open_view
 from lidarpool.recordings.opening import open_recording
-from lidarpool.scenario.point_scene import scene_of_points
+from lidarpool.scenario.point_scene import scene_from_points
 from lidarsim.columns.sweep import Sweep
 
 pytest.importorskip("pye57", reason="pye57 is an extra")
@@ -51,7 +51,7 @@ def pose(x=0.0, quaternion=(1.0, 0.0, 0.0, 0.0)):
 def scene_and_notes(path, scans, **options):
     notes = []
     write_scans(path, scans)
-    scene = scene_of_points(path, voxel_m=0.01, tell=notes.append, **options)
+    scene = scene_from_points(path, voxel_m=0.01, tell=notes.append, **options)
     return scene, [note.removeprefix(f"{path}").lstrip(": ") for note in notes]
 
 
@@ -173,7 +173,7 @@ def test_a_quaternion_is_read_by_names_and_of_any_length(path):
 def test_a_scan_without_coordinates_is_named(path):
     write_scans(path, [{"fields": intensities(np.ones(COUNT))}])
     with pytest.raises(LidarError, match=r"scan 1 \('scan'\) has neither Cartesian nor spherical"):
-        scene_of_points(path)
+        scene_from_points(path)
 
 
 @pytest.mark.parametrize("quantity", ["colors", "intensities"])

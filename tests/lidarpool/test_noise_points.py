@@ -9,7 +9,7 @@ from lidarpool.cli.result_commands import compare as compare_command
 from lidarpool.cli.scenario_commands import scene as scene_command
 from lidarpool.pages.opened import open_view
 from lidarpool.recordings.opening import open_recording
-from lidarpool.scenario.point_scene import scene_of_points
+from lidarpool.scenario.point_scene import scene_from_points
 from lidarsim.scene.files.noise_points import OmittedPoints, usable_points
 
 laspy = pytest.importorskip("laspy", reason="laspy is an extra")
@@ -38,7 +38,7 @@ def marks(value, other=0):
 def top_of(path, **options):
     """Return the height of the highest surface of the scene of a cloud, and the notes."""
     notes = []
-    scene = scene_of_points(path, tell=notes.append, **options)
+    scene = scene_from_points(path, tell=notes.append, **options)
     return round((scene.bounds + scene.origin)[1, 2]), notes
 
 
@@ -108,7 +108,7 @@ def test_views_leave_them_out(tmp_path):
 def test_a_file_of_nothing_else_is_refused(tmp_path):
     path = written(tmp_path / "a.las", withheld=np.ones(900))
     with pytest.raises(LidarError, match=r"has 0: 900 withheld points were skipped"):
-        scene_of_points(path)
+        scene_from_points(path)
     with pytest.raises(LidarError, match=r"contains no points, .*900 withheld points were skipped"):
         compare(path, path)
     with pytest.raises(LidarError, match=r"contains no points\..*900 withheld"):

@@ -15,7 +15,7 @@ from trimesh.transformations import rotation_matrix
 from lidarpool import Scene, SceneMesh
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.campaign_sections import is_campaign
-from lidarpool.scenario.plausibility import implausibilities
+from lidarpool.scenario.plausibility import plausibility_warnings
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
@@ -77,7 +77,7 @@ def warnings_of(folder: Path, meshes: list[SceneMesh] | None = None, **scenario:
     if meshes:
         write_scene(folder / "scene.glb", Scene.from_meshes(meshes))
         scenario["scene"] = "scene.glb"
-    return implausibilities(prepare(Scenario.from_data(scenario, folder=folder), plans=False))
+    return plausibility_warnings(prepare(Scenario.from_data(scenario, folder=folder), plans=False))
 
 
 @pytest.mark.parametrize(
@@ -301,4 +301,4 @@ def test_examples_have_no_warnings(with_city, name):
     path = with_city / f"{name}.yaml"
     scenario = CampaignSpec.load(path).scenario(0) if is_campaign(path) else Scenario.load(path)
     assert scenario is not None
-    assert implausibilities(prepare(scenario, plans=False)) == []
+    assert plausibility_warnings(prepare(scenario, plans=False)) == []

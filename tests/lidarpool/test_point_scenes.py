@@ -9,7 +9,7 @@ from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.open3d_access.open3d_module import load_open3d
 from lidarpool.pages.opened import open_view
 from lidarpool.recordings.opening import open_recording
-from lidarpool.scenario.point_scene import scene_of_points
+from lidarpool.scenario.point_scene import scene_from_points
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.scene.files.pcd import pcd_bytes
 
@@ -137,7 +137,7 @@ def off_plane(scene, at=(0, 0, 0)):
 )  # fmt: skip
 def test_all_formats_give_surfels_in_the_plane_of_the_points(tmp_path, name):
     path = written(tmp_path / name.lower(), plane()).rename(tmp_path / name)
-    scene = scene_of_points(path, voxel_m=1e-3)
+    scene = scene_from_points(path, voxel_m=1e-3)
     assert scene.names == (path.stem,)
     assert len(scene.faces) == 2 * len(GRID)
     assert off_plane(scene) < 1e-5
@@ -146,8 +146,8 @@ def test_all_formats_give_surfels_in_the_plane_of_the_points(tmp_path, name):
 
 def test_points_in_one_voxel_become_one_surfel(tmp_path):
     path = written(tmp_path / "a.ply", plane())
-    few = scene_of_points(path, voxel_m=0.5)
-    many = scene_of_points(path)
+    few = scene_from_points(path, voxel_m=0.5)
+    many = scene_from_points(path)
     assert 50 <= len(few.faces) / 2 <= 100
     assert 400 < len(many.faces) / 2 < len(GRID), "by default about the spacing of the points"
 
@@ -160,7 +160,7 @@ def test_a_place_scanned_again_has_the_ranges_of_the_real_one(tmp_path):
     sweeps = [scanner.sweep(Pose((x, y, 2))) for x, y in ((0, 0), (3, 2), (-2, 3))]
     points = np.concatenate([sweep.positions for sweep in sweeps])
     save_cloud(Cloud(points.astype(np.float64), {}), tmp_path / "scan.ply")
-    write_scene(tmp_path / "place.glb", scene_of_points(tmp_path / "scan.ply"))
+    write_scene(tmp_path / "place.glb", scene_from_points(tmp_path / "scan.ply"))
     pose = [(1, 2, 1.5)]
     true, again = (
         Scanner(scene, load_sensor("velodyne/vlp16")).ranges(pose)
@@ -174,7 +174,7 @@ def test_a_place_scanned_again_has_the_ranges_of_the_real_one(tmp_path):
 
 
 def test_far_clouds_keep_their_digits(tmp_path):
-    scene = scene_of_points(written(tmp_path / "a.ply", plane(FAR)), voxel_m=1e-3)
+    scene = scene_from_points(written(tmp_path / "a.ply", plane(FAR)), voxel_m=1e-3)
     assert off_plane(scene, FAR) < 1e-5
     for name in ("b.glb", "b.obj"):
         again = Scene.load(write_scene(tmp_path / name, scene))
@@ -186,7 +186,7 @@ def test_far_clouds_keep_their_digits(tmp_path):
 
 def test_stray_points_make_no_large_surfels(tmp_path):
     points = np.concatenate([plane(), [[0, 0, 50], [30, 0, 0], [0, np.nan, 0]]])
-    scene = scene_of_points(written(tmp_path / "a.xyz", points), voxel_m=0.1)
+    scene = scene_from_points(written(tmp_path / "a.xyz", points), voxel_m=0.1)
     sides = np.ptp(scene.vertices[scene.faces], axis=1)
     assert sides.max() <= 2 * np.sqrt(2) * 0.3 + 1e-9
 
@@ -202,9 +202,9 @@ def test_classes_colors_and_intensities_stay_in_the_scene(tmp_path, name):
     points = plane().repeat(3, axis=0)
     path = written_with_columns(tmp_path / name, points, CLASSES, INTENSITIES, COLORS)
     notes = []
-    scene_of_points(path, voxel_m=0.01, tell=notes.append)
+    scene_from_points(path, voxel_m=0.01, tell=notes.append)
     for color in ("rgb", "intensity"):
-        scene = scene_of_points(path, voxel_m=0.01, color=color, tell=notes.append)
+        scene = scene_from_points(path, voxel_m=0.01, color=color, tell=notes.append)
         write_scene(tmp_path / "b.glb", scene)
         again = Scene.load(tmp_path / "b.glb", colors=True, materials=True)
         assert again.triangles == 2 * len(GRID)
@@ -227,7 +227,7 @@ def test_the_most_frequent_class_of_each_surfel_counts(tmp_path):
     kinds = [("x", "f8"), ("y", "f8"), ("z", "f8"), ("class", "u1")]
     rows = np.rec.fromarrays(columns, np.dtype(kinds))
     path.write_bytes(header_of(".ply", rows) + rows.tobytes())
-    scene = scene_of_points(path, voxel_m=1e-3)
+    scene = scene_from_points(path, voxel_m=1e-3)
     names = np.array(scene.material_names)
     materials = scene.meshes()[0].materials
     centers = scene.vertices[scene.faces].mean(axis=1) + scene.origin
@@ -250,7 +250,7 @@ def test_scans_of_an_e57_are_joined_and_face_their_scanners(tmp_path):
             file.write_scan_raw(
                 data, rotation=np.array([1, 0, 0, 1]) / np.sqrt(2), translation=scanner
             )
-    write_scene(tmp_path / "b.glb", scene_of_points(path, voxel_m=1e-3))
+    write_scene(tmp_path / "b.glb", scene_from_points(path, voxel_m=1e-3))
     scene = Scene.load(tmp_path / "b.glb")
     quads = scene.vertices.reshape(-1, 4, 3)
     centers = quads.mean(axis=1) + scene.origin - corner
@@ -284,7 +284,7 @@ def pcd_with_viewpoint(path, columns=()):
 
 def test_the_viewpoint_of_a_pcd_places_and_orients_surfels(tmp_path):
     path, points = pcd_with_viewpoint(tmp_path / "a.pcd")
-    scene = scene_of_points(path, voxel_m=1e-3)
+    scene = scene_from_points(path, voxel_m=1e-3)
     centers = scene.vertices.reshape(-1, 4, 3).mean(axis=1) + scene.origin
     order = np.lexsort(np.round(centers, 3).T)
     expected = points[np.lexsort(np.round(points, 3).T)]
@@ -298,7 +298,7 @@ def test_vectors_of_a_pcd_are_turned_by_its_viewpoint(tmp_path):
     names = ("origin_x", "origin_y", "origin_z")
     columns = [(name, values.astype("f4")) for name, values in zip(names, origin.T, strict=True)]
     path, _ = pcd_with_viewpoint(tmp_path / "a.pcd", columns)
-    assert facing(scene_of_points(path, voxel_m=1e-3), STATION + np.array([0, 0, 50])).all()
+    assert facing(scene_from_points(path, voxel_m=1e-3), STATION + np.array([0, 0, 50])).all()
 
 
 @pytest.mark.parametrize("name", ["a.pcd", "a.ptx", "a.npy", "a.csv"])
@@ -314,7 +314,7 @@ def test_scenes_comparisons_and_views_have_the_same_points(tmp_path, name):
         path.write_text(text.replace("1 0 0 0\n0 1 0 0\n", "0 1 0 0\n-1 0 0 0\n"))
         points = plane() @ QUARTER.T + STATION
     bounds = [points.min(axis=0), points.max(axis=0)]
-    scene = scene_of_points(path, voxel_m=1e-3)
+    scene = scene_from_points(path, voxel_m=1e-3)
     np.testing.assert_allclose(scene.bounds, bounds, atol=0.2)
     recording = open_recording(path)
     compared = recording[0].returns()
@@ -340,7 +340,7 @@ def test_scans_of_a_ptx_are_joined_and_face_their_scanners(tmp_path):
         text += f"40\n30\n{position}\n{axes}{transformation}{position} 1\n"
         text += "".join(f"{x:.9f} {y:.9f} {z:.9f} 0.5\n" for x, y, z in local)
     (tmp_path / "a.ptx").write_text(text)
-    scene = scene_of_points(tmp_path / "a.ptx", voxel_m=1e-3)
+    scene = scene_from_points(tmp_path / "a.ptx", voxel_m=1e-3)
     centers = scene.vertices.reshape(-1, 4, 3).mean(axis=1) + scene.origin
     assert len(centers) == 2 * len(GRID) and np.abs(np.abs(centers[:, 0]) - 1).max() < 1e-4
     sides = np.where(centers[:, :1] < 0, [[-3.0, 2, 1.5]], [[3.0, 2, 1.5]])
@@ -368,7 +368,7 @@ def test_what_one_of_two_scans_lacks_is_gray(tmp_path, first, second, quantity):
     path = tmp_path / "a.ptx"
     path.write_text(ptx_scan(1, first) + ptx_scan(50, second))
     notes = []
-    scene = scene_of_points(path, voxel_m=1e-3, tell=notes.append)
+    scene = scene_from_points(path, voxel_m=1e-3, tell=notes.append)
     red, x = reds(scene)
     assert (red[x < 10] == (200 if quantity == "color" else 255)).all()
     assert (red[x > 10] == 188).all()
@@ -385,7 +385,7 @@ def test_clouds_of_a_pts_without_colors_are_gray(tmp_path, second):
     path = tmp_path / "a.pts"
     path.write_text(pts_cloud(1, "100 200 200 200") + pts_cloud(50, second))
     notes = []
-    red, x = reds(scene_of_points(path, voxel_m=1e-3, tell=notes.append))
+    red, x = reds(scene_from_points(path, voxel_m=1e-3, tell=notes.append))
     assert (red[x < 10] == 200).all() and (red[x > 10] == 188).all()
     assert any("1,200 of 2,400 points have no color. Surfels" in note for note in notes)
 
@@ -411,7 +411,7 @@ def test_the_first_column_with_values_is_used_and_others_are_named_as_in_the_fil
         Empty=np.zeros(len(GRID)),
     )
     notes = []
-    scene = scene_of_points(path, voxel_m=1e-3, tell=notes.append)
+    scene = scene_from_points(path, voxel_m=1e-3, tell=notes.append)
     red, x = reds(scene)
     assert (red[x < 1.9] == 188).all() and (red[x > 2.1] == 255).all()
     assert scene.material_names == ("class 2",)
@@ -422,7 +422,7 @@ def test_the_first_column_with_values_is_used_and_others_are_named_as_in_the_fil
 def test_origins_that_are_zero_are_not_named_as_skipped(tmp_path):
     zeros = dict.fromkeys(["origin_x", "origin_y", "origin_z"], np.zeros(len(GRID)))
     notes = []
-    scene_of_points(ply_with(tmp_path / "a.ply", **zeros), voxel_m=1e-3, tell=notes.append)
+    scene_from_points(ply_with(tmp_path / "a.ply", **zeros), voxel_m=1e-3, tell=notes.append)
     assert not notes
 
 
@@ -432,7 +432,7 @@ def test_packed_colors_are_read_in_all_formats(tmp_path):
         rows[axis] = values
     rows["rgb"] = 200 << 16 | 100 << 8 | 50
     np.save(tmp_path / "a.npy", rows)
-    scene = scene_of_points(tmp_path / "a.npy", voxel_m=1e-3)
+    scene = scene_from_points(tmp_path / "a.npy", voxel_m=1e-3)
     assert np.unique(scene.meshes()[0].colors.mean_colors(), axis=0).tolist() == [[200, 100, 50]]
 
 
@@ -447,7 +447,7 @@ def test_parts_of_a_las_are_one_cloud(tmp_path, monkeypatch):
 
     def made():
         notes = []
-        scene = scene_of_points(path, voxel_m=1e-3, tell=notes.append)
+        scene = scene_from_points(path, voxel_m=1e-3, tell=notes.append)
         return scene.vertices.tolist(), reds(scene)[0].tolist(), scene.material_names, notes
 
     whole = made()
@@ -465,7 +465,7 @@ def test_too_many_points_are_refused_before_they_are_read(tmp_path, monkeypatch)
     monkeypatch.setattr("lidarpool.scenario.point_files.memory", lambda: 100_000)
     monkeypatch.setattr("laspy.LasReader.read_points", None)
     with pytest.raises(LidarError, match=r"a\.las: it has 1,200 points, which require 820\.31 kiB"):
-        scene_of_points(path)
+        scene_from_points(path)
 
 
 def test_a_parquet_file_is_a_scene(tmp_path):
@@ -476,7 +476,7 @@ def test_a_parquet_file_is_a_scene(tmp_path):
     path = tmp_path / "a.parquet"
     parquet.write_table(pyarrow.table(columns), path, row_group_size=500)
     notes = []
-    scene = scene_of_points(path, voxel_m=1e-3, tell=notes.append)
+    scene = scene_from_points(path, voxel_m=1e-3, tell=notes.append)
     assert scene.triangles == 2 * len(GRID) and off_plane(scene) < 1e-5
     assert scene.material_names == ("class 5",)
     assert len(notes) == 1 and notes[0].endswith("which were skipped: t")
@@ -487,7 +487,7 @@ def test_classes_of_semantic_kitti_become_materials(tmp_path):
     (tmp_path / "labels").mkdir()
     path = written(tmp_path / "velodyne/000000.bin", plane())
     np.full(len(GRID), 40, "<u4").tofile(tmp_path / "labels/000000.label")
-    assert scene_of_points(path, voxel_m=1e-3).material_names == ("class 40",)
+    assert scene_from_points(path, voxel_m=1e-3).material_names == ("class 40",)
 
 
 def leica_file(path, intensities):
@@ -508,7 +508,7 @@ def test_intensities_of_leica_begin_at_zero(tmp_path, name):
     intensities = np.where(GRID[:, 0] < 2, 2047, 0)
     intensities[0] = -2048
     notes = []
-    scene = scene_of_points(
+    scene = scene_from_points(
         leica_file(tmp_path / name, intensities), voxel_m=1e-3, tell=notes.append
     )
     red, x = reds(scene)
@@ -522,7 +522,7 @@ def test_negative_intensities_of_an_unknown_scale_are_noted(tmp_path):
     intensities[0] = -25
     path = leica_file(tmp_path / "a.ply", intensities)
     notes = []
-    red, x = reds(scene_of_points(path, voxel_m=1e-3, tell=notes.append))
+    red, x = reds(scene_from_points(path, voxel_m=1e-3, tell=notes.append))
     assert (red[x > 2] == 188).all() and set(red[x < 2].tolist()) == {0, 255}
     scale = "has intensities from -25 to 5 on an unknown scale"
     assert notes == [f"{path} {scale}. They were shifted so that -25 becomes 0"]
@@ -535,7 +535,7 @@ def test_all_clouds_of_a_pts_have_the_same_scale(tmp_path):
             points = plane((20 * side, 0, 0))
             file.write(f"{len(points)}\n")
             file.writelines(f"{x:.6f} {y:.6f} {z:.6f} {intensity}\n" for x, y, z in points)
-    red, x = reds(scene_of_points(path, voxel_m=1e-3))
+    red, x = reds(scene_from_points(path, voxel_m=1e-3))
     assert (red[x < 0] == 188).all() and (red[x > 0] == 255).all()
     intensities = open_recording(path)[0].intensity
     np.testing.assert_array_equal(np.unique(intensities), [1024, 2048])
@@ -550,7 +550,7 @@ def test_empty_cells_are_missing_intensities_and_classes(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("x,y,z,intensity,class\n" + "\n".join(rows))
     notes = []
-    scene = scene_of_points(path, voxel_m=1e-3, tell=notes.append)
+    scene = scene_from_points(path, voxel_m=1e-3, tell=notes.append)
     red, x = reds(scene)
     assert (red[x < 2] == 255).all() and (red[x > 2.5] == 188).all()
     names = np.array(scene.meshes()[0].materials.names)[scene.meshes()[0].materials.index]
@@ -570,7 +570,7 @@ def test_pulses_without_a_return_are_left_out_with_a_note(tmp_path):
     points = np.concatenate([plane((1, 0, 0)), np.zeros((20, 3))])
     notes = []
     path = written(tmp_path / "a.npy", points)
-    scene = scene_of_points(path, voxel_m=1e-3, tell=notes.append)
+    scene = scene_from_points(path, voxel_m=1e-3, tell=notes.append)
     assert scene.triangles == 2 * len(GRID)
     assert notes == [f"20 points of {path} at the origin were skipped as pulses without a return"]
 
@@ -579,13 +579,13 @@ def test_units_of_a_header_are_converted_with_a_note(tmp_path):
     path = written(tmp_path / "a.csv", plane() * 1000)
     path.write_text(path.read_text().replace("x,y,z", "x_mm,y_mm,z_mm"))
     notes = []
-    scene = scene_of_points(path, tell=notes.append)
+    scene = scene_from_points(path, tell=notes.append)
     np.testing.assert_allclose(scene.bounds, [[0, 0, 0], [4, 3, 2]], atol=0.2)
     assert (
         "was converted to meters, because its header states units of 0.001, 0.001, 0.001 m"
         in notes[0]
     )
-    meters = scene_of_points(path, unit="cm", tell=notes.append)
+    meters = scene_from_points(path, unit="cm", tell=notes.append)
     np.testing.assert_allclose(meters.bounds, [[0, 0, 0], [40, 30, 20]], atol=2)
     np.testing.assert_allclose(open_recording(path)[0].points.max(axis=0), [4, 3, 2])
     points = open_recording(path, unit="m")[0].points
@@ -601,16 +601,16 @@ def test_units_of_a_header_are_converted_with_a_note(tmp_path):
 )
 def test_missing_intensities_are_an_error(tmp_path, name, words):
     with pytest.raises(LidarError, match=words):
-        scene_of_points(written(tmp_path / name, plane()), color="intensity")
+        scene_from_points(written(tmp_path / name, plane()), color="intensity")
 
 
 def test_columns_without_names_are_noted(tmp_path):
     notes = []
-    scene_of_points(written(tmp_path / "a.xyz", plane()), voxel_m=0.1, tell=notes.append)
+    scene_from_points(written(tmp_path / "a.xyz", plane()), voxel_m=0.1, tell=notes.append)
     assert len(notes) == 1 and notes[0].endswith("which were skipped: column_4")
     rows = "\n".join(f"wall {x} {y} {z} 7" for x, y, z in plane())
     (tmp_path / "b.csv").write_text("kind,x,y,z,gps\n" + rows.replace(" ", ","))
-    scene_of_points(tmp_path / "b.csv", voxel_m=0.1, tell=notes.append)
+    scene_from_points(tmp_path / "b.csv", voxel_m=0.1, tell=notes.append)
     assert len(notes) == 2 and notes[1].endswith("which were skipped: gps, kind")
 
 
@@ -622,7 +622,7 @@ def test_cut_files_are_refused(tmp_path, name):
         path.write_bytes(data[: int(share * len(data))])
         expected = f"is truncated: |{path}: it is empty" if share < 0.001 else "is truncated: "
         with pytest.raises(LidarError, match=expected):
-            scene_of_points(path)
+            scene_from_points(path)
 
 
 @pytest.mark.parametrize(
@@ -646,7 +646,7 @@ def test_what_is_wrong_is_said(tmp_path, name, text, words):
     if text is not None:
         path.write_text(text)
     with pytest.raises(LidarError, match=words):
-        scene_of_points(path)
+        scene_from_points(path)
 
 
 def test_the_command_says_what_is_not_kept(tmp_path):
@@ -666,8 +666,8 @@ def test_too_many_points_are_refused(tmp_path, monkeypatch):
     path = written(tmp_path / "a.ply", plane())
     monkeypatch.setattr("lidarpool.scenario.point_scene.memory", lambda: 1_000_000)
     with pytest.raises(LidarError, match=r"1,200 surfels, .* Increase `voxel_m`, which is 0.01"):
-        scene_of_points(path, voxel_m=0.01)
-    assert len(scene_of_points(path, voxel_m=0.3).faces) < 2 * 500
+        scene_from_points(path, voxel_m=0.01)
+    assert len(scene_from_points(path, voxel_m=0.3).faces) < 2 * 500
 
 
 def test_a_huge_number_of_records_is_refused_at_once(tmp_path):
@@ -679,7 +679,7 @@ def test_a_huge_number_of_records_is_refused_at_once(tmp_path):
         LidarError,
         match="header declares 2,147,483,647 variable-length",
     ):
-        scene_of_points(path)
+        scene_from_points(path)
 
 
 def test_the_command(tmp_path):

@@ -12,7 +12,7 @@ from lidarpool import LidarError, Scene, compare
 from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.pages.opened import growing_view, open_view
 from lidarpool.recordings.opening import open_recording
-from lidarpool.scenario.point_scene import scene_of_points
+from lidarpool.scenario.point_scene import scene_from_points
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
@@ -72,7 +72,7 @@ def written(path, points, records=(), step_m=1e-4):
 def bounds_of(path, **options):
     """Return the bounds of the scene of a cloud in the world, and the notes."""
     notes = []
-    scene = scene_of_points(path, tell=notes.append, voxel_m=0.3, size=0.01, **options)
+    scene = scene_from_points(path, tell=notes.append, voxel_m=0.3, size=0.01, **options)
     return scene.bounds + scene.origin, [note.removeprefix(f"{path} ") for note in notes]
 
 
@@ -106,7 +106,7 @@ def test_stretched_meters_are_refused_with_what_helps(tmp_path, case):
     path = written(tmp_path / "a.las", points, records)
     assert np.ptp(points[:, 0]) > 1.2 * SIDE_M or case == "equal areas"
     expected = rf"a\.las: it is in .*{message}.*--epsg 32632 .*reprojection\.out_srs=EPSG:32632"
-    for read in (scene_of_points, open_view, growing_view, open_recording):
+    for read in (scene_from_points, open_view, growing_view, open_recording):
         with pytest.raises(LidarError, match=expected) as refused:
             read(path)
         assert len(str(refused.value)) < 500 and "\n" not in str(refused.value)
@@ -140,7 +140,7 @@ def test_clouds_are_brought_to_true_meters(tmp_path, case):
 def test_angles_and_geocentric_coordinates(tmp_path, system, records, words):
     path = written(tmp_path / "a.las", ground(system), records())
     with pytest.raises(LidarError, match=f"its coordinates {words}.*--epsg CODE .*pdal translate"):
-        scene_of_points(path)
+        scene_from_points(path)
     (lower, upper), notes = bounds_of(path, epsg=32632)
     np.testing.assert_allclose(lower, ground("EPSG:32632").min(axis=0), atol=0.05)
     np.testing.assert_allclose(upper, ground("EPSG:32632").max(axis=0), atol=0.05)
@@ -180,14 +180,14 @@ def test_what_cannot_be_brought_is_refused(tmp_path):
         (1025, "EPSG:1025 is unknown to PROJ"),
     ):
         with pytest.raises(LidarError, match=message):
-            scene_of_points(path, epsg=epsg)
+            scene_from_points(path, epsg=epsg)
     with pytest.raises(LidarError, match="`epsg` and `unit` cannot be combined"):
-        scene_of_points(path, epsg=32632, unit="m")
+        scene_from_points(path, epsg=32632, unit="m")
     bare = written(tmp_path / "b.las", ground("EPSG:3857"))
     np.savetxt(tmp_path / "b.xyz", ground("EPSG:3857"))
     for file in (bare, tmp_path / "b.xyz"):
         with pytest.raises(LidarError, match=r"states no coordinate system.*Remove --epsg"):
-            scene_of_points(file, epsg=32632)
+            scene_from_points(file, epsg=32632)
 
 
 def test_a_given_unit_counts_and_is_noted(tmp_path):
@@ -232,7 +232,7 @@ def test_without_rasterio_names_and_codes_count(tmp_path, monkeypatch):
     (note,) = open_recording(paths["equal areas"]).notes
     assert "whose scale is assumed to be true" in note and 'pip install -e ".[geo]"' in note
     with pytest.raises(LidarError, match=r"requires rasterio, .*\.\[geo\]"):
-        scene_of_points(paths["wkt"], epsg=32632)
+        scene_from_points(paths["wkt"], epsg=32632)
 
 
 def with_comment(path, comment, points):
@@ -246,14 +246,14 @@ def with_comment(path, comment, points):
 @pytest.mark.parametrize("comment", ["comment crs: EPSG:3857", "obj_info EPSG:3857"])
 def test_a_ply_may_state_its_system_in_a_comment(tmp_path, comment):
     path = with_comment(tmp_path / "a.ply", comment, ground("EPSG:3857"))
-    for read in (scene_of_points, open_recording):
+    for read in (scene_from_points, open_recording):
         with pytest.raises(LidarError, match=r"EPSG:3857.*--epsg 32632"):
             read(path)
     (lower, _), _ = bounds_of(path, epsg=32632)
     np.testing.assert_allclose(lower, ground("EPSG:32632").min(axis=0), atol=0.05)
     text = f"comment crs: {CRS.from_epsg(3857).to_wkt()}"
     with pytest.raises(LidarError, match="EPSG:3857"):
-        scene_of_points(with_comment(tmp_path / "b.ply", text, ground("EPSG:3857")))
+        scene_from_points(with_comment(tmp_path / "b.ply", text, ground("EPSG:3857")))
     other = with_comment(tmp_path / "c.ply", "comment from EPSG:3857 tiles", ground("EPSG:3857"))
     assert bounds_of(other)[1] == []
 
@@ -305,14 +305,14 @@ def test_a_scene_keeps_the_system_of_its_cloud(tmp_path, suffix):
 
 def test_scenes_keep_the_chosen_system_and_none_of_converted_coordinates(tmp_path):
     degrees = written(tmp_path / "a.las", ground("EPSG:4326"), wkt("EPSG:4326"))
-    assert scene_of_points(degrees, epsg=32632, voxel_m=0.3).epsg == 32632
+    assert scene_from_points(degrees, epsg=32632, voxel_m=0.3).epsg == 32632
     utm = written(tmp_path / "b.las", ground("EPSG:25832"), wkt("EPSG:25832"))
-    assert scene_of_points(utm, unit="m", voxel_m=0.3).epsg is None
+    assert scene_from_points(utm, unit="m", voxel_m=0.3).epsg is None
     feet = written(tmp_path / "c.las", ground("EPSG:2263"), wkt("EPSG:2263"))
     with contextlib.suppress(LidarError):
-        assert scene_of_points(feet, voxel_m=0.3).epsg is None
+        assert scene_from_points(feet, voxel_m=0.3).epsg is None
     stated = with_comment(tmp_path / "d.ply", "comment crs: EPSG:25832", ground("EPSG:25832"))
-    assert scene_of_points(stated, voxel_m=0.3).epsg == 25832
+    assert scene_from_points(stated, voxel_m=0.3).epsg == 25832
     foreign = tmp_path / "e.obj"
     foreign.write_text("# made by hand\n# crs: EPSG:25832\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     assert Scene.load(foreign).epsg is None
@@ -332,7 +332,7 @@ def e57_with(monkeypatch, path, metadata, points):
 def test_an_e57_may_state_its_system(tmp_path, monkeypatch):
     text = CRS.from_epsg(3857).to_wkt(version="WKT2_2019")
     path = e57_with(monkeypatch, tmp_path / "a.e57", text, ground("EPSG:3857"))
-    for read in (scene_of_points, open_recording):
+    for read in (scene_from_points, open_recording):
         with pytest.raises(LidarError, match=r"EPSG:3857.*--epsg 32632"):
             read(path)
     (lower, _), notes = bounds_of(path, epsg=32632)
@@ -341,7 +341,7 @@ def test_an_e57_may_state_its_system(tmp_path, monkeypatch):
     true_one = e57_with(monkeypatch, tmp_path / "b.e57", "EPSG:32632", ground("EPSG:32632"))
     assert bounds_of(true_one)[1] == [] and open_recording(true_one).notes == ()
     assert open_view(true_one).epsg == 32632
-    assert scene_of_points(true_one, voxel_m=0.3).epsg == 32632
+    assert scene_from_points(true_one, voxel_m=0.3).epsg == 32632
     definition = "+proj=merc +datum=WGS84"
     by_proj = e57_with(monkeypatch, tmp_path / "d.e57", definition, ground("EPSG:3395"))
     with pytest.raises(LidarError, match=r"whose meter is 0\.67.*--epsg 32632"):
@@ -373,5 +373,5 @@ def test_coordinates_of_another_system_are_told(tmp_path):
     )
     swapped = written(tmp_path / "b.las", points, wkt("EPSG:31467"))
     with pytest.raises(LidarError, match=r"EPSG:31467.*area of use \(Germany.*wrong") as refused:
-        scene_of_points(swapped)
+        scene_from_points(swapped)
     assert "326" not in str(refused.value).partition("wrong system")[2]

@@ -20,7 +20,7 @@ from lidarpool.clouds.writing import ExportSpec
 from lidarpool.pages.preview import first_sweeps
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.empty_cloud import empty_cloud_reason
-from lidarpool.scenario.plausibility import implausibilities
+from lidarpool.scenario.plausibility import plausibility_warnings
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.scene.files.stated_system import StatedSystem
@@ -148,7 +148,7 @@ def placed_at(place, **world):
     """Return the warnings of a room at a place of its file's coordinates."""
     copies = [{"name": "Room", "box": [8, 6, 3], "at": [[*place, 0]]}]
     data = {"scene": {"copies": copies}, "poses": [[place[0], place[1], 1]], "world": world}
-    return implausibilities(prepare(Scenario.from_data({**PLAN, **data}), plans=False))
+    return plausibility_warnings(prepare(Scenario.from_data({**PLAN, **data}), plans=False))
 
 
 def test_a_scene_outside_the_area_of_use_is_told_with_both_remedies():
@@ -234,8 +234,8 @@ def test_commands_warn_of_the_place(tmp_path, command):
 def test_results_of_python_note_the_place():
     """Whoever makes a job, its result has the warning among its notes."""
     job = job_of(world={"epsg": 25832, "origin": [0, 0]})
-    assert job.place_problem.startswith("The scene is at x 0, y 0, outside the area of use")
-    assert job_of(world={"epsg": 25832, "origin": ORIGIN}).place_problem == ""
+    assert job.location_warning.startswith("The scene is at x 0, y 0, outside the area of use")
+    assert job_of(world={"epsg": 25832, "origin": ORIGIN}).location_warning == ""
 
 
 def test_projected_coordinates_without_a_system_are_noted(tmp_path):

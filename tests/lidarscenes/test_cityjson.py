@@ -357,8 +357,8 @@ def test_the_sensor_stands_beside_buildings_or_around_them(tmp_path, ground, sid
         objects["g"] = thing(flat, kind="TINRelief")
     write(tmp_path / "a.city.json", city(objects, vertices))
     built = prepare(Scenario.load(tmp_path / "a.city.json"))
-    assert built.placing.surrounds_object is not ground
-    for pose in built.placing.poses:
+    assert built.placement.surrounds_object is not ground
+    for pose in built.placement.poses:
         x, y, z = np.subtract(pose.position, TRANSFORM["translate"]) * 2
         inside = [max(abs(x - at), abs(y)) < side and z < 16 for at in (0, 3 * side)]
         assert not any(inside)

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from lidarpool import LidarError
 from lidarpool.cli.scenario_commands import import_
-from lidarpool.scenario.point_scene import surfels
+from lidarpool.scenario.point_scene import surfel_mesh
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.helios import ImportedSurvey, import_survey
@@ -51,7 +51,7 @@ def legs(settings, *places, platform='movePerSec_m="10"'):
 def import_checked(survey: Path, out: Path) -> ImportedSurvey:
     """Import a survey as the command does."""
     return import_survey(
-        survey, out, check=lambda file: prepare(Scenario.load(file)), surfels=surfels
+        survey, out, check=lambda file: prepare(Scenario.load(file)), surfels=surfel_mesh
     )
 
 
@@ -685,7 +685,7 @@ def test_a_scenario_that_the_check_refuses_is_not_written(survey, tmp_path):
         raise LidarError(f"{file}: no such sensor.")
 
     with pytest.raises(LidarError) as refused:
-        import_survey(path, tmp_path / "out", check=refuse, surfels=surfels)
+        import_survey(path, tmp_path / "out", check=refuse, surfels=surfel_mesh)
     assert str(refused.value).endswith(
         f"cannot be converted to a scenario: {tmp_path / 'out/scenario.yaml'}: no such sensor."
     )

@@ -560,7 +560,7 @@ def test_a_raster_alone_is_a_survey(tmp_path):
     built = prepare(Scenario.load(tmp_path / "hill.tif"))
     # In the middle, 1, 2 and 3 m above the ground.
     np.testing.assert_allclose(
-        [pose.position for pose in built.placing.poses],
+        [pose.position for pose in built.placement.poses],
         [(x0 + 60, y0 - 60, 102.95 + above) for above in (1, 2, 3)],
     )
     assert built.survey.epsg == 2056
@@ -573,7 +573,7 @@ def test_a_raster_alone_is_a_survey(tmp_path):
     heights[20:40, 20:40] = np.nan
     write(tmp_path / "hole.tif", heights)
     built = prepare(Scenario.load(tmp_path / "hole.tif"))
-    at = np.array(built.placing.poses[0].position)
+    at = np.array(built.placement.poses[0].position)
     assert np.hypot(*(at[:2] - [X0 + 60, Y0 - 60])) < 23
     assert at[2] == pytest.approx(101 + ((at[0] - X0) / 2 - 0.5) / 10)
 

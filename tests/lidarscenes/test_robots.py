@@ -637,7 +637,7 @@ def test_a_robot_that_leaves_needs_joints_for_its_stay_only(folder):
 def test_a_robot_alone_stands_still_with_its_joints_at_zero(folder):
     alone = prepare(Scenario.load(folder / "rover.urdf"))
     robot = load_robot(folder / "rover.urdf")
-    assert alone.placing.surrounds_object and not alone.scene.actors
+    assert alone.placement.surrounds_object and not alone.scene.actors
     assert alone.scene.names == tuple(actor.name for actor in robot.actors())
     assert "are at zero. To move them" in advice(alone)[0]
     entry = {"file": "rover.urdf", "rotation_deg": [0, 0, 90], "translation": [5, 0, 0]}

@@ -14,7 +14,7 @@ import trimesh
 from lidarpool import compare, load_robot, load_sensor, load_trajectory, read_cloud
 from lidarpool.clouds.format_table import point_suffixes
 from lidarpool.scenario.campaign import CampaignSpec
-from lidarpool.scenario.point_scene import scene_of_points, surfels
+from lidarpool.scenario.point_scene import scene_from_points, surfel_mesh
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.helios import import_survey
@@ -50,7 +50,7 @@ def copies(path):
 
 READERS = {
     **{f"mesh{suffix}": load_meshes for suffix in endings()},
-    **{f"points{suffix}": scene_of_points for suffix in point_suffixes()},
+    **{f"points{suffix}": scene_from_points for suffix in point_suffixes()},
     **{f"recording{suffix}": lambda path: compare(path, path) for suffix in RECORDINGS},
     **{f"trajectory{suffix}": load_trajectory for suffix in TABLES},
     "times.txt": lambda path: load_trajectory(kitti_beside(path), times=path),
@@ -67,7 +67,7 @@ READERS = {
     "traffic.xml.gz": traffic,
     "copies.csv": copies,
     "survey.xml": lambda path: import_survey(
-        path, path.with_name("out"), check=Scenario.load, surfels=surfels
+        path, path.with_name("out"), check=Scenario.load, surfels=surfel_mesh
     ),
 }
 
@@ -145,7 +145,7 @@ def test_formats_that_are_not_read_say_what_to_do(tmp_path, suffix):
     path.write_text("anything")
     assert f"a{suffix} cannot be read. " in refused(load_meshes, path)
     if suffix not in point_suffixes():
-        assert f"a{suffix} cannot be read. " in refused(scene_of_points, path)
+        assert f"a{suffix} cannot be read. " in refused(scene_from_points, path)
 
 
 @pytest.mark.parametrize(
@@ -254,7 +254,7 @@ def test_counts_of_meshes_are_compared_with_the_file(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", RECORDED)
-@pytest.mark.parametrize("read", [scene_of_points, lambda path: compare(path, path)])
+@pytest.mark.parametrize("read", [scene_from_points, lambda path: compare(path, path)])
 def test_counts_of_clouds_are_compared_with_the_file(tmp_path, name, read):
     path = tmp_path / name
     path.write_bytes(FALSE_COUNTS[name])
@@ -262,7 +262,7 @@ def test_counts_of_clouds_are_compared_with_the_file(tmp_path, name, read):
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
-@pytest.mark.parametrize("read", [scene_of_points, lambda path: compare(path, path)])
+@pytest.mark.parametrize("read", [scene_from_points, lambda path: compare(path, path)])
 def test_counts_of_las_are_compared_with_the_file(tmp_path, suffix, read):
     laspy = pytest.importorskip("laspy", reason="laspy is an extra")
     path = tmp_path / f"a{suffix}"

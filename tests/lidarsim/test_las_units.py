@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from lidarpool import compare
 from lidarpool.cli.scenario_commands import scene as command
-from lidarpool.scenario.point_scene import scene_of_points
+from lidarpool.scenario.point_scene import scene_from_points
 from lidarsim import LidarError, Scene
 from lidarsim.scene.files import coordinate_systems
 
@@ -116,7 +116,7 @@ def check_conversion(folder, records, meters, height_m, **options):
     factors = np.array([meters, meters, height_m])
     path = written(folder / "a.las", PLACE / factors, records, **options)
     notes = []
-    scene = scene_of_points(path, voxel_m=0.01, tell=notes.append)
+    scene = scene_from_points(path, voxel_m=0.01, tell=notes.append)
     low, high = scene.bounds
     np.testing.assert_allclose((low + high) / 2, (302, 201.5, 11), atol=0.01)
     assert bool(notes) == ((meters, height_m) != (1.0, 1.0)), notes
@@ -173,10 +173,10 @@ def test_what_cannot_be_known_is_refused_unless_the_unit_is_given(
     monkeypatch.setattr(coordinate_systems, "find_spec", lambda name: None)
     path = written(tmp_path / "a.las", PLACE / FOOT, records)
     with pytest.raises(LidarError, match=message):
-        scene_of_points(path)
+        scene_from_points(path)
     with pytest.raises(LidarError, match=message):
         compare(path, path)
-    low, _ = scene_of_points(path, voxel_m=0.01, unit="ft").bounds
+    low, _ = scene_from_points(path, voxel_m=0.01, unit="ft").bounds
     np.testing.assert_allclose(low, PLACE.min(axis=0), atol=0.1)
     other = written(tmp_path / "meters.las", PLACE)
     assert compare(path, other, unit_a="ft").figures["distances"]["a_to_b"]["mean_m"] < 1e-5

@@ -46,7 +46,7 @@ from lidarpool.cli.commands import cli
 from lidarpool.clouds.format_table import EXPORTS, LAYOUTS, point_suffixes
 from lidarpool.datasets.dataset import DATA_SETS
 from lidarpool.scenario.campaign_sections import CampaignSection
-from lidarpool.scenario.plausibility import implausibilities
+from lidarpool.scenario.plausibility import plausibility_warnings
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.schema import campaign_schema, scenario_schema
@@ -461,7 +461,7 @@ def test_yaml_is_what_it_is_for(block):
         scenario = Scenario.from_data(data, source=block.where)
         if all(path.exists() for path in scenario.files):
             with suppress(LidarError):  # a fragment, such as materials of another scene
-                assert implausibilities(prepare(scenario, plans=False)) == []
+                assert plausibility_warnings(prepare(scenario, plans=False)) == []
 
 
 # What in code needs an extra of lidarpool, {extra: pattern}.

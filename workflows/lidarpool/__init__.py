@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-import lidarview  # noqa: F401 - which draws the pictures of notebooks
+import lidarview  # noqa: F401 - draws the pictures in notebooks
 from lidarsim._version import __version__
 
 if TYPE_CHECKING:
@@ -117,9 +117,9 @@ __all__ = [
     "twin",
 ]
 
-# Modules of the names above, except names of lidarsim. A module is imported when one of its names
-# is asked for: importing all takes a second, and the command sees to its signals before that
-# (`__main__.py`).
+# Modules that define the names above, except names that come from lidarsim. Modules are imported
+# lazily, because importing all of them takes a second, and the command-line interface must install
+# its signal handlers before that (`__main__.py`).
 _MODULES = {
     ".api.dask_frames": ("to_dask",),
     ".api.result": ("Result",),

@@ -1,4 +1,7 @@
-"""The imports of plug-ins that write and read clouds, with an example in docs/how-to/plugins.md."""
+"""Public classes for plug-ins that read or write point clouds.
+
+See docs/how-to/plugins.md for an example.
+"""
 
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.sweep import Sweep

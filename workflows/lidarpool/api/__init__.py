@@ -1,1 +1,1 @@
-"""The Python interface: `simulate`, and its result."""
+"""Python interface to simulations and their results."""

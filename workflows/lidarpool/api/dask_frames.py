@@ -1,4 +1,4 @@
-"""Points of a result as Dask's dataframes."""
+"""Conversion of stored points to Dask DataFrames."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ def to_dask(points: StoredCloud) -> Any:
     Parameters
     ----------
     points
-        Stored points of a result, `Result.points`.
+        Stored points of a result, such as `Result.points`.
 
     Returns
     -------
-    The Dask DataFrame.
+    dask.dataframe.DataFrame
+        DataFrame with one row per point.
 
     Raises
     ------
@@ -35,15 +36,14 @@ def to_dask(points: StoredCloud) -> Any:
     need_packages("pandas", "pyarrow")
     import dask.dataframe as dd
 
-    # Without the scene, which would go to all workers, and without parts.
+    # The template omits the scene, which would be sent to all workers, and the list of parts.
     template = replace(points, names=(), firsts=(), rows=(), cells=None, keeper=None, sweeps=None)
     filled = [name for name, rows in zip(points.names, points.rows, strict=True) if rows]
     empty = template.load().to_dataframe()
     if not filled:
         return dd.from_pandas(empty, npartitions=1)
-    return dd.from_map(_frame_of_part, filled, points=template, meta=empty)
+    return dd.from_map(_read_frame, filled, points=template, meta=empty)
 
 
-def _frame_of_part(name: str, points: StoredCloud) -> Any:
-    """Return a pandas DataFrame of a part."""
+def _read_frame(name: str, points: StoredCloud) -> Any:
     return points.cloud_of(read_part(points.storage, name)).to_dataframe()

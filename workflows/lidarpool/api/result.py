@@ -1,4 +1,4 @@
-"""A run's result, with the outputs of `lidarpool run`."""
+"""The result of a survey, which can write the same files as `lidarpool run`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ..run.run_result import RunResult
 if TYPE_CHECKING:
     from lidarview.picture_file import PictureContent
 
-_SHOWN = ("hits", "cloud")  # pictures of a result in a notebook
+_NOTEBOOK_PICTURES = ("hits", "cloud")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -34,7 +34,7 @@ class Result(RunResult):
 
     @property
     def objects(self) -> tuple[str, ...]:
-        """Names of the objects, in the order of the column `object`."""
+        """Names of the objects, indexed by the values of the `object` column."""
         return self.scene.object_names
 
     def report(
@@ -46,9 +46,9 @@ class Result(RunResult):
         formats: Sequence[str | Mapping[str, Any]] = (),
         overwrite: bool = False,
     ) -> None:
-        """Write the same files as `lidarpool run`: the cloud, the pictures and the report.
+        """Write the cloud, the pictures and the report, as `lidarpool run` does.
 
-        Either all files are written, or none.
+        Either all files are written or none.
 
         Parameters
         ----------
@@ -107,7 +107,8 @@ class Result(RunResult):
 
         Returns
         -------
-        Paths of the picture files.
+        list of Path
+            Paths of the picture files.
 
         Raises
         ------
@@ -153,14 +154,16 @@ class Result(RunResult):
 
     @cached_property
     def _pictured(self) -> PictureContent:
-        """Content of the pictures."""
         from ..report.picture_content import picture_content
 
         return picture_content(self)
 
     @cached_property
     def _cloud_file(self) -> Path:
-        """The cloud as a file, in a folder that is removed with this object."""
+        """Path of the cloud as a PLY file in a temporary folder.
+
+        The folder is removed when the result is garbage-collected.
+        """
         folder = mkdtemp(prefix="lidarpool-")
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         path = Path(folder) / "cloud.ply"
@@ -168,17 +171,17 @@ class Result(RunResult):
         return path
 
     def __repr__(self) -> str:
-        survey, cloud, *further = (f"{name}: {value}" for name, value in self._figures())
+        survey, cloud, *further = (f"{name}: {value}" for name, value in self._summary())
         return "\n".join([survey, cloud, "; ".join(further)]).rstrip()
 
     def _repr_html_(self) -> str:
-        """Return the table and pictures that notebooks show."""
+        """Return the table and pictures that notebooks display."""
         further = {
             "backend": self.backend,
             "seconds": f"{self.seconds:.1f}",
             "folder": self.points.storage.url,
         }
-        return table_of([*self._figures(), *further.items()]) + self._images
+        return table_of([*self._summary(), *further.items()]) + self._images
 
     @cached_property
     def _images(self) -> str:
@@ -186,11 +189,11 @@ class Result(RunResult):
         from lidarview.cell_pictures import compress_png
 
         with TemporaryDirectory(prefix="lidarpool-") as folder:
-            drawn = self.pictures(folder, only=_SHOWN, size=PICTURE_SIZE)
+            drawn = self.pictures(folder, only=_NOTEBOOK_PICTURES, size=PICTURE_SIZE)
             return "".join(image_of(compress_png(path.read_bytes()), path.stem) for path in drawn)
 
-    def _figures(self) -> Iterator[tuple[str, str]]:
-        """Yield names and values of the main figures."""
+    def _summary(self) -> Iterator[tuple[str, str]]:
+        """Yield labels and texts that summarize the result."""
         yield (
             "survey",
             f"{scans_in_words(self.survey.scan_count, self.survey.sweep_count)}, "

@@ -1,4 +1,4 @@
-"""Runs from Python: `simulate`, and campaigns of many jobs into a data set."""
+"""Simulations from Python, as single surveys or as campaigns that create data sets."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from ..run.run_result import CampaignRun, RunResult
 from ..run.runner import cast_to_store
 from ..run.store.run_store import RUN_FOLDER
 from ..run.stream import SweepStream
-from ..scenario import campaign as described
+from ..scenario.campaign import CampaignSpec
 from ..scenario.job import Job
 from .result import Result
 
-# Options without a meaning in a call: a survey has no data set, a campaign plans no paths, and its
-# run is stored beside the data set; a stream stores nothing and has no stages 1 and 4.
-_NOT_OF_SURVEYS = ("restart", "retry_failed", "verify", "overwrite")
-_NOT_OF_CAMPAIGNS = ("folder", "other_workers", "pace")
-_NOT_OF_STREAMS = (
-    *_NOT_OF_SURVEYS,
-    *_NOT_OF_CAMPAIGNS,
+# Run options that a call does not accept. A survey has no data set. A campaign does not plan paths,
+# and stores its run next to the data set. A stream stores nothing and has no stages 1 and 4.
+_UNUSED_BY_SURVEYS = ("restart", "retry_failed", "verify", "overwrite")
+_UNUSED_BY_CAMPAIGNS = ("folder", "other_workers", "pace")
+_UNUSED_BY_STREAMS = (
+    *_UNUSED_BY_SURVEYS,
+    *_UNUSED_BY_CAMPAIGNS,
     "parts",
     "resume",
     "live",
@@ -77,8 +77,9 @@ def simulate(
     ----------------
     client
         Client of a cluster whose workers declare the resources GPU, LIDAR and OTHER. During the
-        run, the cluster's dashboard has a page that shows the partitions. Its address is logged. By
-        default, a local cluster is started on the loopback interface and stopped at the end.
+        run, the cluster's dashboard has a page that shows the partitions. The address of that page
+        is logged. By default, a local cluster is started on the loopback interface and stopped at
+        the end.
     backend
         Ray-casting backend for stage 2: auto, cuda, tiles or numpy.
     live
@@ -86,9 +87,9 @@ def simulate(
         cell. With "foxglove" or "rerun", the sweeps are shown in Foxglove or Rerun. To show the
         result afterwards, call `Result.view`.
     pace
-        Speed at which `on_frame` and the live page receive the frames in scan order, relative to
-        the rate of the scanner. For example, 0.1 is a tenth of that rate. By default, they receive
-        each frame as soon as its points are stored.
+        Rate at which `on_frame` and the live page receive the frames in scan order, relative to the
+        rate of the scanner. For example, 0.1 is a tenth of the scanner's rate. By default, each
+        frame is passed on as soon as its points are stored.
     queue_capacity
         Maximum number of items by which stage 1 can be ahead of stage 2.
     collectors
@@ -101,9 +102,9 @@ def simulate(
     tls
         Whether to encrypt the traffic of a local cluster with a new certificate.
     startup_timeout_s, worker_timeout_s
-        Maximum time in seconds to wait for workers: the former applies to partitions that have no
-        workers at startup, the latter to partitions that lose all their workers later. To wait for
-        a scheduler, use ``Client(address, timeout=600)``.
+        Maximum time in seconds to wait for workers. `startup_timeout_s` applies to partitions that
+        have no workers at startup, and `worker_timeout_s` to partitions that lose all their workers
+        later. To wait for a scheduler, use ``Client(address, timeout=600)``.
     folder
         Folder of the run, from which the run can be resumed if this process or its machine dies.
         Its parent must exist. The run stays in the folder. Remove it with `remove_run` once the
@@ -117,9 +118,9 @@ def simulate(
         `folder`.
     resume
         Whether to continue an unfinished run in `folder`. If there is none, a new run is started.
-        `on_frame` is called with the frames that it has not received yet. It receives the frames
-        from the last second before the earlier run died again, or from the last few seconds if
-        `folder` is a URL.
+        `on_frame` is called with the frames that it has not received yet. Frames that it received
+        in the last second before the earlier run died are repeated, or those of the last few
+        seconds if `folder` is a URL.
 
     Returns
     -------
@@ -142,18 +143,18 @@ def simulate(
     >>> print(len(result.cloud), "points")                            # doctest: +SKIP
     1613 points
     """
-    chosen = check_keywords("simulate", options, without=_NOT_OF_SURVEYS)
+    chosen = check_keywords("simulate", options, without=_UNUSED_BY_SURVEYS)
     run_options = RunOptions(**chosen)
     jobs = SingleJob(Job(scene, survey, planning))
-    if run_options.starts_workers:  # before the folder is changed
+    if run_options.starts_workers:  # fail before the folder is changed
         check_backend_here(run_options.backend)
     with page_of(jobs, run_options.live) as page:
         result = cast_to_store(jobs, run_options, Screen(on_progress), page, on_frame)
     return Result(**declared(result, RunResult))
 
 
-class Campaign(described.CampaignSpec):  # noqa: D101 - as there
-    __doc__ = described.CampaignSpec.__doc__
+class Campaign(CampaignSpec):  # noqa: D101 - inherits the docstring
+    __doc__ = CampaignSpec.__doc__
 
     def run(
         self,
@@ -180,7 +181,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         ----------------
         client
             Client of a cluster whose workers declare the resources GPU and LIDAR. The LIDAR
-            partition requires one more slot than for a survey, which is used to write the jobs. By
+            partition requires one slot more than for a survey, because one slot writes the jobs. By
             default, a local cluster is started.
         backend, collectors, queue_capacity, batch_mb
             As for `simulate`. By default, the values are taken from the scenario.
@@ -188,7 +189,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             Number of casting workers in a local cluster. By default, the number is taken from the
             scenario.
         scratch_dir
-            Location of the points during the run, like `parts` of `simulate`.
+            Location of the points during the run, as for `parts` of `simulate`.
         resume
             Whether to continue an unfinished run in `out`. If there is none, a new run is started.
         restart
@@ -221,10 +222,10 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             of a different campaign or version. The message states the cause and the remedy.
         """
         target = output_destination(out)
-        chosen = check_keywords("run", options, without=_NOT_OF_CAMPAIGNS)
+        chosen = check_keywords("run", options, without=_UNUSED_BY_CAMPAIGNS)
         folder = Storage.at(target).below(RUN_FOLDER)
         run_options = RunOptions(folder=folder, **chosen).with_pool(self.pool, chosen)
-        jobs = self.of_shard(Shard(*shard))
+        jobs = self.for_shard(Shard(*shard))
         with page_of(jobs, run_options.live) as page:
             return run_campaign(target, jobs, run_options, Screen(on_progress), page)
 
@@ -238,8 +239,8 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         """Stream the sweeps of the jobs as they are simulated, without writing a data set.
 
         The sweeps are the same as in a data set of the campaign, with all columns, and are ordered
-        by job, sensor and time. The workers send points directly to this process, and not through
-        the scheduler. If a worker dies, its sweeps are simulated again. A job that fails is
+        by job, sensor and time. The workers send points directly to this process rather than
+        through the scheduler. If a worker dies, its sweeps are simulated again. A job that fails is
         skipped, and the reason is logged.
 
         Parameters
@@ -270,7 +271,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             is lost.
         """
         check_number("ahead", ahead, whole=True, ge=1)
-        chosen = check_keywords("stream", options, without=_NOT_OF_STREAMS)
+        chosen = check_keywords("stream", options, without=_UNUSED_BY_STREAMS)
         if split is not None and split not in self.splits:
             hint = (
                 did_you_mean(split, self.splits)

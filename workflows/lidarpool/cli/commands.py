@@ -353,13 +353,13 @@ def run(
             "the files one by one."
         )
     if is_several or (not of_mesh and is_campaign(paths[0])):
-        campaign = CampaignSpec.of_scenarios(paths) if is_several else CampaignSpec.load(paths[0])
+        campaign = CampaignSpec.from_scenarios(paths) if is_several else CampaignSpec.load(paths[0])
         if number is not None:
             run_job(campaign, number, out, terminal, options, backend, extent)
         elif extent is not None:
             raise click.UsageError("`--cloud-only` and `--pictures` cannot be used with campaigns.")
         else:
-            campaign = campaign.of_shard(settings["shard"] or ALL)
+            campaign = campaign.for_shard(settings["shard"] or ALL)
             run_campaign(campaign, out, terminal, options, backend)
     elif options.retry_failed or options.verify or number is not None:
         raise click.UsageError(

@@ -22,11 +22,11 @@ from ..run.forecast import forecast
 from ..run.job_source import SingleJob
 from ..run.options import RunOptions
 from ..run.pipeline.stage_names import GPU
-from ..scenario.advice import advice, unlabeled
+from ..scenario.advice import advice, unlabeled_notes
 from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_sections import is_campaign
 from ..scenario.job import Job
-from ..scenario.plausibility import implausibilities
+from ..scenario.plausibility import plausibility_warnings
 from ..scenario.prepare import prepare
 from ..scenario.scenario import Scenario
 from .shared_options import world_lines
@@ -103,14 +103,14 @@ def forecast_scenario(
                 refuse=None if has_jobs else lambda: output.check_existing(SingleJob(job)),
             )
         figures["notes"] += advice(prepared)
-        figures["warnings"] += implausibilities(prepared)
+        figures["warnings"] += plausibility_warnings(prepared)
         figures["sources"] = dict(prepared.findings.sources)
         if campaign is not None:
-            file_format = campaign.keep.of_jobs
+            file_format = campaign.keep.export_spec
             figures["notes"] += file_format.frame_notes(scenario.cloud.coordinates)
             figures["notes"] += file_format.cloud_format.renaming_notes([*scenario.sensors])
             if "class" in file_format.needs:
-                figures["notes"] += unlabeled(job.scene, job.survey)
+                figures["notes"] += unlabeled_notes(job.scene, job.survey)
             figures["job"] = _job_figures(campaign, job_number, figures)
         return job, figures
 

@@ -42,8 +42,8 @@ from ..run.store.run_store import RUN_FOLDER
 from ..scenario.advice import advice
 from ..scenario.campaign import CampaignSpec
 from ..scenario.job import Job
-from ..scenario.plausibility import implausibilities
-from ..scenario.prepare import Prepared, prepare
+from ..scenario.plausibility import plausibility_warnings
+from ..scenario.prepare import PreparedScenario, prepare
 from ..scenario.scenario import Scenario
 from .shared_options import show
 from .terminal import Terminal
@@ -78,7 +78,7 @@ def run_scenario(
     with terminal.status("reading the scene", logged=False):
         prepared = prepare(scenario)
     timeline.mark(timeline.SCENE)
-    for warning in implausibilities(prepared):
+    for warning in plausibility_warnings(prepared):
         terminal.warn(warning)
     if shard is None:
         _run_survey(prepared, out, options, terminal, extent)
@@ -103,7 +103,7 @@ def run_scenario(
 
 
 def _run_survey(
-    prepared: Prepared,
+    prepared: PreparedScenario,
     out: Path | Storage,
     options: RunOptions,
     terminal: Terminal,
@@ -148,7 +148,7 @@ def run_campaign(
             "`--pace` can only be used with a single survey, not with a campaign."
         )
     options = options.with_pool(campaign.pool, {"backend": backend})
-    campaign.keep.of_jobs.check_installed()
+    campaign.keep.export_spec.check_installed()
     for warning in _first_job_warnings(campaign, terminal):
         terminal.warn(warning)
     with page_of(campaign, options.live) as page:
@@ -181,7 +181,7 @@ def _first_job_warnings(campaign: CampaignSpec, terminal: Terminal) -> list[str]
     number = campaign.numbers[0]
     with suppress(LidarError), terminal.status("reading the scene", logged=False):
         if (scenario := campaign.scenario(number)) is not None:  # jobs may come from a function
-            warnings = implausibilities(prepare(scenario, plans=False))
+            warnings = plausibility_warnings(prepare(scenario, plans=False))
             return [f"job {campaign.name(number)}: {warning}" for warning in warnings]
     return []
 
@@ -217,7 +217,7 @@ def run_job(
         options = replace(options, folder=Storage.at(out).below(RUN_FOLDER))
         compare = partial(_compare_with_dataset, target, number, name)
     prepared = campaign.prepare(number, dataset.columns)
-    for warning in implausibilities(prepared):
+    for warning in plausibility_warnings(prepared):
         terminal.warn(warning)
     prepared = replace(prepared, job=prepared.job.with_fields(number=0))
     options = options.with_pool(prepared.scenario.pool, {"backend": backend})

@@ -78,7 +78,7 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
         scenario = Scenario.from_data(content, source=str(target))
         prepared = prepare(scenario, plans=False)
         notes = advice(prepared)
-        if (placing := prepared.placing) is not None:
+        if (placing := prepared.placement) is not None:
             note = placing.note
             data["poses"] = placing.entries
             data |= {"sensor": dict(placing.grid)} if placing.grid else {}
@@ -140,7 +140,7 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     from lidarscenes.mujoco.import_model import import_model
     from lidarscenes.sensors.import_sensor import ENDINGS, import_sensor
 
-    from ..scenario.point_scene import surfels
+    from ..scenario.point_scene import surfel_mesh
     from ..scenario.prepare import prepare
     from ..scenario.scenario import Scenario
     from ..scenario.sections import SensorSection
@@ -168,7 +168,7 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
         unsupported = import_atomically(import_sensor, survey, folder, assets, check)
     else:
         unsupported = import_survey(
-            survey, folder, assets, check=check, surfels=surfels
+            survey, folder, assets, check=check, surfels=surfel_mesh
         ).unsupported
     file = folder / SCENARIO_FILE
     scenario = Scenario.load(file)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from lidarsim.numerics.arrays import Floats
 
     from ..plan.stations import StationPlan, SurveyCoverage
-    from ..scenario.prepare import Prepared
+    from ..scenario.prepare import PreparedScenario
     from ..scenario.scenario import Scenario
     from .terminal import Terminal
 
@@ -195,7 +195,7 @@ def stations(
 def _scenario_model(scenario: Scenario) -> str | None:
     """Return the sensor model of a scenario, or the path of its sensor file."""
     model = scenario.sensor.model
-    if model is not None and scenario.sensor.has_own_model:
+    if model is not None and scenario.sensor.has_custom_model:
         return str(scenario.path(model))
     return model
 
@@ -316,7 +316,7 @@ def _show_coverage(
     options.show(figures, chain([head], table, note_lines), as_json)
 
 
-def _station_positions(prepared: Prepared) -> Floats:
+def _station_positions(prepared: PreparedScenario) -> Floats:
     """Return the positions of the sensor at all stations in world coordinates, in meters.
 
     The result has shape (s, 3).
@@ -327,7 +327,7 @@ def _station_positions(prepared: Prepared) -> Floats:
     return prepared.scene.georeferenced((0, 0, 0)).origin + [pose.position for pose in poses]
 
 
-def _coverage_figures(coverage: SurveyCoverage, prepared: Prepared) -> dict[str, Any]:
+def _coverage_figures(coverage: SurveyCoverage, prepared: PreparedScenario) -> dict[str, Any]:
     """Return the coverage of a cloud as printed by --json."""
     names = prepared.scene.names
     reachable_m2 = float(coverage.reachable_m2.sum())
@@ -350,21 +350,23 @@ def _object_figures(
     }
 
 
-def _prepared_with_notes(scenario: Scenario, terminal: Terminal) -> tuple[Prepared, list[str]]:
+def _prepared_with_notes(
+    scenario: Scenario, terminal: Terminal
+) -> tuple[PreparedScenario, list[str]]:
     """Prepare a scenario, and print its notes and warnings except those about automatic poses.
 
     Returns the prepared scenario with the notes and warnings.
     """
     from ..scenario.advice import advice
-    from ..scenario.default_poses import Placing
+    from ..scenario.default_poses import SensorPlacement
     from ..scenario.prepare import prepare
 
     with terminal.status("reading the scene", logged=False):
         prepared = prepare(scenario, plans=False)
-    notes = advice(replace(prepared, placing=Placing(())))
+    notes = advice(replace(prepared, placement=SensorPlacement(())))
     for note in notes:
         terminal.tell(note)
-    if problem := prepared.job.place_problem:
+    if problem := prepared.job.location_warning:
         terminal.warn(problem)
     return prepared, [*notes, *terminal.warnings]
 
@@ -374,7 +376,7 @@ def _target_phrase(targets: Sequence[str]) -> str:
     return f" of {joined(targets)}" if targets else ""
 
 
-def _target_notes(plan: StationPlan, prepared: Prepared) -> Iterator[str]:
+def _target_notes(plan: StationPlan, prepared: PreparedScenario) -> Iterator[str]:
     """Yield a note if a single object accounts for most of the reachable area."""
     reachable_m2 = plan.reachable_m2
     largest = int(reachable_m2.argmax())
@@ -468,7 +470,7 @@ def _stations_scenario(
 
 
 def _plan_figures(
-    plan: StationPlan, prepared: Prepared, sensor: str, notes: list[str]
+    plan: StationPlan, prepared: PreparedScenario, sensor: str, notes: list[str]
 ) -> dict[str, Any]:
     """Return the station plan as printed by --json."""
     names = prepared.scene.names
@@ -487,7 +489,9 @@ def _plan_figures(
     }
 
 
-def _plan_lines(plan: StationPlan, prepared: Prepared, targets: Sequence[str]) -> Iterator[str]:
+def _plan_lines(
+    plan: StationPlan, prepared: PreparedScenario, targets: Sequence[str]
+) -> Iterator[str]:
     """Yield the stations and the covered areas of a plan as lines of text."""
     names = prepared.scene.names
     yield (

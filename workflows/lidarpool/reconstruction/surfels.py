@@ -120,7 +120,7 @@ class Surfels:
         """
         from scipy.spatial import cKDTree
 
-        voxels = PointVoxels.of_points(Path(name), points, voxel_m)
+        voxels = PointVoxels.from_points(Path(name), points, voxel_m)
         count = len(voxels.counts)
         if count * POINT_BYTES > memory() // 2:
             raise LidarError(

@@ -37,7 +37,7 @@ class VoxelPlanes:
         """
         from scipy.spatial import cKDTree
 
-        means = PointVoxels.of_points(Path(name), points, voxel_m).means(points)
+        means = PointVoxels.from_points(Path(name), points, voxel_m).means(points)
         if len(means) < _NEIGHBORS:
             return None
         _, neighbors = cKDTree(means).query(means, _NEIGHBORS)

@@ -277,7 +277,7 @@ class DataSetOutput:
             "backend": store.backend,
             "sensors": sums.sensors,
             "files": file_hashes(self.campaign.files),
-            "campaign": self.campaign.described,
+            "campaign": self.campaign.card_content,
             "shards": [str(self.campaign.shard)],
         }
         # The record is written first, because it associates the other files with a campaign.

@@ -64,7 +64,7 @@ def write_card(
     storage
         Folder of the data set, which must exist.
     campaign, run
-        The campaign in the form of `CampaignSpec.described`, and the totals of its run.
+        The campaign in the form of `CampaignSpec.card_content`, and the totals of its run.
     jobs
         Job rows in order, for example from `lidarpool.datasets.job_table.read_table`.
     versions

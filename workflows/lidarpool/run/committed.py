@@ -41,8 +41,8 @@ class CommittedRun:
     def notes(self) -> tuple[str, ...]:
         """Warnings about the scenario, followed by the notes of the run."""
         only_job = self.store.only_job
-        place_problem = "" if only_job is None else only_job.job.place_problem
-        notes = (*self.store.warnings, place_problem, *self.store.notes)
+        location_warning = "" if only_job is None else only_job.job.location_warning
+        notes = (*self.store.warnings, location_warning, *self.store.notes)
         return tuple(dict.fromkeys(filter(None, notes)))
 
     def result(self, screen: Screen) -> RunResult:

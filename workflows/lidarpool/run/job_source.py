@@ -116,7 +116,7 @@ def failed_row(jobs: Jobs, number: int, error: object) -> JobRow:
     values: Mapping[str, Value | None] = {}
     with suppress(Exception):  # the values may be the cause of the error
         values = jobs.values(number)
-    message = jobs.without_folders(str(error))
+    message = jobs.strip_folders(str(error))
     return JobRow(number, jobs.name(number), jobs.split(number), dict(values), message)
 
 

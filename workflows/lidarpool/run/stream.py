@@ -37,7 +37,7 @@ from ..clouds.kitti import kitti_intensity
 from ..datasets.job_table import JobRow
 from ..datasets.sweep_data import sweep_of_job
 from ..scenario.campaign import CampaignSpec
-from ..scenario.campaign_sections import Keep
+from ..scenario.campaign_sections import DatasetFormat
 from ..scenario.empty_cloud import empty_cloud_reason
 from ..scenario.job import Job
 from .cluster.checks import check_workers, find_workers
@@ -129,7 +129,7 @@ class _StreamedSweeps:
     """Sweeps of a job that are being cast, and the columns that are ready to be read."""
 
     job: Job
-    keep: Keep  # data set format of the campaign, which determines the points
+    keep: DatasetFormat  # data set format of the campaign, which determines the points
     casting: PipelineJob
     columns: dict[int, PartColumns] = field(default_factory=dict)  # {first scan: batch}
     sweeps_begun: int = 0  # number of sweeps that have been passed to the dispatcher
@@ -183,7 +183,7 @@ class _Casting:
         self._casting = CastingWorkers(partition, run, workers.backend, workers.software)
         self._dispatcher = Dispatcher(self._casting, collector_count=1, mark="")
         self._watch = Watch(client, [GPU], (), options.worker_timeout_s)
-        columns = stream.campaign.keep.of_jobs.needs
+        columns = stream.campaign.keep.export_spec.needs
         self._maker = JobProducer(stream.campaign, stream.numbers, columns)
         self._jobs: dict[int, _StreamedSweeps] = {}  # {job number: sweeps}
         self._next: _StreamedSweeps | None = None  # job with sweeps that have not been begun yet

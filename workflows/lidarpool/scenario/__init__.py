@@ -1,1 +1,1 @@
-"""Scenario files: models, template, schema."""
+"""Scenario and campaign files, and the jobs that are created from them."""

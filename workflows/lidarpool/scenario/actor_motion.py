@@ -1,4 +1,4 @@
-"""Motion in a scenario: sensors on carriers, actors on trajectories, traffic of simulations."""
+"""Scenario sections for motion, such as mounts, trajectories and actors."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from lidarsim.numerics.arrays import Floats
 from lidarsim.schema.declared import Several, Text, TextOrTexts, about, by_text, declared, one_of
 from lidarsim.survey.survey import Mounted, StepCount
 
-from .ground import StandingSurfaces, follow_surfaces
+from .ground import SupportSurfaces, follow_surfaces
 from .sections import (
     DeformingSection,
     IgnoredColumns,
     MeshEntry,
     MeshFile,
     NoiseSection,
-    PathOf,
     PoseEntry,
+    ResolvePath,
     ReturnsSection,
     Section,
     SensorSection,
@@ -63,14 +63,14 @@ class MountSection(Section, InstrumentPose):
     ] = None
 
     def pose(self) -> Pose:
-        """Return position and angles as a pose."""
+        """Return the position and angles as a pose."""
         return Pose(**declared(self, Pose))
 
 
 MountEntry = Annotated[MountSection, by_position(MountSection)]
 
 
-class CarriedSection(SensorSection):
+class MountedSensorSection(SensorSection):
     """A sensor on a platform, with its mount, start and time steps.
 
     In YAML, the model alone is sufficient.
@@ -92,7 +92,7 @@ class CarriedSection(SensorSection):
 
     def mounted(
         self,
-        path: PathOf,
+        path: ResolvePath,
         mount: Pose,
         noise: NoiseSection,
         returns: ReturnsSection,
@@ -100,7 +100,8 @@ class CarriedSection(SensorSection):
     ) -> Mounted:
         """Return the sensor on its platform, with its start and time steps.
 
-        `path` returns the path of a file in the scenario. LidarError if a file cannot be used.
+        The parameters are those of `SensorSection.mounted`. Raise LidarError if a file cannot be
+        used.
         """
         mounted = super().mounted(path, mount, noise, returns, name)
         sensor = mounted.sensor
@@ -109,7 +110,7 @@ class CarriedSection(SensorSection):
         return replace(mounted, sensor=sensor, steps=self.steps)
 
 
-CarriedEntry = Annotated[CarriedSection, by_text("model", CarriedSection)]
+MountedSensorEntry = Annotated[MountedSensorSection, by_text("model", MountedSensorSection)]
 
 
 class TimedPose(Section, Pose):
@@ -118,7 +119,7 @@ class TimedPose(Section, Pose):
     If no pose has an angle, the platform is level and faces its direction of travel.
     """
 
-    # Any number: `seconds_of` names the unit that too large numbers probably have.
+    # The range is large, because `seconds_of` suggests a unit for times that are not in seconds.
     time_s: Annotated[float, about("time of the pose, in seconds", ge=-1e20, le=1e20)]
 
 
@@ -132,7 +133,7 @@ TimeUnitEntry = Annotated[
 
 
 class TrajectorySection(Section):
-    """Poses over time, from a file, from points or from traffic.
+    """A trajectory from a file, from a list of poses, or from traffic.
 
     In YAML, the file name alone is sufficient.
     """
@@ -228,43 +229,44 @@ class TrajectorySection(Section):
 
     def track(
         self,
-        path: PathOf,
-        standing: StandingSurfaces,
+        path: ResolvePath,
+        support: SupportSurfaces,
         start_s: float | None = None,
         *,
         name: str,
         without_angles: dict[str, bool],
     ) -> Track:
-        """Return the trajectory in a scene's local coordinates.
+        """Return the trajectory in the local coordinates of a scene.
 
         Parameters
         ----------
         path
-            Returns the path of a file in the scenario.
-        standing
-            Surfaces of the scene, for a trajectory that follows surfaces.
+            Function that returns the path of a file in the scenario.
+        support
+            Surfaces of the scene, which the trajectory may follow.
         start_s
-            Start of the survey, in seconds by the clock of its trajectory.
+            Start of the survey in seconds, relative to the clock of its trajectory.
         name
-            What has the trajectory, for notes.
+            Name of the platform or actor on the trajectory, for notes.
         without_angles
-            Gets {name: whether the path has corners} if the poses have no angles.
+            If the poses have no angles, `name` is added to this dictionary with the value True if
+            the path has corners, otherwise False.
 
         Raises
         ------
         LidarError
-            If a file cannot be read, or the trajectory leaves its surfaces.
+            If a file cannot be read, or if the trajectory leaves its surfaces.
         """
-        track = self._track_without_surfaces(path, standing.origin, start_s)
+        track = self._track_without_surfaces(path, support.origin, start_s)
         if track.quaternions is None:
             without_angles[name] = len(track.with_turns.times_s) > len(track.times_s)
         if self.surfaces is None:
             return track
-        # Pieces may end before the survey does.
-        pieces = follow_surfaces(replace(track, beyond="hold"), standing.of_objects(self.surfaces))
+        # The trajectory is split where it leaves the surfaces, so a piece may be too short.
+        pieces = follow_surfaces(replace(track, beyond="hold"), support.select(self.surfaces))
         if len(pieces) == 1 and self.beyond == "absent":
             return replace(pieces[0], beyond="absent")
-        assert track.start_s is not None  # every track has a start
+        assert track.start_s is not None  # set by Track.__post_init__
         start = track.start_s
         stop = track.start_s + track.duration_ns / 1e9
         for piece in pieces:
@@ -275,23 +277,26 @@ class TrajectorySection(Section):
             "Shorten it so that it ends on these surfaces."
         )
 
-    def footprint(self, path: PathOf) -> Floats:
-        """Return positions on the trajectory seen from above, (n, 2), world meters.
+    def footprint(self, path: ResolvePath) -> Floats:
+        """Return horizontal positions on the trajectory during the survey.
 
-        There are none on the trajectory of a vehicle of traffic. `path` returns the path of a file
-        in the scenario. LidarError if a file cannot be read.
+        The positions are in world coordinates, in meters, and have shape (n, 2). If the trajectory
+        is that of a vehicle in traffic, the array is empty. `path` is a function that returns the
+        path of a file in the scenario. Raise LidarError if a file cannot be read.
         """
         if self.vehicle is not None:
             return np.zeros((0, 2))
         track = self._track_without_surfaces(path, np.zeros(3), None)
-        assert track.start_s is not None  # every track has a start
+        assert track.start_s is not None  # set by Track.__post_init__
         stop_s = track.start_s + track.duration_ns / 1e9
         within = (track.start_s <= track.times_s) & (track.times_s <= stop_s)
         ends, _ = track.poses(0, np.array([0.0, track.duration_ns]))
         return np.concatenate([ends, track.positions[within]])[:, :2]
 
-    def _track_without_surfaces(self, path: PathOf, origin: Floats, start_s: float | None) -> Track:
-        """Return the trajectory in local coordinates, with heights as given."""
+    def _track_without_surfaces(
+        self, path: ResolvePath, origin: Floats, start_s: float | None
+    ) -> Track:
+        """Return the trajectory in local coordinates, with heights as in the file or points."""
         options: dict[str, Any] = {
             "smooth": self.interpolation == "smooth",
             "start_s": self.start_s if start_s is None else start_s,
@@ -339,7 +344,7 @@ class JointTable(Section):
 class ActorSection(DeformingSection):
     """A moving or stationary object or robot.
 
-    In its own axes, x is forward and z is up.
+    In the frame of the actor, x points forward and z points up.
     """
 
     name: Annotated[Text, about("name of the object")]
@@ -377,7 +382,7 @@ class ActorSection(DeformingSection):
 
     @model_validator(mode="after")
     def _check_actor(self) -> ActorSection:
-        """Raise ValueError if fields of an actor or robot do not fit together."""
+        """Raise ValueError if fields of an actor or robot cannot be combined."""
         trajectory = self.trajectory
         if trajectory is not None and self.at is not None:
             raise ValueError("`trajectory` and `at` cannot be combined.")
@@ -405,38 +410,42 @@ class ActorSection(DeformingSection):
         return self
 
     @property
-    def is_carrier(self) -> bool:
-        """Whether the actor has the survey's trajectory, and carries its sensors."""
+    def is_platform(self) -> bool:
+        """Whether the actor is the platform, which follows the trajectory of the survey."""
         return self.trajectory is None and self.at is None
 
     @property
     def robot(self) -> MeshFile | None:
-        """File of the actor, if the file is a robot's, else None."""
+        """File of the actor if it describes a robot, otherwise None."""
         return self.file if self.file and self.file.file.lower().endswith(ROBOTS) else None
 
     def track(
         self,
-        path: PathOf,
-        standing: StandingSurfaces,
-        carrier: Track | None,
+        path: ResolvePath,
+        support: SupportSurfaces,
+        platform_track: Track | None,
         without_angles: dict[str, bool],
     ) -> Track:
-        """Return the trajectory of the actor from the survey's start, in local coordinates.
+        """Return the trajectory of the actor from the start of the survey, in local coordinates.
 
-        `path` returns the path of a file in the scenario; `carrier` is the survey's trajectory;
-        `without_angles` is extended as by `TrajectorySection.track`.
+        Parameters
+        ----------
+        path, support, without_angles
+            As for `TrajectorySection.track`.
+        platform_track
+            Trajectory of the survey, or None if the survey has poses.
         """
-        start_s = 0.0 if carrier is None else carrier.start_s or 0.0
+        start_s = 0.0 if platform_track is None else platform_track.start_s or 0.0
         if self.at is not None:
-            # Two poses: joints of a robot go by the clock of its trajectory.
-            positions = np.array([self.at.position] * 2) - standing.origin
+            # Two poses define a clock, which the joints of a robot use.
+            positions = np.array([self.at.position] * 2) - support.origin
             rotations = quaternions_of(np.array([self.at.rotation_matrix] * 2))
             times = start_s + np.arange(2.0)
             return Track(times, positions, rotations, start_s=start_s, beyond="hold")
         if self.trajectory is None:
-            assert carrier is not None, "checked with the scenario"
-            return carrier
+            assert platform_track is not None, "guaranteed by the validation of the scenario"
+            return platform_track
         with prefixed(f"actor {self.name!r}"):
             return self.trajectory.track(
-                path, standing, start_s, name=self.name, without_angles=without_angles
+                path, support, start_s, name=self.name, without_angles=without_angles
             )

@@ -1,4 +1,4 @@
-"""Notes on likely mistakes in a scenario that can be prepared."""
+"""Notes about likely mistakes in a valid scenario."""
 
 from __future__ import annotations
 
@@ -24,49 +24,50 @@ from lidarsim.simulator.steps.step_list import setup_of
 from lidarsim.survey.survey import START_FROM, Survey
 from lidarsim.words import as_scenario, listed, plural, rounded
 
-from .georeference import missing_system
-from .prepare import Prepared
-from .scenario import Scenario, survey_of
+from .georeference import missing_epsg_note
+from .prepare import PreparedScenario
+from .scenario import Scenario, mesh_survey_name
 
-# Sizes of scenes in meters are between these. An .stl is mostly a part, in millimeters; an object
-# seen from outside is rarely longer than a bus. glTF is in meters, and some exporters write
-# millimeters.
+# Plausible lengths of scenes. Larger or smaller scenes probably have a wrong unit.
 LARGE_M = 500.0
-LARGE_STL_M = 20.0
-LARGE_OBJECT_M = 10.0
-LARGE_STATED_M = 100.0
+LARGE_STL_M = 20.0  # most .stl files contain parts in millimeters
+LARGE_OBJECT_M = 10.0  # single objects are rarely longer than a bus
+LARGE_STATED_M = 100.0  # some exporters write glTF in millimeters, although it must be in meters
 SMALL_M = 0.2
-_LAST_DATE = datetime(2100, 1, 1, tzinfo=UTC)  # later seconds since 1970 are likely no dates
-HAZE_KM = 10.0  # no lidar detects light that returns from clearer air
-MIN_STEPS = 100  # smallest length of a scene, in steps of the precision
+_LAST_DATE = datetime(2100, 1, 1, tzinfo=UTC)  # later times are probably not seconds since 1970
+HAZE_KM = 10.0  # lidars cannot detect backscatter if the visibility is better
+MIN_STEPS = 100  # minimum length of a scene in units of the precision
 
 
-def advice(prepared: Prepared) -> list[str]:
-    """Return notes on likely mistakes, such as a size that suggests another unit.
+def advice(prepared: PreparedScenario) -> list[str]:
+    """Return notes about likely mistakes, such as a size that suggests a wrong unit.
 
-    There are also notes on objects that were left out, files whose axes were guessed, poses that
-    were chosen, and settings without effect.
+    The notes also cover skipped objects, files whose up axis was assumed, default poses, and
+    settings that have no effect.
     """
     notes = prepared.findings.notes
     remarks = prepared.findings.remarks
     axes = [
-        _for_mesh(remark) if _is_of_mesh(prepared.scenario) else remark for remark in remarks[:1]
+        _with_command_option(remark) if _is_mesh_survey(prepared.scenario) else remark
+        for remark in remarks[:1]
     ]
     if others := len(remarks[1:]):
         axes = [f"{axes[0]}. The same applies to {plural(others, 'other file')}"]
     side = float(np.ptp(prepared.scene.bounds, axis=0).max())
     step = prepared.survey.precision_m
-    placed = () if prepared.placing is None else prepared.placing.notes
-    system = missing_system(prepared.scene, prepared.survey.epsg)
-    likely = filter(None, (_size_note(prepared, side), system, *placed, _color_note(prepared)))
+    placement_notes = () if prepared.placement is None else prepared.placement.notes
+    system = missing_epsg_note(prepared.scene, prepared.survey.epsg)
+    likely = filter(
+        None, (_size_note(prepared, side), system, *placement_notes, _color_note(prepared))
+    )
     coarse = [
         f"points are rounded to {step:g} m, but the scene is only {side:.3g} m long. Set a smaller "
         "`cloud.precision_m` in a scenario"
     ] * (side < MIN_STEPS * step)
     labels = _unnamed_classes(prepared.survey)
     if any(column.name == "class" for column in prepared.survey.stored_columns):
-        labels = chain(unlabeled(prepared.scene, prepared.survey), labels)
-    settings = (*coarse, *_notes_of_formats(prepared), *labels, *_without_effect(prepared.scenario))
+        labels = chain(unlabeled_notes(prepared.scene, prepared.survey), labels)
+    settings = (*coarse, *_format_notes(prepared), *labels, *_without_effect(prepared.scenario))
     light = (*_single_returns(prepared), *_dark_fog(prepared.survey))
     groups = (
         *(notes, axes, likely, _heading_notes(prepared.findings.without_angles)),
@@ -75,10 +76,10 @@ def advice(prepared: Prepared) -> list[str]:
     return [as_scenario(line) for line in chain.from_iterable(groups)]
 
 
-def unlabeled(scene: Scene, survey: Survey) -> list[str]:
-    """Return a note on static objects without a class, for a cloud with the classes of points.
+def unlabeled_notes(scene: Scene, survey: Survey) -> list[str]:
+    """Return a note if static objects have no class, for clouds that contain the class column.
 
-    There is none if the survey names class 0, for example "background".
+    The list is empty if the survey assigns a name to class 0, for example "background".
     """
     if 0 in survey.classes:
         return []
@@ -108,21 +109,21 @@ def unlabeled(scene: Scene, survey: Survey) -> list[str]:
     ]
 
 
-def _is_of_mesh(scenario: Scenario) -> bool:
+def _is_mesh_survey(scenario: Scenario) -> bool:
     """Return whether a mesh file was passed in place of a scenario."""
     files = [scenario.path(entry.file) for entry in scenario.scene.files]
-    return scenario.source in map(survey_of, files)
+    return scenario.source in map(mesh_survey_name, files)
 
 
-def _for_mesh(remark: str) -> str:
-    """Return a remark on axes with the option of the command line in place of the field."""
+def _with_command_option(remark: str) -> str:
+    """Return a remark about axes with the command-line option instead of the field."""
     return re.sub(r'<file\.up_axis="(\w)">', r"`--up-axis \1`", remark).replace(
         "set up_axis explicitly", "pass `--up-axis` explicitly"
     )
 
 
 def _unnamed_classes(survey: Survey) -> Iterator[str]:
-    """Yield a note if some classes have names, and others of the survey's objects have none."""
+    """Yield a note if only some of the classes in a survey have names."""
     used = {material.semantic_class for material in survey.materials}
     if unnamed := sorted(used - {0, *survey.classes}) if survey.classes else []:
         noun = "classes" if unnamed[1:] else "class"
@@ -133,24 +134,28 @@ def _unnamed_classes(survey: Survey) -> Iterator[str]:
         )
 
 
-def _notes_of_formats(prepared: Prepared) -> list[str]:
-    """Return notes on what the formats of the output cannot store."""
+def _format_notes(prepared: PreparedScenario) -> list[str]:
+    """Return notes about data that the output formats cannot store."""
     specs = prepared.scenario.output.write
     notes = (note for spec in specs for note in spec.cloud_format.survey_notes(prepared.survey))
     return [*dict.fromkeys(notes)]
 
 
-def _size_note(prepared: Prepared, side: float) -> str:
-    """Return a note if the longest side of the scene (meters) suggests another unit, else ""."""
+def _size_note(prepared: PreparedScenario, side: float) -> str:
+    """Return a note if the length of the scene suggests a wrong unit, otherwise an empty string.
+
+    `side` is the length of the longest side in meters.
+    """
     scenario = prepared.scenario
-    placing = prepared.placing
+    placement = prepared.placement
     files = [entry.file for entry in scenario.scene.files if entry.unit is None]
-    files = [file for file in files if file not in prepared.findings.classes]  # towns are large
+    # City models, whose files assign classes, are large.
+    files = [file for file in files if file not in prepared.findings.classes]
     unitless = [file for file in files if _lacks_unit(scenario.path(file))]
     has_stl = any(file.lower().endswith(".stl") for file in unitless)
     min_m = SMALL_M
     max_m = LARGE_STL_M if has_stl else LARGE_M
-    if surrounded := placing is not None and placing.surrounds_object:
+    if surrounded := placement is not None and placement.surrounds_object:
         min_m = 0.0
         max_m = LARGE_OBJECT_M if unitless else LARGE_STATED_M
     if not (unitless or (surrounded and files)) or min_m <= side <= max_m:
@@ -169,15 +174,15 @@ def _size_note(prepared: Prepared, side: float) -> str:
 
 
 def _lacks_unit(path: Path) -> bool:
-    """Return whether neither a mesh file nor its format states a unit."""
+    """Return whether neither a mesh file nor its format specifies a unit."""
     row = format_of(path)
     return row is not None and row.unitless and not written_by_lidarpool(path)
 
 
-def _color_note(prepared: Prepared) -> str:
-    """Return a note on objects that lack the colors that settings need, or an empty string."""
+def _color_note(prepared: PreparedScenario) -> str:
+    """Return a note about objects without colors that settings require, or an empty string."""
     scene = prepared.scene
-    if not prepared.scenario.colored:
+    if not prepared.scenario.needs_colors:
         return ""
     if not scene.colored:
         return (
@@ -200,7 +205,7 @@ def _color_note(prepared: Prepared) -> str:
 
 
 def _without_effect(scenario: Scenario) -> Iterator[str]:
-    """Yield notes on settings without effect, and on contradictions between settings."""
+    """Yield notes about settings that have no effect or contradict each other."""
     for entry in scenario.output.write:
         yield from entry.frame_notes(scenario.cloud.coordinates)
         yield from entry.cloud_format.renaming_notes([*scenario.sensors])
@@ -231,10 +236,10 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
         )
 
 
-def _single_returns(prepared: Prepared) -> Iterator[str]:
-    """Yield a note if sensors report several returns, and no pulse has a second one.
+def _single_returns(prepared: PreparedScenario) -> Iterator[str]:
+    """Yield a note if sensors report several returns, but no pulse can have a second return.
 
-    False alarms do not count, although they are returns, too.
+    False alarms are ignored, although they are also returns.
     """
     survey = prepared.survey
     setups = [setup_of(prepared.scene, survey, number) for number in range(len(survey.carried))]
@@ -260,7 +265,7 @@ def _single_returns(prepared: Prepared) -> Iterator[str]:
 
 
 def _dark_fog(survey: Survey) -> Iterator[str]:
-    """Yield notes if fog attenuates light and returns none."""
+    """Yield a note if fog attenuates light but causes no returns."""
     if survey.visibility_km is None or survey.visibility_km > HAZE_KM:
         return
     if survey.fog_lidar_ratio_sr is None:
@@ -285,7 +290,10 @@ def _dark_fog(survey: Survey) -> Iterator[str]:
 
 
 def _heading_notes(without_angles: Mapping[str, bool]) -> Iterator[str]:
-    """Yield notes on trajectories without angles: {name: whether the path has corners}."""
+    """Yield a note about trajectories without angles.
+
+    `without_angles` maps the name of each trajectory to whether its path has corners.
+    """
     if not without_angles:
         return
     names = [*without_angles]
@@ -307,15 +315,16 @@ def _heading_notes(without_angles: Mapping[str, bool]) -> Iterator[str]:
     yield note
 
 
-def _timing_notes(prepared: Prepared) -> Iterator[str]:
-    """Yield notes on times: a date that is lost, faults without sweeps, and absent actors.
+def _timing_notes(prepared: PreparedScenario) -> Iterator[str]:
+    """Yield notes about times.
 
-    Animations of actors that end before the survey have notes, too.
+    The notes concern dates that are not stored, faults during which no sweep starts, actors that
+    are absent during the survey, and animations that end before the survey.
     """
     survey = prepared.survey
     if isinstance(survey.path, Track) and survey.start is None:
         start_s = survey.path.start_s
-        assert start_s is not None  # every track has a start
+        assert start_s is not None  # set by Track.__post_init__
         if START_FROM.timestamp() <= start_s < _LAST_DATE.timestamp():
             moment = datetime.fromtimestamp(start_s, UTC).isoformat()
             yield (

@@ -1,4 +1,8 @@
-"""Sources of the jobs of a campaign: a function, scenario files, or bases with other values."""
+"""Job sources of campaigns.
+
+The jobs of a campaign come from a Python function, from a list of scenario files, or from base
+scenarios with sampled values.
+"""
 
 from __future__ import annotations
 
@@ -30,21 +34,30 @@ from ..datasets.job_table import Value
 from ..identity.field_words import describe_fields
 from ..identity.fingerprint import fingerprint
 from ..identity.software import plugin_versions
-from .campaign_sections import MAX_JOBS, CampaignSection, Choice, JobRandom, is_campaign, read_rows
+from .campaign_sections import (
+    MAX_JOBS,
+    CampaignSection,
+    JobRandom,
+    ValueRule,
+    is_campaign,
+    read_rows,
+)
 from .field_paths import FieldSteps, find_field, replace_value
 from .job import Job
-from .prepare import Prepared, prepare
+from .prepare import PreparedScenario, prepare
 from .scenario import Scenario
 from .sections import file_states
 from .static_scene import SceneCache
 
-_NOISE = "noise.seed"  # path of the seed that differs from job to job
-_MAX_DESCRIBED = 20  # scenarios whose fields are stored with a run, to name those that differ
-_UNSAFE = re.compile(r"[^\w.-]+", re.ASCII)  # characters to replace in a name of files
+_NOISE_SEED = "noise.seed"  # path of the seed that differs between jobs
+# Maximum number of scenarios whose fields are stored with a run. If the run is resumed with changed
+# scenarios, the error message names the fields that differ.
+_MAX_DESCRIBED = 20
+_UNSAFE = re.compile(r"[^\w.-]+", re.ASCII)  # characters that file names must not contain
 
 
 class JobSource:
-    """Makes the jobs of a campaign by their numbers."""
+    """Base class of the sources that create the jobs of a campaign by number."""
 
     count: int
     names: tuple[str, ...] = ()
@@ -54,45 +67,51 @@ class JobSource:
     identity: Mapping[str, str]
 
     def name(self, number: int) -> str:
-        """Return the name of a job in files: four digits or more."""
+        """Return the name of a job, which is used in file names.
+
+        By default, the name is the number of the job with at least four digits.
+        """
         return f"{number:04}"
 
     def values(self, number: int) -> dict[str, Value | None]:
-        """Return the values that differ from job to job."""
+        """Return those values of a job that differ between jobs."""
         return {}
 
     def scenario(self, number: int) -> Scenario | None:
-        """Return the scenario of a job, or None if a function makes the job."""
+        """Return the scenario of a job, or None if a function creates the job."""
         return None
 
     @property
     def fields(self) -> dict[str, str]:
-        """Fields of the scenarios that jobs are made of, in words."""
+        """Fields of the scenarios that jobs are created from, as text."""
         return {}
 
-    def named_in(self, file: Path) -> str:
-        """Return what names a file, to start a message, such as a scenario and its field."""
+    def message_prefix(self, file: Path) -> str:
+        """Return a message prefix that states where a file name is set, or an empty string.
+
+        The prefix names, for example, a scenario and one of its fields.
+        """
         return ""
 
     def prepare(
         self, number: int, cache: SceneCache | None, columns: Sequence[str], fields: Any
-    ) -> Prepared:
-        """Prepare the scenario of a job, with the arguments of `job`."""
+    ) -> PreparedScenario:
+        """Prepare the scenario of a job. The arguments are those of `job`."""
         scenario = self.scenario(number)
-        assert scenario is not None, "of a file"
-        input_files = file_hashes(scenario.files)
-        fields |= {"values": self.values(number), "input_files": input_files}
+        assert scenario is not None, "only jobs with a scenario can be prepared"
+        made_of = file_hashes(scenario.files)
+        fields |= {"values": self.values(number), "made_of": made_of}
         return prepare(scenario, plans=False, cache=cache, columns=columns, **fields)
 
     def job(
         self, number: int, cache: SceneCache | None, columns: Sequence[str], fields: Any
     ) -> Job:
-        """Make a job, with further columns of its cloud and further fields of the job."""
+        """Create a job with additional cloud columns and additional fields of `Job`."""
         return self.prepare(number, cache, columns, fields).job
 
 
 class FunctionJobs(JobSource):
-    """Jobs that a function of Python makes."""
+    """Jobs created by a Python function."""
 
     def __init__(self, make: Callable[..., Any], count: int, seed: int) -> None:
         self._make = make
@@ -100,28 +119,28 @@ class FunctionJobs(JobSource):
         self._seed = seed
 
     @cached_property
-    def names(self) -> tuple[str, ...]:  # type: ignore[override]  # made on first use
-        """Names of the values of the first job that can be made."""
+    def names(self) -> tuple[str, ...]:  # type: ignore[override]  # computed on first use
+        """Names of the values of the first job that can be created."""
         for number in range(self.count):
-            with suppress(LidarError):  # a job that fails must not end the others
+            with suppress(LidarError):  # a failed job must not stop the others
                 return tuple(self._call(number).values)
         return ()
 
     @property
     def identity(self) -> dict[str, str]:  # type: ignore[override]
-        """Hash of the function."""
+        """Hash of the function, as {"make": hash}."""
         return {"make": fingerprint(self._make)}
 
     def values(self, number: int) -> dict[str, Value | None]:
-        """Make a job and return its values."""
+        """Create a job and return its values."""
         return dict(self.job(number, None, (), {}).values)
 
     def job(
         self, number: int, cache: SceneCache | None, columns: Sequence[str], fields: Any
     ) -> Job:
-        """Make a job, and check its values.
+        """Create a job and validate its values.
 
-        Noise without a seed gets a seed of the job.
+        If the seed of the noise is 0, it is replaced by a seed that depends on the job.
         """
         job = self._call(number)
         if extra := [name for name in job.values if name not in self.names]:
@@ -143,9 +162,10 @@ class FunctionJobs(JobSource):
         check_all_returns(columns, survey.keep_every)
         survey = replace(
             survey,
-            noise=_seeded(survey.noise, seed),
+            noise=_with_seed(survey.noise, seed),
             sensors=[
-                replace(mounted, noise=_seeded(mounted.noise, seed)) for mounted in survey.sensors
+                replace(mounted, noise=_with_seed(mounted.noise, seed))
+                for mounted in survey.sensors
             ],
             columns=(*survey.columns, *columns),
         )
@@ -154,14 +174,14 @@ class FunctionJobs(JobSource):
     def _call(self, number: int) -> Job:
         """Call the function.
 
-        Raises LidarError if the function fails or returns no job.
+        Raise LidarError if the function fails or does not return a job.
         """
         with prefixed(f"job {number}"):
             try:
                 job = self._make(number, JobRandom(self._seed, number, "make").generator())
             except LidarError:
                 raise
-            except Exception as error:  # a failure of a job must not end the others
+            except Exception as error:  # a failed job must not stop the others
                 message = f"the function raised {type(error).__name__}: {error}"
                 raise LidarError(message) from error
             if not isinstance(job, Job):
@@ -172,7 +192,7 @@ class FunctionJobs(JobSource):
 
 
 class ScenarioJobs(JobSource):
-    """Jobs of scenario and mesh files: a job for each file."""
+    """Jobs created from scenario and mesh files, one per file."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         if not paths:
@@ -193,31 +213,33 @@ class ScenarioJobs(JobSource):
         mistakes.tell()
         self.files = files
         self.identity = {"scenarios": fingerprint(fingerprints)}
-        self._names = _unique([path.stem for path in paths])
+        self._names = _unique_names([path.stem for path in paths])
 
     @property
     def fields(self) -> dict[str, str]:
-        """Fields of the first scenarios, in words."""
+        """Fields of the first scenarios, as text."""
         paths = self.paths[:_MAX_DESCRIBED]
-        return _fields_of({path.name: Scenario.load(path) for path in paths})
+        return _describe_scenarios({path.name: Scenario.load(path) for path in paths})
 
     def name(self, number: int) -> str:
-        """Return the name of a job: the name of its file without suffix."""
+        """Return the name of a job, which is the name of its file without the suffix."""
         return self._names[number]
 
-    def named_in(self, file: Path) -> str:
-        """Return the scenario and the field that name a file, to start a message."""
-        return next(filter(None, (Scenario.load(path).named_in(file) for path in self.paths)), "")
+    def message_prefix(self, file: Path) -> str:
+        """Return a message prefix with the scenario and the field that name a file."""
+        return next(
+            filter(None, (Scenario.load(path).message_prefix(file) for path in self.paths)), ""
+        )
 
     def scenario(self, number: int) -> Scenario:
         """Read the scenario of a job."""
         return Scenario.load(self.paths[number])
 
 
-def _unique(stems: Iterable[str]) -> list[str]:
-    """Return different names for files: «hall», «hall-2»."""
+def _unique_names(stems: Iterable[str]) -> list[str]:
+    """Return unique job names for file names, such as "hall" and "hall-2"."""
     unique_names: list[str] = []
-    lower_case: set[str] = set()  # some systems do not distinguish capitals
+    lower_case: set[str] = set()  # some file systems are case-insensitive
     for stem in stems:
         first = _UNSAFE.sub("_", stem).lstrip(".") or "job"
         names = chain([first], (f"{first}-{number}" for number in itertools.count(2)))
@@ -227,8 +249,8 @@ def _unique(stems: Iterable[str]) -> list[str]:
     return unique_names
 
 
-class VariedJobs(JobSource):
-    """Jobs of a campaign file: its bases with drawn values."""
+class SampledJobs(JobSource):
+    """Jobs of a campaign file, which are its base scenarios with sampled values."""
 
     def __init__(self, section: CampaignSection, path: Path) -> None:
         self._vary = section.vary
@@ -237,7 +259,7 @@ class VariedJobs(JobSource):
         self.folders = {path.parent}
         mistakes = Mistakes()
         self._bases: list[_Base] = []
-        tables: dict[Any, list[Any]] = {}  # {file and kind of entry: entries}
+        tables: dict[Any, list[Any]] = {}  # {(file, annotation, ignored columns): rows}
         for name in section.base:
             with mistakes.noted(), prefixed(path):
                 file = path.parent / Path(name).expanduser()
@@ -250,7 +272,8 @@ class VariedJobs(JobSource):
             base.check(self._source, mistakes)
         mistakes.tell()
         self.files = {path for base in self._bases for path in base.files}
-        self._strides: dict[str, int] = {}  # {path with each: jobs until its value changes}
+        # {path of a field with `each`: number of consecutive jobs with the same value}
+        self._strides: dict[str, int] = {}
         grid = len(self._bases)
         for text, choice in section.vary.items():
             if choice.each is not None:
@@ -269,13 +292,13 @@ class VariedJobs(JobSource):
         self.count = section.count or grid
         self.choices = {text: choice.words for text, choice in section.vary.items()}
         if len(self._bases) > 1:
-            bases = Choice(each=tuple(base.name for base in self._bases))
+            bases = ValueRule(each=tuple(base.name for base in self._bases))
             self.choices = {"base": bases.words, **self.choices}
         self.names = tuple(self.choices)
 
     @cached_property
     def identity(self) -> dict[str, str]:  # type: ignore[override]
-        """Hashes of the varied fields, of the bases and of the tables."""
+        """Hashes of the varied fields, the bases and the tables."""
         return {
             "vary": fingerprint({t: c.model_dump() for t, c in self._vary.items()}, [*self._vary]),
             "base": fingerprint([(base.name, _fingerprint(base.scenario)) for base in self._bases]),
@@ -284,14 +307,17 @@ class VariedJobs(JobSource):
 
     @property
     def fields(self) -> dict[str, str]:
-        """Fields of the bases, and rows of the tables, in words."""
+        """Fields of the bases and rows of the tables, as text."""
         bases = self._bases[:_MAX_DESCRIBED]
         tables = {f"rows of {text}": rows for base in bases for text, rows in base.tables.items()}
         words = describe_fields({name: to_json(rows).decode() for name, rows in tables.items()})
-        return _fields_of({base.name: base.scenario for base in bases}) | dict(words)
+        return _describe_scenarios({base.name: base.scenario for base in bases}) | dict(words)
 
-    def named_in(self, file: Path) -> str:
-        """Return the field that names a file, also with table and line, to start a message."""
+    def message_prefix(self, file: Path) -> str:
+        """Return a message prefix with the field that names a file.
+
+        If the file is named in a table, the prefix also contains the table and the line.
+        """
         tables = {path: text for base in self._bases for text, path in base.table_files.items()}
         for table, text in tables.items():
             for number, line in enumerate(read_text(table).splitlines(), 1):
@@ -299,19 +325,19 @@ class VariedJobs(JobSource):
                     return f"{self._source}: {text}: {table}, line {number}: "
         scenarios = [base.scenario for base in self._bases]
         scenarios += [base.files[file] for base in self._bases if file in base.files]
-        return next(filter(None, (scenario.named_in(file) for scenario in scenarios)), "")
+        return next(filter(None, (scenario.message_prefix(file) for scenario in scenarios)), "")
 
     def values(self, number: int) -> dict[str, Value | None]:
-        """Return the values that a job has for the table of jobs."""
+        """Return the values of a job for the job table."""
         return self._draw(number)[0]
 
     def scenario(self, number: int) -> Scenario:
-        """Return the base of a job with the values of the job."""
+        """Return the base scenario of a job with the values of the job."""
         values, changes = self._draw(number)
         base = self._bases[number % len(self._bases)]
         noise_seed = _noise_seed(self._seed, number)
         try:
-            return base.changed(changes, f"{self._source}: job {number}", noise_seed)
+            return base.with_values(changes, f"{self._source}: job {number}", noise_seed)
         except LidarError as error:
             listed = ", ".join(
                 f"{name}: {'none' if value is None else value}" for name, value in values.items()
@@ -321,10 +347,10 @@ class VariedJobs(JobSource):
             ) from error
 
     def _draw(self, number: int) -> tuple[dict[str, Value | None], dict[str, Any]]:
-        """Draw the values of a job: for the table of jobs, and for the scenario."""
+        """Draw the values of a job, and return them for the job table and for the scenario."""
         base = self._bases[number % len(self._bases)]
         values: dict[str, Value | None] = {"base": base.name} if len(self._bases) > 1 else {}
-        changes: dict[str, Any] = {}  # {path: value, or rows to be added}
+        changes: dict[str, Any] = {}  # {path: value, or rows to append}
         for text, choice in self._vary.items():
             rng = JobRandom(self._seed, number, text)
             if choice.sample is not None:
@@ -342,20 +368,20 @@ class VariedJobs(JobSource):
 
 
 class _Base:
-    """A base scenario, and the fields that the paths of a campaign lead to."""
+    """A base scenario and the fields that a campaign varies in it."""
 
     def __init__(
-        self, path: Path, vary: Mapping[str, Choice], tables: dict[Any, list[Any]], label: str
+        self, path: Path, vary: Mapping[str, ValueRule], tables: dict[Any, list[Any]], label: str
     ) -> None:
-        self._label = label  # label for messages
+        self._label = label  # used in messages
         self.scenario = Scenario.load(path)
         self.name = path.name
         self._vary = vary
-        self._noise, _ = find_field(self.scenario, _NOISE)
+        self._noise_seed_steps, _ = find_field(self.scenario, _NOISE_SEED)
         self._steps: dict[str, FieldSteps] = {}
         self.tables: dict[str, list[Any]] = {}
         self.table_files: dict[str, Path] = {}
-        self.files: dict[Path, Scenario] = {}  # {file that a job may read: a scenario with it}
+        self.files: dict[Path, Scenario] = {}  # {file that a job may read: scenario that names it}
         mistakes = Mistakes()
         for text, choice in vary.items():
             with mistakes.noted(), prefixed(label):
@@ -379,7 +405,11 @@ class _Base:
         mistakes.tell()
 
     def _check_disjoint(self) -> None:
-        """Refuse paths that lead to the same field, or into a field that is replaced as a whole."""
+        """Raise LidarError if two paths overlap.
+
+        Paths overlap if they refer to the same field, or if one field contains the other and is
+        replaced as a whole.
+        """
         keys = {text: tuple(key for key, _ in steps) for text, steps in self._steps.items()}
         for first, second in combinations(keys, 2):
             short, long = sorted((second, first), key=lambda text: len(keys[text]))
@@ -394,44 +424,49 @@ class _Base:
                 )
 
     def check(self, source: str, mistakes: Mistakes) -> None:
-        """Note values that are not valid, and collect the files that jobs may be made of.
+        """Add invalid values to `mistakes`, and collect the files that jobs may read.
 
-        The first values of all paths are tried together, then the second, and so on; only if
-        a trial fails, each path alone, to name the value.
+        The first values of all paths are tried together, then the second values, and so on. If a
+        trial fails, the paths are tried one by one to identify the invalid value.
         """
         trials = {text: self._trials(text) for text in self._vary}
         for index in range(max([1, *map(len, trials.values())])):
             changes = {text: values[index % len(values)] for text, values in trials.items()}
             try:
-                scenario = self.changed(changes, f"{source}: {self._label}")
+                scenario = self.with_values(changes, f"{source}: {self._label}")
             except LidarError as error:
-                wrong = [line for text in self._vary for line in islice(self._mistakes(text), 1)]
+                wrong = [
+                    line for text in self._vary for line in islice(self._invalid_values(text), 1)
+                ]
                 mistakes.lines += [f"{source}: {self._label}: {line}" for line in wrong]
                 mistakes.lines += () if wrong else str(error).splitlines()
                 return
             self.files |= dict.fromkeys(scenario.files, scenario)
 
     def _trials(self, text: str) -> list[Any]:
-        """Return values for a path that are valid if all jobs are, rows of a table in pieces."""
+        """Return representative values of a path, which are validated instead of all values.
+
+        The rows of a table are divided into groups that are as large as the largest sample.
+        """
         choice = self._vary[text]
         if choice.sample is None:
             return choice.limit_values
         min_rows, max_rows = choice.sample.count
         table = self.tables[text]
         starts = range(0, len(table), max(1, max_rows)) if max_rows else ()
-        pieces = [table[start : start + max_rows] for start in starts]
-        return [table[:min_rows], *pieces]
+        groups = [table[start : start + max_rows] for start in starts]
+        return [table[:min_rows], *groups]
 
-    def _mistakes(self, text: str) -> Iterator[str]:
-        """Yield lines on the values of a path that are not valid in the base."""
+    def _invalid_values(self, text: str) -> Iterator[str]:
+        """Yield a line for each value of a path that is not valid in the base."""
         choice = self._vary[text]
         field = dotted([key for key, _ in self._steps[text]])
         for value in () if choice.sample else choice.limit_values:
             try:
-                self.changed({text: value}, "")
+                self.with_values({text: value}, "")
             except LidarError as error:
-                in_a_line = str(error).replace("\n  ", " ")  # joins the lines of a list
-                message = in_a_line.partition("\n")[0].removeprefix(": ")
+                lines = str(error).replace("\n  ", " ")  # join the continuation lines of a list
+                message = lines.partition("\n")[0].removeprefix(": ")
                 value_line = f"{text} can be {shown(value)}"
                 invalid = f"{field} cannot be {shown(value)}."
                 start, _, end = message.partition(f", but is {shown(value)}.")
@@ -443,21 +478,21 @@ class _Base:
                 else:
                     yield f"{value_line}: {message}"
 
-    def changed(self, changes: Mapping[str, Any], source: str, noise_seed: int = 0) -> Scenario:
-        """Return the scenario with drawn values.
+    def with_values(self, changes: Mapping[str, Any], source: str, noise_seed: int = 0) -> Scenario:
+        """Return the scenario with other values.
 
-        Noise without a seed gets `noise_seed`.
+        If the seed of the noise is 0, it is replaced by `noise_seed`.
         """
 
         def new_value(text: str, value: Any) -> Any:
-            if text not in changes:  # the seed
+            if text not in changes:  # the noise seed, which is replaced only if it is 0
                 return value or noise_seed
             adds_rows = self._vary[text].sample is not None
             return [*(value or ()), *changes[text]] if adds_rows else changes[text]
 
         steps_by_path = {text: self._steps[text] for text in changes}
         if noise_seed:
-            steps_by_path.setdefault(_NOISE, self._noise)
+            steps_by_path.setdefault(_NOISE_SEED, self._noise_seed_steps)
         result: Any = self.scenario
         for text, steps in steps_by_path.items():
             result = replace_value(result, steps, partial(new_value, text))
@@ -466,17 +501,20 @@ class _Base:
 
 
 def _noise_seed(seed: int, number: int) -> int:
-    """Return the seed of the noise of a job, above 0."""
-    return JobRandom(seed, number, _NOISE).bits(63) or 1
+    """Return the noise seed of a job, which is never 0."""
+    return JobRandom(seed, number, _NOISE_SEED).bits(63) or 1
 
 
-def _seeded(noise: Any, seed: int) -> Any:
-    """Return noise with a seed, if there is noise and its seed is 0."""
+def _with_seed(noise: Any, seed: int) -> Any:
+    """Return noise with `seed` in place of a seed of 0. If `noise` is None, return None."""
     return noise if noise is None or noise.seed else replace(noise, seed=seed)
 
 
-def _fields_of(scenarios: Mapping[str, Scenario]) -> dict[str, str]:
-    """Return the fields of scenarios by their names, without their sections on the cluster."""
+def _describe_scenarios(scenarios: Mapping[str, Scenario]) -> dict[str, str]:
+    """Return the fields of scenarios as text, without the `pool` sections.
+
+    `scenarios` is a mapping from scenario names to scenarios.
+    """
     words: dict[str, str] = {}
     for name, scenario in scenarios.items():
         content = scenario.model_dump(exclude={"pool"}, exclude_unset=True)
@@ -485,15 +523,17 @@ def _fields_of(scenarios: Mapping[str, Scenario]) -> dict[str, str]:
 
 
 def _fingerprint(scenario: Scenario) -> str:
-    """Return the fingerprint of a scenario without its section on the cluster."""
+    """Return the fingerprint of a scenario without its `pool` section."""
     return fingerprint(scenario.model_dump(exclude={"pool"}))
 
 
 def file_hashes(files: Iterable[Path]) -> list[tuple[str, str]]:
-    """Return name and SHA-256 of readable files, sorted: the same in any folder.
+    """Return the names and SHA-256 hashes of files, sorted.
 
-    For a mesh file that a plug-in reads, the plug-in's distribution, version and sources follow.
-    Files that mesh files refer to (images, buffers) are not read.
+    The result does not depend on the folder of the files, and skips files that cannot be read. For
+    each mesh file that a plug-in reads, it also contains the distribution of the plug-in with its
+    version and the hash of its sources. Files that mesh files refer to, such as images and buffers,
+    are not included.
     """
     pairs = set()
     for state in file_states(files):
@@ -506,9 +546,9 @@ def file_hashes(files: Iterable[Path]) -> list[tuple[str, str]]:
 
 @cache
 def _hash(path: Path, *_: int) -> str:
-    """Return the SHA-256 of a file.
+    """Return the SHA-256 hash of a file.
 
-    A file is read once for each of its states.
+    The hash is cached by the state of the file, so the file is read again only after it changes.
     """
     with open_input(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,4 +1,4 @@
-"""Sections of a campaign file, and the draws of its jobs: values, and rows of tables."""
+"""Sections of campaign files, and the random numbers that determine the values of jobs."""
 
 from __future__ import annotations
 
@@ -58,29 +58,31 @@ from lidarsim.words import did_you_mean_each, in_yaml, joined, printable
 from ..clouds.format_table import DATA_SETS, LAYOUTS
 from ..clouds.writing import ExportSpec
 from ..datasets.job_table import Value
-from .sections import IgnoredColumns, Section, may_be_empty
+from .sections import IgnoredColumns, Section, allow_empty
 
-SIGMAS = 6.0  # a normal number beyond is drawn again, 2 of a billion
-MIN_SHARE = 0.01  # least share of a normal distribution within limits
+# Normally distributed numbers are limited to this many standard deviations from the mean. Numbers
+# outside the limit, 2 in a billion, are drawn again.
+SIGMAS = 6.0
+MIN_SHARE = 0.01  # minimum share of a normal distribution within its limits
 
 _CAMPAIGN_SUFFIXES = (".yaml", ".yml")
-_KEYS = re.compile(r"""^(?:["']?(?:base|vary)["']?\s*:|\{)""", re.MULTILINE)  # or a mapping {…}
+# Matches the keys `base` and `vary`, and the start of a flow mapping, which may contain them.
+_KEYS = re.compile(r"""^(?:["']?(?:base|vary)["']?\s*:|\{)""", re.MULTILINE)
 _EXACT = Context(prec=40)
-_DIGITS = 12  # digits of rounded numbers, so that tables are readable and hold the exact number
+_DIGITS = 12  # numbers are rounded, so that tables are readable and contain the exact values
 
 
 class JobRandom:
-    """Random numbers of a job for a purpose.
+    """Reproducible stream of random numbers for one quantity of a job.
 
-    Each call draws the next.
+    Each number is computed from a hash of the campaign seed, the job number, the name of the
+    quantity, and the number of earlier draws. The numbers of a quantity therefore do not change if
+    other quantities are added, removed or reordered, or if the number of jobs changes.
 
-    The numbers are hashes, the same on every machine and in every year: of the campaign's seed,
-    the job's number, the purpose, and the count of earlier draws for the purpose. A quantity that
-    is added, removed or moved does not change the others, nor does the number of jobs.
-
-    They are made of integers, of single operations on floats, and of the logarithms, roots and
-    powers of `decimal`, which are rounded correctly everywhere. The functions of C and of NumPy
-    differ in the last bit between processors and libraries.
+    The numbers are the same on every machine. They are computed with integers, with basic
+    floating-point operations, and with functions of `decimal`, which are correctly rounded. The
+    functions of the C library and NumPy are not used, because their results differ in the last bit
+    between processors and library versions.
 
     Examples
     --------
@@ -93,61 +95,62 @@ class JobRandom:
         self._drawn = 0
 
     def bits(self, count: int = 64) -> int:
-        """Draw a number of random bits, 256 at most, as an integer."""
+        """Draw an integer with `count` random bits. The maximum count is 256."""
         self._drawn += 1
         digest = self._hash.copy()
         digest.update(str(self._drawn).encode())
         return int.from_bytes(digest.digest(), "big") >> (256 - count)
 
     def below(self, count: int) -> int:
-        """Draw a whole number from 0 to count - 1."""
+        """Draw an integer from 0 to `count` - 1."""
         return self.bits(128) * count >> 128
 
     def integer(self, minimum: int, maximum: int) -> int:
-        """Draw a whole number between two limits, both included."""
+        """Draw an integer from `minimum` to `maximum`, inclusive."""
         return minimum + self.below(maximum - minimum + 1)
 
     def unit(self) -> float:
-        """Draw a number from 0 to 1, without 1."""
+        """Draw a number from the half-open interval [0, 1)."""
         return self.bits(53) * 2.0**-53
 
     def uniform(self, minimum: float, maximum: float) -> float:
-        """Draw a number from an interval."""
-        return _within(_short(minimum + (maximum - minimum) * self.unit()), minimum, maximum)
+        """Draw a uniformly distributed number."""
+        return _clip(_round(minimum + (maximum - minimum) * self.unit()), minimum, maximum)
 
     def log_uniform(self, minimum: float, maximum: float) -> float:
-        """Draw a number whose logarithm is uniform."""
+        """Draw a number whose logarithm is uniformly distributed."""
         log_minimum, log_maximum = (_EXACT.ln(Decimal(limit)) for limit in (minimum, maximum))
-        share = _share(self.bits(53))
+        share = _as_fraction(self.bits(53))
         number = _EXACT.exp(
             _EXACT.add(
                 log_minimum, _EXACT.multiply(share, _EXACT.subtract(log_maximum, log_minimum))
             )
         )
-        return _within(_short(float(number)), minimum, maximum)
+        return _clip(_round(float(number)), minimum, maximum)
 
     def normal(self, mean: float, std: float, limits: tuple[float, float] | None = None) -> float:
         """Draw a normally distributed number.
 
-        Numbers outside the limits are drawn again.
+        Numbers outside the limits are drawn again. By default, the limits are `SIGMAS` standard
+        deviations below and above the mean.
         """
         minimum, maximum = limits or (mean - SIGMAS * std, mean + SIGMAS * std)
         while True:
-            number = _short(mean + std * self._standard())
+            number = _round(mean + std * self._standard_normal())
             if minimum <= number <= maximum:
                 return number
 
-    def _standard(self) -> float:
-        """Draw a standard normal number, by the polar method of Marsaglia and Bray (1964)."""
+    def _standard_normal(self) -> float:
+        """Draw a standard normal number with the polar method of Marsaglia and Bray (1964)."""
         while True:
-            x, y = (_share(2 * self.bits(53) + 1 - 2**53) for _ in range(2))
+            x, y = (_as_fraction(2 * self.bits(53) + 1 - 2**53) for _ in range(2))
             square = _EXACT.fma(x, x, _EXACT.multiply(y, y))
             if square < 1:
                 ratio = _EXACT.divide(_EXACT.multiply(Decimal(-2), _EXACT.ln(square)), square)
                 return float(_EXACT.multiply(x, _EXACT.sqrt(ratio)))
 
-    def position(self, count: int, weights: Sequence[float] = ()) -> int:
-        """Draw an index below `count`, uniformly or with weights."""
+    def index(self, count: int, weights: Sequence[float] = ()) -> int:
+        """Draw an index below `count`, uniformly or with the given weights."""
         if not weights:
             return self.below(count)
         cumulative = list(accumulate(weights))
@@ -155,15 +158,18 @@ class JobRandom:
         return next((i for i, upper in enumerate(cumulative) if number < upper), count - 1)
 
     def subset(self, count: int, chosen: int) -> list[int]:
-        """Draw a number of different integers below `count`, ascending (Floyd 1987)."""
+        """Draw distinct integers below `count`, and return them in ascending order (Floyd 1987).
+
+        `chosen` is the number of integers to draw.
+        """
         numbers: set[int] = set()
         for last in range(count - chosen, count):
             number = self.below(last + 1)
             numbers.add(last if number in numbers else number)
         return sorted(numbers)
 
-    def order(self, count: int) -> list[int]:
-        """Draw a permutation of the integers below `count` (Fisher and Yates)."""
+    def permutation(self, count: int) -> list[int]:
+        """Draw a permutation of the integers below `count` with the Fisher-Yates shuffle."""
         numbers = list(range(count))
         for last in range(count - 1, 0, -1):
             partner = self.below(last + 1)
@@ -171,27 +177,27 @@ class JobRandom:
         return numbers
 
     def generator(self) -> np.random.Generator:
-        """Return a generator of NumPy, for functions that draw their own numbers."""
+        """Return a NumPy generator for functions that draw their own numbers."""
         return np.random.Generator(np.random.Philox(key=self.bits(128)))
 
 
-def _share(bits: int) -> Decimal:
-    """Return a number of 53 random bits as a decimal share of 1."""
+def _as_fraction(bits: int) -> Decimal:
+    """Return an integer divided by 2**53 as a decimal number."""
     return _EXACT.divide(Decimal(bits), Decimal(2**53))
 
 
-def _short(value: float) -> float:
-    """Return a number rounded to `_DIGITS` digits."""
+def _round(value: float) -> float:
+    """Round a number to `_DIGITS` significant digits."""
     return float(f"{value:.{_DIGITS}g}")
 
 
-def _within(value: float, minimum: float, maximum: float) -> float:
-    """Return the nearest number between two limits."""
+def _clip(value: float, minimum: float, maximum: float) -> float:
     return min(max(value, minimum), maximum)
 
 
 MAX_JOBS = 10_000_000
-_SHOWN = 60  # letters of a list or mapping in the table of jobs; else its position
+# Longer lists and mappings are shown in the job table by their position in the list of choices.
+_MAX_LABEL_LENGTH = 60
 
 Options = Annotated[
     Annotated[Several[Any], Field(min_length=1)]
@@ -202,8 +208,8 @@ Options = Annotated[
 Weight = Annotated[float, Field(ge=0, le=1e9)]
 
 
-class Normal(Section):
-    """A normal distribution.
+class NormalDistribution(Section):
+    """A normal distribution, optionally truncated.
 
     Numbers outside `limits` are drawn again.
     """
@@ -218,8 +224,8 @@ class Normal(Section):
     ] = None
 
     @model_validator(mode="after")
-    def _check_room(self) -> Normal:
-        """Raise ValueError if the limits exclude nearly all numbers, or numbers overflow."""
+    def _check_limits(self) -> NormalDistribution:
+        """Raise ValueError if the limits exclude nearly all numbers, or if numbers overflow."""
         if self.limits is not None:
             lower_share, upper_share = map(NormalDist(self.mean, self.std).cdf, self.limits)
             if upper_share - lower_share < MIN_SHARE:
@@ -232,13 +238,13 @@ class Normal(Section):
 
     @property
     def limit_values(self) -> tuple[float, float]:
-        """Smallest and largest number that is drawn."""
+        """Smallest and largest number that can be drawn."""
         reach = SIGMAS * self.std
         return self.limits or (self.mean - reach, self.mean + reach)
 
 
-class Sample(Section):
-    """Rows of a table, as additional entries of a list such as `actors`."""
+class RowSample(Section):
+    """Random rows of a table, which are appended to a list such as `actors`."""
 
     file: Annotated[
         Text,
@@ -259,10 +265,10 @@ class Sample(Section):
 _KINDS = ("uniform", "log_uniform", "normal", "integer", "choice", "each", "sample")
 
 
-class Choice(Section):
+class ValueRule(Section):
     """Rule that chooses a value for each job.
 
-    Exactly one field must be set, apart from `weights`.
+    Exactly one field other than `weights` must be set.
     """
 
     uniform: Annotated[
@@ -274,7 +280,7 @@ class Choice(Section):
         about("number whose logarithm is uniformly distributed between two limits", [0.2, 20]),
     ] = None
     normal: Annotated[
-        Normal | None, about("normally distributed number", {"mean": 0, "std": 1})
+        NormalDistribution | None, about("normally distributed number", {"mean": 0, "std": 1})
     ] = None
     integer: Annotated[
         MinMax[int] | None, about("random integer from a minimum to a maximum, inclusive", [1, 6])
@@ -297,7 +303,7 @@ class Choice(Section):
         ),
     ] = None
     sample: Annotated[
-        Sample | None,
+        RowSample | None,
         about(
             "random rows of a table that are added to a list",
             {"from": "parked.csv", "count": [0, 40]},
@@ -307,8 +313,8 @@ class Choice(Section):
     _one_kind = one_of(*_KINDS)
 
     @model_validator(mode="after")
-    def _check_weights(self) -> Choice:
-        """Raise ValueError if the weights do not fit the values of `choice`."""
+    def _check_weights(self) -> ValueRule:
+        """Raise ValueError if the weights do not match the values of `choice`."""
         if self.weights is not None:
             if self.choice is None or len(self.weights) != len(self.choice):
                 raise ValueError("`weights` must have one weight for each value of `choice`.")
@@ -318,32 +324,36 @@ class Choice(Section):
 
     @property
     def kind(self) -> str:
-        """Name of the field that is given, such as «uniform»."""
+        """Name of the field that is set, such as "uniform"."""
         return next(name for name in _KINDS if getattr(self, name) is not None)
 
     @cached_property
     def options(self) -> list[tuple[Any, Value | None]]:
-        """Values of `choice` or `each`, with their labels in the table of jobs."""
+        """Values of `choice` or `each`, with their labels in the job table."""
         values = self.choice if self.choice is not None else self.each
         if isinstance(values, Mapping):
             return [(value, name) for name, value in values.items()]
-        return [(value, _in_table(value, number)) for number, value in enumerate(values or ())]
+        return [(value, _table_label(value, index)) for index, value in enumerate(values or ())]
 
     @property
     def limit_values(self) -> list[Any]:
-        """Values that are valid if all drawn values are: the limits of a range, or a list."""
+        """Representative values, which are validated instead of all possible values.
+
+        For a range, these are its limits. For a list, these are all of its values.
+        """
         if self.normal is not None:
             return list(self.normal.limit_values)
         chosen = [value for value, _ in self.options]
         return list(self.uniform or self.log_uniform or self.integer or chosen)
 
     def draw(self, rng: JobRandom) -> tuple[Any, Value | None]:
-        """Draw a value and its label in the table of jobs, None for an empty cell.
+        """Draw a value, and return it with its label in the job table.
 
-        `each` and `sample` are not drawn here: they need more than a job's random numbers.
+        The label None results in an empty cell. `each` and `sample` are not supported, because they
+        require more than the random numbers of a job.
         """
         if self.choice is not None:
-            return self.options[rng.position(len(self.options), self.weights or ())]
+            return self.options[rng.index(len(self.options), self.weights or ())]
         if self.normal is not None:
             value = rng.normal(self.normal.mean, self.normal.std, self.normal.limits)
         else:
@@ -351,7 +361,7 @@ class Choice(Section):
         return value, value
 
     def hint(self, error: str) -> str:
-        """Return advice on a limit that a field refuses, to end a message."""
+        """Return advice to append to the error message for an invalid limit, or an empty string."""
         if self.integer is None and "whole number" in error and not self.options:
             return " Use `integer: [MIN, MAX]`."
         has_limits = self.normal is None or self.normal.limits is not None
@@ -359,7 +369,7 @@ class Choice(Section):
 
     @property
     def words(self) -> str:
-        """Range of the values in words: «0.2 to 20, log_uniform»."""
+        """Description of the possible values, such as "0.2 to 20, log_uniform"."""
         if self.sample is not None:
             min_rows, max_rows = self.sample.count
             rows = f"{min_rows:,}" if min_rows == max_rows else f"{min_rows:,} to {max_rows:,}"
@@ -381,32 +391,38 @@ class Choice(Section):
         return f"chosen from {listed}{', with these weights' * (self.weights is not None)}"
 
 
-def _choice(value: Any) -> Any:
-    """Return an entry of `vary`, or raise an error for an entry that is not a choice."""
-    if not isinstance(value, (dict, Choice)):
+def _check_rule(value: Any) -> Any:
+    """Return an entry of `vary`. Raise an error if the entry is not a choice."""
+    if not isinstance(value, (dict, ValueRule)):
         raise must_be(
             "a mapping that defines the choice, such as {uniform: [0, 1]} or {choice: [1, 4]}"
         )
     return value
 
 
-ChoiceEntry = Annotated[Choice, BeforeValidator(_choice, json_schema_input_type=Choice)]
+ValueRuleEntry = Annotated[
+    ValueRule, BeforeValidator(_check_rule, json_schema_input_type=ValueRule)
+]
 
 
-def _in_table(value: Any, position: int) -> Value | None:
-    """Return the label of a value in the table of jobs, by its position in a list."""
+def _table_label(value: Any, index: int) -> Value | None:
+    """Return the label of a value in the job table.
+
+    `index` is the index of the value in the list of choices, which replaces long lists and
+    mappings.
+    """
     if isinstance(value, (list, dict)):
         text = json.dumps(value, ensure_ascii=False, default=str)
-        return text if len(text) <= _SHOWN else f"choice {position + 1}"
+        return text if len(text) <= _MAX_LABEL_LENGTH else f"choice {index + 1}"
     is_plain = value is None or isinstance(value, (bool, int, float, str))
-    return value if is_plain else str(value)  # a date or time
+    return value if is_plain else str(value)  # dates and times
 
 
 @dataclass(frozen=True)
-class Keep(FileSection):
-    """The format of a data set.
+class DatasetFormat(FileSection):
+    """Format of a data set.
 
-    LidarError for an unknown format or layout.
+    The constructor raises LidarError if the format or layout is unknown.
     """
 
     format: Annotated[
@@ -449,11 +465,11 @@ class Keep(FileSection):
 
     def __post_init__(self) -> None:
         check_fields(self)
-        _ = self.of_jobs  # LidarError if its fields do not fit together
+        _ = self.export_spec  # raises LidarError if the fields cannot be combined
 
     @property
-    def of_jobs(self) -> ExportSpec:
-        """Format of the files of a job."""
+    def export_spec(self) -> ExportSpec:
+        """Format of the files that are written for each job."""
         return ExportSpec(
             DATA_SETS[self.format],
             self.layout,
@@ -463,21 +479,21 @@ class Keep(FileSection):
         )
 
 
-KeepEntry = Annotated[
-    Keep,
+DatasetFormatEntry = Annotated[
+    DatasetFormat,
     short(
         lambda v: v is None or is_text(v),
         lambda v: {"format": v} if v else {},
-        Text | Keep | None,
+        Text | DatasetFormat | None,
     ),
 ]
 
 
 class CampaignSection(Section):
-    """A campaign of jobs, which are base scenarios with fields that vary between jobs.
+    """A campaign, whose jobs are base scenarios with fields that vary between jobs.
 
-    File names are relative to the folder of the base. The name of the base is relative to the
-    folder of the campaign.
+    File names are relative to the folder of the base scenario. The file name of the base scenario
+    is relative to the folder of the campaign file.
     """
 
     base: Annotated[
@@ -496,30 +512,30 @@ class CampaignSection(Section):
     ] = None
     seed: Annotated[Seed, about("random seed; the same seed results in the same values")] = 0
     vary: Annotated[
-        dict[Text, ChoiceEntry],
-        may_be_empty(dict[Text, Choice]),
+        dict[Text, ValueRuleEntry],
+        allow_empty(dict[Text, ValueRule]),
         about(
             "mapping from the path of a field to the rule that chooses its value; a path consists "
             "of keys, and of the indices or names of list entries",
             {"weather.visibility_km": {"log_uniform": [0.2, 20]}},
             {"sensors.roof.model": {"choice": ["velodyne/vlp16", "ouster/os1-64"]}},
         ),
-    ] = {}  # noqa: RUF012 - of a frozen model
-    keep: Annotated[KeepEntry, about("format of the data set")] = Keep()
+    ] = {}  # noqa: RUF012 - the model is frozen
+    keep: Annotated[DatasetFormatEntry, about("format of the data set")] = DatasetFormat()
     splits: Annotated[
         dict[str, UnitShare],
-        may_be_empty(dict[str, UnitShare]),
+        allow_empty(dict[str, UnitShare]),
         about(
             "mapping from the name of a split to its share of the jobs; the shares add up to 1",
             {"train": 0.8, "val": 0.1, "test": 0.1},
         ),
-    ] = {}  # noqa: RUF012 - of a frozen model
+    ] = {}  # noqa: RUF012 - the model is frozen
     license: Annotated[str, about("license of the data set, for its card", "CC-BY-4.0")] = ""
     title: Annotated[str, about("title of the data set (default: the file name)")] = ""
 
     @model_validator(mode="after")
     def _check_splits(self) -> CampaignSection:
-        """Raise ValueError if names or shares of splits are not valid."""
+        """Raise ValueError if the name or share of a split is invalid."""
         for name in self.splits:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
                 raise ValueError(
@@ -535,10 +551,13 @@ class CampaignSection(Section):
 
 
 class Splits:
-    """Splits of jobs: each block of jobs has exactly the shares, in random order.
+    """Random assignment of jobs to the splits of a data set.
 
-    The block is the shortest that the shares divide, so a job's split does not depend on the
-    number of jobs: of 0.8, 0.1 and 0.1 each ten jobs have 8, 1 and 1.
+    Jobs are divided into blocks, and each block is distributed over the splits in exact proportion
+    to their shares. For example, with shares of 0.8, 0.1 and 0.1, every block of ten jobs
+    contributes 8, 1 and 1 jobs. The split of a job therefore does not depend on the number of jobs.
+    Blocks are as short as possible, but no longer than `MAX_BLOCK`, in which case the shares are
+    rounded.
     """
 
     MAX_BLOCK = 1000
@@ -556,45 +575,48 @@ class Splits:
             self._block += [name] * (round(cumulative * size) - len(self._block))
 
     def __call__(self, number: int) -> str:
-        """Return the split of a job, or no text without splits."""
+        """Return the split of a job, or an empty string if there are no splits."""
         if not self._block:
             return ""
         block, offset = divmod(number, len(self._block))
-        return self._block[_order(self._seed, block, len(self._block))[offset]]
+        return self._block[_block_order(self._seed, block, len(self._block))[offset]]
 
 
 @lru_cache
-def _order(seed: int, block: int, count: int) -> list[int]:
-    """Return the random order of the jobs of a block."""
-    return JobRandom(seed, block, "splits").order(count)
+def _block_order(seed: int, block: int, count: int) -> list[int]:
+    """Return the random order of the jobs in a block."""
+    return JobRandom(seed, block, "splits").permutation(count)
 
 
-_DELIMITERS = ",;\t"  # between cells
+_DELIMITERS = ",;\t"
 _INTEGER = re.compile(r"[-+]?[0-9]+")
 _REAL = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
 _WORDS = {"true": True, "false": False}
 
 
 def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
-    """Read entries of a list from a table, whose columns are their fields: box, at.0.position.
+    """Read entries of a list from a table.
 
-    A cell is a number, true or false, or a list or mapping as in YAML, else text; an empty cell
-    leaves the field out. Lines that begin with # are remarks.
+    Each column contains the values of a field, such as `box` or `at.0.position`. A cell contains a
+    number, true, false, a list or mapping in YAML, or text. If a cell is empty, the field is
+    omitted. Lines that begin with # are comments.
 
     Parameters
     ----------
+    path
+        Path of the table, a .csv file.
     kind
-        Annotation of the list.
+        Type annotation of the list.
     ignore
         Names of columns to ignore, which may contain * and ?.
 
     Raises
     ------
     LidarError
-        If the file cannot be read, the field is not a list, or a row is not a valid entry; the
-        message has the line.
+        If the file cannot be read, the field is not a list, or a row is not a valid entry. For
+        invalid rows, the message contains the line.
     """
-    entry = next(_entries(kind), None)
+    entry = next(_entry_types(kind), None)
     if entry is None:
         raise LidarError(
             "`sample` can only be used on a list such as `actors`, but this field is not a list."
@@ -623,22 +645,22 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
                     f"{len(table.header)}."
                 )
             values = [cell for index, cell in enumerate(cells) if index not in ignored]
-            rows.append(_checked(adapter, dict(zip(names, values, strict=False))))
+            rows.append(_validate_row(adapter, dict(zip(names, values, strict=False))))
     mistakes.tell()
     return rows
 
 
 class _Cells(NamedTuple):
-    """The cells of a table."""
+    """Cells of a table."""
 
     header: list[str]
-    rows: list[tuple[int, list[str]]]  # line in the file, and cells without outer spaces
+    rows: list[tuple[int, list[str]]]  # (line in the file, cells without surrounding spaces)
 
 
 def _read_cells(path: Path) -> _Cells:
     """Read the cells of a table.
 
-    Raises ValueError if the table is empty.
+    Raise ValueError if the table is empty.
     """
     lines = read_text(path).splitlines()
     first = next((line for line in lines if line.strip() and line.lstrip()[0] != "#"), "")
@@ -655,7 +677,7 @@ def _read_cells(path: Path) -> _Cells:
 
 
 def _check_columns(names: Sequence[str], model: Any) -> None:
-    """Raise ValueError unless the columns are fields of an entry, or indices of a list."""
+    """Raise ValueError if a column is neither a field of an entry nor a list index."""
     fields = [field.alias or name for name, field in getattr(model, "model_fields", {}).items()]
     unknown = [
         name
@@ -673,37 +695,40 @@ def _check_columns(names: Sequence[str], model: Any) -> None:
         )
 
 
-def _checked(adapter: TypeAdapter[Any], cells: dict[str, str]) -> Any:
-    """Return the entry of a row's cells, {column: cell}, or raise ValidationError."""
-    values = {name: _value(cell) for name, cell in cells.items() if cell}
+def _validate_row(adapter: TypeAdapter[Any], cells: dict[str, str]) -> Any:
+    """Return the entry for the cells of a row, which are a mapping from columns to cells.
+
+    Raise ValidationError if the row is not a valid entry.
+    """
+    values = {name: _parse_cell(cell) for name, cell in cells.items() if cell}
     try:
-        return adapter.validate_python(_nested(values))
+        return adapter.validate_python(_nest(values))
     except ValidationError as error:
-        # A field that takes text may have a number: the name of a car is 7.
+        # Text fields may contain numbers. For example, the name of a car may be 7.
         wrong = {".".join(map(str, detail["loc"])) for detail in error.errors()}
         text = {name: cells[name] for name in wrong & values.keys()}
         with suppress(ValidationError):
-            return adapter.validate_python(_nested(values | text))
+            return adapter.validate_python(_nest(values | text))
         raise
 
 
-def _value(cell: str) -> Any:
-    """Return the value of a cell: a number, truth value, list, mapping or text."""
+def _parse_cell(cell: str) -> Any:
+    """Convert a cell to a number, truth value, list or mapping, or return it as text."""
     if _INTEGER.fullmatch(cell):
-        with suppress(ValueError):  # for thousands of digits
+        with suppress(ValueError):  # Python does not convert integers with thousands of digits
             return int(cell)
     if _REAL.fullmatch(cell):
         return float(cell)
     if cell[0] in "[{":
         with suppress(ValueError, RecursionError):
-            return json.loads(cell)  # a hundred times as fast as YAML
+            return json.loads(cell)  # a hundred times faster than YAML
         with suppress(yaml.YAMLError, ValueError, OverflowError, RecursionError):
             return load_yaml(cell)
     return _WORDS.get(cell.lower(), cell)
 
 
-def _nested(values: dict[str, Any]) -> Any:
-    """Return mappings and lists of names with dots: {"box.0": 4} is {"box": [4]}."""
+def _nest(values: dict[str, Any]) -> Any:
+    """Expand dotted names to mappings and lists, such as {"box.0": 4} to {"box": [4]}."""
     result: dict[str, Any] = {}
     for name, value in values.items():
         *outer, last = name.split(".")
@@ -711,38 +736,44 @@ def _nested(values: dict[str, Any]) -> Any:
         for step in outer:
             node = node.setdefault(step, {})
             if not isinstance(node, dict):
-                return result | {name: value}  # refused as an unknown field
+                return result | {name: value}  # validation reports it as an unknown field
         node[last] = value
-    return _lists(result)
+    return _convert_to_lists(result)
 
 
-def _lists(node: Any) -> Any:
-    """Return mappings with the keys "0", "1", … as lists, at any depth."""
+def _convert_to_lists(node: Any) -> Any:
+    """Convert mappings with the keys "0", "1", … to lists, at any depth."""
     if not isinstance(node, dict):
         return node
-    inner = {key: _lists(value) for key, value in node.items()}
+    inner = {key: _convert_to_lists(value) for key, value in node.items()}
     numbered = bool(inner) and list(inner) == [str(i) for i in range(len(inner))]
     return list(inner.values()) if numbered else inner
 
 
-def _entries(kind: Any) -> Iterator[Any]:
-    """Yield the entries' annotations of lists in an annotation, such as `tuple[X, ...] | None`."""
+def _entry_types(kind: Any) -> Iterator[Any]:
+    """Yield the types of the entries of all lists in an annotation.
+
+    For example, yield X for `tuple[X, ...] | None`.
+    """
     args = get_args(kind)
     if get_origin(kind) is tuple and len(args) == 2 and args[1] is Ellipsis:
         yield args[0]
     else:
         for inner in args:
-            yield from _entries(inner)
+            yield from _entry_types(inner)
 
 
 def is_campaign(path: str | Path) -> bool:
-    """Return whether a file describes a campaign: YAML with the key `base` or `vary`."""
+    """Return whether a file is a campaign file, which is YAML with the key `base` or `vary`.
+
+    Files that cannot be read are not campaign files.
+    """
     path = Path(path)
     if path.suffix.lower() not in _CAMPAIGN_SUFFIXES:
         return False
     try:
         if not _KEYS.search(read_input_text(path)):
-            return False  # without reading all poses of a scenario as YAML
+            return False  # avoids parsing all poses of a large scenario as YAML
         return bool({"base", "vary"} & read_yaml(path).keys())
     except (OSError, ValueError, LidarError):
-        return False  # the reader of scenarios reports the error
+        return False  # loading the file as a scenario reports the error

@@ -6,7 +6,7 @@ from typing import Any
 
 from .scenario import Scenario
 
-# Also written out in examples/seed.yaml.
+# examples/seed.yaml contains the same scenario.
 _DATA: dict[str, Any] = {
     "scene": "seed",
     "poses": [[0, 0, 1], [0, 0, 2], [0, 0, 3]],
@@ -17,5 +17,8 @@ _DATA: dict[str, Any] = {
 
 
 def demo_scenario() -> Scenario:
-    """Return the scenario of the demo: six objects, 108 scans from three poses, a planned path."""
+    """Return the scenario of the demo.
+
+    The scene has six objects. The scenario simulates 108 scans from three poses, and plans a path.
+    """
     return Scenario.from_data(_DATA, source="the demo")

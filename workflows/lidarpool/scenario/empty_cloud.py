@@ -1,4 +1,4 @@
-"""The most likely reason why a survey gives no points."""
+"""Diagnosis of surveys that produce no points."""
 
 from __future__ import annotations
 
@@ -13,36 +13,44 @@ from lidarsim.survey.survey import Survey
 from lidarsim.words import joined, plural, rounded
 
 from ..datasets.job_table import JobRow
-from .default_poses import seen_from
+from .default_poses import outside_view_hint
 
 EMPTY = "the cloud has no points"
-NO_POINTS = "no points: "  # before the names of jobs
-NAMED_JOBS = 5  # jobs in a warning
+NO_POINTS = "no points: "  # precedes the names of jobs
+NAMED_JOBS = 5  # maximum number of job names in a warning
 
-# Casters of larger scenes take too long for a warning.
+# For larger scenes, building a ray caster takes too long for a warning.
 MAX_TRIANGLES = 2_000_000
 
 
 def empty_cloud_reason(scene: Scene, survey: Survey, scans: range | None = None) -> str:
-    """Return the most likely reason why a survey gives no points, without a last period.
+    """Return the most likely reason why a survey produces no points.
 
-    Some rays are cast without limits of range and without effects: if these rays meet nothing, the
-    reason is the pose, or the unit of the scene; else the range, or an effect. `scans` are the
-    scans that were cast, by default all.
+    A sample of rays is cast without range limits and effects. If none of them hits a surface, the
+    reason is probably a pose or the unit of the scene. Otherwise, it is probably a range limit or
+    an effect. The returned text has no final period.
+
+    Parameters
+    ----------
+    scene, survey
+        Scene and survey of the job.
+    scans
+        Scans that were simulated (default: all).
     """
-    scene = scene.georeferenced((0, 0, 0))  # poses that the reason names are the scenario's
+    # Poses in the reason are in the coordinates of the scenario.
+    scene = scene.georeferenced((0, 0, 0))
     if survey.scan_count == 0 or (scans is not None and not len(scans)):
         return "no scan was cast"
     if scene.triangles > MAX_TRIANGLES:
-        return f"check the ranges, poses and units. {_start(scene, survey)}"
+        return f"check the ranges, poses and units. {_start_position(scene, survey)}"
     ranges = sample_ranges(scene, survey, scans)
     if not len(ranges):
         faults = "faults, " * bool(survey.faults)
         unseen = "unseen, " * any(carried.unseen for carried in survey.carried)
-        poses_note = seen_from(scene, survey.carried[0])
+        poses_note = outside_view_hint(scene, survey.carried[0])
         return (
             f"no ray hits a surface at any distance. Check {unseen}{faults}poses and units. "
-            f"{_start(scene, survey)}. {poses_note}"
+            f"{_start_position(scene, survey)}. {poses_note}"
         )
     limits = [*dict.fromkeys(_limits(survey, ranges))]
     if not limits:
@@ -52,11 +60,14 @@ def empty_cloud_reason(scene: Scene, survey: Survey, scans: range | None = None)
             f"Check {suspects}"
         )
     clauses = ", and ".join(limits)
-    return f"{clauses}. Check the ranges, poses and units. {_start(scene, survey)}"
+    return f"{clauses}. Check the ranges, poses and units. {_start_position(scene, survey)}"
 
 
 def empty_jobs_warning(empty: Sequence[JobRow], reason: str) -> str:
-    """Return a warning that jobs have no points, with `reason` of the first job or no text."""
+    """Return a warning that lists jobs without points.
+
+    `reason` is the most likely reason for the first job, or an empty string.
+    """
     names = ", ".join(row.name for row in empty[:NAMED_JOBS])
     if unnamed := len(empty) - NAMED_JOBS:
         names += f" and {unnamed:,} more" * (unnamed > 0)
@@ -66,17 +77,17 @@ def empty_jobs_warning(empty: Sequence[JobRow], reason: str) -> str:
 
 
 def _limits(survey: Survey, ranges: Floats) -> Iterator[str]:
-    """Yield the limits of range that exclude all surfaces."""
+    """Yield clauses about the range limits if they exclude all surfaces."""
     lower = [carried.sensor.min_range_m for carried in survey.carried]
     upper = [carried.sensor.max_range_m for carried in survey.carried]
-    too_near = ranges < min(lower)
+    too_close = ranges < min(lower)
     too_far = ranges > max(upper)
-    if not (too_near | too_far).all():
+    if not (too_close | too_far).all():
         return
-    if too_near.any():
+    if too_close.any():
         yield (
-            f"{'all' if too_near.all() else 'some'} surfaces are closer than `min_range_m` "
-            f"({min(lower):g} m), at ranges from {_span(ranges[too_near])}"
+            f"{'all' if too_close.all() else 'some'} surfaces are closer than `min_range_m` "
+            f"({min(lower):g} m), at ranges from {_span(ranges[too_close])}"
         )
     if too_far.any():
         yield (
@@ -86,7 +97,7 @@ def _limits(survey: Survey, ranges: Floats) -> Iterator[str]:
 
 
 def _effects(survey: Survey) -> Iterator[str]:
-    """Name the settings of a survey that may suppress all returns."""
+    """Yield the names of settings that may suppress all returns."""
     if any(noise.detection_range_m is not None for noise in survey.noise_each):
         yield "noise.detection_range_m"
     if any(noise.dropout for noise in survey.noise_each):
@@ -102,11 +113,10 @@ def _effects(survey: Survey) -> Iterator[str]:
 
 
 def _span(ranges: Floats) -> str:
-    """Return the smallest and largest range in words."""
     return f"{rounded(np.min(ranges), 4)} to {rounded(np.max(ranges), 4)} m"
 
 
-def _start(scene: Scene, survey: Survey) -> str:
-    """Return the first position of the sensor in words, in the coordinates of the scenario."""
+def _start_position(scene: Scene, survey: Survey) -> str:
+    """Return a sentence with the first position of the sensor in scenario coordinates."""
     (x, y, z) = survey.pose(0).position + scene.origin
     return f"The sensor starts at ({x:,.3f}, {y:,.3f}, {z:,.3f})"

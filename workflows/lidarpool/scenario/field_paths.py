@@ -1,4 +1,4 @@
-"""Paths such as ``sensors.roof.model`` to fields of a scenario."""
+"""Paths to fields of a scenario, such as ``sensors.roof.model``."""
 
 from __future__ import annotations
 
@@ -14,22 +14,25 @@ from lidarsim.words import did_you_mean, listed, plural, shortened
 
 from .scenario import Scenario
 
-# Keys of fields and numbers of entries, each with its value. The value of a section that is left
-# out is the section of its defaults.
+# Steps from a scenario to a field. Each step is a key or a list index, with the value at that point
+# of the path. For an omitted section, the value is a section with the default values.
 FieldSteps = tuple[tuple[str | int, Any], ...]
 
 
 def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
-    """Find the field of a scenario that a path such as ``sensors.roof.model`` leads to.
+    """Find a field of a scenario by its path, such as ``sensors.roof.model``.
 
     Returns
     -------
-    The steps to the field, and its annotation.
+    steps
+        Steps to the field.
+    kind
+        Type annotation of the field.
 
     Raises
     ------
     LidarError
-        If the path leads to no field; the message has the nearest name.
+        If the path does not refer to a field. The message suggests a similar name.
     """
     node: Any = scenario
     kind: Any = type(scenario)
@@ -39,14 +42,14 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
     while remaining:
         path = ".".join(text.split(".")[: -len(remaining)])  # path of the node
         if node is None and not remaining[0].isdecimal() and (sections := list(sections_in(kind))):
-            model = issubclass(sections[0], BaseModel)  # built with its defaults
+            model = issubclass(sections[0], BaseModel)  # models have the default values
             node = sections[0].model_construct() if model else object.__new__(sections[0])
             steps[-1] = (steps[-1][0], node)
         if is_section(type(node)):
-            key, node, kind = _field(scenario, node, remaining[0], path)
+            key, node, kind = _find_in_section(scenario, node, remaining[0], path)
             part_count = 1
         elif isinstance(node, dict):
-            keys = {str(key): key for key in node}  # keys of classes are numbers
+            keys = {str(key): key for key in node}  # the keys of `classes` are integers
             name, part_count = _match_name([*keys], remaining, path)
             node = node[key := keys[name]]
         elif isinstance(node, (tuple, list)):
@@ -62,8 +65,14 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
     return tuple(steps), kind
 
 
-def _field(scenario: Scenario, node: BaseModel, name: str, path: str) -> tuple[str, Any, Any]:
-    """Return a field of the section at a path by its name in YAML: name, value, annotation."""
+def _find_in_section(
+    scenario: Scenario, node: BaseModel, name: str, path: str
+) -> tuple[str, Any, Any]:
+    """Return the name, value and annotation of a field.
+
+    `node` is the section at `path`, and `name` is the name of the field in YAML. Raise LidarError
+    if there is no such field.
+    """
     section = type(node)
     fields = fields_of(section)
     attributes = {field.alias or attribute: attribute for attribute, field in fields.items()}
@@ -72,7 +81,7 @@ def _field(scenario: Scenario, node: BaseModel, name: str, path: str) -> tuple[s
     if name not in attributes:
         kind = f"a field of {path}" if path else "a section of a scenario"
         hint = did_you_mean(name, attributes) or _path_hint(scenario, name)
-        if name.isdecimal() and "position" in attributes:  # of the short form [x, y, z]
+        if name.isdecimal() and "position" in attributes:  # the pose is in the short form [x, y, z]
             hint = f" Did you mean {f'{path}.position.{name}'!r}?"
         raise LidarError(f"{name!r} is not {kind}.{hint}")
     attribute = attributes[name]
@@ -80,10 +89,13 @@ def _field(scenario: Scenario, node: BaseModel, name: str, path: str) -> tuple[s
 
 
 def _path_hint(scenario: Scenario, name: str) -> str:
-    """Return " Did you mean 'sensor.performance'?" for the field of a name, or empty."""
+    """Return a hint with the paths of fields with a given name, or an empty string.
+
+    For example, return " Did you mean 'sensor.performance'?".
+    """
     for owners in owners_by_level(name, owner_of_file(Scenario)):
         paths = [path for owner in owners if (path := _path_in(scenario, owner.names, name))]
-        # A scenario has either sensors or sensor, for example.
+        # Prefer sections that are set, because a scenario has either `sensor` or `sensors`.
         given = [path for path in paths if path.split(".")[0] in scenario.model_fields_set]
         if paths:
             return f" Did you mean {' or '.join(map(repr, (given or paths)[:3]))}?"
@@ -91,7 +103,11 @@ def _path_hint(scenario: Scenario, name: str) -> str:
 
 
 def _path_in(scenario: Scenario, names: Sequence[str], name: str) -> str:
-    """Return the path of a field in a scenario, in lists of the first entry, or an empty path."""
+    """Return the path of a field in a scenario, or an empty string if its section is not set.
+
+    `names` are the names of the sections around the field. In lists and mappings, the path leads to
+    the first entry.
+    """
     node: Any = scenario
     keys: list[str] = []
     for section in names:
@@ -105,14 +121,15 @@ def _path_in(scenario: Scenario, names: Sequence[str], name: str) -> str:
             key: Any = next(iter(node)) if isinstance(node, dict) else 0
             node = node[key]
             keys.append(str(key))
-    is_absent = node is None and len(keys) > 1  # such as the file of an actor that is a box
+    is_absent = node is None and len(keys) > 1  # for example, the file of an actor that is a box
     return "" if is_absent else ".".join([*keys, name])
 
 
 def _match_name(names: Sequence[str], path_parts: Sequence[str], path: str) -> tuple[str, int]:
-    """Return the longest name that leading parts of a path make, and the number of parts.
+    """Return the longest name at the start of a path, and its number of parts.
 
-    Names may have dots.
+    Names may contain dots, and therefore consist of several parts. Raise LidarError if no name
+    matches.
     """
     for part_count in range(len(path_parts), 0, -1):
         if (name := ".".join(path_parts[:part_count])) in names:
@@ -124,9 +141,13 @@ def _match_name(names: Sequence[str], path_parts: Sequence[str], path: str) -> t
 
 
 def _match_entry(entries: Sequence[Any], path_parts: Sequence[str], path: str) -> tuple[int, int]:
-    """Return the index of the entry that leading parts of a path name, and the number of parts."""
+    """Return the index of the list entry at the start of a path, and its number of path parts.
+
+    The path contains the index or the name of the entry. Raise LidarError if there is no such
+    entry.
+    """
     if path_parts[0].isdecimal():
-        digits = path_parts[0].lstrip("0") or "0"  # Python refuses to convert thousands of them
+        digits = path_parts[0].lstrip("0") or "0"  # Python does not convert thousands of digits
         index = int(digits) if len(digits) <= len(f"{len(entries)}") else len(entries)
         if index < len(entries):
             return index, 1
@@ -142,10 +163,10 @@ def _match_entry(entries: Sequence[Any], path_parts: Sequence[str], path: str) -
 
 
 def replace_value(node: Any, steps: FieldSteps, change: Callable[[Any], Any]) -> Any:
-    """Return a section with the value at the end of the steps replaced by `change(value)`.
+    """Return a section in which the value at the end of `steps` is replaced by `change(value)`.
 
-    The section itself is not changed. Sections along the steps become mappings of their fields, to
-    be checked again; other sections stay as they are.
+    The section itself is not modified. In the result, sections along the steps are mappings from
+    field names to values, which have to be validated again. Other sections are unchanged.
     """
     if not steps:
         return change(node)

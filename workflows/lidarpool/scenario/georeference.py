@@ -1,4 +1,4 @@
-"""The place of a scene in the coordinate system that a scenario states."""
+"""Checks of a scene's location in the coordinate system of a scenario."""
 
 from __future__ import annotations
 
@@ -11,51 +11,53 @@ from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.files.coordinate_systems import outside_system, target_problem, zone_in_area
 from lidarsim.scene.scene import Scene
 
-# Coordinates of the files and `world.origin` are the same place, given twice, if both are this far
-# from zero, and differ by less than this share. Local coordinates are near zero.
+# `world.origin` was probably added to world coordinates if it is at least `_FAR_M` from zero, and
+# if its distance from the coordinates in the files is less than `_SAME_SHARE` of that. Local
+# coordinates are close to zero.
 _FAR_M = 50_000.0
 _SAME_SHARE = 0.2
-_PROJECTED_M = 100_000.0
+_PROJECTED_M = 100_000.0  # coordinates this far from zero are probably projected
 
 
 def check_epsg(epsg: int, scene: Scene) -> None:
-    """Check that a coordinate system is in meters that are true where a scene is.
+    """Check that a coordinate system is in true meters at the location of a scene.
 
     Raises
     ------
     LidarError
-        If lengths in the system are wrong by more than 1 % in the middle of the scene, or not in
-        meters. Without rasterio, only systems for maps of the world are refused.
+        If the unit of the system is not the meter, or if lengths at the center of the scene are
+        wrong by more than 1 %. If rasterio is not installed, only systems for world maps are
+        rejected.
     """
-    x, y = _middle(scene).tolist()
+    x, y = _center(scene).tolist()
     problem = target_problem(
         epsg, x, y, why_there=", where the scene is (`world.origin` moves the scene)"
     )
     if problem and outside_system(epsg, x, y):
-        raise LidarError(place_problem(scene, epsg))
+        raise LidarError(location_warning(scene, epsg))
     if problem:
         raise LidarError(f"`world.epsg` (`epsg` in Python) is {problem}.")
 
 
-def place_problem(scene: Scene, epsg: int | None) -> str:
-    """Return a warning of a scene that is likely not where its world coordinates say, or "".
+def location_warning(scene: Scene, epsg: int | None) -> str:
+    """Return a warning if a scene is probably at the wrong location, otherwise an empty string.
 
-    It is likely elsewhere if it is far outside the area of use of the coordinate system, or if
-    `world.origin` was added to coordinates that are world coordinates already.
+    The location is probably wrong if it is far outside the area of use of the coordinate system, or
+    if `world.origin` was added to coordinates that are already world coordinates.
 
     Parameters
     ----------
     scene
-        The scene at its place in the world.
+        The scene in world coordinates.
     epsg
-        EPSG code of the coordinate system, or None if none is stated.
+        EPSG code of the coordinate system, or None if it is unknown.
     """
-    x, y = _middle(scene).tolist()
+    x, y = _center(scene).tolist()
     if epsg is not None and (area := outside_system(epsg, x, y)):
         return f"The scene is at x {x:,.0f}, y {y:,.0f}, outside {area}. {_remedies(epsg, scene)}"
     if _is_added_twice(scene):
-        origin = _in_words(scene.world_origin)
-        in_files = _in_words(_middle(scene) - scene.world_origin[:2])
+        origin = _format_xy(scene.world_origin)
+        in_files = _format_xy(_center(scene) - scene.world_origin[:2])
         return (
             f"`world.origin` ({origin}) is added to the coordinates of the scene's files, "
             f"although these coordinates are already close to it ({in_files}). If they are world "
@@ -64,31 +66,32 @@ def place_problem(scene: Scene, epsg: int | None) -> str:
     return ""
 
 
-def missing_system(scene: Scene, epsg: int | None) -> str:
-    """Return a note on a scene in projected coordinates of which the system is not stated, or "".
+def missing_epsg_note(scene: Scene, epsg: int | None) -> str:
+    """Return a note if a scene is in projected coordinates, but the coordinate system is not set.
 
-    `scene` is at its place in the world. Coordinates of 100 km and more are likely projected.
+    Otherwise, return an empty string. `scene` is in world coordinates. Coordinates of 100 km and
+    more are probably projected.
     """
-    middle = _middle(scene)
-    if epsg is not None or np.linalg.norm(middle) < _PROJECTED_M:
+    center = _center(scene)
+    if epsg is not None or np.linalg.norm(center) < _PROJECTED_M:
         return ""
     return (
-        f"the scene is at {_in_words(middle)}, which are probably projected coordinates, but no "
+        f"the scene is at {_format_xy(center)}, which are probably projected coordinates, but no "
         "coordinate system is set. Files such as LAS and LAZ will therefore not state one. Set "
         "`world: {epsg: CODE}` in the scenario"
     )
 
 
-def _middle(scene: Scene) -> Floats:
-    """Return x and y of the middle of a scene, (2,), world meters."""
-    middle: Floats = (scene.bounds.mean(axis=0) + scene.origin)[:2]
-    return middle
+def _center(scene: Scene) -> Floats:
+    """Return the x and y of the center of a scene in world coordinates. Shape (2,)."""
+    center: Floats = (scene.bounds.mean(axis=0) + scene.origin)[:2]
+    return center
 
 
 def _is_added_twice(scene: Scene) -> bool:
-    """Return whether the coordinates of the files are near `world.origin`, and far from zero."""
+    """Return whether `world.origin` was probably added to coordinates that already include it."""
     origin = scene.world_origin[:2]
-    in_files = _middle(scene) - origin
+    in_files = _center(scene) - origin
     distance_m = float(np.linalg.norm(origin))
     return distance_m > _FAR_M and bool(
         np.linalg.norm(in_files - origin) < _SAME_SHARE * distance_m
@@ -96,8 +99,8 @@ def _is_added_twice(scene: Scene) -> bool:
 
 
 def _remedies(epsg: int, scene: Scene) -> str:
-    """Return sentences on what to change for a scene outside the area of use of its system."""
-    placed = _middle(scene)
+    """Return advice for a scene that is outside the area of use of its coordinate system."""
+    placed = _center(scene)
     in_files = placed - scene.world_origin[:2]
     zone = zone_in_area(epsg, *placed.tolist())
     example = "" if zone is None else f", such as EPSG:{zone}, in which they are inside this area"
@@ -114,6 +117,5 @@ def _remedies(epsg: int, scene: Scene) -> str:
     )
 
 
-def _in_words(place: Sequence[float] | Floats) -> str:
-    """Return x and y in words."""
-    return f"x {place[0]:,.0f}, y {place[1]:,.0f}"
+def _format_xy(position: Sequence[float] | Floats) -> str:
+    return f"x {position[0]:,.0f}, y {position[1]:,.0f}"

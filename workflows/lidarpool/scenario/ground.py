@@ -1,4 +1,4 @@
-"""Surfaces of a scene that face up, which copies, traffic and carriers stand on."""
+"""Upward-facing surfaces of a scene, on which copies, traffic and platforms are placed."""
 
 from __future__ import annotations
 
@@ -18,30 +18,31 @@ from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.words import name_hint
 from raybeam import RayCaster, available_backends
 
-STEP_M = 0.5  # step of a trajectory that follows a surface
+STEP_M = 0.5  # maximum distance between the poses of a trajectory that follows a surface
 MAX_STEPS = 1_000_000
 
 
-class StandingSurfaces:
-    """The triangles of a scene that face up, of all objects or of a selection.
+class SupportSurfaces:
+    """Upward-facing triangles of all or some objects in a scene.
 
-    The highest of several surfaces counts. `scene` is None for a scene without triangles.
+    If there are several surfaces at a position, the highest is used. `scene` is None if the scene
+    has no triangles, and `objects` contains the indices of the objects, or None for all objects.
     """
 
     def __init__(self, scene: Scene | None, objects: Indices | None = None) -> None:
         self._scene = scene
         self._objects = objects
-        self._selections: dict[tuple[str, ...], StandingSurfaces] = {}  # {names: their surfaces}
+        self._selections: dict[tuple[str, ...], SupportSurfaces] = {}  # {name patterns: surfaces}
 
     @property
     def origin(self) -> Floats:
-        """Origin of the scene, (3,), world meters."""
+        """Scene origin in world coordinates, in meters. Shape (3,)."""
         return np.zeros(3) if self._scene is None else self._scene.origin
 
-    def of_objects(self, names: Sequence[str]) -> StandingSurfaces:
-        """Return the surfaces of the objects that fit names.
+    def select(self, names: Sequence[str]) -> SupportSurfaces:
+        """Return the surfaces of the objects whose names match one of the patterns.
 
-        Raises LidarError if no triangle faces up.
+        Raise LidarError if no object matches a pattern, or if none of the triangles faces up.
         """
         key = tuple(names)
         scene = self._scene
@@ -60,7 +61,7 @@ class StandingSurfaces:
                     f"{name_hint(name, scene.names)}"
                 )
         matches = np.unique(np.concatenate(rows))
-        selected = self if len(matches) == len(scene.names) else StandingSurfaces(scene, matches)
+        selected = self if len(matches) == len(scene.names) else SupportSurfaces(scene, matches)
         if not len(selected._tops[0]):
             raise LidarError(
                 f"{', '.join(map(repr, names))} cannot be used as surfaces, because none of their "
@@ -71,7 +72,11 @@ class StandingSurfaces:
 
     @cached_property
     def _tops(self) -> tuple[Floats, Ints32]:
-        """Triangles that face up, local (f, 3, 3), and their objects (f,)."""
+        """Upward-facing triangles and the indices of their objects.
+
+        The triangles are in local coordinates and have shape (f, 3, 3). The indices have shape
+        (f,).
+        """
         assert self._scene is not None
         scene = self._scene
         shared = self._scene.instances
@@ -80,24 +85,23 @@ class StandingSurfaces:
         corners = scene.vertices[scene.faces]
         owner = scene.face_object
         if self._objects is not None:
-            of_objects = np.isin(owner, self._objects)
-            corners = corners[of_objects]
-            owner = owner[of_objects]
+            selected = np.isin(owner, self._objects)
+            corners = corners[selected]
+            owner = owner[selected]
         (ax, ay), (bx, by) = ((corners[:, k] - corners[:, 0]).T[:2] for k in (1, 2))
         up = ax * by - ay * bx > 0
         return corners[up], owner[up]
 
     @cached_property
     def _caster(self) -> RayCaster:
-        """Ray caster of the surfaces."""
-        # Never CUDA, whose context would stay in this process.
+        # CUDA is not used, because its context would remain in this process.
         backend = "numpy" if available_backends()["tiles"] else "tiles"
         corners = self._tops[0].reshape(-1, 3)
         return RayCaster(corners, np.arange(len(corners)).reshape(-1, 3), backend)
 
     @property
     def rectangle(self) -> Floats:
-        """Lowest x and y, highest x and y of the surfaces, world meters: (4,)."""
+        """Minimum x and y, and maximum x and y of the surfaces. Shape (4,), world coordinates."""
         assert self._scene is not None
         x, y = self._tops[0][..., :2].reshape(-1, 2).T
         origin = self._scene.origin[[0, 1, 0, 1]]
@@ -105,13 +109,23 @@ class StandingSurfaces:
 
     @cached_property
     def owners(self) -> Ints32:
-        """Indices of the objects that have triangles facing up, ascending."""
+        """Indices of the objects that have upward-facing triangles, in ascending order."""
         return np.unique(self._tops[1])
 
     def heights_below(self, positions: Floats) -> tuple[Floats, Ints32]:
-        """Return the heights of the surface below positions (n, 2), and its objects, world meters.
+        """Return the height of the highest surface at each position, and its object.
 
-        Both are (n,): nan and -1 without a surface.
+        Parameters
+        ----------
+        positions
+            Horizontal positions in world coordinates, in meters. Shape (n, 2).
+
+        Returns
+        -------
+        heights
+            Heights in world coordinates, in meters, or NaN if there is no surface. Shape (n,).
+        objects
+            Indices of the objects, or -1 if there is no surface. Shape (n,).
         """
         heights = np.full(len(positions), np.nan)
         objects = np.full(len(positions), -1, np.int32)
@@ -128,16 +142,24 @@ class StandingSurfaces:
         return heights, objects
 
 
-def follow_surfaces(track: Track, standing: StandingSurfaces) -> list[Track]:
-    """Return the pieces of a trajectory that are on surfaces, with a pose every 0.5 m.
+def follow_surfaces(track: Track, support: SupportSurfaces) -> list[Track]:
+    """Return the parts of a trajectory that are on surfaces.
 
-    Heights of the trajectory are above the surface. The z axes of the poses are the mean normal
-    of the surface within a meter; headings stay.
+    Poses are at most `STEP_M` apart. Their z axes are perpendicular to the mean slope of the
+    surface within a meter, and their headings are preserved.
 
     Parameters
     ----------
     track
-        In a scene's local coordinates; heights above the surface.
+        Trajectory in the local coordinates of a scene, with heights relative to the surfaces.
+    support
+        Surfaces that the trajectory follows.
+
+    Returns
+    -------
+    list of Track
+        Trajectories in the local coordinates of the scene. There is one for each part of `track`
+        that is on the surfaces.
 
     Raises
     ------
@@ -149,11 +171,13 @@ def follow_surfaces(track: Track, standing: StandingSurfaces) -> list[Track]:
     moved = replace(track, start_s=float(times[0]), duration_s=None)
     positions, rotations = moved.poses(0, (times - times[0]) * 1e9)
     positions = positions.copy()
-    ahead = rotations[:, :2, 0] / np.linalg.norm(rotations[:, :2, 0], axis=1)[:, None]
-    heights, axes = _surface_poses(positions[:, :2], ahead, standing)
-    positions[:, 2] += heights  # world heights: the heights they are added to lack the origin
+    forward = rotations[:, :2, 0] / np.linalg.norm(rotations[:, :2, 0], axis=1)[:, None]
+    heights, axes = _surface_poses(positions[:, :2], forward, support)
+    # `heights` are world coordinates. The heights of the trajectory are relative to the surface,
+    # but the origin has been subtracted from them, so the sum is in local coordinates.
+    positions[:, 2] += heights
     edges = np.flatnonzero(np.diff(np.isfinite(heights), prepend=False, append=False))
-    stretches = [
+    parts = [
         slice(start, stop) for start, stop in edges.reshape(-1, 2).tolist() if stop - start > 1
     ]
     return [
@@ -163,14 +187,14 @@ def follow_surfaces(track: Track, standing: StandingSurfaces) -> list[Track]:
             positions=positions[rows],
             quaternions=quaternions_of(axes[rows]),
         )
-        for rows in stretches
+        for rows in parts
     ]
 
 
 def _step_times(track: Track) -> Floats:
-    """Return times in seconds at steps of at most `STEP_M`.
+    """Return the times, in seconds, of poses that are at most `STEP_M` apart.
 
-    Raises LidarError if there are too many.
+    Raise LidarError if there are too many.
     """
     distances_m = np.linalg.norm(np.diff(track.positions, axis=0), axis=1)
     steps = np.maximum(np.ceil(distances_m / STEP_M), 1).astype(np.int64)
@@ -186,23 +210,37 @@ def _step_times(track: Track) -> Floats:
 
 
 def _surface_poses(
-    positions: Floats, ahead: Floats, standing: StandingSurfaces
+    positions: Floats, forward: Floats, support: SupportSurfaces
 ) -> tuple[Floats, Floats]:
-    """Return the heights (n,) of surfaces below positions, and the axes (n, 3, 3) of the slope.
+    """Return the height of the surface at each position, and the axes of a pose on its slope.
 
-    `positions` (n, 2) are local, in meters; `ahead` (n, 2) are the unit directions of travel.
+    Parameters
+    ----------
+    positions
+        Horizontal positions in local coordinates, in meters. Shape (n, 2).
+    forward
+        Directions of travel as unit vectors. Shape (n, 2).
+    support
+        The surfaces.
+
+    Returns
+    -------
+    heights
+        Heights in world coordinates, in meters, or NaN if there is no surface. Shape (n,).
+    axes
+        Rotation matrices of the poses. Shape (n, 3, 3).
     """
-    leftward = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+    leftward = np.column_stack([-forward[:, 1], forward[:, 0]])
     probes = [
         positions + STEP_M * direction
-        for direction in (0 * ahead, ahead, -ahead, leftward, -leftward)
+        for direction in (0 * forward, forward, -forward, leftward, -leftward)
     ]
-    origin = standing.origin
-    heights = [standing.heights_below(probe + origin[:2])[0] for probe in probes]
-    middle, front, back, port, starboard = (np.where(np.isnan(h), heights[0], h) for h in heights)
-    x = np.column_stack([2 * STEP_M * ahead, front - back])
-    y = np.column_stack([2 * STEP_M * leftward, port - starboard])
+    origin = support.origin
+    heights = [support.heights_below(probe + origin[:2])[0] for probe in probes]
+    center, front, back, left, right = (np.where(np.isnan(h), heights[0], h) for h in heights)
+    x = np.column_stack([2 * STEP_M * forward, front - back])
+    y = np.column_stack([2 * STEP_M * leftward, left - right])
     x /= np.linalg.norm(x, axis=1)[:, None]
     z = np.cross(x, y)
     z /= np.linalg.norm(z, axis=1)[:, None]
-    return middle, np.stack([x, np.cross(z, x), z], axis=2)
+    return center, np.stack([x, np.cross(z, x), z], axis=2)

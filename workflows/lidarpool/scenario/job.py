@@ -1,4 +1,4 @@
-"""A job: a survey of a scene, checked as a whole."""
+"""Jobs, which combine a scene and a survey and validate them together."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 
 from ..clouds.writing import ExportSpec
 from ..plan import Planning
-from .georeference import check_epsg, place_problem
+from .georeference import check_epsg, location_warning
 
 _log = logging.getLogger(__name__)
 
@@ -34,7 +34,7 @@ _log = logging.getLogger(__name__)
 class Job:
     """A survey of a scene, optionally with path planning.
 
-    A function that makes the jobs of a `Campaign` sets only the scene, the survey and the values.
+    A function that creates the jobs of a `Campaign` sets only the scene, the survey and the values.
     The campaign sets the number, name and split of each job.
 
     Parameters
@@ -42,21 +42,21 @@ class Job:
     scene, survey, planning
         As for `simulate`, in the local coordinates of the scene.
     values
-        Values that differ between the jobs of a campaign, as a mapping from names to numbers, text,
-        True or False, or None for an empty cell. All jobs of a campaign have the same names, which
-        are columns of its job table.
+        Values that differ between the jobs of a campaign, as a mapping from names to numbers,
+        strings or booleans, or None for an empty cell. All jobs of a campaign have the same names,
+        which are the columns of the job table.
     number, name, split
-        Number of the job in its campaign, its name in files, and the name of its split.
+        Number of the job in its campaign, its name in file names, and the name of its split.
     outputs
         Formats of the cloud in addition to PLY.
-    input_files
-        Names and SHA-256 hashes of the files that the job was made from.
+    made_of
+        Names and SHA-256 hashes of the files that the job was created from.
 
     Raises
     ------
     LidarError
-        If a field has the wrong type, the precision of the survey is too small for the scene, a
-        material matches no object, an object has no material although others have one, or the
+        If a field has the wrong type, if the precision of the survey is too small for the extent of
+        the scene, if a material matches no object, if only some objects have a material, or if the
         coordinate system of the survey is not in true meters at the location of the scene.
     """
 
@@ -80,9 +80,9 @@ class Job:
         scene = self.scene
         survey = self.survey
         MaterialTable.build(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
-        unseen_objects(scene, survey)  # LidarError for a pattern that fits no object
-        # Largest local coordinate, of actors too. Divided by the precision it must fit 32-bit
-        # integers.
+        unseen_objects(scene, survey)  # raises LidarError if a pattern matches no object
+        # Largest local coordinate, including actors. In units of the precision, coordinates are
+        # stored as 32-bit integers.
         reach_m = float(np.abs(scene.bounds).max(initial=0.0))
         if survey.spray_g_m3:  # vehicles on a wet road raise spray
             check_spray(scene.actors)
@@ -98,20 +98,21 @@ class Job:
             )
         if survey.epsg is not None:
             check_epsg(survey.epsg, scene)
-        if self.place_problem:
-            _log.warning("%s", self.place_problem)
+        if self.location_warning:
+            _log.warning("%s", self.location_warning)
         warn_of_gray(scene, survey)
         warn_of_reach(scene, survey)
 
     @cached_property
-    def place_problem(self) -> str:
-        """Warning that the scene is probably in the wrong place, or an empty string."""
-        return place_problem(self.scene, self.survey.epsg)
+    def location_warning(self) -> str:
+        """Warning that the scene is probably at the wrong location, or an empty string."""
+        return location_warning(self.scene, self.survey.epsg)
 
     def with_fields(self, **fields: Any) -> Self:
-        """Return a copy with other fields, without the checks of a new job.
+        """Return a copy in which some fields are replaced.
 
-        Only for fields that these checks do not concern, such as `number`.
+        The job is not validated again, so only use this method for fields that do not affect the
+        validation, such as `number`.
         """
         job = copy(self)
         vars(job).update(fields)
@@ -124,18 +125,18 @@ class Job:
 
     @cached_property
     def sweeps(self) -> Sweeps:
-        """Sweeps with their poses and the boxes of actors.
+        """Sweeps with their poses and the bounding boxes of actors.
 
-        The computation takes seconds for thousands of poses.
+        Computing thousands of poses takes seconds.
         """
         return Sweeps.from_survey(self.survey, self.scene)
 
 
 def _outlier_advice(scene: Scene) -> str:
-    """Return advice to remove the object that is far from all others, or an empty string."""
-    with np.errstate(invalid="ignore"):  # bounds of an object without triangles are infinite
-        middles = scene.object_bounds.mean(axis=1)
-    distances_m = np.linalg.norm(middles - np.nanmedian(middles, axis=0), axis=1)
+    """Return advice to remove an object that is far from all others, or an empty string."""
+    with np.errstate(invalid="ignore"):  # the bounds of objects without triangles are infinite
+        centers = scene.object_bounds.mean(axis=1)
+    distances_m = np.linalg.norm(centers - np.nanmedian(centers, axis=0), axis=1)
     order = np.argsort(np.nan_to_num(distances_m))
     if len(order) < 3 or not distances_m[order[-1]] > 10 * distances_m[order[-2]]:
         return ""

@@ -1,4 +1,4 @@
-"""Moving objects of traces of the Open Simulation Interface (ASAM OSI), as actors."""
+"""Traffic from traces of the Open Simulation Interface (ASAM OSI)."""
 
 from __future__ import annotations
 
@@ -26,31 +26,34 @@ from .traffic import (
     TrafficClock,
     TrafficContent,
     TrafficSection,
-    TravellerChoice,
+    TravelerFilter,
     VehicleSection,
 )
 
 OSI_SUFFIXES = (".osi", ".mcap")
-_MAX_SIZE_M = 1e4  # limit for a moving object: ships and trains are shorter
-_ROW = 6  # x, y, z of the box's center, meters; yaw, pitch and roll, radians
+_MAX_SIZE_M = 1e4  # longer than any ship or train
+# Number of values in a row: x, y and z of the box center in meters, and yaw, pitch and roll in
+# radians.
+_ROW = 6
 
 
 @dataclass(frozen=True, eq=False)
-class ObjectPassage:
-    """Consecutive messages of a trace that contain a moving object."""
+class OsiPassage:
+    """Consecutive messages in a trace that contain a moving object."""
 
-    name: str  # its identity
-    kind: str  # its type, such as «heavy_truck»
-    size: tuple[float, float, float] | None  # length, width and height, meters; None if unknown
+    name: str  # ID of the object
+    kind: str  # type of the object, such as "heavy_truck"
+    size: tuple[float, float, float] | None  # length, width and height in meters, None if unknown
     times_s: array[float] = field(default_factory=lambda: array("d"))
-    rows: array[float] = field(default_factory=lambda: array("d"))  # `_ROW` numbers at each time
+    rows: array[float] = field(default_factory=lambda: array("d"))  # `_ROW` values at each time
 
     def entry(self, section: TrafficSection) -> VehicleSection | None:
-        """Return the first entry that fits the type, or else a box of the object's size.
+        """Return the first entry that matches the type, otherwise a box with the object's size.
 
-        None without an entry and a size: the object is a carrier, since others are left out.
+        Return None if no entry matches and the size is unknown. In this case, the object is the
+        platform, because other objects without a shape are skipped.
         """
-        matching = section.entry_of(self.kind)
+        matching = section.find_entry(self.kind)
         if matching is not None or self.size is None:
             return matching
         return VehicleSection(box=self.size)
@@ -58,10 +61,12 @@ class ObjectPassage:
     def track(
         self, section: TrafficSection, mesh: SceneMesh | None, origin: Floats, start_s: float
     ) -> Track:
-        """Return the local trajectory of a mesh, above `section.surfaces` if there are any.
+        """Return the trajectory of the origin of a mesh, in local coordinates.
 
-        OSI gives the middle of the object's box. The mesh stands on the bottom of the box, its
-        middle under the box's. Without a mesh, the trajectory follows OSI's position.
+        Positions in OSI refer to the center of the bounding box of the object. The mesh is placed
+        on the bottom of this box and centered horizontally. If `mesh` is None, the trajectory is
+        that of the box center. If `section.surfaces` is set, the heights are relative to these
+        surfaces.
         """
         rows = np.array(self.rows).reshape(-1, _ROW)
         centers = rows[:, :3] + section.translation
@@ -82,31 +87,34 @@ class ObjectPassage:
 
 
 class _PassageCollector:
-    """Collects passages from messages, with the last passage before the first time."""
+    """Collector of passages from messages.
 
-    def __init__(self, section: TrafficSection, first_s: float, choice: TravellerChoice) -> None:
-        self.passages: list[ObjectPassage] = []
-        self.travellers: dict[int, tuple[int, ObjectPassage]] = {}  # {id: (last message, passage)}
-        self.shapeless: dict[int, str] = {}  # {id: type} of objects without a size and an entry
+    Of the messages before the first time, only the last is kept.
+    """
+
+    def __init__(self, section: TrafficSection, first_s: float, travelers: TravelerFilter) -> None:
+        self.passages: list[OsiPassage] = []
+        self.travelers: dict[int, tuple[int, OsiPassage]] = {}  # {ID: (last message, passage)}
+        self.shapeless: dict[int, str] = {}  # {ID: type} of objects without a size and an entry
         self.time_s = -np.inf
         self.message = -1
         self._section = section
         self._clock = TrafficClock(section.time_unit)
         self._first_s = first_s
-        self._choice = choice
-        self.left_out: set[str] = set()  # identities that are not in `choice`
+        self._filter = travelers
+        self.left_out: set[str] = set()  # IDs that the filter excludes
 
-    def add(self, truth: Any) -> None:
-        """Add the moving objects of a message GroundTruth.
+    def add_message(self, truth: Any) -> None:
+        """Add the moving objects in a GroundTruth message.
 
-        Raises ValueError if it is not valid.
+        Raise ValueError if the message is invalid.
         """
         if truth.timestamp is None:
             raise ValueError("a message has no timestamp")
         time_s = self._clock.seconds(truth.timestamp.seconds + truth.timestamp.nanos / 1e9)
         if time_s < self.time_s:
             raise ValueError(f"the time {time_s:g} s is before the previous time {self.time_s:g} s")
-        if time_s == self.time_s:  # message of another topic, or of another sensor
+        if time_s == self.time_s:  # the message comes from another topic or another sensor
             return
         self.time_s = time_s
         self.message += 1
@@ -115,9 +123,9 @@ class _PassageCollector:
             identity = 0 if moving.id is None else int(moving.id.value)
             is_host = identity == host
             identities = (str(identity), HOST) if is_host else (str(identity),)
-            if not self._choice.has(*identities):
+            if not self._filter.matches(*identities):
                 self.left_out.update(identities)
-            elif not is_host or self._section.host or self._choice.only is not None:
+            elif not is_host or self._section.host or self._filter.only is not None:
                 self._add_object(identity, moving)
 
     def _add_object(self, identity: int, moving: Any) -> None:
@@ -126,25 +134,28 @@ class _PassageCollector:
             return
         if self.time_s <= self._first_s:
             del passage.times_s[:], passage.rows[:]
-        row = _pose_of(moving)
+        row = _pose_row(moving)
         if not np.isfinite(row).all():
             raise ValueError(f"moving object {identity} has no finite pose at {self.time_s:g} s")
         passage.times_s.append(self.time_s)
         passage.rows.extend(row)
 
-    def _passage(self, identity: int, moving: Any) -> ObjectPassage | None:
-        """Return the passage that an object continues, or a new one, or None without a shape."""
-        last_message, passage = self.travellers.get(identity, (-2, None))
+    def _passage(self, identity: int, moving: Any) -> OsiPassage | None:
+        """Return the passage that an object continues, or a new passage.
+
+        Return None if the object has no shape, unless it is the only object to read.
+        """
+        last_message, passage = self.travelers.get(identity, (-2, None))
         if passage is None or last_message < self.message - 1:
-            kind = _kind_of(moving)
-            size = _size_of(moving)
-            is_shapeless = size is None and self._section.entry_of(kind) is None
-            if is_shapeless and self._choice.only is None:
+            kind = _object_type(moving)
+            size = _object_size(moving)
+            is_shapeless = size is None and self._section.find_entry(kind) is None
+            if is_shapeless and self._filter.only is None:
                 self.shapeless[identity] = kind
                 return None
-            passage = ObjectPassage(str(identity), kind, size)
+            passage = OsiPassage(str(identity), kind, size)
             self.passages.append(passage)
-        self.travellers[identity] = self.message, passage
+        self.travelers[identity] = self.message, passage
         return passage
 
 
@@ -153,24 +164,30 @@ def read_osi(
     section: TrafficSection,
     first_s: float,
     last_s: float,
-    choice: TravellerChoice = TravellerChoice(),  # noqa: B008 - it never changes
+    travelers: TravelerFilter = TravelerFilter(),  # noqa: B008 - immutable
 ) -> TrafficContent:
-    """Read the moving objects of a trace between two times, and the messages before and after.
+    """Read the moving objects between two times from an OSI trace.
 
-    Only these messages stay in memory.
+    The data includes the last message before and the first message after this interval. Other
+    messages are discarded while the file is read.
+
+    Parameters
+    ----------
+    path, section, first_s, last_s, travelers
+        As for `read_fcd`.
 
     Raises
     ------
     LidarError
-        If betterosi is missing, or the file cannot be read or has no ground truth.
+        If betterosi is not installed, or if the file cannot be read or has no ground truth.
     """
     need("betterosi", "osi", f"Reading {path}")
-    collector = _PassageCollector(section, first_s, choice)
+    collector = _PassageCollector(section, first_s, travelers)
     stationary = 0
-    for truth in _ground_truths(path):
+    for truth in _iter_ground_truth(path):
         previous_s = collector.time_s
         with reading(str(path)):
-            collector.add(truth)
+            collector.add_message(truth)
         stationary = max(stationary, len(truth.stationary_object))
         if previous_s > last_s:  # the first message after the last time is needed as well
             break
@@ -198,14 +215,14 @@ def read_osi(
         for passage in collector.passages
         if len(passage.times_s) > 1 and passage.times_s[-1] >= first_s
     ]
-    counted = plural(len(collector.travellers), "moving object")
+    counted = plural(len(collector.travelers), "moving object")
     return TrafficContent(present, counted, collector.left_out, notes)
 
 
-def _ground_truths(path: Path) -> Iterator[Any]:
-    """Yield the ground truth of each message of a trace.
+def _iter_ground_truth(path: Path) -> Iterator[Any]:
+    """Yield the ground truth in each message of a trace.
 
-    Raises LidarError if the trace has no ground truth.
+    Raise LidarError if the type of the messages is unknown or not supported.
     """
     osi: Any = import_module("betterosi")
     with reading(str(path)):
@@ -232,9 +249,9 @@ def _ground_truths(path: Path) -> Iterator[Any]:
 
 
 def _message_type(osi: Any, path: Path) -> str | None:
-    """Return the type of messages by the name of a trace, or None if the content must tell.
+    """Return the message type that the file name of a trace indicates, or None if it has none.
 
-    LidarError if the name tells of messages without ground truth.
+    Raise LidarError if messages of this type contain no ground truth.
     """
     kind: str | None = osi.io.osi_message_type_from_filename(path)
     if kind in (None, "GroundTruth", "SensorView"):
@@ -245,8 +262,11 @@ def _message_type(osi: Any, path: Path) -> str | None:
     )
 
 
-def _pose_of(moving: Any) -> list[float]:
-    """Return the numbers of a row of `ObjectPassage`, or NaN without a position."""
+def _pose_row(moving: Any) -> list[float]:
+    """Return the pose of a moving object as a row of `OsiPassage.rows`.
+
+    If the object has no position, all values are NaN.
+    """
     base = moving.base
     if base is None or base.position is None:
         return _ROW * [np.nan]
@@ -256,10 +276,10 @@ def _pose_of(moving: Any) -> list[float]:
     return [position.x, position.y, position.z, *rotation]
 
 
-def _size_of(moving: Any) -> tuple[float, float, float] | None:
-    """Return length, width and height, or None without dimensions.
+def _object_size(moving: Any) -> tuple[float, float, float] | None:
+    """Return the length, width and height of a moving object, or None if they are unknown.
 
-    Raises ValueError if the dimensions are absurd.
+    Raise ValueError if a dimension is implausible.
     """
     size = None if moving.base is None else moving.base.dimension
     if size is None:
@@ -272,8 +292,11 @@ def _size_of(moving: Any) -> tuple[float, float, float] | None:
     return sides
 
 
-def _kind_of(moving: Any) -> str:
-    """Return the type of a moving object in lower case, of vehicles from the classification."""
+def _object_type(moving: Any) -> str:
+    """Return the type of a moving object in lower case.
+
+    The type of a vehicle is taken from its classification, if that is known.
+    """
     kind = getattr(moving.type, "name", "").lower()
     if kind == "vehicle" and moving.vehicle_classification is not None:
         vehicle = getattr(moving.vehicle_classification.type, "name", "").lower()

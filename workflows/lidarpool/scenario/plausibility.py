@@ -1,4 +1,4 @@
-"""Warnings of implausible surveys: poses, motions and noise that are likely mistakes."""
+"""Warnings about implausible poses, motions and noise, which are likely mistakes."""
 
 from __future__ import annotations
 
@@ -20,80 +20,89 @@ from lidarsim.simulator.casting.visibility import static_key, unseen_objects, wi
 from lidarsim.survey.survey import Survey
 from lidarsim.words import as_scenario, printable, rounded
 
-from .default_poses import free_above, on_one_line, seen_from, surroundings_of
-from .prepare import Prepared
+from .default_poses import (
+    as_yaml_line,
+    build_placement_checker,
+    find_free_position_above,
+    outside_view_hint,
+)
+from .prepare import PreparedScenario
 
 GROUND_SPEED_M_S = 150.0  # faster than trains, except on test tracks
 AIR_SPEED_M_S = 350.0  # faster than the aircraft that carry lidars
-AIRBORNE_M = 50.0  # a carrier flies at this height above the ground or higher
-MAX_RATE_DEG_S = 720.0  # two rotations a second
-NOISE_SHARE = 0.1  # share of the range
+AIRBORNE_M = 50.0  # minimum height above the ground at which a platform is airborne
+MAX_RATE_DEG_S = 720.0  # two rotations per second
+NOISE_SHARE = 0.1  # maximum noise relative to the range
 
-# Orientation against the direction of travel: angles of this size are not drift of a vehicle, if
-# they are constant, which is the length of the mean of unit vectors with these angles.
+# A platform faces away from its direction of travel if the mean angle is larger than the first
+# value and constant. The constancy is the length of the mean of unit vectors with these angles.
 _ASKEW_DEG = 30.0
 _CONSTANT = 0.95
-# below these speeds and lengths directions of travel are noise
+# Below this speed, or on shorter paths, the direction of travel is dominated by noise.
 _MOVES_M_S = 0.1
 _TRAVELS_M = 2.0
-# Cosines of tilt, on the average: a level carrier, and a carrier that lies on its side.
+# Mean cosine between the z axis and vertical, above which a platform is level, and below which it
+# lies on its side.
 _LEVEL = 0.9
 _TILTED = 0.5
-# A path that rises and falls by more than these meters and this share of its length, while it
-# stays within a share of that height along x or y, has another axis up.
+# z is probably not the up axis if the path extends over more than `_RISE_M` along z, if it climbs
+# and descends by more than `_RISE_SHARE` of its length, and if its extent along x or y is less than
+# `_FLAT` of its extent along z.
 _RISE_M = 5.0
 _RISE_SHARE = 0.3
 _FLAT = 0.1
 
-_POSITIONS = 24  # sampled positions of the sensors
-_TIMES = 20_000  # sampled times of a trajectory
-_FAR_PERCENT = 95  # percentile of distances that stands for the range of a sensor without a limit
+_POSITIONS = 24  # number of sampled sensor positions
+_TIMES = 20_000  # number of sampled times on a trajectory
+_FAR_PERCENT = 95  # percentile of distances that replaces a missing range limit
 
 
 class _Motion(NamedTuple):
-    """A trajectory at the middle of the times between its poses."""
+    """Motion of the platform at the midpoints between the poses of its trajectory."""
 
     times_ns: Floats  # (k,)
-    durations_s: Floats  # (k,): between the poses
+    durations_s: Floats  # (k,), time between the poses
     positions: Floats  # (k, 3), meters
-    rotations: Floats  # (k, 3, 3), from the carrier frame to the scene frame
+    rotations: Floats  # (k, 3, 3), from the platform frame to the scene frame
     velocities: Floats  # (k, 3), m/s
     rates: Floats  # (k, 3), rad/s
 
     @property
     def speeds(self) -> Floats:
-        """Speeds (k,), m/s."""
+        """Speeds in m/s. Shape (k,)."""
         return np.asarray(np.linalg.norm(self.velocities, axis=1))
 
 
 class _SensorPosition(NamedTuple):
-    """A position of a sensor at a time."""
+    """Position of a sensor at a point in time."""
 
     time_ns: float
     position: Floats  # (3,), local coordinates
-    sensor: int  # number of the sensor
+    sensor: int  # index of the sensor
     station: int
 
 
-def implausibilities(prepared: Prepared) -> list[str]:
-    """Return warnings of places, poses, motions and noise that real surveys do not have.
+def plausibility_warnings(prepared: PreparedScenario) -> list[str]:
+    """Return warnings about poses, motions, noise and coordinates that are implausible.
 
-    Poses that were chosen for the user are not judged. Some thousand rays are cast in scenes with
-    a moderate number of triangles.
+    Default poses are not checked. Unless the scene has too many triangles, a few thousand rays are
+    cast.
     """
     scene = prepared.scene.georeferenced((0, 0, 0))  # in the coordinates of the scenario
     survey = prepared.survey
     chosen = prepared.scenario.poses is None and prepared.scenario.trajectory is None
     samples = [] if chosen else _sample_positions(survey)
     positions = np.array([sample.position for sample in samples]).reshape(-1, 3)
-    surroundings = surroundings_of(scene, positions) if samples else None
-    warnings = [*filter(None, [prepared.job.place_problem])]
-    warnings += [*_noise_warnings(survey, _sight_m(scene, surroundings, positions))]
+    surroundings = build_placement_checker(scene, positions) if samples else None
+    warnings = [*filter(None, [prepared.job.location_warning])]
+    visible_range_m = _visible_range_m(scene, surroundings, positions)
+    warnings += [*_noise_warnings(survey, visible_range_m)]
     if not chosen:
         warnings += _position_warnings(scene, survey, surroundings, samples)
     if survey.path.moves:
         motion = _motion(survey)
-        warnings += _speed_warnings(motion, flies=_flies(scene, survey, surroundings, positions))
+        is_airborne = _is_airborne(scene, survey, surroundings, positions)
+        warnings += _speed_warnings(motion, is_airborne=is_airborne)
         warnings += _up_axis_warnings(motion, scene.bounds[0, 2])
         warnings += _orientation_warnings(motion)
     return [as_scenario(warning) for warning in dict.fromkeys(warnings)]
@@ -103,7 +112,7 @@ def implausibilities(prepared: Prepared) -> list[str]:
 
 
 def _sample_positions(survey: Survey) -> list[_SensorPosition]:
-    """Return sampled positions of the sensors, in local coordinates."""
+    """Return sampled positions of the sensors in local coordinates."""
     path = survey.path
     mounts = [*enumerate(carried.mount for carried in survey.carried)]
     if path.moves:
@@ -127,7 +136,10 @@ def _position_warnings(
     surroundings: PlacementChecker | None,
     samples: list[_SensorPosition],
 ) -> Iterator[str]:
-    """Warn of positions under the scene, or inside its bodies or actors that the sensor sees."""
+    """Yield warnings about sensors that are below the scene, or inside a closed body or an actor.
+
+    Objects that a sensor does not see are ignored.
+    """
     unseen = unseen_objects(scene, survey)
     where = partial(_bad_positions, scene, samples, moves=survey.path.moves)
     if surroundings is not None:
@@ -138,22 +150,24 @@ def _position_warnings(
         if under.any():
             first = samples[int(under.argmax())]
             seen = seen_by[first.sensor]
-            assert seen is not None  # it is below objects of these
-            free = None if survey.path.moves else free_above(scene, seen, first.position)
+            assert seen is not None  # because the sensor is below visible objects
+            free = (
+                None if survey.path.moves else find_free_position_above(scene, seen, first.position)
+            )
             yield (
                 f"the sensor is below the scene{where(under)}. Check z, the heights and `up_axis`"
-                f"{_moved_pose(scene, survey, first, free)}"
+                f"{_free_pose_hint(scene, survey, first, free)}"
             )
         inside &= ~under
         if inside.any():
             first = samples[int(inside.argmax())]
             seen = seen_by[first.sensor]
-            assert seen is not None  # it is inside a body of these
+            assert seen is not None  # because the sensor is inside a visible body
             body = seen.find_enclosing_body(first.position)
-            way_out = _way_out(scene, survey, seen, first, body)
+            advice = _exit_advice(scene, survey, seen, first, body)
             yield (
                 f"the sensor is inside the closed body {printable(body.name)!r}{where(inside)}. It "
-                f"hits only the back faces of surfaces{way_out}. If the body is the sensor "
+                f"hits only the back faces of surfaces{advice}. If the body is the sensor "
                 "housing, add its name to `unseen` of the sensor"
             )
     for actor, name in enumerate(scene.object_names[len(scene.names) :]):
@@ -167,33 +181,41 @@ def _position_warnings(
             )
 
 
-def _way_out(
+def _exit_advice(
     scene: Scene,
     survey: Survey,
     seen: PlacementChecker,
     first: _SensorPosition,
     body: EnclosingBody,
 ) -> str:
-    """Return sentences, starting with a period, on a pose outside a body around a position."""
+    """Return a hint on how to move a sensor out of a body.
+
+    The hint starts with a period, so that it can be appended to a sentence.
+    """
     if not survey.path.moves:
         if (free := seen.find_free_position(first.position)) is not None:
-            return _moved_pose(scene, survey, first, free)
+            return _free_pose_hint(scene, survey, first, free)
         if body.is_whole_scene:
-            return f". {seen_from(scene, survey.carried[0])}"
+            return f". {outside_view_hint(scene, survey.carried[0])}"
     lower, upper = (", ".join(f"{x:,.2f}" for x in corner) for corner in body.bounds + scene.origin)
     return f". The body extends from ({lower}) to ({upper})"
 
 
-def _moved_pose(scene: Scene, survey: Survey, sample: _SensorPosition, free: Floats | None) -> str:
-    """Return a sentence, starting with a period, with the pose whose sensor is at a free position.
+def _free_pose_hint(
+    scene: Scene, survey: Survey, sample: _SensorPosition, free: Floats | None
+) -> str:
+    """Return a hint with the pose at which the sensor is at a free position.
 
-    It is empty without such a position.
+    The hint starts with a period, so that it can be appended to a sentence. It is empty if `free`
+    is None.
     """
     if free is None:
         return ""
     pose = survey.path.pose(sample.station).position + scene.origin + free - sample.position
     number = f" for pose {sample.station + 1}" * (survey.path.stations > 1)
-    return f". The nearest free position found{number} is {on_one_line(np.round(pose, 2).tolist())}"
+    return (
+        f". The nearest free position found{number} is {as_yaml_line(np.round(pose, 2).tolist())}"
+    )
 
 
 def _surroundings_of_sensors(
@@ -202,9 +224,10 @@ def _surroundings_of_sensors(
     samples: list[_SensorPosition],
     unseen: Sequence[Bools | None],
 ) -> list[PlacementChecker | None]:
-    """Return the surroundings that each sensor sees, or None if a sensor sees nothing.
+    """Return the surroundings that are visible to each sensor.
 
-    `surroundings` belong to all objects, and `unseen` the masks of the sensors.
+    An entry is None if the sensor sees no objects. `surroundings` contains all objects, and
+    `unseen` contains a mask of the invisible objects for each sensor.
     """
     known: dict[bytes, PlacementChecker | None] = {b"": surroundings}
     keys = [static_key(scene, mask) for mask in unseen]
@@ -212,16 +235,16 @@ def _surroundings_of_sensors(
         if mask is not None and key not in known:
             seen = without_objects(scene, mask)
             positions = np.array([sample.position for sample in samples])
-            known[key] = None if seen is None else surroundings_of(seen, positions)
+            known[key] = None if seen is None else build_placement_checker(seen, positions)
     return [known[key] for key in keys]
 
 
 def _bad_positions(
     scene: Scene, samples: list[_SensorPosition], is_bad: Bools, *, moves: bool
 ) -> str:
-    """Return the first bad position in words, with its time if the carrier moves, and the number.
+    """Describe the number of bad positions and the first of them.
 
-    The time is since the survey's start.
+    If the platform moves, the description includes the time since the start of the survey.
     """
     first = samples[int(is_bad.argmax())]
     x, y, z = first.position + scene.origin
@@ -231,14 +254,14 @@ def _bad_positions(
 
 
 def _inside_actor(actor: Actor, samples: list[_SensorPosition]) -> Bools:
-    """Return whether the sensor is inside an actor's closed mesh, for each position: (k,)."""
+    """Return whether each sensor position is inside the closed mesh of an actor. Shape (k,)."""
     times = np.array([sample.time_ns for sample in samples])
     inside = np.zeros(len(samples), np.bool_)
     if not samples:
         return inside
     positions, rotations = full_poses(actor.trajectory, 0, times)
     offsets = np.array([sample.position for sample in samples]) - positions
-    local = np.einsum("kji,kj->ki", rotations, offsets)  # positions in the actor's frame
+    local = np.einsum("kji,kj->ki", rotations, offsets)  # positions in the actor frame
     lower_m, upper_m = actor.mesh.bounds
     in_bounds = np.flatnonzero(((local > lower_m) & (local < upper_m)).all(axis=1))
     if len(in_bounds):
@@ -250,8 +273,10 @@ def _inside_actor(actor: Actor, samples: list[_SensorPosition]) -> Bools:
 # -- noise -----------------------------------------------------------------------------------
 
 
-def _sight_m(scene: Scene, surroundings: PlacementChecker | None, positions: Floats) -> float:
-    """Return the range of a sensor without a limit of range, meters."""
+def _visible_range_m(
+    scene: Scene, surroundings: PlacementChecker | None, positions: Floats
+) -> float:
+    """Return a typical maximum distance to the scene, for sensors without a range limit."""
     if surroundings is not None:
         distances = surroundings.cast_around(positions).distance
         if len(distances := distances[np.isfinite(distances)]):
@@ -259,10 +284,10 @@ def _sight_m(scene: Scene, surroundings: PlacementChecker | None, positions: Flo
     return float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
 
 
-def _noise_warnings(survey: Survey, sight_m: float) -> Iterator[str]:
-    """Warn of noise above a tenth of the range."""
+def _noise_warnings(survey: Survey, visible_range_m: float) -> Iterator[str]:
+    """Yield warnings about noise that exceeds a tenth of the range."""
     for carried, noise in zip(survey.carried, survey.noise_each, strict=True):
-        range_m = min(carried.sensor.max_range_m, sight_m)
+        range_m = min(carried.sensor.max_range_m, visible_range_m)
         name = f" of {carried.name}" * bool(carried.name)
         for field in ("range_m", "range_at_threshold_m", "channel_bias_m", "warm_up_m"):
             value = float(np.max(np.abs(getattr(noise, field))))
@@ -282,11 +307,11 @@ def _noise_warnings(survey: Survey, sight_m: float) -> Iterator[str]:
 
 
 def _motion(survey: Survey) -> _Motion:
-    """Return the motion of the carrier of a moving survey, also after the last scan."""
+    """Return the motion of the platform, including the part of the path after the last scan."""
     path = survey.path
     end_ns = path.duration_ns if np.isfinite(path.duration_ns) else survey.duration_ns
     if isinstance(path, Track):
-        assert path.start_s is not None  # every track has a start
+        assert path.start_s is not None  # set by Track.__post_init__
         knots = (path.times_s - path.start_s) * 1e9
         knots = np.unique(np.clip(knots, 0.0, end_ns))
     else:
@@ -297,10 +322,13 @@ def _motion(survey: Survey) -> _Motion:
     return _Motion(times, durations_s, *full_poses(path, 0, times), *velocities(path, 0, times))
 
 
-def _flies(
+def _is_airborne(
     scene: Scene, survey: Survey, surroundings: PlacementChecker | None, positions: Floats
 ) -> bool:
-    """Return whether the carrier is airborne, judged by its sensors and its height above ground."""
+    """Return whether the platform is airborne.
+
+    A platform is airborne if it carries a line scanner or is high above the ground.
+    """
     if any(isinstance(carried.sensor, LineSensor) for carried in survey.carried):
         return True
     heights = positions[:, 2] - scene.bounds[1, 2]
@@ -311,10 +339,10 @@ def _flies(
     return bool(len(heights) and np.median(heights) > AIRBORNE_M)
 
 
-def _speed_warnings(motion: _Motion, *, flies: bool) -> Iterator[str]:
-    """Warn of speeds and angular rates that carriers do not have."""
-    limit_m_s = AIR_SPEED_M_S if flies else GROUND_SPEED_M_S
-    medium = "in the air" if flies else "on the ground"
+def _speed_warnings(motion: _Motion, *, is_airborne: bool) -> Iterator[str]:
+    """Yield warnings about speeds and angular rates that platforms do not reach."""
+    limit_m_s = AIR_SPEED_M_S if is_airborne else GROUND_SPEED_M_S
+    medium = "in the air" if is_airborne else "on the ground"
     speeds = motion.speeds
     rates = np.degrees(np.linalg.norm(motion.rates, axis=1))
     if (speeds > limit_m_s).any():
@@ -334,14 +362,14 @@ def _speed_warnings(motion: _Motion, *, flies: bool) -> Iterator[str]:
 
 
 def _time(motion: _Motion, row: int) -> str:
-    """Return the time of a row in words."""
     return f"{rounded(motion.times_ns[row] / 1e9, 4)} s"
 
 
 def _up_axis_warnings(motion: _Motion, lowest_m: float) -> Iterator[str]:
-    """Warn of a path that rises and falls as roads do not, and is flat along x or y.
+    """Yield a warning if the path is steep along z and flat along x or y.
 
-    A path straight up is a lift's or drone's, unless the path starts below the scene.
+    Vertical paths, such as those of elevators and drones, are plausible unless they extend below
+    the scene.
     """
     extent_m = np.ptp(motion.positions, axis=0)
     length_m = motion.speeds @ motion.durations_s
@@ -362,23 +390,24 @@ def _up_axis_warnings(motion: _Motion, lowest_m: float) -> Iterator[str]:
 
 
 def _orientation_warnings(motion: _Motion) -> Iterator[str]:
-    """Warn of carriers that lie on their sides, or do not face their direction of travel."""
-    as_given = _Facing.measure(motion, motion.rotations)
-    # Of a file in the order w, x, y, z, w was read as x, x as y, and so on.
+    """Yield a warning if the platform lies on its side or does not face its direction of travel."""
+    as_read = _MeanOrientation.measure(motion, motion.rotations)
+    # If the quaternions in the file have the order w, x, y, z, then w was read as x, x as y, and so
+    # on.
     quaternions = quaternions_of(motion.rotations)
-    w_first = _Facing.measure(motion, matrices(quaternions[:, [1, 2, 3, 0]]))
-    tilted = as_given.level <= _TILTED
-    is_w_first = as_given.level <= _LEVEL < w_first.level and not w_first.askew
-    if not (tilted or as_given.askew or is_w_first):
+    w_first = _MeanOrientation.measure(motion, matrices(quaternions[:, [1, 2, 3, 0]]))
+    tilted = as_read.level <= _TILTED
+    is_w_first = as_read.level <= _LEVEL < w_first.level and not w_first.askew
+    if not (tilted or as_read.askew or is_w_first):
         return
     faults = []
     if tilted or is_w_first:
-        tilt = np.degrees(np.arccos(np.clip(as_given.level, -1, 1)))
+        tilt = np.degrees(np.arccos(np.clip(as_read.level, -1, 1)))
         faults.append(f"the z axis of the platform is tilted by {tilt:.0f} degrees from vertical")
-    if as_given.askew:
+    if as_read.askew:
         faults.append(
-            f"the platform constantly faces {abs(as_given.angle_deg):.0f} degrees to the "
-            f"{'left' if as_given.angle_deg > 0 else 'right'} of its direction of travel"
+            f"the platform constantly faces {abs(as_read.angle_deg):.0f} degrees to the "
+            f"{'left' if as_read.angle_deg > 0 else 'right'} of its direction of travel"
         )
     advice = "Check the order of quaternions (x, y, z, w) and the units and axes of angles"
     if is_w_first:
@@ -391,30 +420,30 @@ def _orientation_warnings(motion: _Motion) -> Iterator[str]:
     yield f"{' and '.join(faults)}. {advice}"
 
 
-class _Facing(NamedTuple):
-    """Mean orientation of a carrier along its path."""
+class _MeanOrientation(NamedTuple):
+    """Mean orientation of a platform along its path."""
 
-    level: float  # mean cosine between its z axis and up
-    angle_deg: float  # mean angle from its direction of travel to its x axis, to the left
-    constancy: float  # constancy of that angle, 0 to 1; 0 if the carrier hardly travels
+    level: float  # mean cosine between the z axis of the platform and vertical
+    angle_deg: float  # mean angle from the direction of travel to the x axis, positive to the left
+    constancy: float  # constancy of that angle, from 0 to 1; 0 if the platform hardly moves
 
     @property
     def askew(self) -> bool:
-        """Whether the carrier constantly faces away from its direction of travel."""
+        """Whether the platform constantly faces away from its direction of travel."""
         return self.constancy > _CONSTANT and abs(self.angle_deg) > _ASKEW_DEG
 
     @classmethod
-    def measure(cls, motion: _Motion, rotations: Floats) -> _Facing:
-        """Return the mean orientation by rotations (k, 3, 3) along a path."""
+    def measure(cls, motion: _Motion, rotations: Floats) -> _MeanOrientation:
+        """Return the mean orientation along a path. `rotations` has shape (k, 3, 3)."""
         level = float(np.average(rotations[:, 2, 2], weights=motion.durations_s))
-        ahead = rotations[:, :2, 0]
+        forward = rotations[:, :2, 0]
         travel = motion.velocities[:, :2]
         speeds = np.linalg.norm(travel, axis=1)
         lengths_m = np.where(speeds > _MOVES_M_S, speeds * motion.durations_s, 0.0)
         if lengths_m.sum() < _TRAVELS_M:
             return cls(level, 0.0, 0.0)
-        sines = travel[:, 0] * ahead[:, 1] - travel[:, 1] * ahead[:, 0]
-        cosines = (travel * ahead).sum(axis=1)
+        sines = travel[:, 0] * forward[:, 1] - travel[:, 1] * forward[:, 0]
+        cosines = (travel * forward).sum(axis=1)
         angles = np.arctan2(sines, cosines)
         mean = np.average(np.exp(1j * angles), weights=lengths_m)
         return cls(level, float(np.degrees(np.angle(mean))), float(np.abs(mean)))

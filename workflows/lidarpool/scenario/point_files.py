@@ -1,4 +1,4 @@
-"""Reads the points of files from which scenes are created, with their quantities."""
+"""Reader of point cloud files from which scenes are created."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from lidarsim.words import plural, printable
 from ..clouds.format_table import format_of_path, point_suffixes
 from ..clouds.recording import METERS, Recording, RecordingSource
 
-MIN_POINTS = 12  # minimum for a scene, because each surfel is fitted to as many points
+MIN_POINTS = 12  # number of points to which each surfel is fitted
 POINT_BYTES = 700  # peak memory per point while surfels are computed and written
 NO_CLASS = np.iinfo(np.int64).min  # class of a point without a class
 _SAMPLE = 1000  # points at which the lengths in another coordinate system are checked
@@ -46,8 +46,8 @@ def read_points(
 ) -> tuple[Sweep, int | None]:
     """Read the finite points of a file in true meters, and their EPSG code if it is known.
 
-    Scans are joined in the frame of the file. The sweep contains those of the following columns
-    that the file has:
+    Scans are merged in the frame of the file. The sweep contains the following columns if the file
+    has them:
 
     - `class`: int64, `NO_CLASS` for points without a class.
     - `intensity`: float64, not negative, on the scale of the file.
@@ -93,11 +93,11 @@ def read_points(
             raise LidarError("it is empty (0 bytes).")
     recording = cloud_format.open(RecordingSource(path, str(path), as_stored=True))
     with reading(str(path)):
-        content = _read(recording, keep_noise)
+        content = _read_scans(recording, keep_noise)
         if note := content.omitted.note():
             tell(f"{path}: {note}")
         to_meters, placed_epsg = _to_meters(path, recording, content.points, unit, epsg, tell)
-        points = _converted(content.points, to_meters)
+        points = _convert_points(content.points, to_meters)
     _check_points(path, points, content.omitted)
     for line in (*recording.notes, *(f"{path} {note}" for note in points.notes)):
         tell(line)
@@ -113,7 +113,10 @@ def read_points(
 
 
 def vectors(points: Sweep, names: Sequence[str]) -> AnyArray | None:
-    """Return columns as the components of vectors (n, k), or None if the first is missing."""
+    """Return columns as an array of vectors, or None if the first column is missing.
+
+    The result has shape (n, k), where k is the number of columns.
+    """
     if names[0] not in points.columns:
         return None
     return np.stack([points.columns[name] for name in names], axis=1)
@@ -135,19 +138,19 @@ def _check_points(path: Path, points: Sweep, omitted: OmittedPoints) -> None:
 
 
 class _Content(NamedTuple):
-    """Content of a file."""
+    """Content of a point cloud file."""
 
-    # Points in the units and the frame of the file. Columns that are used have the names of the
-    # file, and `skipped` lists all columns with values other than zero.
+    # Points in the units and the frame of the file. The columns have the same names as in the file,
+    # and `skipped` lists all columns with values other than zero.
     points: Sweep
     omitted: OmittedPoints  # withheld points and noise
     no_returns: int  # number of points at the origin that were skipped
 
 
-def _read(recording: Recording, keep_noise: bool) -> _Content:
-    """Read the scans or parts of a file, and join them in the frame of the file.
+def _read_scans(recording: Recording, keep_noise: bool) -> _Content:
+    """Read the scans or parts of a file, and merge them in the frame of the file.
 
-    Raises LidarError if there is not enough memory for the points.
+    Raise LidarError if there is not enough memory for the points.
     """
     if not len(recording) and not recording.is_cloud:
         raise ValueError("it contains no scans")
@@ -170,7 +173,7 @@ def _read(recording: Recording, keep_noise: bool) -> _Content:
             usable, omitted_here = usable_points(scan.columns, recording.noise_classes)
             scan = scan if usable is None else scan.select(usable)
             omitted = OmittedPoints(*np.add(omitted, omitted_here).tolist())
-        scans.append(_placed(_with_used_columns(scan, missing_if_zero)))
+        scans.append(_to_file_frame(_with_used_columns(scan, missing_if_zero)))
     joined = scans[0] if len(scans) == 1 else Sweep.joined(scans)
     joined = joined.replace(
         units_m=scans[0].units_m if scans else None,
@@ -214,14 +217,14 @@ def _with_used_columns(scan: Sweep, missing_if_zero: Iterable[Sequence[str]]) ->
         for name, values in columns_for(columns, component).items()
     }
     for names in missing_if_zero:
-        for group in _groups(used, names):
+        for group in _column_groups(used, names):
             if not any(map(_has_values, group.values())):
                 used = {name: values for name, values in used.items() if name not in group}
     skipped = [name for name in columns if name in used or _has_values(columns[name])]
     return scan.replace(columns=used, skipped=[*skipped, *scan.skipped])
 
 
-def _placed(scan: Sweep) -> Sweep:
+def _to_file_frame(scan: Sweep) -> Sweep:
     """Return a scan in the frame of the file, with the position of its scanner as origins."""
     points = np.asarray(scan.points, np.float64)
     columns = dict(scan.columns)
@@ -230,10 +233,10 @@ def _placed(scan: Sweep) -> Sweep:
         offset = scan.pose[:3, 3]
         points = points @ rotation.T + offset
         for names, shift in ((NORMALS, np.zeros(3)), (ORIGINS, offset)):
-            for group in _groups(columns, names):
-                placed = _stacked(group).astype(np.float64) @ rotation.T + shift
+            for group in _column_groups(columns, names):
+                placed = _stack(group).astype(np.float64) @ rotation.T + shift
                 columns |= zip(group, placed.T, strict=True)
-    if scan.scanner is not None and not _groups(columns, ORIGINS):
+    if scan.scanner is not None and not _column_groups(columns, ORIGINS):
         # Ray origins in the file are more accurate than the position of the scanner.
         columns |= {
             name: np.full(len(scan), position)
@@ -250,10 +253,10 @@ def _to_meters(
     epsg: int | None,
     tell: Callable[[str], None],
 ) -> tuple[Callable[[Floats], Floats], int | None]:
-    """Return a function that converts positions (n, 3) to true meters, and their EPSG code.
+    """Return a function that converts positions to true meters, and the resulting EPSG code.
 
     The code is None if the coordinate system of the converted positions is unknown. `tell` is
-    called with notes on the conversion.
+    called with notes on the conversion. Positions have shape (n, 3).
     """
     finite = points.points[np.isfinite(points.points).all(axis=1)]
     if epsg is not None:
@@ -286,18 +289,18 @@ def _to_meters(
     return convert, placed_epsg
 
 
-def _converted(stored: Sweep, to_meters: Callable[[Floats], Floats]) -> Sweep:
+def _convert_points(stored: Sweep, to_meters: Callable[[Floats], Floats]) -> Sweep:
     """Return the finite points of a file in meters, with the columns of `read_points`.
 
     `notes` are clauses that follow the name of the file, and `skipped` lists unused columns.
     """
     points = to_meters(stored.points)
-    classes = _first(stored.columns, _CLASS)
-    intensities = _first(stored.columns, *_INTENSITIES)
-    colors = _first(stored.columns, COLORS)
-    normals = _first(stored.columns, NORMALS)
-    origins = next(iter(_groups(stored.columns, ORIGINS)), {})
-    skipped = _unused(stored, {*classes, *intensities, *colors, *normals, *origins})
+    classes = _first_with_values(stored.columns, _CLASS)
+    intensities = _first_with_values(stored.columns, *_INTENSITIES)
+    colors = _first_with_values(stored.columns, COLORS)
+    normals = _first_with_values(stored.columns, NORMALS)
+    origins = next(iter(_column_groups(stored.columns, ORIGINS)), {})
+    skipped = _unused_columns(stored, {*classes, *intensities, *colors, *normals, *origins})
     notes = [*stored.notes]
     columns: dict[str, AnyArray] = {}
     for values in classes.values():
@@ -307,29 +310,29 @@ def _converted(stored: Sweep, to_meters: Callable[[Floats], Floats]) -> Sweep:
         columns["intensity"], note = from_zero(np.where(np.isfinite(numbers), numbers, np.nan))
         notes += [note] if note else []
     if colors:
-        columns |= zip(COLORS, _as_srgb(_stacked(colors)).T, strict=True)
+        columns |= zip(COLORS, _as_srgb(_stack(colors)).T, strict=True)
     if origins:
         try:
-            scanners = to_meters(_stacked(origins).astype(np.float64))
+            scanners = to_meters(_stack(origins).astype(np.float64))
             columns |= zip(ORIGINS, scanners.T, strict=True)
         except LidarError:  # E57 poses may be zero, which some coordinate systems do not contain
             skipped.append("scanner positions that cannot be converted to that system")
     elif normals:
-        columns |= zip(NORMALS, np.nan_to_num(_stacked(normals).astype(np.float64)).T, strict=True)
+        columns |= zip(NORMALS, np.nan_to_num(_stack(normals).astype(np.float64)).T, strict=True)
     converted = stored.replace(points=points, columns=columns, notes=notes, skipped=skipped)
     # Depth cameras write NaN for pixels without a return.
     finite = np.isfinite(points).all(axis=1)
     return converted if finite.all() else converted.select(np.flatnonzero(finite))
 
 
-def _unused(stored: Sweep, used: Collection[str]) -> list[str]:
+def _unused_columns(stored: Sweep, used: Collection[str]) -> list[str]:
     """Return the names in `skipped` that are not used, except columns that contain only zeros."""
     names = [name for name in stored.skipped if name not in used]
     columns = stored.columns
     return [name for name in names if name not in columns or _has_values(columns[name])]
 
 
-def _groups(columns: Columns, names: Sequence[str]) -> list[Columns]:
+def _column_groups(columns: Columns, names: Sequence[str]) -> list[Columns]:
     """Return groups of columns, each of which contains the components of a quantity.
 
     If there are several groups, the group with the standard names is the first.
@@ -338,17 +341,17 @@ def _groups(columns: Columns, names: Sequence[str]) -> list[Columns]:
     return [dict(group) for group in zip(*found, strict=False)]
 
 
-def _first(columns: Columns, *quantities: Sequence[str]) -> Columns:
+def _first_with_values(columns: Columns, *quantities: Sequence[str]) -> Columns:
     """Return the columns of the first quantity that has values other than zero, if any.
 
     LAS files contain columns of zeros for quantities that were not measured.
     """
-    groups = (group for names in quantities for group in _groups(columns, names))
+    groups = (group for names in quantities for group in _column_groups(columns, names))
     return next((group for group in groups if any(map(_has_values, group.values()))), {})
 
 
-def _stacked(group: Columns) -> AnyArray:
-    """Return columns as the components of vectors (n, k)."""
+def _stack(group: Columns) -> AnyArray:
+    """Return columns as an array of vectors. Shape (n, k)."""
     return np.stack([*group.values()], axis=1)
 
 
@@ -360,7 +363,7 @@ def _has_values(values: AnyArray) -> bool:
 def _as_integers(classes: AnyArray) -> Ints:
     """Return classes as integers, with `NO_CLASS` for NaN.
 
-    Raises ValueError if a class is not an integer.
+    Raise ValueError if a class is not an integer.
     """
     if classes.dtype.kind == "f":
         classes = np.where(np.isnan(classes), float(NO_CLASS), classes)
@@ -371,7 +374,7 @@ def _as_integers(classes: AnyArray) -> Ints:
 
 
 def _as_srgb(colors: AnyArray) -> Floats32:
-    """Return colors (n, 3) from 0 to 255.
+    """Convert colors to the range from 0 to 255. Shape (n, 3).
 
     The input has 8 or 16 bits, or consists of floats from 0 to 1 or from 0 to 255.
     """

@@ -1,8 +1,9 @@
-"""Point clouds as scenes: each point becomes a surfel, a small rectangle in the points' plane.
+"""Conversion of point clouds to scenes of surfels.
 
-Poisson surfaces (Kazhdan and Hoppe 2013), which Open3D makes, too, were compared by casting: of a
-simulated scan of a city they took twenty times as long, needed the side that each point was seen
-from, and closed openings, so that a tenth of the ranges were wrong by more than 0.3 m.
+A surfel is a small rectangle in the plane of neighboring points. Poisson surface reconstruction
+(Kazhdan and Hoppe 2013), which Open3D also provides, was tested as an alternative on a simulated
+scan of a city. It took twenty times as long and required the side from which each point was seen.
+It also closed openings, so a tenth of the simulated ranges were wrong by more than 0.3 m.
 """
 
 from __future__ import annotations
@@ -32,24 +33,24 @@ from ..open3d_access.open3d_module import load_open3d
 from .point_files import MIN_POINTS, NO_CLASS, POINT_BYTES, read_points, vectors
 from .surfel_gaps import expected_loss
 
-# Chosen on scans of a city, from 7 to 30 neighbors and 0.7 to 1.4: more of either closes more gaps
-# between points, and makes surfels reach farther beyond edges.
+# These values were chosen on scans of a city, from 7 to 30 neighbors and extents of 0.7 to 1.4.
+# Larger values close more gaps between points, but surfels also extend farther beyond edges.
 _NEIGHBORS = MIN_POINTS
 _EXTENT = 0.85
-# length of half a surfel, in voxels: distant and stray points have no neighbors
+# Maximum half length of a surfel in voxels, for distant and stray points without close neighbors.
 _MAX_HALF_VOXELS = 3
-_SAMPLE = 20_000  # points whose neighbors tell the spacing
-_NEAREST = 9  # a point itself, and the eight around it on a square grid
-_MAX_VOXELS = 1 << 62  # voxels of the box around the points: 64 bits number voxels
-CLASS_MATERIAL = "class "  # and the number: name of the material of surfels with a class
-_GRAY = "have the mean color of their neighbors, or are gray"  # in notes
-_LEAST_LOSS = 0.02  # share of returns lost in gaps that a note tells
-# docs/how-to/point-clouds.md has the scans
+_SAMPLE = 20_000  # number of points from which the spacing is estimated
+_NEAREST = 9  # a point and its eight neighbors on a square grid
+_MAX_VOXELS = 1 << 62  # voxels are numbered with 64-bit integers
+CLASS_MATERIAL = "class "  # followed by the class number in the material names of surfels
+_GRAY = "have the mean color of their neighbors, or are gray"  # used in notes
+_MIN_NOTED_LOSS = 0.02  # minimum share of lost returns that is reported in a note
+# docs/how-to/point-clouds.md describes these scans.
 _MEASURED_LOSS = "4 to 40 % in scenes from one to three scans of a city"
-_WHITE_QUANTILE = 0.99  # share of intensities up to white: mirrors return more
+_WHITE_QUANTILE = 0.99  # quantile of the intensities that is white, because mirrors return more
 
 
-def scene_of_points(
+def scene_from_points(
     path: str | Path,
     *,
     voxel_m: float | None = None,
@@ -60,53 +61,61 @@ def scene_of_points(
     color: Literal["rgb", "intensity"] | None = None,
     tell: Callable[[str], None] = warn,
 ) -> Scene:
-    """Make a scene of a point cloud, for example a scan of a real place.
+    """Convert a point cloud to a scene of surfels, for example a scan of a real site.
 
-    A surfel lies where a principal component analysis of the 12 nearest points puts their plane,
-    and is about as large as the gaps between the points in both directions. Its front faces the
-    scanner, where the file has positions of scanners, or has the side of the file's normals.
+    Each surfel is fitted to the 12 nearest points by principal component analysis, and is about as
+    large as the gaps between the points in both directions. If the file contains scanner positions,
+    the front of a surfel faces the scanner. Otherwise, it faces the direction of the normals in the
+    file, if there are any.
 
-    A surfel has the mean color of its points, and as the name of its material the most frequent
-    of their classes, such as «class 2».
+    A surfel has the mean color of its points. The name of its material is the most frequent class
+    of its points, such as "class 2".
 
     Parameters
     ----------
     path
-        .ply, .pcd, text (.xyz, .txt, .asc, .csv), .pts, .ptx, .npy, .bin of KITTI or nuScenes, .las
-        or .laz, which need laspy, .e57, which needs pye57, or .parquet, which needs pyarrow. Scans
-        are joined by their poses. Z-up; .las and .laz in the units of their coordinate system, text
-        in the units of its header, others in meters.
+        Point cloud file. Supported formats are .ply, .pcd, text (.xyz, .txt, .asc, .csv), .pts,
+        .ptx, .npy, .bin of KITTI or nuScenes, .las and .laz (require laspy), .e57 (requires pye57)
+        and .parquet (requires pyarrow). If the file contains several scans, their poses are used to
+        merge them. The z axis points up. Coordinates in .las and .laz files have the units of their
+        coordinate system, and coordinates in text files have the units in their header. All other
+        files are in meters.
     voxel_m
-        Edge of cubes; the points of a cube become their mean. By default the median distance of
-        points to the eighth of their neighbors.
+        Edge length of voxels in meters. The points in a voxel are replaced by their mean. By
+        default, the edge length is the median distance between a point and its eighth neighbor.
     size
-        A factor of the surfels' sides: larger surfels close gaps, and reach farther beyond edges.
+        Scale factor for the surfels. Larger surfels close more gaps, but also extend farther beyond
+        edges.
     unit
-        Unit of x, y and z, in place of meters or of the units that a .las or .laz states.
+        Unit of x, y and z, which overrides the unit that the file states.
     epsg
-        Code of a projected system in true meters, such as the code of a UTM zone. Points are
-        brought to the system from the system that the file states; needs rasterio. Heights are
-        converted to meters and stay as in the file otherwise. By default coordinates are kept.
+        EPSG code of a projected coordinate system that preserves lengths in meters, such as a UTM
+        zone. Points are transformed to this system from the system that the file states, which
+        requires rasterio. Heights are only converted to meters. By default, coordinates are not
+        transformed.
     keep_noise
-        Whether points become surfaces that a file withholds or classifies as noise (class 7, in
-        point formats 6 to 10 of LAS also 18); by default they are left out.
+        Whether to include points that the file withholds or classifies as noise (class 7, and also
+        class 18 in LAS point formats 6 to 10).
     color
-        What colors surfels: red, green and blue, or mean intensities as grays. The 99th
-        percentile of intensities is white. By default red, green and blue if the file has them.
+        Source of the surfel colors: "rgb" for red, green and blue, or "intensity" for gray levels
+        from the mean intensities, where the 99th percentile is white. By default, red, green and
+        blue are used if the file contains them.
     tell
-        Called with a line on converted units, on points that are left out, and on what a scene does
-        not keep; by default this package's logger warns.
+        Function that is called with notes on converted units, skipped points and discarded data. By
+        default, the notes are logged as warnings.
 
     Returns
     -------
-    A scene of a single object, named by the file; each surfel is two triangles.
+    Scene
+        Scene with a single object, which is named after the file. Each surfel consists of two
+        triangles.
 
     Raises
     ------
     LidarError
-        If the file cannot be read, has fewer than 12 points, lacks what `color` names, has a
-        coordinate system without lengths or with lengths that are not true, as Web Mercator, cannot
-        be brought to `epsg`, or needs too much memory.
+        If the file cannot be read, has fewer than 12 points, lacks the quantity in `color`, cannot
+        be transformed to `epsg`, or requires too much memory, or if its coordinate system has no
+        lengths or distorts them, as Web Mercator does.
     """
     if unit is not None:
         check_choice("unit", unit, UNITS_M)
@@ -125,17 +134,17 @@ def scene_of_points(
 
 
 class PointScene(NamedTuple):
-    """A scene that was made of a point cloud.
+    """A scene that was created from a point cloud.
 
     Attributes
     ----------
     scene
         The scene, with the coordinate system of the cloud.
     voxel_m
-        Edge of the cubes whose points became a surfel, meters.
+        Edge length of the voxels in meters.
     loss
-        Share of returns that are expected to be lost in gaps between points (`expected_loss`), or
-        None if it cannot be estimated.
+        Share of returns that are expected to be lost in gaps between points (see `expected_loss`),
+        or None if it cannot be estimated.
     """
 
     scene: Scene
@@ -144,7 +153,7 @@ class PointScene(NamedTuple):
 
     @property
     def gap_note(self) -> str:
-        """A note on returns that are lost in gaps between points, or ""."""
+        """Note on returns that are lost in gaps between points, or an empty string."""
         larger_m = rounded(2 * self.voxel_m, 2)
         advice = f"To close gaps, increase `--voxel-m` (`voxel_m` in Python), such as to {larger_m}"
         if self.loss is None:
@@ -153,7 +162,7 @@ class PointScene(NamedTuple):
                 "because the scanner positions are unknown. In measurements, it was "
                 f"{_MEASURED_LOSS}. {advice}"
             )
-        if self.loss < _LEAST_LOSS:
+        if self.loss < _MIN_NOTED_LOSS:
             return ""
         return (
             f"scans from the same positions would lose about {self.loss:.0%} of the returns in "
@@ -172,13 +181,16 @@ def points_to_scene(
     color: str | None,
     tell: Callable[[str], None],
 ) -> PointScene:
-    """Make a scene of a point cloud as `scene_of_points`, and estimate what it loses."""
+    """Convert a point cloud to a scene, and estimate the share of lost returns.
+
+    The parameters are those of `scene_from_points`.
+    """
     for name, value in (("voxel_m", voxel_m), ("size", size)):
         if value is not None and not 0 < value < np.inf:
             raise LidarError(f"{name} must be a positive number, but is {value}.")
     points, placed_epsg = read_points(path, unit, tell, epsg=epsg, keep_noise=keep_noise)
-    points = _colored(path, points, color, tell)
-    surfels = _surfels_of(path, points, voxel_m, size)
+    points = _select_color(path, points, color, tell)
+    surfels = _compute_surfels(path, points, voxel_m, size)
     loss = None
     if (scanners := vectors(points, ORIGINS)) is not None:
         corners = surfels.mesh.vertices.reshape(-1, 4, 3)
@@ -187,22 +199,28 @@ def points_to_scene(
     return PointScene(scene, surfels.voxel_m, loss)
 
 
-def surfels(path: Path, points: Floats, voxel_m: float | None, size: float = 1.0) -> SceneMesh:
-    """Return the surfels of the points (n, 3) of a file."""
-    return _surfels_of(path, Sweep(points), voxel_m, size).mesh
+def surfel_mesh(path: Path, points: Floats, voxel_m: float | None, size: float = 1.0) -> SceneMesh:
+    """Return the surfels of points as a mesh.
+
+    `path` is the file of the points, which is used for the name of the mesh and in messages.
+    `points` has shape (n, 3).
+    """
+    return _compute_surfels(path, Sweep(points), voxel_m, size).mesh
 
 
 class _Surfels(NamedTuple):
-    """Surfels of points."""
+    """Surfels of a point cloud."""
 
     mesh: SceneMesh
-    voxel_m: float  # edge of the cubes whose points became a surfel, meters
+    voxel_m: float  # edge length of the voxels
 
 
-def _colored(path: Path, points: Sweep, color: str | None, tell: Callable[[str], None]) -> Sweep:
+def _select_color(
+    path: Path, points: Sweep, color: str | None, tell: Callable[[str], None]
+) -> Sweep:
     """Return points with either colors or intensities.
 
-    LidarError if the chosen quantity is missing.
+    Raise LidarError if the selected quantity is missing.
     """
     columns = dict(points.columns)
     present = {"rgb": "red" in columns, "intensity": "intensity" in columns}
@@ -232,7 +250,7 @@ def _colored(path: Path, points: Sweep, color: str | None, tell: Callable[[str],
 def _note_unknown(
     path: Path, quantity: str, unknown: Bools, outcome: str, tell: Callable[[str], None]
 ) -> None:
-    """Call `tell` if points (n,) lack a quantity that others have."""
+    """Call `tell` if some points lack a quantity. `unknown` has shape (n,)."""
     if count := int(unknown.sum()):
         tell(
             f"{path}: {count:,} of {plural(len(unknown), 'point')} have no {quantity}. Surfels of "
@@ -240,9 +258,9 @@ def _note_unknown(
         )
 
 
-def _surfels_of(path: Path, points: Sweep, voxel_m: float | None, size: float) -> _Surfels:
-    """Return the surfels of the points of a file, with their colors and classes."""
-    # Covariances of Open3D lose the digits of points far from zero.
+def _compute_surfels(path: Path, points: Sweep, voxel_m: float | None, size: float) -> _Surfels:
+    """Return the surfels of the points in a file, with their colors and classes."""
+    # Points are centered, because Open3D loses precision in covariances far from the origin.
     positions = points.points
     origin = np.round((positions.min(axis=0) + positions.max(axis=0)) / 2)
     positions = positions - origin
@@ -250,7 +268,7 @@ def _surfels_of(path: Path, points: Sweep, voxel_m: float | None, size: float) -
     voxel_m = voxel_m or _spacing_m(o3d, positions)
     if not voxel_m:
         raise LidarError(f"Most points of {path} have the same positions. Set `voxel_m`.")
-    voxels = PointVoxels.of_points(path, positions, voxel_m)
+    voxels = PointVoxels.from_points(path, positions, voxel_m)
     count = len(voxels.counts)
     if count * POINT_BYTES > memory() // 2:
         raise LidarError(
@@ -266,7 +284,7 @@ def _surfels_of(path: Path, points: Sweep, voxel_m: float | None, size: float) -
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(voxels.means(positions)))
     cloud.estimate_covariances(o3d.geometry.KDTreeSearchParamKNN(_NEIGHBORS))
     outward = _outward(points)
-    outward = None if outward is None else voxels.means(_directions(outward))
+    outward = None if outward is None else voxels.means(_normalize(outward))
     corners = _surfel_corners(
         np.asarray(cloud.points), np.asarray(cloud.covariances), voxel_m, size, outward
     )
@@ -281,27 +299,27 @@ def _surfels_of(path: Path, points: Sweep, voxel_m: float | None, size: float) -
 
 
 def surfel_faces(count: int) -> Ints:
-    """Return the triangles (2 · count, 3) of surfels with four vertices each, in order."""
+    """Return the triangles of surfels that have four consecutive vertices each.
+
+    The result has shape (2 * count, 3).
+    """
     faces: Ints = 4 * np.arange(count)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
     return faces.reshape(-1, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class PointVoxels:
-    """Points sorted by the voxels that contain the points.
+    """Assignment of points to voxels. Only voxels that contain points are stored."""
 
-    Only voxels with points are counted.
-    """
-
-    order: Ints  # (n,): indices of the points, voxel by voxel
-    starts: Ints  # (v,): where the points of each voxel start in `order`
-    counts: Ints  # (v,): number of points in each voxel
+    order: Ints  # (n,), indices of the points, sorted by voxel
+    starts: Ints  # (v,), index of the first point of each voxel in `order`
+    counts: Ints  # (v,), number of points in each voxel
 
     @classmethod
-    def of_points(cls, path: Path, positions: Floats, voxel_m: float) -> PointVoxels:
-        """Sort the points (n, 3) of a file into voxels.
+    def from_points(cls, path: Path, positions: Floats, voxel_m: float) -> PointVoxels:
+        """Assign the points in a file to voxels. `positions` has shape (n, 3).
 
-        LidarError if there are too many voxels.
+        Raise LidarError if there are too many voxels.
         """
         lower = positions.min(axis=0)
         spans = (positions.max(axis=0) - lower) / voxel_m + 1
@@ -309,7 +327,7 @@ class PointVoxels:
             raise LidarError(
                 f"{path} is too large for voxels of {voxel_m:.3g} m. Increase `voxel_m`."
             )
-        # The first voxel has the lowest point in its middle.
+        # The minimum x, y and z are at the center of the first voxel.
         cells = np.floor((positions - lower) / voxel_m + 0.5).astype(np.int64)
         _, ny, nz = (int(span) + 1 for span in spans)
         numbers = (cells[:, 0] * ny + cells[:, 1]) * nz + cells[:, 2]
@@ -319,22 +337,26 @@ class PointVoxels:
         return cls(order, starts, np.diff(starts, append=len(order)))
 
     def means(self, values: AnyArray) -> Floats:
-        """Return the means (v, k) in each voxel of values (n, k) of the points."""
+        """Return the mean value in each voxel. `values` has shape (n, k), and the result (v, k)."""
         sums = np.add.reduceat(values[self.order].astype(np.float64), self.starts, axis=0)
         means: Floats = sums / self.counts[:, None]
         return means
 
     def known_means(self, values: AnyArray) -> Floats:
-        """Return the means (v, k) in each voxel of the values (n, k) that are not NaN, or NaN."""
+        """Return the mean value in each voxel, ignoring NaN.
+
+        `values` has shape (n, k), and the result (v, k). The mean is NaN if all values are NaN.
+        """
         known = ~np.isnan(values)
-        with np.errstate(invalid="ignore"):  # 0 / 0 of voxels without values
+        with np.errstate(invalid="ignore"):  # 0 / 0 in voxels without values
             return self.means(np.where(known, values, 0.0)) / self.means(known)
 
     def most_frequent(self, numbers: Ints, distinct: int, unknown: int | None = None) -> Ints:
-        """Return the most frequent number (v,) in each voxel, of several the lowest.
+        """Return the most frequent number in each voxel. Shape (v,).
 
-        `numbers` (n,) of the points are from 0 to below `distinct`. The number `unknown` is
-        returned only for voxels that have no other.
+        Ties are resolved in favor of the lowest number. `numbers` has shape (n,) and contains
+        integers from 0 to `distinct` - 1. The number `unknown` is returned only if a voxel contains
+        no other number.
         """
         voxel = np.repeat(np.arange(len(self.counts)), self.counts)
         pairs, repeats = np.unique(voxel * distinct + numbers[self.order], return_counts=True)
@@ -347,29 +369,32 @@ class PointVoxels:
 
 
 def _outward(points: Sweep) -> Floats | None:
-    """Return vectors (n, 3) to the scanner, otherwise normals, or None if neither is known.
+    """Return vectors from the points to the scanner, or else the normals.
 
-    Points whose scanner has an unknown position have a zero vector.
+    Return None if neither is known. If the scanner position of a point is unknown, its vector is
+    zero. The result has shape (n, 3).
     """
     scanners = vectors(points, ORIGINS)
     return vectors(points, NORMALS) if scanners is None else np.nan_to_num(scanners - points.points)
 
 
-def _directions(outward: Floats) -> Floats:
-    """Return the directions of vectors (n, 3), of length 1 or, of zero vectors, 0."""
+def _normalize(outward: Floats) -> Floats:
+    """Scale vectors to length 1. Zero vectors are not changed. Shape (n, 3)."""
     lengths = np.sqrt((outward * outward).sum(axis=1, keepdims=True))
     return np.divide(outward, lengths, out=np.zeros_like(outward), where=lengths > 0)
 
 
 def _surfel_colors(o3d: Any, points: Sweep, voxels: PointVoxels, centers: Floats) -> Colors | None:
-    """Return the mean colors of surfels in linear light, or grays of their mean intensities.
+    """Return the colors of surfels from the mean colors or intensities of their points.
 
-    `centers` (v, 3) are the centers of the surfels. A surfel whose points have neither has the mean
-    of its neighbors, or, if these have neither, the gray of a file without colors.
+    Colors are averaged in linear light. A surfel without a color has the mean color of its
+    neighbors, or the default gray if they have no color either. Return None if the points have
+    neither colors nor intensities. `centers` contains the centers of the surfels and has shape
+    (v, 3).
     """
     light: Floats
     if (srgb := vectors(points, COLORS)) is not None:
-        light = voxels.known_means(_light(srgb))
+        light = voxels.known_means(_to_linear(srgb))
     elif (strengths := points.intensity) is not None:
         white = np.nanquantile(strengths, _WHITE_QUANTILE)
         intensities = voxels.known_means(strengths[:, None])
@@ -382,7 +407,10 @@ def _surfel_colors(o3d: Any, points: Sweep, voxels: PointVoxels, centers: Floats
 
 
 def _fill_from_neighbors(o3d: Any, light: Floats, centers: Floats) -> None:
-    """Replace NaN in the light (v, 3) of surfels by the mean of the neighbors that have light."""
+    """Replace NaN in `light` by the mean of the neighboring surfels whose light is known.
+
+    `light` and `centers` have shape (v, 3). `light` is modified in place.
+    """
     unknown = np.flatnonzero(np.isnan(light[:, 0]))
     if not 0 < len(unknown) < len(light):
         return
@@ -391,27 +419,27 @@ def _fill_from_neighbors(o3d: Any, light: Floats, centers: Floats) -> None:
     neighbors, _ = tree.knn_search(o3d.core.Tensor(centers[unknown]), _NEIGHBORS)
     around = light[neighbors.numpy()]
     known = ~np.isnan(around)
-    with np.errstate(invalid="ignore"):  # 0 / 0 of surfels without such neighbors
+    with np.errstate(invalid="ignore"):  # 0 / 0 for surfels without such neighbors
         light[unknown] = np.where(known, around, 0.0).sum(axis=1) / known.sum(axis=1)
 
 
-def _light(colors: AnyArray) -> Floats:
-    """Return the linear light (n, 3) of sRGB colors from 0 to 255, NaN of NaN."""
+def _to_linear(colors: AnyArray) -> Floats:
+    """Convert sRGB colors from 0 to 255 to linear light. NaN is preserved. Shape (n, 3)."""
     known = np.isfinite(colors)
     light = LINEAR[np.where(known, colors, 0).astype(np.uint8)]
     return np.where(known, light, np.nan)
 
 
 def surfel_materials(point_classes: Ints | None, voxels: PointVoxels) -> FaceMaterials | None:
-    """Return the most frequent classes of surfels as names of materials, such as «class 2».
+    """Return the most frequent class of each surfel as a material name, such as "class 2".
 
-    `point_classes` (n,) are the classes of the points, `NO_CLASS` for points without a class, or
-    None if they are unknown.
+    `point_classes` contains the classes of the points, which are `NO_CLASS` for points without a
+    class. Its shape is (n,). If it is None, return None.
     """
     if point_classes is None:
         return None
     classes, numbers = np.unique(point_classes, return_inverse=True)
-    unknown = 0 if classes[0] == NO_CLASS else None  # the lowest of all classes
+    unknown = 0 if classes[0] == NO_CLASS else None  # `NO_CLASS` is lower than all classes
     modes = voxels.most_frequent(numbers, len(classes), unknown)
     present, rows = np.unique(modes, return_inverse=True)
     names = tuple(
@@ -424,7 +452,10 @@ def surfel_materials(point_classes: Ints | None, voxels: PointVoxels) -> FaceMat
 def _surfel_corners(
     points: Floats, covariances: Floats, voxel_m: float, size: float, outward: Floats | None
 ) -> Floats:
-    """Return the corners (n, 4, 3) of surfels, counter-clockwise seen from `outward` (n, 3)."""
+    """Return the corners of surfels, counterclockwise as seen from the direction of `outward`.
+
+    `outward` has shape (n, 3), and the result has shape (n, 4, 3).
+    """
     corners = np.empty((len(points), 4, 3))
     for start in range(0, len(points), 1 << 18):
         block = slice(start, start + (1 << 18))
@@ -442,7 +473,7 @@ def _surfel_corners(
 
 
 def _spacing_m(o3d: Any, points: Floats) -> float:
-    """Return the median distance of points to the eighth of their neighbors."""
+    """Return the median distance between a point and its eighth neighbor."""
     tree = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(points))
     tree.knn_index()
     sampled = points[:: -(-len(points) // _SAMPLE)]

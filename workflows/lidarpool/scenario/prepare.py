@@ -1,4 +1,8 @@
-"""Prepares a scenario: reads its files, and makes a job of its scene, survey and planning."""
+"""Conversion of scenarios to jobs.
+
+Preparing a scenario means reading its files, and creating a job with its scene, survey and
+planning.
+"""
 
 from __future__ import annotations
 
@@ -29,61 +33,61 @@ from ..clouds.writing import with_format_columns
 from ..plan import Planning
 from ..plan.planning import Search
 from .actor_motion import ActorSection, MountSection
-from .default_poses import Placing, place_sensor
+from .default_poses import SensorPlacement, place_sensor
 from .georeference import check_epsg
-from .ground import StandingSurfaces
+from .ground import SupportSurfaces
 from .job import Job
 from .osi_traffic import OSI_SUFFIXES, read_osi
 from .scenario import Scenario
 from .sections import CopiesSection, SensorSection
-from .static_scene import Findings, SceneCache, Shapes, StaticScene, read_static_scene
+from .static_scene import FileFindings, SceneCache, ShapeLoader, StaticScene, read_static_scene
 from .traffic import (
     TrafficContent,
     TrafficSection,
-    TravellerChoice,
+    TravelerFilter,
     VehicleSection,
-    actors_of,
-    carrier_of,
+    build_traffic_actors,
+    platform_track,
     read_fcd,
 )
 
 _log = logging.getLogger(__name__)
 
-# Objects lower than this are floors and markings, which a path may cross.
+# Objects below this height, such as floors and markings, are not obstacles.
 FLAT_M = 0.2
 
-# Default poses of the sensor among the objects of the demo, world meters.
+# Default poses of the sensor in the scene of the demo, in world coordinates.
 SEED_POSES = tuple(Pose((0.0, 0.0, height)) for height in (1.0, 2.0, 3.0))
 
-# Class of buildings by ASPRS LAS: sensors are not placed inside objects of this class.
+# ASPRS LAS classes that affect default poses.
 BUILDING = 6
 ROAD_SURFACE = 11
 
-# Precision of points in scenarios, if no sensor states a resolution.
+# Default precision of points if no sensor specifies a resolution.
 MESH_PRECISION_M = 0.001
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared:
-    """A scenario whose files were read and checked.
+class PreparedScenario:
+    """A scenario whose files have been read and validated.
 
     Attributes
     ----------
     scenario
         The scenario.
     job
-        Scene, survey and planning of the scenario. The scene is where `world.origin` places it.
-    placing
-        Poses that `place_sensor` chose in a scene of mesh files; None if the scenario gives poses
-        or a trajectory, or has the objects of the demo.
+        Scene, survey and planning of the scenario. `world.origin` has been added to the scene.
+    placement
+        Default poses that `place_sensor` chose. It is None if the scenario defines poses or a
+        trajectory, or contains the objects of the demo.
     findings
         Notes about the files, and descriptions of their content.
     """
 
     scenario: Scenario
     job: Job
-    placing: Placing | None
-    findings: Findings
+    placement: SensorPlacement | None
+    findings: FileFindings
 
     @property
     def scene(self) -> Scene:
@@ -103,8 +107,8 @@ def prepare(
     cache: SceneCache | None = None,
     columns: Sequence[str] = (),
     **fields: Any,
-) -> Prepared:
-    """Read the files of a scenario, and make a job of its scene, survey and planning.
+) -> PreparedScenario:
+    """Read the files of a scenario, and create a job from its scene, survey and planning.
 
     Parameters
     ----------
@@ -113,18 +117,18 @@ def prepare(
     plans
         Whether the job includes the planning of the scenario.
     cache
-        Static scenes of other scenarios, which this scenario may share.
+        Cache of static scenes that this scenario may share with other scenarios.
     columns
-        Names of columns that the cloud gets in addition to the columns of the scenario.
+        Names of columns to add to the cloud.
     **fields
-        Further fields of the job, such as `name`.
+        Additional fields of the job, such as `name`.
 
     Raises
     ------
     LidarError
-        If a file cannot be read, or fields contradict each other or the scene.
+        If a file cannot be read, or if fields contradict each other or the scene.
     """
-    with scenario.naming_lost_files():
+    with scenario.explain_missing_files():
         _check_sensors(scenario)
         static = read_static_scene(scenario) if cache is None else cache.find(scenario)
         return _prepare(scenario, static, plans, columns, fields)
@@ -136,15 +140,15 @@ def _prepare(
     plans: bool,
     columns: Sequence[str],
     fields: Mapping[str, Any],
-) -> Prepared:
-    """Prepare a scenario whose static scene was read."""
+) -> PreparedScenario:
+    """Prepare a scenario whose static scene has been read."""
     findings = static.findings.copy()
-    shapes = Shapes(scenario, findings)
+    shapes = ShapeLoader(scenario, findings)
     survey_parts = _survey_parts(shapes, static)
     track_or_poses = survey_parts.track_or_poses
     track = track_or_poses if isinstance(track_or_poses, Track) else None
-    actors = _build_actors(shapes, static.standing, track)
-    vehicles = _build_traffic(survey_parts, shapes, static.standing)
+    actors = _build_actors(shapes, static.support, track)
+    vehicles = _build_traffic(survey_parts, shapes, static.support)
     scene = static.scene
     if actors or vehicles:
         scene = scene.with_actors([*scene.actors, *actors, *(actor for actor, _ in vehicles)])
@@ -159,49 +163,50 @@ def _prepare(
             scene=scene.georeferenced(scenario.world.origin),
             survey=_build_survey(survey_parts, materials, columns),
             planning=planning,
-            # Results always have a PLY.
+            # PLY files are always written.
             outputs=tuple(entry for entry in scenario.output.write if entry.format != "ply"),
             **fields,
         )
     mistakes.tell()
-    return Prepared(scenario, job, survey_parts.placing, findings)
+    return PreparedScenario(scenario, job, survey_parts.placement, findings)
 
 
 class _SurveyParts(NamedTuple):
-    """Parts of a survey that are known before the materials are."""
+    """Parts of a survey that do not depend on the materials."""
 
     scenario: Scenario
-    findings: Findings
+    findings: FileFindings
     sensors: Sequence[Mounted]
-    # Trajectory of the carrier, local; or poses, world: the scenario's, else default poses.
+    # Trajectory of the platform in local coordinates, or poses in world coordinates. Default poses
+    # are used if the scenario defines neither.
     track_or_poses: Track | Sequence[Pose]
-    origin: Floats  # (3,), of the scene, world meters
-    epsg: int | None  # EPSG code of the rasters' coordinate system
-    placing: Placing | None  # the choice of default poses
+    origin: Floats  # (3,), scene origin in world coordinates, meters
+    epsg: int | None  # EPSG code that the files of the scene state
+    placement: SensorPlacement | None  # default poses, if they are used
 
 
-def _survey_parts(shapes: Shapes, static: StaticScene) -> _SurveyParts:
-    """Return the sensors of a scenario and their poses, which may be chosen."""
+def _survey_parts(shapes: ShapeLoader, static: StaticScene) -> _SurveyParts:
+    """Return the sensors of a scenario, and their trajectory, poses or default poses."""
     scenario = shapes.scenario
     scene = static.scene
     findings = shapes.findings
     epsg = _common_epsg(scenario, findings)
-    with prefixed(scenario.source):  # errors begin with the scenario's name
-        if scenario.world.epsg is not None:  # before files of moving objects are read
+    with prefixed(scenario.source):
+        if scenario.world.epsg is not None:  # fail before files of moving objects are read
             check_epsg(scenario.world.epsg, scene.georeferenced(scenario.world.origin))
-        track = _carrier_track(shapes, static.standing)
+        track = _platform_track(shapes, static.support)
         sensors = _mounted_sensors(shapes)
-    placing: Placing | None = None
+    placement: SensorPlacement | None = None
     if scenario.poses is None and track is None and not scenario.scene.has_seed:
-        placing = _placing(scenario, scene, findings, sensors[0])
-        if placing.grid:  # no sensor is given, and the scene is a single object
-            sensors = [replace(sensors[0], sensor=Sensor.grid(**placing.grid))]
-    track_or_poses = track or scenario.poses or (placing.poses if placing else SEED_POSES)
-    return _SurveyParts(scenario, findings, sensors, track_or_poses, scene.origin, epsg, placing)
+        placement = _place_sensor(scenario, scene, findings, sensors[0])
+        if placement.grid:  # no sensor is set, and the scene is a single object
+            sensors = [replace(sensors[0], sensor=Sensor.grid(**placement.grid))]
+    track_or_poses = track or scenario.poses or (placement.poses if placement else SEED_POSES)
+    return _SurveyParts(scenario, findings, sensors, track_or_poses, scene.origin, epsg, placement)
 
 
-def _carrier_track(shapes: Shapes, standing: StandingSurfaces) -> Track | None:
-    """Return the trajectory of the carrier in local coordinates, or None without a trajectory."""
+def _platform_track(shapes: ShapeLoader, support: SupportSurfaces) -> Track | None:
+    """Return the trajectory of the platform in local coordinates, or None if there is none."""
     scenario = shapes.scenario
     entry = scenario.trajectory
     if entry is None:
@@ -209,72 +214,73 @@ def _carrier_track(shapes: Shapes, standing: StandingSurfaces) -> Track | None:
     if entry.vehicle is None:
         return entry.track(
             scenario.path,
-            standing,
+            support,
             name="the platform",
             without_angles=shapes.findings.without_angles,
         )
     section = scenario.traffic
-    assert section is not None, "checked with the scenario"
-    content = _traffic_content(scenario, -np.inf, np.inf, TravellerChoice(only=entry.vehicle))
-    return carrier_of(entry, section, content, shapes.mesh_of, standing)
+    assert section is not None, "guaranteed by the validation of the scenario"
+    content = _read_traffic(scenario, -np.inf, np.inf, TravelerFilter(only=entry.vehicle))
+    return platform_track(entry, section, content, shapes.load_mesh, support)
 
 
-def _traffic_content(
-    scenario: Scenario, first_s: float, last_s: float, choice: TravellerChoice
+def _read_traffic(
+    scenario: Scenario, first_s: float, last_s: float, travelers: TravelerFilter
 ) -> TrafficContent:
-    """Read the traffic of a scenario between two times, by the clock of its file."""
+    """Read the traffic of a scenario between two times, which refer to the clock of the file."""
     section = scenario.traffic
     assert section is not None
     file = scenario.path(section.file)
     if file.suffix.lower() in OSI_SUFFIXES:
-        return read_osi(file, section, first_s, last_s, choice)
-    return read_fcd(file, section, first_s, last_s, choice)
+        return read_osi(file, section, first_s, last_s, travelers)
+    return read_fcd(file, section, first_s, last_s, travelers)
 
 
-def _placing(scenario: Scenario, scene: Scene, findings: Findings, sensor: Mounted) -> Placing:
-    """Choose poses for a scenario of mesh files that gives neither poses nor a trajectory.
+def _place_sensor(
+    scenario: Scenario, scene: Scene, findings: FileFindings, sensor: Mounted
+) -> SensorPlacement:
+    """Choose poses for a scenario that defines neither poses nor a trajectory.
 
-    Scenes with rasters or networks of roads are landscapes. If the scenario states no field of the
-    sensor, and the scene looks like a single object, the sensor becomes a grid as wide as the
-    object.
+    Scenes with rasters or road networks are landscapes. If the scenario does not specify the
+    sensor, and the scene is a single object, the sensor is a grid that is as wide as the object.
     """
     is_unmounted = scenario.mount is None and not scenario.sensors
     return place_sensor(
         scene,
         sensor,
         landscape=bool(findings.landscapes),
-        buildings=findings.named(BUILDING),
-        roads=findings.named(ROAD_SURFACE),
+        buildings=findings.class_patterns(BUILDING),
+        roads=findings.class_patterns(ROAD_SURFACE),
         narrow=is_unmounted and scenario.sensor.model_fields_set <= {"unseen"},
     )
 
 
 def _build_traffic(
-    survey_parts: _SurveyParts, shapes: Shapes, standing: StandingSurfaces
+    survey_parts: _SurveyParts, shapes: ShapeLoader, support: SupportSurfaces
 ) -> list[tuple[Actor, VehicleSection]]:
-    """Build the actors of the traffic that are present during the survey.
+    """Build the actors of the traffic during the survey.
 
-    Each actor comes with the entry of `traffic.vehicles` that gives its shape; the list is empty
-    without traffic.
+    Each actor is returned with the entry that defines its shape. The list is empty if the scenario
+    has no traffic.
     """
     scenario = survey_parts.scenario
     if scenario.traffic is None:
         return []
     with prefixed(scenario.source):
-        duration_s = (
-            _build_survey(survey_parts, []).duration_ns / 1e9
-        )  # materials do not matter for it
+        # The duration does not depend on the materials.
+        duration_s = _build_survey(survey_parts, []).duration_ns / 1e9
         track_or_poses = survey_parts.track_or_poses
-        # of the survey, by the clock of the carrier's trajectory
+        # The start of the survey refers to the clock of the platform's trajectory.
         start_s = track_or_poses.start_s or 0.0 if isinstance(track_or_poses, Track) else 0.0
-        return _traffic_actors(scenario.traffic, shapes, standing, start_s, duration_s)
+        return _traffic_actors(scenario.traffic, shapes, support, start_s, duration_s)
 
 
-def _common_epsg(scenario: Scenario, findings: Findings) -> int | None:
+def _common_epsg(scenario: Scenario, findings: FileFindings) -> int | None:
     """Return the EPSG code that the files of a scene state, or None.
 
-    LidarError if the coordinate systems of these files differ, or `world.origin` would move them.
-    A file that states another system than `world.epsg` gets a note, unless it is transformed.
+    Return None if `world.epsg` is set. In this case, add a note for each file that states a
+    different system and is not transformed. Raise LidarError if the files have different coordinate
+    systems, or if `world.origin` would move them.
     """
     systems = {system.crs: system for system in findings.systems}
     x, y, _ = scenario.world.origin
@@ -305,9 +311,10 @@ def _common_epsg(scenario: Scenario, findings: Findings) -> int | None:
 
 
 def _check_sensors(scenario: Scenario) -> None:
-    """Check that the models and calibrations of sensors can be read, before the scene is.
+    """Raise LidarError if the model or calibration of a sensor cannot be read.
 
-    The scene may take minutes. Sensors are read once.
+    This is checked before the scene is read, which may take minutes. Sensors are cached, so they
+    are not read again.
     """
     sections: Mapping[str, SensorSection] = scenario.sensors or {"": scenario.sensor}
     with prefixed(scenario.source):
@@ -315,8 +322,7 @@ def _check_sensors(scenario: Scenario) -> None:
             section.mounted(scenario.path, CENTER, scenario.noise, scenario.returns, name)
 
 
-def _mounted_sensors(shapes: Shapes) -> list[Mounted]:
-    """Return the mounted sensors of a scenario."""
+def _mounted_sensors(shapes: ShapeLoader) -> list[Mounted]:
     scenario = shapes.scenario
     sections: Mapping[str, SensorSection] = scenario.sensors or {"": scenario.sensor}
     path = scenario.path
@@ -328,30 +334,30 @@ def _mounted_sensors(shapes: Shapes) -> list[Mounted]:
     ]
 
 
-def _mount_pose(section: SensorSection, shapes: Shapes) -> Pose:
-    """Return the pose of a sensor in the carrier frame.
+def _mount_pose(section: SensorSection, shapes: ShapeLoader) -> Pose:
+    """Return the pose of a sensor in the platform frame.
 
-    A mount with a link is relative to that link of a robot on the carrier; LidarError if no robot
-    or several have the link, or joints move the link.
+    If the mount has a link, its pose is relative to that link of a robot on the platform. Raise
+    LidarError if the link is not a link of exactly one robot, or if joints move it.
     """
     scenario = shapes.scenario
     mount: MountSection | None = getattr(section, "mount", scenario.mount)
     if mount is None or mount.link is None:
         return CENTER if mount is None else mount.pose()
-    carriers = [
-        (entry, shapes.robot(entry.robot))
+    robots = [
+        (entry, shapes.load_robot(entry.robot))
         for entry in scenario.actors
-        if entry.is_carrier and entry.robot
+        if entry.is_platform and entry.robot
     ]
-    matching_carriers = [(entry, robot) for entry, robot in carriers if mount.link in robot.links]
-    if len(matching_carriers) != 1:
-        links = [link for _, robot in carriers for link in robot.links]
+    matching_robots = [(entry, robot) for entry, robot in robots if mount.link in robot.links]
+    if len(matching_robots) != 1:
+        links = [link for _, robot in robots for link in robot.links]
         raise LidarError(
             "`mount.link` must be a link of exactly one robot on the platform, but "
-            f"{plural(len(matching_carriers), 'robot has', 'robots have')} a link "
+            f"{plural(len(matching_robots), 'robot has', 'robots have')} a link "
             f"{mount.link!r}.{name_hint(mount.link, links)}"
         )
-    ((entry, robot),) = matching_carriers
+    ((entry, robot),) = matching_robots
     with prefixed(f"actor {entry.name!r}"):
         path = robot.path(mount.link, **_joint_arguments(entry, scenario))
     if path.moves:
@@ -364,7 +370,7 @@ def _mount_pose(section: SensorSection, shapes: Shapes) -> Pose:
 
 
 def _joint_arguments(entry: ActorSection, scenario: Scenario) -> dict[str, Any]:
-    """Return the arguments of `Robot.path` and `Robot.actors` for an actor's table of joints."""
+    """Return the arguments of `Robot.path` and `Robot.actors` for the joint table of an actor."""
     if entry.joints is None:
         return {}
     return {
@@ -374,37 +380,42 @@ def _joint_arguments(entry: ActorSection, scenario: Scenario) -> dict[str, Any]:
     }
 
 
-def _build_actors(shapes: Shapes, standing: StandingSurfaces, track: Track | None) -> list[Actor]:
+def _build_actors(
+    shapes: ShapeLoader, support: SupportSurfaces, track: Track | None
+) -> list[Actor]:
     """Build the actors of a scenario, without traffic.
 
-    `track` is the trajectory of the carrier, or None. Trajectories start at the survey's start; an
-    actor with neither trajectory nor pose is the carrier, and follows `track`.
+    `track` is the trajectory of the platform, or None. It is also the trajectory of actors that
+    have neither a trajectory nor a pose. All trajectories start at the start of the survey.
     """
     scenario = shapes.scenario
     actors = list[Actor]()
     with prefixed(scenario.source):
         without_angles = shapes.findings.without_angles
         trajectories = [
-            entry.track(scenario.path, standing, track, without_angles) for entry in scenario.actors
+            entry.track(scenario.path, support, track, without_angles) for entry in scenario.actors
         ]
     for entry, trajectory in zip(scenario.actors, trajectories, strict=True):
         if entry.robot:
             with prefixed(f"{scenario.source}: actor {entry.name!r}"):
-                actors += _robot_actors(entry, shapes.robot(entry.robot), trajectory, shapes)
+                actors += _robot_actors(entry, shapes.load_robot(entry.robot), trajectory, shapes)
         else:
             offset_s = 0.0 if entry.animation is None else entry.animation.offset_s
-            mesh = replace(shapes.mesh_of(entry), name=entry.name)
+            mesh = replace(shapes.load_mesh(entry), name=entry.name)
             actors.append(Actor(mesh, trajectory, offset_s, entry.spray))
     return actors
 
 
 def _robot_actors(
-    entry: ActorSection, robot: Robot, trajectory: Track, shapes: Shapes
+    entry: ActorSection, robot: Robot, trajectory: Track, shapes: ShapeLoader
 ) -> Sequence[Actor]:
-    """Return the actors of a robot, one per link, without the links that sensors are mounted on."""
+    """Return the actors of a robot, one per link.
+
+    If the robot is on the platform, links on which sensors are mounted are omitted.
+    """
     add_note = shapes.findings.notes.append
-    links = shapes.scenario.links
-    sensor_links = links.intersection(robot.meshes) if entry.is_carrier else ()
+    links = shapes.scenario.mount_links
+    sensor_links = links.intersection(robot.meshes) if entry.is_platform else ()
     for link in sorted(sensor_links):
         add_note(
             f"link {link} of {entry.name} is not part of the scene, because a sensor is mounted "
@@ -416,25 +427,25 @@ def _robot_actors(
 
 def _traffic_actors(
     section: TrafficSection,
-    shapes: Shapes,
-    standing: StandingSurfaces,
+    shapes: ShapeLoader,
+    support: SupportSurfaces,
     start_s: float,
     duration_s: float,
 ) -> list[tuple[Actor, VehicleSection]]:
-    """Return the vehicles and persons present during the survey, each with its entry.
+    """Return the vehicles and persons in the traffic during the survey, with their entries.
 
-    `start_s` and `duration_s` are start and duration of the survey, in seconds by the clock of the
-    carrier's trajectory.
+    `start_s` and `duration_s` are the start and duration of the survey in seconds. The start refers
+    to the clock of the platform's trajectory.
     """
     file_start_s = start_s - section.offset_s
     findings = shapes.findings
     scenario = shapes.scenario
     file_stop_s = file_start_s + duration_s
-    carrier = None if scenario.trajectory is None else scenario.trajectory.vehicle
-    choice = TravellerChoice(without=carrier)
-    content = _traffic_content(scenario, file_start_s, file_stop_s, choice)
+    platform = None if scenario.trajectory is None else scenario.trajectory.vehicle
+    travelers = TravelerFilter(without=platform)
+    content = _read_traffic(scenario, file_start_s, file_stop_s, travelers)
     findings.notes += content.notes
-    actors = actors_of(section, content.passages, shapes.mesh_of, standing, start_s)
+    actors = build_traffic_actors(section, content.passages, shapes.load_mesh, support, start_s)
     if not actors:
         findings.notes.append(
             f"{section.file} has no vehicle or person in the scene from {file_start_s:g} to "
@@ -448,15 +459,15 @@ def _traffic_actors(
 
 def _materials(
     scenario: Scenario,
-    findings: Findings,
+    findings: FileFindings,
     scene: Scene,
     vehicles: Sequence[tuple[Actor, VehicleSection]],
 ) -> list[Material]:
-    """Return the scenario's materials, with further entries for the classes of objects.
+    """Return the materials of a scenario, with additional entries for the classes of objects.
 
-    Classes of actors, copies and traffic come from the scenario; classes of other objects come from
-    files. `vehicles` are the last actors of the scene, with their entries of the traffic. Rows of
-    objects are indices into `scene.object_names`.
+    The classes of actors, copies and traffic are set in the scenario, and the classes of other
+    objects are read from files. `vehicles` contains the last actors of the scene, with their
+    entries in `traffic.vehicles`.
     """
     vehicle_classes = [entry.semantic_class for _, entry in vehicles]
     default_material = Material("*")
@@ -467,7 +478,7 @@ def _materials(
         materials = [default_material]
     for classed_object in classed:
         materials = _with_object_class(materials, classed_object, kinds)
-    first_vehicle_row = len(scene.object_names) - len(vehicles)
+    first_vehicle_row = len(scene.object_names) - len(vehicles)  # index into `scene.object_names`
     for semantic_class in sorted({number for number in vehicle_classes if number is not None}):
         vehicle_rows = np.array(
             [
@@ -478,30 +489,32 @@ def _materials(
         )
         materials = with_class(materials or [default_material], semantic_class, vehicle_rows, kinds)
     if findings.classes:
-        class_patterns = {number: findings.named(number) for number in findings.class_names}
+        class_patterns = {
+            number: findings.class_patterns(number) for number in findings.class_names
+        }
         materials = with_classes(materials or [default_material], class_patterns, kinds)
     return materials
 
 
 class _ClassedObject(NamedTuple):
-    """An object whose entry of `scene.copies` or `actors` gives it a class."""
+    """An object with a class that is set in `scene.copies` or `actors`."""
 
-    name: str  # name of the entry, or of a robot's link
-    patterns: list[str]  # fit the names of the object and its numbered copies in the scene
+    name: str  # name of the entry or the robot link
+    patterns: list[str]  # match the names of the object and its numbered copies in the scene
     semantic_class: int
 
 
 def _classed_objects(scenario: Scenario, scene: Scene) -> list[_ClassedObject]:
-    """Return the objects whose entries of copies and actors give a class.
+    """Return the objects whose entries in `scene.copies` and `actors` set a class.
 
-    All copies of an entry are one such object; each link of a robot is a separate object.
+    All copies of an entry are treated as one object, and each link of a robot as a separate object.
     """
     classed: list[_ClassedObject] = []
-    for entry in scenario.placed:
+    for entry in scenario.object_entries:
         if entry.semantic_class is None:
             continue
         patterns = {entry.name: [escape(entry.name)]}
-        numbered = f"{escape(entry.name)}.[0-9]*"  # second and further copies: Tree.2
+        numbered = f"{escape(entry.name)}.[0-9]*"  # all copies except the first, such as Tree.2
         if isinstance(entry, CopiesSection) and len(rows_named(numbered, scene.names)):
             patterns[entry.name].append(numbered)
         elif isinstance(entry, ActorSection) and entry.robot:
@@ -516,10 +529,10 @@ def _classed_objects(scenario: Scenario, scene: Scene) -> list[_ClassedObject]:
 def _with_object_class(
     materials: Sequence[Material], classed: _ClassedObject, kinds: SurfaceKinds
 ) -> list[Material]:
-    """Return materials with the class of an object.
+    """Return materials that assign a class to an object.
 
-    Each entry that applies to the object is preceded by an entry with the same properties, for the
-    object alone, with the class.
+    Before each entry that applies to the object, an entry with the same properties and the class is
+    inserted, which only applies to the object.
     """
     object_rows = np.concatenate([rows_named(pattern, kinds.names) for pattern in classed.patterns])
     object_materials = {kinds.material[kind] for kind in kinds.of_rows(object_rows).tolist()}
@@ -529,8 +542,8 @@ def _with_object_class(
     }
     result: list[Material] = []
     for material in materials:
-        # The first entry for a face counts. An earlier entry for a single copy, such as Tree.7,
-        # does not apply to the object's name, and stays before the new entry: it still counts.
+        # The first matching entry applies to a face. An entry for a single copy, such as Tree.7,
+        # does not match the name of the object. It stays before the new entry and still applies.
         if material.named(classed.name, object_materials):
             result.append(replace(material, **changes))
         result.append(material)
@@ -544,8 +557,8 @@ def _build_survey(
 ) -> Survey:
     """Build the survey along a trajectory or at poses, in local coordinates.
 
-    `columns` are names of columns that the cloud gets beside the columns of the scenario and of
-    formats.
+    `columns` contains the names of columns to add to the cloud, besides those that the scenario and
+    the formats require.
     """
     scenario = survey_parts.scenario
     sensors = survey_parts.sensors
@@ -559,14 +572,14 @@ def _build_survey(
     track = track_or_poses if isinstance(track_or_poses, Track) else None
     poses = () if isinstance(track_or_poses, Track) else track_or_poses
     all_have_noise = all(mounted.noise is not None for mounted in sensors)
-    mounted_on_purpose = scenario.sensors or scenario.mount is not None or scenario.sensor.unseen
-    needs_no_mounting = not mounted_on_purpose and sensors[0].noise is None
+    is_mounted = scenario.sensors or scenario.mount is not None or scenario.sensor.unseen
+    is_plain_sensor = not is_mounted and sensors[0].noise is None
     survey = Survey(
         poses=[
             replace(p, position=tuple(np.subtract(p.position, survey_parts.origin))) for p in poses
         ],
         trajectory=track,
-        **({"sensor": sensors[0].sensor} if needs_no_mounting else {"sensors": sensors}),
+        **({"sensor": sensors[0].sensor} if is_plain_sensor else {"sensors": sensors}),
         steps=scenario.steps,
         materials=materials,
         classes=_class_names(survey_parts, materials, cloud["columns"]),
@@ -584,16 +597,17 @@ def _build_survey(
 def _class_names(
     survey_parts: _SurveyParts, materials: Sequence[Material], columns: Sequence[str]
 ) -> dict[int, str]:
-    """Return the names of the classes of a survey, {number: name}.
+    """Return the names of the classes of a survey, as a mapping from numbers to names.
 
-    Names come from `scenario.classes`, and from the classes that files give to objects, unless the
-    scenario uses the number or the name otherwise. `columns` are the columns of the cloud.
+    The names are taken from `scenario.classes`, and from the classes that files assign to objects,
+    unless the scenario uses the number or the name for a different class. `columns` are the columns
+    of the cloud.
     """
     scenario = survey_parts.scenario
-    entries = (*scenario.placed, *(scenario.traffic.vehicles if scenario.traffic else ()))
+    entries = (*scenario.object_entries, *(scenario.traffic.vehicles if scenario.traffic else ()))
     scenario_classes = {entry.semantic_class for entry in (*scenario.materials, *entries)}
     file_classes = {material.semantic_class for material in materials} - scenario_classes
-    numbers: dict[str, int] = {}  # {name of a class: number}
+    numbers: dict[str, int] = {}  # {class name: number}
     if scenario.classes or "class" in columns:
         numbers = {
             name: number
@@ -605,7 +619,10 @@ def _class_names(
 
 
 def _build_planning(scenario: Scenario, scene: Scene) -> Planning | None:
-    """Build the planning in local coordinates, or None if the scenario asks for no planning."""
+    """Build the planning in local coordinates. Return None if the scenario does not plan a path.
+
+    Raise LidarError if the start or target is inside an obstacle.
+    """
     section = scenario.planning
     x0, y0, _ = scene.origin
     start = section.start
@@ -632,10 +649,11 @@ def _build_planning(scenario: Scenario, scene: Scene) -> Planning | None:
 
 
 def _obstacle_discs(scenario: Scenario, scene: Scene) -> tuple[Floats, list[str]]:
-    """Return the obstacles as discs (m, 3) of x, y, radius, local, meters, and their labels (m,).
+    """Return the obstacles as discs, with their labels.
 
-    By default all static objects higher than `FLAT_M` are obstacles. `planning.clearance_m` is not
-    added to the radii.
+    Each row of the discs contains x, y and radius in local coordinates, in meters. The shape is
+    (m, 3). By default, all static objects that are at least `FLAT_M` high are obstacles. The radii
+    do not include `planning.clearance_m`.
     """
     if scenario.planning.obstacles is None:
         tall = np.flatnonzero(np.ptp(scene.object_bounds[..., 2], axis=1) >= FLAT_M)
@@ -643,11 +661,11 @@ def _obstacle_discs(scenario: Scenario, scene: Scene) -> tuple[Floats, list[str]
     discs: dict[str, list[float]] = {}  # {label: x, y, radius}
     for number, entry in enumerate(scenario.planning.obstacles):
         if entry.object is None:
-            assert entry.center and entry.radius_m, "either of the two kinds is given"
+            assert entry.center and entry.radius_m, "guaranteed by the validation of the obstacle"
             center = np.subtract(entry.center, scene.origin[:2])
             discs[f"planning.obstacles[{number}]"] = [*center, entry.radius_m]
             continue
-        # An exact name comes first, even with brackets; else the text is a pattern.
+        # Exact names, which may contain brackets, take precedence over patterns.
         matches = [i for i, name in enumerate(scene.names) if name == entry.object] or [
             i for i, name in enumerate(scene.names) if fnmatchcase(name, entry.object)
         ]

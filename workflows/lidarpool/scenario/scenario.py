@@ -1,4 +1,4 @@
-"""Scenario files: surveys as data, checked before a run."""
+"""Scenario files, which describe surveys and are validated before a run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from lidarsim.sensor.models import plugin_model_file
 from lidarsim.survey.faults import Fault
 from lidarsim.survey.survey import MAX_SENSORS, CloudOptions, StepCount
 
-from .actor_motion import ActorSection, CarriedEntry, MountEntry, TrajectoryEntry
+from .actor_motion import ActorSection, MountedSensorEntry, MountEntry, TrajectoryEntry
 from .sections import (
     CopiesSection,
     NoiseSection,
@@ -42,14 +42,14 @@ from .sections import (
     Section,
     SensorSection,
     WorldSection,
-    may_be_empty,
-    scene_in_short,
+    allow_empty,
+    allow_scene_short_form,
 )
 from .traffic import TrafficSection
 
-_NAMING_FILES = {"file", "calibration", "model", "times"}  # fields whose texts name files
+_FILE_FIELDS = {"file", "calibration", "model", "times"}  # fields that contain file names
 
-# Options of a mesh file without a scenario, and the fields of a scenario for them.
+# Options for simulating a mesh file without a scenario, and the corresponding scenario fields.
 MESH_OPTIONS = {
     "sensor": "sensor",
     "unit": "scene.files.unit",
@@ -61,10 +61,18 @@ MESH_OPTIONS = {
 
 
 def mesh_data(files: Sequence[Path], folder: Path, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the data that a scenario file of mesh files would have.
+    """Return the content of a scenario file for mesh files.
 
-    Names of files start from `folder`, the scenario's. `options` are {name in `MESH_OPTIONS`:
-    value}. Sections without an option are left out, and the scene without files.
+    Sections without an option are omitted, and the scene is omitted if there are no files.
+
+    Parameters
+    ----------
+    files
+        Paths of the mesh files.
+    folder
+        Folder of the scenario, to which file names are relative.
+    options
+        Mapping from names in `MESH_OPTIONS` to values.
     """
 
     def relative(file: str | Path) -> str:
@@ -85,9 +93,9 @@ def mesh_data(files: Sequence[Path], folder: Path, options: Mapping[str, Any]) -
 
 
 def _with_sensor(path: Path, data: Any, options: Mapping[str, Any]) -> Any:
-    """Return the data of a scenario file with another sensor.
+    """Return the content of a scenario file with a different sensor.
 
-    LidarError for other options.
+    Raise LidarError if there are options other than `sensor`.
     """
     is_campaign = isinstance(data, dict) and "base" in data
     if is_campaign or {*options} != {"sensor"}:
@@ -97,7 +105,7 @@ def _with_sensor(path: Path, data: Any, options: Mapping[str, Any]) -> Any:
             f"{'the base of ' * is_campaign}{path} instead."
         )
     if not isinstance(data, dict):
-        return data  # `from_data` says what is wrong
+        return data  # `from_data` reports the error
     if "sensors" in data:
         raise LidarError(
             f"`--sensor` requires a scenario with a single sensor. Change `sensors` in {path} "
@@ -106,16 +114,16 @@ def _with_sensor(path: Path, data: Any, options: Mapping[str, Any]) -> Any:
     return data | {"sensor": mesh_data([], path.parent, options)["sensor"]}
 
 
-def survey_of(mesh_file: Path) -> str:
-    """Return the name of the survey of a mesh file without a scenario, for messages."""
+def mesh_survey_name(mesh_file: Path) -> str:
+    """Return the survey name for messages if a mesh file is simulated without a scenario."""
     return f"survey of {mesh_file}"
 
 
 class Scenario(Section):
-    """A survey and its path planning, as described by a scenario file.
+    """A survey with optional path planning, as described by a scenario file.
 
-    Without arguments it has no scene, which a survey needs. `lidarpool.scenario.demo` has the
-    scenario of the demo.
+    A scenario that is created without arguments has no scene and cannot be simulated. See
+    `lidarpool.scenario.demo` for the scenario of the demo.
 
     Parameters
     ----------
@@ -123,22 +131,24 @@ class Scenario(Section):
     planning, pool
         See `lidarpool.scenario.sections`.
     poses
-        Poses of the sensor, in the coordinates of the scene. By default the sensor is at the origin
-        (objects of the demo), 1, 2 and 3 meters above the ground; in other scenes chosen by
-        `place_sensor`: in the middle of a room or landscape, or around an object.
-    steps, classes
-        Time steps from each pose, and names of semantic classes, {number: name}.
+        Poses of the sensor, in the coordinates of the scene. In the scene of the demo, the default
+        is 1, 2 and 3 m above the origin. In other scenes, `place_sensor` chooses poses at the
+        center of a room or landscape, or around an object.
+    steps
+        Number of time steps at each pose.
+    classes
+        Mapping from the numbers of semantic classes to their names.
 
     Raises
     ------
     pydantic.ValidationError
-        If a value is out of range; `load` and `from_data` raise LidarError.
+        If a value is invalid. `load` and `from_data` raise LidarError instead.
     """
 
-    scene: Annotated[SceneSection, scene_in_short] = SceneSection()
-    world: Annotated[WorldSection, may_be_empty(WorldSection)] = WorldSection()
+    scene: Annotated[SceneSection, allow_scene_short_form] = SceneSection()
+    world: Annotated[WorldSection, allow_empty(WorldSection)] = WorldSection()
     sensor: Annotated[
-        SensorSection, may_be_empty(SensorSection), by_text("model", SensorSection | None)
+        SensorSection, allow_empty(SensorSection), by_text("model", SensorSection | None)
     ] = SensorSection()
     poses: Annotated[
         Several[PoseEntry] | None,
@@ -160,13 +170,13 @@ class Scenario(Section):
         ),
     ] = None
     sensors: Annotated[
-        dict[Text, CarriedEntry],
+        dict[Text, MountedSensorEntry],
         about(
             "sensors on one platform, by name, each with its mount; replaces sensor",
             {"roof": {"model": "ouster/os1-64", "mount": [0, 0, 2]}, "front": "velodyne/vlp16"},
             max_length=MAX_SENSORS,
         ),
-    ] = {}  # noqa: RUF012 - of a frozen model
+    ] = {}  # noqa: RUF012 - the model is frozen
     actors: Annotated[
         Several[ActorSection],
         about(
@@ -216,10 +226,10 @@ class Scenario(Section):
             "column class",
             {40: "road"},
         ),
-    ] = {}  # noqa: RUF012 - of a frozen model
-    returns: Annotated[ReturnsSection, may_be_empty(ReturnsSection)] = ReturnsSection()
-    noise: Annotated[NoiseSection, may_be_empty(NoiseSection)] = NoiseSection()
-    weather: Annotated[Weather, may_be_empty(Weather)] = Weather()
+    ] = {}  # noqa: RUF012 - the model is frozen
+    returns: Annotated[ReturnsSection, allow_empty(ReturnsSection)] = ReturnsSection()
+    noise: Annotated[NoiseSection, allow_empty(NoiseSection)] = NoiseSection()
+    weather: Annotated[Weather, allow_empty(Weather)] = Weather()
     navigation: Annotated[
         Navigation | None,
         about(
@@ -231,30 +241,37 @@ class Scenario(Section):
         Several[Fault],
         about("faults of the sensors", [{"kind": "dirt", "transmission": 0.3}], max_length=256),
     ] = ()
-    cloud: Annotated[CloudOptions, may_be_empty(CloudOptions)] = CloudOptions()
-    output: Annotated[OutputSection, may_be_empty(OutputSection)] = OutputSection()
-    planning: Annotated[PlanningSection, may_be_empty(PlanningSection)] = PlanningSection()
-    pool: Annotated[PoolSection, may_be_empty(PoolSection)] = PoolSection()
+    cloud: Annotated[CloudOptions, allow_empty(CloudOptions)] = CloudOptions()
+    output: Annotated[OutputSection, allow_empty(OutputSection)] = OutputSection()
+    planning: Annotated[PlanningSection, allow_empty(PlanningSection)] = PlanningSection()
+    pool: Annotated[PoolSection, allow_empty(PoolSection)] = PoolSection()
 
-    _folder: Path = PrivateAttr(default=Path())  # folder that relative file names start from
-    _source: str = PrivateAttr(default="the scenario")  # source for messages
+    _folder: Path = PrivateAttr(default=Path())  # folder of relative file names
+    _source: str = PrivateAttr(default="the scenario")  # name of the scenario in messages
 
     @property
     def title(self) -> str:
-        """Name of the survey, for titles: the name of the file without its ending."""
+        """Title of the survey, which is the name of its file without the extension."""
         path = Path(self._source)
         return path.stem if path.suffix in (".yaml", ".yml") else self._source
 
     @classmethod
     def load(cls, path: str | Path, options: Mapping[str, Any] = MappingProxyType({})) -> Scenario:
-        """Read a scenario file (YAML), or make the scenario of a mesh file by `mesh_data`.
+        """Read a scenario file, or create a scenario for a mesh file with `mesh_data`.
 
-        Of the options, a scenario file with one sensor takes another `sensor`.
+        Parameters
+        ----------
+        path
+            Scenario file (YAML) or mesh file.
+        options
+            Mapping from names in `MESH_OPTIONS` to values. For a scenario file, only `sensor` is
+            allowed, which replaces the sensor of the scenario.
 
         Raises
         ------
         LidarError
-            With the file, the field, what was given and what is allowed.
+            If the scenario is invalid. The message names the file, the field, the value and the
+            allowed values.
         """
         path = Path(path)
         mesh = path.suffix.lower() not in ("", ".yaml", ".yml")
@@ -262,39 +279,37 @@ class Scenario(Section):
         if options and not mesh:
             data = _with_sensor(path, data, options)
         return cls.from_data(
-            data, source=survey_of(path) if mesh else str(path), folder=path.parent
+            data, source=mesh_survey_name(path) if mesh else str(path), folder=path.parent
         )
 
     @classmethod
     def from_data(
         cls, data: dict[str, Any], *, source: str = "scenario", folder: str | Path = "."
     ) -> Scenario:
-        """Check the content of a scenario file.
+        """Create a scenario from the content of a scenario file.
 
         Parameters
         ----------
         data
-            Sections as YAML gives them.
+            Sections of the scenario, as read from YAML.
         source
-            Name for messages.
+            Name of the scenario in messages.
         folder
-            Where relative file names start from.
+            Folder to which relative file names refer.
 
         Raises
         ------
         LidarError
-            As `load`.
+            If the scenario is invalid, as for `load`.
         """
         return cls().with_sections(data, source=source, folder=Path(folder))
 
     def with_sections(
         self, data: dict[str, Any], *, source: str, folder: Path | None = None
     ) -> Scenario:
-        """Return the scenario with sections replaced.
+        """Return a copy in which some sections are replaced.
 
-        Unchanged sections are not validated again.
-
-        LidarError as `load`.
+        Unchanged sections are not validated again. Raise LidarError if the scenario is invalid.
         """
         with sentences(Scenario, source, data, _is_contradictory):
             sections = Scenario.model_validate(data)
@@ -306,21 +321,21 @@ class Scenario(Section):
         return scenario
 
     def _check(self) -> None:
-        """Raise LidarError if fields do not fit together."""
+        """Raise LidarError if fields cannot be combined or the model of a sensor is invalid."""
         mistakes = Mistakes()
         for reason in self._contradictions():
             mistakes.lines.append(f"{self._source}: {reason}")
         for section in self.sensors.values() or (self.sensor,):
             if section.calibration is None:
-                with mistakes.noted(), self.naming_lost_files(), prefixed(self._source):
+                with mistakes.noted(), self.explain_missing_files(), prefixed(self._source):
                     mounted = section.mounted(self.path, CENTER, self.noise, self.returns)
                     (mounted.returns or self.returns).divergence(mounted.sensor.optics)
         mistakes.tell()
 
     def _contradictions(self) -> Iterator[str]:
-        """Yield the reasons why fields do not fit together, each a sentence."""
+        """Yield a sentence for each reason why fields cannot be combined."""
         yield from self._planning_contradictions()
-        yield from self._carrier_contradictions()
+        yield from self._platform_contradictions()
         copies = [entry.name for entry in self.scene.copies]
         name_counts = Counter([*copies, *(entry.name for entry in self.actors)])
         if twice := next((name for name in copies if name_counts[name] > 1), None):
@@ -341,7 +356,7 @@ class Scenario(Section):
             )
 
     def _planning_contradictions(self) -> Iterator[str]:
-        """Yield the reasons why the planning lacks a start or target."""
+        """Yield a sentence if the planning has no start or target."""
         planning = self.planning
         if planning.enabled is False or (planning.start and planning.target):
             return
@@ -351,8 +366,8 @@ class Scenario(Section):
                 "`planning.target`."
             )
 
-    def _carrier_contradictions(self) -> Iterator[str]:
-        """Yield the reasons why trajectory, poses, carrier and mounts do not fit together."""
+    def _platform_contradictions(self) -> Iterator[str]:
+        """Yield a sentence for each contradiction in the trajectory, poses, platform and mounts."""
         if self.trajectory is not None and self.trajectory.beyond != "refuse":
             yield (
                 "`trajectory.beyond` is only allowed for actors, because the trajectory of the "
@@ -369,14 +384,14 @@ class Scenario(Section):
                     "`trajectory.vehicle` can only be combined with `start_s` and `duration_s`, "
                     f"not with `trajectory.{min(others)}`. Set other options in `traffic`."
                 )
-        carriers = [entry for entry in self.actors if entry.is_carrier]
-        if carriers and self.trajectory is None:
+        platforms = [entry for entry in self.actors if entry.is_platform]
+        if platforms and self.trajectory is None:
             yield (
-                f"Actor {carriers[0].name!r} has no trajectory. Set its `trajectory`, or "
+                f"Actor {platforms[0].name!r} has no trajectory. Set its `trajectory`, or "
                 "`at: [x, y, z]` if it is stationary. If it is the platform, replace `poses` with "
                 "a `trajectory` of the survey."
             )
-        if self.links and not any(entry.robot for entry in carriers):
+        if self.mount_links and not any(entry.robot for entry in platforms):
             yield (
                 "`mount.link` requires a robot as the platform. Add an actor with a .urdf file "
                 "and without a trajectory."
@@ -384,8 +399,11 @@ class Scenario(Section):
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Files of the scenario, each once: meshes, tables, trajectories, data of sensors."""
-        shaped = (*self.placed, *(self.traffic.vehicles if self.traffic else ()))
+        """Unique paths of the files of the scenario.
+
+        They include meshes, tables, trajectories, traffic, and sensor models and calibrations.
+        """
+        shaped = (*self.object_entries, *(self.traffic.vehicles if self.traffic else ()))
         entries = [*self.scene.files, *(entry.file for entry in shaped if entry.file)]
         files: list[str | None] = [entry.file for entry in entries]
         files += [self.traffic.file] if self.traffic else []
@@ -395,7 +413,7 @@ class Scenario(Section):
         files += [trajectory.times for trajectory in trajectories if trajectory]
         for section in (self.sensor, *self.sensors.values()):
             files += [section.calibration]
-            files += [section.model] if section.has_own_model else []
+            files += [section.model] if section.has_custom_model else []
         paths = [self.path(file) for file in files if file]
         models = (section.model for section in (self.sensor, *self.sensors.values()))
         paths += filter(None, map(plugin_model_file, models))
@@ -404,38 +422,44 @@ class Scenario(Section):
                 paths += files_of_trajectory(self.path(trajectory.file))
         return tuple(dict.fromkeys(paths))
 
-    def named_in(self, file: Path) -> str:
-        """Return the scenario and the field that name a file, to start a message.
+    def message_prefix(self, file: Path) -> str:
+        """Return a message prefix with the scenario and the field that name a file.
 
-        Empty for the mesh file of a survey without a scenario, and if no field names the file.
+        The prefix is empty if no field names the file, or for the mesh file of a survey without a
+        scenario.
         """
-        field = _field_that_names(self, lambda text: self.path(text) == file)
-        return f"{self._source}: {field}: " if field and self._source != survey_of(file) else ""
+        field = _find_file_field(self, lambda text: self.path(text) == file)
+        return (
+            f"{self._source}: {field}: " if field and self._source != mesh_survey_name(file) else ""
+        )
 
     @contextmanager
-    def naming_lost_files(self) -> Iterator[None]:
-        """Name the files that do not exist, with their fields, in a LidarError of the body."""
+    def explain_missing_files(self) -> Iterator[None]:
+        """Context manager that adds missing files and their fields to a LidarError of its body.
+
+        Errors that do not concern missing files are raised unchanged.
+        """
         try:
             yield
         except LidarError as error:
-            # `Path.exists` fails at names that no file can have.
-            lost = [path for path in self.files if not os.path.exists(path)]  # noqa: PTH110
-            if not any(str(path) in str(error) for path in lost):  # there is another fault
+            # `Path.exists` raises an error for names that are not valid file names.
+            missing = [path for path in self.files if not os.path.exists(path)]  # noqa: PTH110
+            if not any(str(path) in str(error) for path in missing):  # the error has another cause
                 raise
             mistakes = Mistakes()
-            for path in lost:
+            for path in missing:
                 likely = endings() if format_of(path) else ()
-                mistakes.lines.append(f"{self.named_in(path)}{not_found(path, likely)}")
+                mistakes.lines.append(f"{self.message_prefix(path)}{not_found(path, likely)}")
             mistakes.lines += [
                 line
                 for line in str(error).splitlines()
-                if not any(str(path) in line for path in lost)
+                if not any(str(path) in line for path in missing)
             ]
             mistakes.tell()
 
     @property
-    def placed(self) -> tuple[CopiesSection | ActorSection, ...]:
-        """Entries of copies and actors."""
+    def object_entries(self) -> tuple[CopiesSection | ActorSection, ...]:
+        """Entries of `scene.copies` and `actors`."""
         return *self.scene.copies, *self.actors
 
     @property
@@ -444,59 +468,57 @@ class Scenario(Section):
         return self._source
 
     def path(self, file: str) -> Path:
-        """Return the path of a file, which starts from the scenario's folder."""
-        # `Path.expanduser` fails at users who are not known.
+        """Return the path of a file whose name is relative to the folder of the scenario."""
+        # `Path.expanduser` raises an error for unknown users.
         return self._folder / os.path.expanduser(file)  # noqa: PTH111
 
     @property
-    def links(self) -> set[str]:
-        """Links of the carrier that sensors are mounted on."""
+    def mount_links(self) -> set[str]:
+        """Names of the robot links on which sensors are mounted."""
         mounts = [self.mount, *(section.mount for section in self.sensors.values())]
         return {mount.link for mount in mounts if mount is not None and mount.link is not None}
 
     @property
-    def colored(self) -> bool:
-        """Whether colors of meshes are read: for a column, or a reflectance of the texture."""
+    def needs_colors(self) -> bool:
+        """Whether a column or `reflectance: texture` requires the colors of meshes."""
         columns = {*self.cloud.columns, *self.output.needs}
         return bool(columns & {*COLORS}) or any(m.reflectance == "texture" for m in self.materials)
 
     @property
-    def names_materials(self) -> bool:
-        """Whether faces keep the names of their materials: for a column or for materials."""
+    def needs_material_names(self) -> bool:
+        """Whether a column or an entry of `materials` requires the material names of meshes."""
         columns = {*self.cloud.columns, *self.output.needs}
         return "material" in columns or any(m.material is not None for m in self.materials)
 
 
 def _is_contradictory(content: Any) -> bool:
-    """Return True if the sections of a scenario contradict each other."""
+    """Return whether sections of a scenario contradict each other."""
     try:
         return any(Scenario.model_validate(content)._contradictions())
-    except ValidationError:  # another fault
+    except ValidationError:  # the content has another error
         return False
 
 
-def _field_that_names(section: Any, is_file: Callable[[str], bool]) -> str:
-    """Return the path of the first field whose text is the name of a file, or an empty string.
+def _find_file_field(section: Any, is_file: Callable[[str], bool]) -> str:
+    """Return the path of the first field that contains the name of a file, or an empty string.
+
+    The path is, for example, ``scene.files[0].file``.
 
     Parameters
     ----------
     section
-        The section that is searched for fields, with sections within it.
+        Section to search, including nested sections.
     is_file
-        Returns True for a text that names the file.
-
-    Returns
-    -------
-    Such as ``scene.files[0].file``.
+        Function that returns whether a string is the name of the file.
     """
-    for path, text in _texts(section):
-        if path[-1] in _NAMING_FILES and is_file(text):
+    for path, text in _iter_strings(section):
+        if path[-1] in _FILE_FIELDS and is_file(text):
             return dotted(path)
     return ""
 
 
-def _texts(node: Any, path: FieldPath = ()) -> Iterator[tuple[FieldPath, str]]:
-    """Yield the texts in a section, a list or a mapping, each with its path."""
+def _iter_strings(node: Any, path: FieldPath = ()) -> Iterator[tuple[FieldPath, str]]:
+    """Yield the strings in a section, list or mapping, with their paths."""
     entries: Any = ()
     if isinstance(node, str):
         yield path, node
@@ -508,4 +530,4 @@ def _texts(node: Any, path: FieldPath = ()) -> Iterator[tuple[FieldPath, str]]:
     elif isinstance(node, (tuple, list)):
         entries = enumerate(node)
     for key, value in entries:
-        yield from _texts(value, (*path, key))
+        yield from _iter_strings(value, (*path, key))

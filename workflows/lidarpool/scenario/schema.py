@@ -1,4 +1,4 @@
-"""JSON Schemas of scenarios and campaigns, and the scenario that `lidarpool init` writes."""
+"""JSON Schemas of scenarios and campaigns, and the scenario files that `lidarpool init` writes."""
 
 from __future__ import annotations
 
@@ -14,21 +14,25 @@ from pydantic.json_schema import GenerateJsonSchema, JsonRef
 from lidarsim.schema.section_fields import fields_of, is_section, kinds_of
 
 from .campaign_sections import CampaignSection
-from .default_poses import on_one_line
+from .default_poses import as_yaml_line
 from .scenario import Scenario
 from .sections import Section
 
-SCHEMA_FILE = "scenario.schema.json"  # name in the folder of a scenario
+SCHEMA_FILE = "scenario.schema.json"  # written next to the scenario
 
 
-class _Plain(GenerateJsonSchema):
-    """Omits titles, which repeat names, and defaults that repeat a section or are infinite."""
+class _CompactGenerator(GenerateJsonSchema):
+    """Schema generator that omits redundant titles and some defaults.
+
+    Titles would repeat the names of fields. Defaults are omitted if they would repeat a whole
+    section or are infinite.
+    """
 
     def field_title_should_be_set(self, schema: Any) -> bool:
         return False
 
     def model_schema(self, schema: Any) -> dict[str, Any]:
-        # pydantic 2.12 leaves out the docstrings of models that are dataclasses as well.
+        # pydantic 2.12 omits the docstrings of models that are also dataclasses.
         result: dict[str, Any] = {
             "description": inspect.getdoc(schema["cls"])
         } | super().model_schema(schema)
@@ -37,7 +41,7 @@ class _Plain(GenerateJsonSchema):
             further = self.get_schema_from_definitions(JsonRef(reference)) or {}
             for name, content in further["properties"].items():
                 other = result["properties"].setdefault(name, content)
-                if other != content:  # options of the same name of two formats
+                if other != content:  # two formats have different options with the same name
                     choice = {"anyOf": [other, content], "description": content["description"]}
                     result["properties"][name] = choice
         return result
@@ -66,26 +70,26 @@ def scenario_schema() -> dict[str, Any]:
 def campaign_schema() -> dict[str, Any]:
     """Return the JSON Schema of campaign files.
 
-    `Campaign.load` also checks that paths lead to fields, and that these take the values.
+    The schema does not check that paths refer to fields, or that values are valid for these fields.
+    `Campaign.load` checks both.
     """
     return _section_schema(CampaignSection, "lidarpool campaign")
 
 
 def _section_schema(section: type[Section], title: str) -> dict[str, Any]:
-    """Return the JSON Schema of a section, with a title."""
-    schema = section.model_json_schema(schema_generator=_Plain)
+    schema = section.model_json_schema(schema_generator=_CompactGenerator)
     return {"$schema": GenerateJsonSchema.schema_dialect, **schema, "title": title}
 
 
 def schema_text(schema: dict[str, Any]) -> str:
-    """Return a schema as JSON, with a line break at its end."""
+    """Return a schema as JSON with a final newline."""
     return json.dumps(schema, indent=2, allow_nan=False) + "\n"
 
 
 SCENARIO_FILE = "scenario.yaml"
 
 _WIDTH = 100
-_COMMENT_COLUMN = 30  # column of the comments that stand beside a field
+_COMMENT_COLUMN = 30  # column where comments beside fields start
 
 _HEAD = f"# yaml-language-server: $schema={SCHEMA_FILE}"
 _FULL_HEAD = f"""\
@@ -100,7 +104,7 @@ _SHORT_HEAD = f"""\
 {_HEAD}
 # A lidar survey for lidarpool. Lengths are in meters, and z is up. Omitted fields have their
 # default values. To write all fields with their default values, run `lidarpool init DIR --all`."""
-# {section of a short scenario: (an example, its meaning)}
+# {section of a short scenario: (example, comment)}
 _SECTIONS = {
     "scene": ("seed", "mesh files relative to this folder, or seed for the demo"),
     "sensor": ("ouster/os1-64", "model from `lidarpool sensors`, or a .yaml file"),
@@ -111,26 +115,35 @@ _SECTIONS = {
 
 
 def short_scenario(data: Mapping[str, Any], note: str) -> str:
-    """Return a short commented scenario in YAML.
+    """Return a short scenario in YAML with comments.
 
-    Sections that `data` lacks are examples.
-
-    `data` is the result of `mesh_data`, `note` a remark on its poses.
+    Parameters
+    ----------
+    data
+        Content of the scenario, from `mesh_data`. Other sections are written as commented-out
+        examples.
+    note
+        Note about the poses.
     """
     lines = [_SHORT_HEAD, ""]
     data = {"scene": "seed"} | dict(data)
     for name, (example, words) in _SECTIONS.items():
         has_data = name in data
-        code = f"{name}: {on_one_line(data[name])}" if has_data else f"# {name}: {example}"
+        code = f"{name}: {as_yaml_line(data[name])}" if has_data else f"# {name}: {example}"
         placed = name == "poses" and has_data
         lines += _pose_lines(data[name], note) if placed else _commented(code, words, "")
     return "\n".join([*lines, ""])
 
 
 def scenario_template(data: Mapping[str, Any], note: str) -> str:
-    """Return a commented scenario in YAML that holds all defaults.
+    """Return a scenario in YAML with comments, which contains all fields.
 
-    `data` is the result of `mesh_data`, and replaces defaults; `note` is a remark on its poses.
+    Parameters
+    ----------
+    data
+        Content of the scenario, from `mesh_data`, which replaces the default values.
+    note
+        Note about the poses.
     """
     lines = [_FULL_HEAD]
     values = {"scene": {"preset": "seed"}} | dict(data)
@@ -148,10 +161,7 @@ def scenario_template(data: Mapping[str, Any], note: str) -> str:
 
 
 def _section_lines(name: str, field: FieldInfo, values: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines of a section or a top-level field.
-
-    `values` replace defaults.
-    """
+    """Yield the lines of a section or top-level field. `values` replaces the default values."""
     section = field.annotation
     if not (isinstance(section, type) and is_section(section)):
         yield from _field_lines(name, field, "", values)
@@ -163,38 +173,41 @@ def _section_lines(name: str, field: FieldInfo, values: dict[str, Any]) -> Itera
 
 
 def _pose_lines(poses: Sequence[Any], note: str) -> Iterator[str]:
-    """Yield poses, a line each, below a remark on the sensor's position."""
+    """Yield a comment with the note, followed by the poses, one per line."""
     if note:
         note = f"{note[:1].upper()}{note[1:]}."
-        # A pose stays on one line, to be copied.
+        # Poses in the note are kept on a single line, so that they can be copied.
         text, mark, poses_text = note.partition("poses: ")
         yield from textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ")
         if mark:
             yield f"# poses: {poses_text.removesuffix('.')}"
     yield from _commented("poses:", _SECTIONS["poses"][1], "")
-    yield from (f"  - {on_one_line(pose)}" for pose in poses)
+    yield from (f"  - {as_yaml_line(pose)}" for pose in poses)
 
 
 def _field_lines(name: str, field: FieldInfo, indent: str, values: dict[str, Any]) -> Iterator[str]:
-    """Yield a field with its value or default, or with examples if the default is computed."""
+    """Yield the lines of a field with its value or default.
+
+    If the field has examples instead of a fixed default, they are commented out.
+    """
     text = field.description or ""
     if name in values or not field.examples:
-        value = on_one_line(values.get(name, field.default))
+        value = as_yaml_line(values.get(name, field.default))
         yield from _commented(f"{name}: {value}", text, indent)
         return
     first, *further_examples = field.examples
-    yield from _commented(f"# {name}: {on_one_line(first)}", text, indent)
+    yield from _commented(f"# {name}: {as_yaml_line(first)}", text, indent)
     for example in further_examples:
-        yield f"{indent}# {name}: {on_one_line(example)}"
+        yield f"{indent}# {name}: {as_yaml_line(example)}"
 
 
 def _commented(code: str, comment: str, indent: str) -> Iterator[str]:
-    """Yield code with its comment to the right, or above without room."""
+    """Yield code with a comment on its right, or above it if there is not enough space."""
     line = f"{indent}{code}".ljust(_COMMENT_COLUMN - 1) + f" # {comment}"
     if len(line) <= _WIDTH and len(indent + code) < _COMMENT_COLUMN:
         yield line
         return
     mark = f"{indent}# "
-    sentence = f"{comment[:1].upper()}{comment[1:]}."  # prose, not a field to be uncommented
+    sentence = f"{comment[:1].upper()}{comment[1:]}."  # prose, not a disabled field
     yield from textwrap.wrap(sentence, _WIDTH, initial_indent=mark, subsequent_indent=mark)
     yield f"{indent}{code}"

@@ -1,4 +1,4 @@
-"""The sections of a scenario file: their fields, limits and defaults."""
+"""Sections of scenario files, with the limits, defaults and descriptions of their fields."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ from lidarsim.survey.survey import EpsgCode, Mounted
 from ..clouds.writing import ExportSpec
 from ..plan.planning import Search
 
-MAX_COPIES = 1_000_000  # limit for an entry
-PathOf = Callable[[str], Path]  # returns the path of a file that a scenario names
+MAX_COPIES = 1_000_000  # maximum number of copies of an entry
+ResolvePath = Callable[[str], Path]  # returns the path of a file that is named in a scenario
 
 IgnoredColumns = Annotated[
     TextOrTexts, about("names of columns to ignore; may contain * and ?", "remarks")
@@ -80,7 +80,10 @@ Length = Annotated[float, Field(gt=0, le=1e4)]
 
 
 class Section(BaseModel):
-    """Fields of a scenario, without unknown fields, infinite numbers, and numbers as text."""
+    """Base class of scenario sections.
+
+    Validation rejects unknown fields, infinite numbers, and numbers that are given as text.
+    """
 
     model_config = STRICT | ConfigDict(frozen=True)
 
@@ -90,8 +93,9 @@ class MeshFile(Section):
 
     In YAML, the file name alone is sufficient.
 
-    The mesh is first scaled, then rotated about the x, y and z axes of the world, then translated.
-    `matrix` replaces these three steps. Relative file names refer to the folder of the scenario.
+    The mesh is scaled first, then rotated about the x, y and z axes of the world, and then
+    translated. `matrix` replaces these three steps. Relative file names refer to the folder of the
+    scenario.
     """
 
     file: Annotated[
@@ -137,7 +141,7 @@ class MeshFile(Section):
     def _with_options(cls, value: Any, handler: Callable[[Any], MeshFile]) -> MeshFile:
         """Validate a file with the options of its format.
 
-        Raises ValueError for options of other formats.
+        Raise ValueError if an option belongs to a different format.
         """
         if cls is not MeshFile or not isinstance(value, dict):
             return handler(value)
@@ -146,37 +150,41 @@ class MeshFile(Section):
             row = format_of(file) if isinstance(file, str) else None
             kind = MeshFile if row is None else _kind_of_file(row.own_options)
             further = value.keys() - kind.model_fields.keys()
-            if further:  # imports the options of all formats
+            if further:  # this imports the options of all formats, so do it only if necessary
                 further &= {name for other in MeshFile.kinds() for name in other.model_fields}
-            if further and not isinstance(file, str):  # the error is the missing name of the file
+            if further and not isinstance(file, str):  # report only that the file name is missing
                 return handler({name: v for name, v in value.items() if name not in further})
             if further:
                 problem = unsupported_options(row, [name for name in value if name in further])
                 raise ValueError(f"{file} {problem}")
-        except LidarError as error:  # error of a plug-in
+        except LidarError as error:  # raised by a plug-in
             raise ValueError(str(error)) from error
         return handler(value) if kind is MeshFile else kind.model_validate(value)
 
     def __reduce__(self) -> Any:
-        """Return what pickle stores, since the sections of formats are made in each process."""
+        """Return the content to pickle.
+
+        The subclasses for file formats are created at run time, so they cannot be pickled by
+        reference.
+        """
         return MeshFile.model_validate, (self.model_dump(exclude_unset=True),)
 
     @staticmethod
     def kinds() -> list[type[MeshFile]]:
-        """Return the sections of files of all formats with options, plug-ins included."""
+        """Return the subclasses for all file formats that have options, including plug-ins."""
         options = dict.fromkeys(row.own_options for row in formats_with_plugins())
         return [kind for kind in map(_kind_of_file, options) if kind is not MeshFile]
 
     @property
     def reading_options(self) -> dict[str, Any]:
-        """Options of `load_objects`, except folders: {name: value}."""
+        """Keyword arguments for `load_objects`, except for folders."""
         own = type(self).model_fields.keys() - MeshFile.model_fields.keys()
         shared = {field.name for field in fields(MeshOptions)} & MeshFile.model_fields.keys()
         return self.model_dump(include={*own, *shared} - {"assets"}, exclude_unset=True)
 
     @model_validator(mode="after")
     def _check_placement(self) -> MeshFile:
-        """Raise ValueError for two placements of a mesh, or a scale of 0."""
+        """Raise ValueError if the mesh is placed twice or a scale is 0."""
         placed = self.model_fields_set & {"translation", "rotation_deg", "scale"}
         if self.matrix is not None and placed:
             raise ValueError(f"`matrix` and `{min(placed)}` cannot be combined.")
@@ -185,7 +193,7 @@ class MeshFile(Section):
         return self
 
     def transform(self) -> Transform:
-        """Return the placement in the world."""
+        """Return the transform from the coordinates of the file to world coordinates."""
         if self.matrix is not None:
             return Transform.from_matrix(self.matrix)
         return Transform.from_parts(self.translation, self.rotation_deg, self.scale)
@@ -193,7 +201,10 @@ class MeshFile(Section):
 
 @cache
 def _kind_of_file(options: type | None) -> type[MeshFile]:
-    """Return the section of files of a format, with its options that `about` describes."""
+    """Return the `MeshFile` subclass for a file format.
+
+    Its fields include those options of the format that are declared with `about`.
+    """
     declared = {} if options is None else fields_of(options)
     described = {name: field for name, field in declared.items() if field.description}
     if options is None or not described:
@@ -206,8 +217,8 @@ MeshEntry = Annotated[MeshFile, SerializeAsAny(), by_text("file", MeshFile)]
 MeshEntries = Several[MeshEntry]
 
 
-def _pose(value: Any) -> Any:
-    """Return a pose as a mapping, where a list is the position."""
+def _as_pose_mapping(value: Any) -> Any:
+    """Convert a list, which is the position of a pose, to a mapping."""
     if isinstance(value, list):
         return {"position": value}
     if not isinstance(value, (dict, Pose)):
@@ -219,12 +230,12 @@ def _pose(value: Any) -> Any:
 
 
 def by_position(kind: Any, position: Any = Triple) -> BeforeValidator:
-    """Let a scenario give just the position of a pose: [0, 0, 1]."""
-    return BeforeValidator(_pose, json_schema_input_type=position | kind)
+    """Return a validator that also accepts the position of a pose alone, such as [0, 0, 1]."""
+    return BeforeValidator(_as_pose_mapping, json_schema_input_type=position | kind)
 
 
 PoseEntry = Annotated[Pose, by_position(Pose)]
-PointXYZ = Annotated[Several[Coordinate], Field(min_length=2, max_length=3)]  # x, y, perhaps z
+PointXYZ = Annotated[Several[Coordinate], Field(min_length=2, max_length=3)]  # [x, y] or [x, y, z]
 
 
 class CopySection(Section, Pose):
@@ -233,7 +244,7 @@ class CopySection(Section, Pose):
     In YAML, [x, y] or [x, y, z] alone is sufficient.
     """
 
-    position: Annotated[  # type: ignore[assignment]  # a copy's z may be left out
+    position: Annotated[  # type: ignore[assignment]  # z may be omitted
         PointXYZ,
         about("x, y and z of the mesh origin, in meters; without z, the copy is on the surface"),
     ]
@@ -262,13 +273,13 @@ class CopyTable(Section):
 
 
 class Scatter(Section):
-    """Copies at random positions, upright on surfaces.
+    """Copies at random positions, which are placed upright on surfaces.
 
-    The same fields result in the same copies.
+    The same settings always result in the same copies.
     """
 
     count: Annotated[int, about("number of copies", ge=1, le=MAX_COPIES)]
-    surfaces: Annotated[  # not "on", which YAML takes for true
+    surfaces: Annotated[  # not named "on", which YAML reads as true
         TextOrTexts,
         about(
             "names of the objects to place copies on; may contain * and ? (default: all objects)",
@@ -293,7 +304,7 @@ class Scatter(Section):
 
 
 class ShapeSection(Section):
-    """Shape of an object, as a file or a box, and the class of its points."""
+    """Shape of an object, which is a mesh file or a box, and the class of its points."""
 
     name: Annotated[Text | None, about("name of the object")] = None
     file: Annotated[
@@ -341,7 +352,7 @@ class AnimationSection(Section):
 
 
 class DeformingSection(ShapeSection):
-    """A shape, possibly animated or on wheels."""
+    """A shape that may be animated or have wheels."""
 
     animation: Annotated[
         Annotated[AnimationSection, by_text("name", AnimationSection)] | None,
@@ -359,7 +370,7 @@ class DeformingSection(ShapeSection):
 
     @model_validator(mode="after")
     def _check_deformation(self) -> DeformingSection:
-        """Raise ValueError for a deformation without a file, or two deformations."""
+        """Raise ValueError if a deformation has no file, or if there are two deformations."""
         deformations = [name for name in ("animation", "wheels") if getattr(self, name) is not None]
         if deformations and self.file is None:
             raise ValueError(f"`{deformations[0]}` requires a mesh file. Set `file`.")
@@ -369,9 +380,9 @@ class DeformingSection(ShapeSection):
 
 
 class CopiesSection(ShapeSection):
-    """Copies of an object at many positions, whose mesh is stored only once.
+    """Copies of an object at many positions.
 
-    Each copy is a separate object.
+    Each copy is a separate object, but all copies share a single mesh.
     """
 
     name: Annotated[
@@ -462,7 +473,7 @@ class SceneSection(Section):
 
 
 class WorldSection(Section):
-    """Coordinate system of the output, and the position of the survey in it.
+    """Coordinate system of the output, and the origin of the scenario in it.
 
     The scene, poses, trajectories and plans use the coordinates of the scenario. `origin` is added
     to points and poses when they are written.
@@ -583,7 +594,7 @@ class SensorSection(Section):
 
     @model_validator(mode="after")
     def _check_source(self) -> SensorSection:
-        """Raise ValueError if fields of the sensor contradict each other."""
+        """Raise ValueError if fields of the sensor cannot be combined."""
         sources = [name for name in ("model", "calibration") if getattr(self, name) is not None]
         # Defaults are allowed, because `lidarpool init --all` writes them.
         fields = SensorSection.model_fields
@@ -606,38 +617,52 @@ class SensorSection(Section):
         return self
 
     @property
-    def has_own_model(self) -> bool:
-        """Whether the model is a file of the user's."""
+    def has_custom_model(self) -> bool:
+        """Whether the model is a file that the user provides."""
         return self.model is not None and self.model.endswith(MODEL_FILES)
 
     def mounted(
         self,
-        path: PathOf,
+        path: ResolvePath,
         mount: Pose,
         noise: NoiseSection,
         returns: ReturnsSection,
         name: str = "",
     ) -> Mounted:
-        """Return the lidar on its carrier.
+        """Return the sensor on its platform.
 
-        Raises LidarError if its files cannot be used.
+        Equal sections share a sensor, unless their files have changed. If the sensor has data sheet
+        values, its noise and returns are those of the data sheet, except for the fields that are
+        set in `noise` and `returns`.
 
-        `path` returns the path of a file in the scenario. Equal sections have the same sensor,
-        unless their files have changed. A sensor with a data sheet has its noise and returns: the
-        sheet's, with the fields that the sections give.
+        Parameters
+        ----------
+        path
+            Function that returns the path of a file in the scenario.
+        mount
+            Pose of the sensor in the platform frame.
+        noise, returns
+            Sections `noise` and `returns` of the scenario.
+        name
+            Name of the sensor.
+
+        Raises
+        ------
+        LidarError
+            If a file cannot be used.
         """
         limit_names = {"rate_hz", "min_range_m", "max_range_m"}
         limits = self.model_dump(include=limit_names, exclude_none=True)
-        model = path(self.model) if self.model and self.has_own_model else self.model
+        model = path(self.model) if self.model and self.has_custom_model else self.model
         calibration = None if self.calibration is None else path(self.calibration)
         if model is None and calibration is None:
             grid = {"layers", "vertical_fov_deg", "horizontal_fov_deg", "step_deg"}
             azimuths = self.columns or self.rays_per_revolution
-            sensor = _grid(azimuths, **self.model_dump(include=grid), **limits)
+            sensor = _grid_sensor(azimuths, **self.model_dump(include=grid), **limits)
         else:
             states = file_states(file for file in (model, calibration) if isinstance(file, Path))
             options = self.model_dump(include={"columns", "step_deg", "performance"})
-            sensor = _loaded(states, model=model, calibration=calibration, **options, **limits)
+            sensor = _load_sensor(states, model=model, calibration=calibration, **options, **limits)
         if self.packets is not None and (self.packets.ports or self.packets.identifiers):
             sensor = _with_packets(sensor, self.packets.model_dump_json())
         if sensor.noise is None or sensor.returns is None:
@@ -650,33 +675,39 @@ class SensorSection(Section):
 
 
 def file_states(files: Iterable[Path]) -> tuple[tuple[Path, int, int], ...]:
-    """Return path, modification time and size of the files that exist, to detect changed files."""
+    """Return the path, modification time and size of each existing file.
+
+    The result is used to detect whether files have changed.
+    """
     states = []
     for path in files:
-        with suppress(OSError, ValueError):  # reported when the file is read
+        with suppress(OSError, ValueError):  # errors are reported when the file is read
             status = path.stat()
             states.append((path, status.st_mtime_ns, status.st_size))
     return tuple(states)
 
 
-_grid = lru_cache(Sensor.grid)
+_grid_sensor = lru_cache(Sensor.grid)
 
 
 @lru_cache
-def _loaded(_: object, **options: Any) -> Sensor:
-    """Return the sensor of files in some states, cached by these states."""
+def _load_sensor(_: object, **options: Any) -> Sensor:
+    """Load a sensor. The first argument contains the states of its files, as a cache key."""
     return load_sensor(**options)
 
 
 @lru_cache
 def _with_packets(sensor: Sensor, section: str) -> Sensor:
-    """Return a sensor with the ports and identifiers of a `PacketSection`, as JSON."""
+    """Return a sensor with the ports and identifiers of a `PacketSection`.
+
+    `section` is the section as JSON, so that it can be a cache key.
+    """
     values = PacketSection.model_validate_json(section)
     return sensor.with_packets(values.ports, values.identifiers)
 
 
 class OutputSection(Section):
-    """Additional files of the result.
+    """Additional output files.
 
     Columns that the formats require are added to the cloud.
     """
@@ -688,7 +719,7 @@ class OutputSection(Section):
 
     @model_validator(mode="after")
     def _check_formats(self) -> OutputSection:
-        """Raise ValueError for a format that is written twice."""
+        """Raise ValueError if a format occurs twice."""
         names = [entry.format for entry in self.write]
         if twice := next((name for name in names if names.count(name) > 1), None):
             raise ValueError(
@@ -699,7 +730,7 @@ class OutputSection(Section):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of the columns that the formats need."""
+        """Names of the columns that the formats require."""
         return tuple(dict.fromkeys(name for entry in self.write for name in entry.needs))
 
 
@@ -738,7 +769,10 @@ Obstacles = Several[Annotated[Obstacle, by_text("object", Obstacle)]]
 
 
 class _Route:
-    """Fields in world coordinates and by names, which come before the fields of `Search`."""
+    """Fields of `PlanningSection` that precede the fields of `Search`.
+
+    Positions are in world coordinates, and obstacles may be selected by name.
+    """
 
     enabled: Annotated[
         bool | None,
@@ -764,14 +798,14 @@ class PlanningSection(Section, Search, _Route):
     """Path planning in the plane, in world coordinates.
 
     A path is planned if `start` and `target` are set, unless `enabled` is false. `obstacles` is a
-    list, or 'auto' for the bounding circle of each object that is not flat. `clearance_m` is added
-    to each radius.
+    list, or `auto` for the bounding circle of each object that is not flat. `clearance_m` is added
+    to the radius of each obstacle.
     """
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TaskOptions:
-    """Tasks of a run, on any cluster."""
+    """Options for the tasks of a run, which apply to any cluster."""
 
     collectors: Annotated[int, about("number of tasks that write the parts", ge=1, le=64)] = 2
     queue_capacity: Annotated[
@@ -795,8 +829,8 @@ class TaskOptions:
     ] = "auto"
 
 
-class _Workers:
-    """Workers of a local cluster, which come first."""
+class _WorkerCounts:
+    """Fields of `PoolSection` that precede the fields of `TaskOptions`."""
 
     gpu: Annotated[
         int | None,
@@ -813,7 +847,7 @@ class _Workers:
     ] = None
 
 
-class PoolSection(Section, TaskOptions, _Workers):
+class PoolSection(Section, TaskOptions, _WorkerCounts):
     """The worker partitions and their tasks.
 
     `gpu` and `other` set the number of workers in a local cluster, which depends on the machine by
@@ -822,13 +856,17 @@ class PoolSection(Section, TaskOptions, _Workers):
     """
 
 
-def may_be_empty(kind: Any) -> Any:
-    """Read a section or mapping with all lines commented out as its defaults."""
+def allow_empty(kind: Any) -> Any:
+    """Return a validator that accepts an empty section or mapping.
+
+    In YAML, the value of a section is null if all of its lines are commented out.
+    """
     return short(lambda v: v is None, lambda v: {}, kind | None)
 
 
-# Short form of a scene: the name of a mesh file or preset, or a list of files.
-scene_in_short = short(
+# Accepts the short forms of a scene, which are the name of a mesh file or preset, or a list of
+# files.
+allow_scene_short_form = short(
     lambda v: v is None or isinstance(v, (str, list)),
     lambda v: {"preset" if v == "seed" else "files": v} if v else {},
     Text | MeshEntries | SceneSection | None,

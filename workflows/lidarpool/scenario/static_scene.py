@@ -1,4 +1,8 @@
-"""The static part of a scenario's scene: mesh files, copies, the ground and the demo's objects."""
+"""The static scene of a scenario.
+
+The static scene consists of mesh files, copies of objects, the ground and the objects of the demo.
+It can be cached and shared between scenarios.
+"""
 
 from __future__ import annotations
 
@@ -31,56 +35,56 @@ from lidarsim.scene.transform import Transform, affine
 from lidarsim.scene.wheels import animate_wheels
 from lidarsim.words import joined, plural
 
-from .ground import StandingSurfaces
+from .ground import SupportSurfaces
 from .scenario import Scenario
 from .sections import (
     MAX_COPIES,
     CopiesSection,
     CopyTable,
     MeshFile,
-    PathOf,
+    ResolvePath,
     Scatter,
     SceneSection,
     ShapeSection,
     file_states,
 )
 
-# Fields of a mesh file's entry that are allowed if the file is a robot.
+# Fields of a `MeshFile` that are allowed if the file is a robot.
 _ROBOT_FIELDS = {"file", "opacity", "assets", "translation", "rotation_deg", "scale", "matrix"}
 
 
-Kept = TypeVar("Kept")
+Value = TypeVar("Value")
 
 
-class FileSystem(NamedTuple):
-    """The coordinate system of a file, whose placement keeps x and y."""
+class FileCrs(NamedTuple):
+    """Coordinate system of a file whose x and y coordinates are not transformed."""
 
     file: str
     crs: str  # as "EPSG:25832" or WKT
     epsg: int | None
-    is_raster: bool  # whether `world.epsg` transforms the file
+    is_raster: bool  # whether the file is reprojected to `world.epsg`
 
 
 @dataclass
-class Findings:
-    """Notes about a scene, collected while its files are read."""
+class FileFindings:
+    """Notes and metadata that are collected while the files of a scene are read."""
 
-    notes: list[str] = field(default_factory=list)  # about objects left out of the scene
-    remarks: list[str] = field(default_factory=list)  # about the up-axes of files
-    sources: dict[str, str] = field(default_factory=dict)  # {file: its content in words}
-    systems: list[FileSystem] = field(default_factory=list)  # of files of the scene
-    landscapes: list[str] = field(default_factory=list)  # files of land, never of single objects
-    # {file of the scene: {number: class}} of files whose format gives classes to objects
+    notes: list[str] = field(default_factory=list)  # notes for the user, such as skipped objects
+    remarks: list[str] = field(default_factory=list)  # remarks on the up axes of files
+    sources: dict[str, str] = field(default_factory=dict)  # {file: description of its content}
+    systems: list[FileCrs] = field(default_factory=list)  # coordinate systems of the files
+    landscapes: list[str] = field(default_factory=list)  # files that contain terrain or roads
+    # {file: {class number: class}} for files whose format assigns classes to objects
     classes: dict[str, Mapping[int, ObjectClass]] = field(default_factory=dict)
-    # {the carrier or an actor: whether its path has corners} of trajectories without angles
+    # {name of the platform or actor: whether its path has corners} for trajectories without angles
     without_angles: dict[str, bool] = field(default_factory=dict)
 
-    def copy(self) -> Findings:
+    def copy(self) -> FileFindings:
         """Return a copy whose lists and dictionaries can be extended separately."""
-        return Findings(*(values.copy() for values in vars(self).values()))
+        return FileFindings(*(values.copy() for values in vars(self).values()))
 
-    def named(self, number: int) -> tuple[str, ...]:
-        """Return name patterns of the objects whose files give them the class of a number."""
+    def class_patterns(self, number: int) -> tuple[str, ...]:
+        """Return name patterns of the objects to which files assign the class `number`."""
         patterns = dict.fromkeys(
             pattern
             for classes in self.classes.values()
@@ -91,7 +95,7 @@ class Findings:
 
     @property
     def class_names(self) -> dict[int, str]:
-        """Names of the classes that files give to objects, by their numbers in ascending order."""
+        """Names of the classes that files assign to objects, by class number in ascending order."""
         names = {
             number: entry.name
             for classes in self.classes.values()
@@ -101,63 +105,64 @@ class Findings:
 
 
 class StaticScene(NamedTuple):
-    """A scene without the actors and traffic of its scenario, and notes from reading the files."""
+    """The scene of a scenario without its actors and traffic, with the findings from its files."""
 
     scene: Scene
-    standing: StandingSurfaces
-    findings: Findings
+    support: SupportSurfaces
+    findings: FileFindings
 
 
 class _StaticObjects(NamedTuple):
     """Objects of a static scene, without the ground."""
 
     objects: Objects
-    findings: Findings
-    corners: Floats  # (n, 2): corners of the objects, seen from above, world meters
+    findings: FileFindings
+    corners: Floats  # (n, 2), corners of the horizontal extent in world coordinates, in meters
 
 
 class SceneCache:
-    """Cache of the last `max_scenes` static scenes.
+    """Cache of the `max_scenes` most recently used static scenes.
 
-    Scenarios with the same scene section, unchanged files, the same options of reading and the same
-    ground share a scene.
+    Scenarios share a scene if they have the same scene section, the same reading options and the
+    same ground, and if their files have not changed.
     """
 
     def __init__(self, max_scenes: int = 4) -> None:
-        self._objects = _LastUsed[_StaticObjects](max_scenes)
-        self._scenes = _LastUsed[StaticScene](max_scenes)
+        self._objects = _LeastRecentlyUsedCache[_StaticObjects](max_scenes)
+        self._scenes = _LeastRecentlyUsedCache[StaticScene](max_scenes)
 
     def find(self, scenario: Scenario) -> StaticScene:
         """Return the static scene of a scenario, from the cache or read from its files."""
-        key = _key(scenario)
+        key = _cache_key(scenario)
         if scenario.scene.ground is None:
             return self._scenes.find(key, lambda: read_static_scene(scenario))
         static = self._objects.find(key, lambda: _read_objects(scenario))
-        ground = _ground(scenario, static)
+        ground = _build_ground(scenario, static)
         rectangle = ground.vertices.tobytes()
         return self._scenes.find((key, rectangle), lambda: _static_scene(static, ground))
 
 
-class _LastUsed(Generic[Kept]):
-    """The last used values of a number of keys."""
+class _LeastRecentlyUsedCache(Generic[Value]):
+    """Cache that discards the least recently used values."""
 
-    def __init__(self, count: int) -> None:
-        self._count = count
-        self._values = dict[object, Kept]()
+    def __init__(self, max_count: int) -> None:
+        self._max_count = max_count
+        self._values = dict[object, Value]()
 
-    def find(self, key: object, make: Callable[[], Kept]) -> Kept:
-        """Return the value of a key, made if it is not there."""
+    def find(self, key: object, make: Callable[[], Value]) -> Value:
+        """Return the value of a key, after creating it if it is not in the cache."""
         value = self._values.pop(key) if key in self._values else make()
-        self._values[key] = value  # at the end: the first value is the least recently used
-        while len(self._values) > self._count:
+        self._values[key] = value  # dictionaries are ordered, so the most recent value is the last
+        while len(self._values) > self._max_count:
             del self._values[next(iter(self._values))]
         return value
 
 
-def _key(scenario: Scenario) -> object:
-    """Return the key of static objects: equal for scenarios that may share the objects.
+def _cache_key(scenario: Scenario) -> object:
+    """Return a key that is equal for scenarios that can share their static objects.
 
-    The key has the scene section, the options of reading, and size and time of the files.
+    The key consists of the scene section, the reading options, and the sizes and modification times
+    of the files.
     """
     section = scenario.scene
     files: list[str] = [entry.file for entry in section.files]
@@ -166,8 +171,8 @@ def _key(scenario: Scenario) -> object:
     states = file_states(map(scenario.path, files))
     reading_options = (
         scenario.path(""),
-        scenario.colored,
-        scenario.names_materials,
+        scenario.needs_colors,
+        scenario.needs_material_names,
         scenario.world.epsg,
     )
     return section.model_dump_json(), *reading_options, states
@@ -176,47 +181,48 @@ def _key(scenario: Scenario) -> object:
 def read_static_scene(scenario: Scenario) -> StaticScene:
     """Read the mesh files of a scenario, and place its copies and ground.
 
-    The scene has the objects of the demo, if asked for, the files' objects, the copies, and the
-    ground. Its actors are objects that move in their files.
+    The scene contains the objects of the demo if the scenario uses them, followed by the objects in
+    mesh files, the copies and the ground. The actors of the scene are the objects that move in
+    their files.
 
     Raises
     ------
     LidarError
-        If the scenario has no scene, a file cannot be read, or copies have no surface to stand on
-        or no room.
+        If the scenario has no scene, if a file cannot be read, or if there is no surface or not
+        enough space for the copies.
     """
     static = _read_objects(scenario)
     has_ground = scenario.scene.ground is not None
-    return _static_scene(static, _ground(scenario, static) if has_ground else None)
+    return _static_scene(static, _build_ground(scenario, static) if has_ground else None)
 
 
 def _static_scene(static: _StaticObjects, ground: SceneMesh | None) -> StaticScene:
-    """Return the scene of objects, and of a ground if there is one."""
+    """Return a scene that consists of static objects and optionally a ground."""
     objects = static.objects
     findings = static.findings.copy()
     if ground is not None:
         objects = objects._replace(static=(*objects.static, ground))
     scene = Scene.from_objects(objects, findings.notes.append)
-    return StaticScene(scene, StandingSurfaces(scene), findings)
+    return StaticScene(scene, SupportSurfaces(scene), findings)
 
 
 def _read_objects(scenario: Scenario) -> _StaticObjects:
     """Read the mesh files of a scenario, and place its copies."""
     section = scenario.scene
     _check_not_empty(scenario)
-    findings = Findings()
-    shapes = Shapes(scenario, findings)
+    findings = FileFindings()
+    shapes = ShapeLoader(scenario, findings)
     meshes: list[SceneMesh | SceneInstance] = list(seed_objects()) if section.has_seed else []
     moving: list[Actor] = []
     mistakes = Mistakes()
     for entry in section.files:
         with mistakes.noted():
-            objects = shapes.read(entry)
+            objects = shapes.read_objects(entry)
             meshes += objects.static
             moving += objects.actors
             if objects.classes:
                 findings.classes[entry.file] = objects.classes
-            if system := _system_of(entry, objects):
+            if system := _file_crs(entry, objects):
                 findings.systems.append(system)
     mistakes.tell()
     meshes = resolve_same_names(meshes, section.same_names, findings.notes.append)
@@ -225,24 +231,27 @@ def _read_objects(scenario: Scenario) -> _StaticObjects:
     objects = Objects(tuple(meshes), tuple(moving))
     corners = np.zeros((0, 2))
     if section.ground is not None and (meshes or moving):
-        corners = _corners(Scene.from_meshes(meshes or objects.at_start(lambda _: None)))
+        corners = _horizontal_bounds(Scene.from_meshes(meshes or objects.at_start(lambda _: None)))
     return _StaticObjects(objects, findings, corners)
 
 
-def _system_of(entry: MeshFile, objects: Objects) -> FileSystem | None:
-    """Return the coordinate system that a file states for its x and y, or None."""
+def _file_crs(entry: MeshFile, objects: Objects) -> FileCrs | None:
+    """Return the coordinate system that a file states for its x and y coordinates.
+
+    Return None if the file states no coordinate system, or if x and y are transformed.
+    """
     if not entry.transform().keeps_xy:
         return None
     if objects.raster is not None:
         raster = objects.raster
-        return FileSystem(entry.file, raster.crs, raster.epsg, True) if raster.crs else None
+        return FileCrs(entry.file, raster.crs, raster.epsg, True) if raster.crs else None
     if objects.epsg is None:
         return None
-    return FileSystem(entry.file, f"EPSG:{objects.epsg}", objects.epsg, False)
+    return FileCrs(entry.file, f"EPSG:{objects.epsg}", objects.epsg, False)
 
 
 def _check_not_empty(scenario: Scenario) -> None:
-    """Raise LidarError if a scenario has nothing that is static."""
+    """Raise LidarError if a scenario has no static objects."""
     section = scenario.scene
     if section.has_seed or section.files or section.copies or section.ground is not None:
         return
@@ -257,23 +266,24 @@ def _check_not_empty(scenario: Scenario) -> None:
     )
 
 
-class Shapes:
-    """Meshes and robots of a scenario, each file read once.
+class ShapeLoader:
+    """Reader of the meshes and robots of a scenario.
 
-    Notes go to `findings`.
+    Shapes are cached, so that entries with the same shape share it. Notes are added to `findings`.
     """
 
-    def __init__(self, scenario: Scenario, findings: Findings) -> None:
+    def __init__(self, scenario: Scenario, findings: FileFindings) -> None:
         self.scenario = scenario
         self.findings = findings
-        self._meshes: dict[Any, SceneMesh] = {}  # {file or size: mesh}
+        self._meshes: dict[Any, SceneMesh] = {}  # {(file or box, animation, wheels): mesh}
         self._robots: dict[MeshFile, Robot] = {}
 
-    def mesh_of(self, entry: ShapeSection) -> SceneMesh:
-        """Return the mesh of a copy, an actor or vehicles: all objects of a file, or a box, joined.
+    def load_mesh(self, entry: ShapeSection) -> SceneMesh:
+        """Return the mesh of a copy, an actor or a vehicle.
 
-        Entries of the same file, animation and wheels share a mesh, named by the first entry.
-        Objects that move in the file stand at their first poses.
+        The mesh is a box, or all objects in a file, which are merged. Entries with the same file,
+        animation and wheels share a mesh, which has the name of the first of these entries. Objects
+        that move in the file are at their first poses.
         """
         shape = entry.file or entry.box or (1.0, 1.0, 1.0)
         meshes = self._meshes
@@ -284,8 +294,8 @@ class Shapes:
             name = entry.name or "vehicle"
             if not isinstance(shape, MeshFile):
                 return meshes.setdefault(key, box(name, shape))
-            # "" is the first animation of the file.
-            file_objects = self.read(shape, animation and (animation.name or ""))
+            # An empty string selects the first animation in the file.
+            file_objects = self.read_objects(shape, animation and (animation.name or ""))
             path = self.scenario.path(shape.file)
             objects = file_objects.at_start(
                 lambda line: self.findings.notes.append(f"{path} moves {line}")
@@ -299,46 +309,44 @@ class Shapes:
                 meshes[key] = replace(mesh, animation=replace(mesh.animation, **settings))
         return meshes[key]
 
-    def robot(self, entry: MeshFile) -> Robot:
-        """Return the robot of a file.
+    def load_robot(self, entry: MeshFile) -> Robot:
+        """Return the robot in a file.
 
-        Raises LidarError if the file cannot be used.
+        Raise LidarError if the file cannot be used.
         """
         if entry not in self._robots:
             path = self.scenario.path(entry.file)
             tell = self.findings.notes.append
-            colors = self.scenario.colored
-            name_materials = self.scenario.names_materials
+            colors = self.scenario.needs_colors
+            name_materials = self.scenario.needs_material_names
             robot = load_robot(
                 path,
                 opacity=entry.opacity,
                 colors=colors,
                 materials=name_materials,
-                assets=self._assets_of(entry),
+                assets=self._assets_folder(entry),
                 tell=tell,
             )
             self._robots[entry] = robot
             self.findings.sources[entry.file] = robot.summary
         return self._robots[entry]
 
-    def _assets_of(self, entry: MeshFile) -> Path | None:
-        """Return the further folder of a file's entry, or None."""
+    def _assets_folder(self, entry: MeshFile) -> Path | None:
         return None if entry.assets is None else self.scenario.path(entry.assets)
 
-    def read(self, entry: MeshFile, animation: str | None = None) -> Objects:
-        """Read the objects of a file in world coordinates.
+    def read_objects(self, entry: MeshFile, animation: str | None = None) -> Objects:
+        """Read the objects in a file in world coordinates.
 
-        Raises LidarError if the file cannot be used.
-
-        `animation` is the name of the animation that the meshes play; "" is the first of the file,
-        None none.
+        `animation` is the name of the animation that the meshes play. An empty string selects the
+        first animation in the file, and None selects no animation. Raise LidarError if the file
+        cannot be used.
         """
         scenario = self.scenario
         findings = self.findings
         with prefixed(scenario.source):
             transform = entry.transform()
         if entry.file.lower().endswith(ROBOTS):
-            return self._still_robot(entry, transform)
+            return self._stationary_robot(entry, transform)
         path = scenario.path(entry.file)
         world_options = {}
         if "epsg" in option_names(format_of(path)):
@@ -348,9 +356,9 @@ class Shapes:
             **entry.reading_options,
             **world_options,
             transform=transform,
-            colors=scenario.colored,
-            materials=scenario.names_materials,
-            assets=self._assets_of(entry),
+            colors=scenario.needs_colors,
+            materials=scenario.needs_material_names,
+            assets=self._assets_folder(entry),
             animation=animation,
             tell=findings.notes.append,
             axes=findings.remarks.append,
@@ -360,14 +368,14 @@ class Shapes:
             findings.landscapes.append(entry.file)
         return objects
 
-    def _still_robot(self, entry: MeshFile, transform: Transform) -> Objects:
-        """Return the links of a robot as static objects, with the joints at zero."""
+    def _stationary_robot(self, entry: MeshFile, transform: Transform) -> Objects:
+        """Return the links of a robot as static objects, with all joints at zero."""
         if refused_fields := sorted(entry.model_fields_set - _ROBOT_FIELDS):
             raise LidarError(
                 f"{self.scenario.path(entry.file)} is a robot, which is always in meters with z "
                 f"up. Remove {joined([f'`{name}`' for name in refused_fields])}."
             )
-        robot = self.robot(entry)
+        robot = self.load_robot(entry)
         tell = self.findings.notes.append
         if robot.moving:
             tell(
@@ -379,27 +387,27 @@ class Shapes:
 
 
 def _place_copies(
-    shapes: Shapes, static_objects: list[SceneMesh | SceneInstance]
+    shapes: ShapeLoader, static_objects: list[SceneMesh | SceneInstance]
 ) -> list[SceneInstance]:
-    """Place the copies, which stand on `static_objects` and on the ground, not on copies.
+    """Place the copies of a scenario on its static objects and ground, but not on other copies.
 
-    `static_objects` are the objects of the demo and of files, in world coordinates.
+    `static_objects` are the objects of the demo and of mesh files, in world coordinates.
     """
     scenario = shapes.scenario
     section = shapes.scenario.scene
     scene = Scene.from_meshes(static_objects) if static_objects else None
     if section.ground is not None and (static_objects or _copy_extents(section)):
-        corners = [] if scene is None else [_corners(scene)]
-        ground = _ground_mesh(section, [*corners, *_copy_extents(section)])
+        corners = [] if scene is None else [_horizontal_bounds(scene)]
+        ground = _build_ground_mesh(section, [*corners, *_copy_extents(section)])
         scene = Scene.from_meshes([*static_objects, ground])
-    standing = StandingSurfaces(scene)
+    support = SupportSurfaces(scene)
     copies: list[SceneInstance] = []
     mistakes = Mistakes()
     for number, entry in enumerate(section.copies):
         with mistakes.noted():
-            mesh = shapes.mesh_of(entry)
+            mesh = shapes.load_mesh(entry)
             with prefixed(f"{scenario.source}: scene.copies[{number}]"):
-                instances = copies_of(entry, mesh, standing, scenario.path)
+                instances = place_copies(entry, mesh, support, scenario.path)
             if entry.file is not None:
                 words = f", {plural(len(instances), 'copy', 'copies')}"
                 shapes.findings.sources[entry.file.file] += words
@@ -409,7 +417,10 @@ def _place_copies(
 
 
 def _copy_extents(section: SceneSection) -> list[Floats]:
-    """Return the corners of scatter rectangles and the positions of lists, (n, 2) each, meters."""
+    """Return the corners of scatter rectangles and the listed positions of copies.
+
+    Each array has shape (n, 2) and contains world coordinates in meters.
+    """
     scatters = [entry.scatter for entry in section.copies if entry.scatter is not None]
     position_lists = [[copy.position[:2] for copy in entry.at] for entry in section.copies]
     return [
@@ -419,10 +430,11 @@ def _copy_extents(section: SceneSection) -> list[Floats]:
 
 
 def _footprints(scenario: Scenario) -> list[Floats]:
-    """Return points that the ground of a scenario lies under, (n, 2) each, world meters.
+    """Return horizontal positions that the ground of a scenario must cover.
 
-    These are the copies' rectangles and positions, the poses, and the trajectories and poses of the
-    carrier and of actors. Vehicles of traffic are not among them.
+    They are the rectangles and positions of copies, the poses of the sensor and of actors, and the
+    trajectories of the platform and of actors. Vehicles in traffic are not included. Each array has
+    shape (n, 2) and contains world coordinates in meters.
     """
     footprints = _copy_extents(scenario.scene)
     poses = [*(scenario.poses or ()), *(entry.at for entry in scenario.actors if entry.at)]
@@ -437,15 +449,18 @@ def _footprints(scenario: Scenario) -> list[Floats]:
     return footprints
 
 
-def _corners(scene: Scene) -> Floats:
-    """Return the lowest and the highest x and y of a scene, (2, 2), world meters."""
+def _horizontal_bounds(scene: Scene) -> Floats:
+    """Return the minimum and maximum x and y of a scene in world coordinates, in meters.
+
+    The result has shape (2, 2).
+    """
     return (scene.bounds + scene.origin)[:, :2]
 
 
-def _ground(scenario: Scenario, static: _StaticObjects) -> SceneMesh:
+def _build_ground(scenario: Scenario, static: _StaticObjects) -> SceneMesh:
     """Return the ground of a scenario.
 
-    Raises LidarError if the scenario has nothing that the ground could lie under.
+    Raise LidarError if the scenario has nothing that determines the extent of the ground.
     """
     footprints = [static.corners, *_footprints(scenario)]
     if not any(map(len, footprints)):
@@ -454,13 +469,16 @@ def _ground(scenario: Scenario, static: _StaticObjects) -> SceneMesh:
             "scenario has no objects, poses, trajectories or actors. Add `poses`, or mesh files "
             "as `scene.files`."
         )
-    return _ground_mesh(scenario.scene, footprints)
+    return _build_ground_mesh(scenario.scene, footprints)
 
 
-def _ground_mesh(section: SceneSection, footprints: Sequence[Floats]) -> SceneMesh:
-    """Return the ground in world coordinates: two triangles under points (n, 2), with a margin."""
+def _build_ground_mesh(section: SceneSection, footprints: Sequence[Floats]) -> SceneMesh:
+    """Return the ground in world coordinates.
+
+    The ground consists of two triangles. It covers all points in `footprints` with a margin.
+    """
     ground = section.ground
-    assert ground is not None, "of a section with a ground"
+    assert ground is not None, "only called for sections with a ground"
     points = np.concatenate(footprints)
     x0, y0 = points.min(axis=0) - ground.margin_m
     x1, y1 = points.max(axis=0) + ground.margin_m
@@ -470,8 +488,8 @@ def _ground_mesh(section: SceneSection, footprints: Sequence[Floats]) -> SceneMe
 
 
 MIN_SCALE = 1e-6
-DRAW_SIZE = 1 << 14  # random positions that are drawn at a time
-# Most positions that are drawn for an entry: the larger of the two limits.
+DRAW_SIZE = 1 << 14  # number of random positions that are drawn at a time
+# The maximum number of positions that are drawn for an entry is the larger of these limits.
 MAX_DRAWS_PER_COPY = 200
 MAX_DRAWS = 1 << 21
 
@@ -485,20 +503,30 @@ _COPY_COLUMNS = (
 )
 
 
-def copies_of(
-    entry: CopiesSection, mesh: SceneMesh, standing: StandingSurfaces, path: PathOf
+def place_copies(
+    entry: CopiesSection, mesh: SceneMesh, support: SupportSurfaces, path: ResolvePath
 ) -> list[SceneInstance]:
     """Place the copies of an entry.
 
-    `path` returns the path of a file in the scenario.
+    Parameters
+    ----------
+    entry
+        Section that defines the copies.
+    mesh
+        Mesh that all copies share.
+    support
+        Surfaces on which copies without a height are placed.
+    path
+        Function that returns the path of a file in the scenario.
 
     Raises
     ------
     LidarError
-        If a table cannot be read, no surface is below a position, or the room is too small.
+        If a table cannot be read, if there is no surface at the position of a copy, or if there is
+        not enough space for randomly placed copies.
     """
     if entry.scatter is not None:
-        poses = _scatter_copies(entry.scatter, entry.name, standing)
+        poses = _scatter_copies(entry.scatter, entry.name, support)
     else:
         if entry.table is not None:
             poses = _read_copies(path(entry.table.file), entry.table)
@@ -508,7 +536,7 @@ def copies_of(
                 np.array([[getattr(copy, name) for name in _ANGLE_NAMES] for copy in entry.at]),
                 np.array([copy.scale for copy in entry.at]),
             )
-        poses.set_missing_heights(standing)
+        poses.set_missing_heights(support)
         poses.check_scales()
     matrices = affine(rotations_of(poses.angles_deg) * poses.scales[:, None], poses.positions)
     return SceneInstance.from_matrices(mesh, matrices, entry.name)
@@ -517,19 +545,19 @@ def copies_of(
 class _CopyPoses(NamedTuple):
     """Poses and scales of the copies of an entry."""
 
-    positions: Floats  # (n, 3), world meters; z is nan for copies that stand on a surface
-    angles_deg: Floats  # (n, 3): yaw, pitch, roll
+    positions: Floats  # (n, 3), world coordinates in meters; z is NaN for copies on a surface
+    angles_deg: Floats  # (n, 3), yaw, pitch and roll
     scales: Floats  # (n, 3)
 
-    def set_missing_heights(self, standing: StandingSurfaces) -> None:
-        """Put copies without z onto the surface below.
+    def set_missing_heights(self, support: SupportSurfaces) -> None:
+        """Place copies without a z coordinate on the highest surface at their x and y.
 
-        Raises LidarError without a surface.
+        Raise LidarError if there is no such surface.
         """
         positions = self.positions
         rows = np.flatnonzero(np.isnan(positions[:, 2]))
         if len(rows):
-            positions[rows, 2], _ = standing.heights_below(positions[rows, :2])
+            positions[rows, 2], _ = support.heights_below(positions[rows, :2])
         if len(rows := np.flatnonzero(np.isnan(positions[:, 2]))):
             x, y = positions[rows[0], :2].tolist()
             raise LidarError(
@@ -548,7 +576,6 @@ class _CopyPoses(NamedTuple):
 
 
 def _read_copies(path: Path, table: CopyTable) -> _CopyPoses:
-    """Read the poses and scales of copies from a table."""
     try:
         columns = with_yaw(
             read_table(
@@ -580,16 +607,16 @@ def _read_copies(path: Path, table: CopyTable) -> _CopyPoses:
     return _CopyPoses(columns_of(_POSITION_NAMES, np.nan), angles_of(columns, count), scales)
 
 
-def _scatter_copies(scatter: Scatter, name: str, standing: StandingSurfaces) -> _CopyPoses:
-    """Draw the poses and scales of copies at random.
+def _scatter_copies(scatter: Scatter, name: str, support: SupportSurfaces) -> _CopyPoses:
+    """Draw random poses and scales of copies.
 
     Positions are drawn in a rectangle, and rejected where the highest surface is not one of
-    `scatter.surfaces`. The arithmetic is only sums, products and comparisons, so that all machines
-    draw the same.
+    `scatter.surfaces`. Only sums, products and comparisons are used, so that the result is the same
+    on all machines.
     """
-    # The seed includes the name, so that trees and rocks of the same seed do not share positions.
+    # The seed includes the name, so that trees and rocks with the same seed do not coincide.
     seeds = [scatter.seed, *name.encode()]
-    positions = _scatter_positions(scatter, seeds, standing)
+    positions = _scatter_positions(scatter, seeds, support)
     count = scatter.count
     yaw_and_scale_draws = np.random.Generator(np.random.PCG64([1, *seeds])).random((count, 2))
     yaw = (
@@ -603,15 +630,19 @@ def _scatter_copies(scatter: Scatter, name: str, standing: StandingSurfaces) -> 
     return _CopyPoses(positions, angles, np.repeat(scales[:, None], 3, axis=1))
 
 
-def _scatter_positions(scatter: Scatter, seeds: list[int], standing: StandingSurfaces) -> Floats:
-    """Draw positions (n, 3) on surfaces, world meters.
+def _scatter_positions(scatter: Scatter, seeds: list[int], support: SupportSurfaces) -> Floats:
+    """Draw random positions on surfaces, in world coordinates in meters.
 
-    Raises LidarError without room.
+    `support` contains the surfaces of all objects. If none of the first positions is on a surface
+    in `scatter.surfaces`, for example because these surfaces are under a roof, all other surfaces
+    are ignored. Raise LidarError if there is not enough space.
 
-    `standing` are the surfaces of all objects. If none of the first positions is on a surface of
-    the scatter, as under a roof, all other surfaces are ignored.
+    Returns
+    -------
+    positions
+        Shape (count, 3).
     """
-    surfaces = standing.of_objects(scatter.surfaces)
+    surfaces = support.select(scatter.surfaces)
     x0, y0, x1, y1 = surfaces.rectangle if scatter.within is None else scatter.within
     rng = np.random.Generator(np.random.PCG64([0, *seeds]))
     occupied = _OccupiedPositions(scatter.spacing_m)
@@ -625,15 +656,15 @@ def _scatter_positions(scatter: Scatter, seeds: list[int], standing: StandingSur
                 f"{y1:.6g}. Reduce `count` or `spacing_m`, or choose other `surfaces`."
             )
         draws = rng.random((DRAW_SIZE, 2)) * [x1 - x0, y1 - y0] + [x0, y0]
-        heights, objects = standing.heights_below(draws)
+        heights, objects = support.heights_below(draws)
         on_surfaces = np.flatnonzero(np.isin(objects, surfaces.owners))
-        if not drawn_count and not len(on_surfaces):  # probably under a roof
-            standing = surfaces
-            heights, objects = standing.heights_below(draws)
+        if not drawn_count and not len(on_surfaces):  # the surfaces are probably under a roof
+            support = surfaces
+            heights, objects = support.heights_below(draws)
             on_surfaces = np.flatnonzero(objects >= 0)
         drawn_count += DRAW_SIZE
         for row in on_surfaces:
-            if occupied.occupy(*draws[row].tolist()):
+            if occupied.try_occupy(*draws[row].tolist()):
                 positions.append(np.array([*draws[row], heights[row]]))
                 if len(positions) == scatter.count:
                     break
@@ -641,15 +672,18 @@ def _scatter_positions(scatter: Scatter, seeds: list[int], standing: StandingSur
 
 
 class _OccupiedPositions:
-    """Occupied positions in the plane, at least `spacing_m` apart."""
+    """Horizontal positions that are at least `spacing_m` apart."""
 
     def __init__(self, spacing_m: float) -> None:
         self._spacing_m = spacing_m
         # {column and row of a square cell with sides of `spacing_m`: positions}
         self._cells: dict[tuple[int, int], list[tuple[float, float]]] = {}
 
-    def occupy(self, x: float, y: float) -> bool:
-        """Occupy a position and return True, or False if an occupied position is too close."""
+    def try_occupy(self, x: float, y: float) -> bool:
+        """Occupy a position unless an occupied position is too close.
+
+        Return whether the position was occupied by this call.
+        """
         spacing_m = self._spacing_m
         if not spacing_m:
             return True

@@ -1,9 +1,9 @@
-"""Gaps between surfels: the share of returns that a scene of points is expected to lose.
+"""Estimate of the returns that a scene of surfels loses in the gaps between its surfels.
 
-A scanner has many points along a ring, and few across. Surfels close gaps of a few spacings, so
-that rays pass between distant rings. The share is estimated for rays from the positions of the
-scanner between its points. Rays from elsewhere are lost more often, because they also meet surfaces
-that the scanner did not see.
+The points of a scanner are dense along each ring, but the rings are far apart. Surfels close gaps
+of a few point spacings, so rays can pass between distant rings. The loss is estimated for rays from
+the positions of the scanner in directions between its points. Rays from other positions are lost
+more often, because they also reach surfaces that the scanner did not see.
 """
 
 from __future__ import annotations
@@ -15,45 +15,46 @@ import numpy as np
 
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 
-MAX_SCANNERS = 100  # more positions are those of a moving sensor, whose rings are not known
-_SAMPLE = 2000  # points around which rays are tried
-_NEIGHBORS = 96  # in angle, as seen by the scanner: on several rings
-_RAYS = 8  # for each of these points
-_SURFELS = 64  # that may cover a ray: the nearest in angle
-_BLOCK = 250  # points at a time, to bound the memory
-_CENTERED = 0.15  # largest distance of the mean of neighbors from their middle, in radii
-_SLACK = 0.1  # of ranges: surfels this far before or behind the points cover rays
-_MIN_NEIGHBORHOODS = 50  # fewer tell too little
+MAX_SCANNERS = 100  # with more positions, the sensor was moving, and its rings are unknown
+_SAMPLE = 2000  # number of points around which rays are cast
+_NEIGHBORS = 96  # number of angular neighbors of a point, which lie on several rings
+_RAYS = 8  # number of rays around each sampled point
+_SURFELS = 64  # number of angular neighbors among the surfels that are tested for each ray
+_BLOCK = 250  # number of points that are processed at a time, which limits memory use
+_CENTERED = 0.15  # maximum distance between a point and the mean of its neighbors, in radii
+_SLACK = 0.1  # relative range tolerance for surfels in front of or behind the neighbors
+_MIN_NEIGHBORHOODS = 50  # minimum number of neighborhoods for an estimate
 
 
 def expected_loss(positions: Floats, scanners: Floats, corners: Floats) -> float | None:
-    """Return the share of returns between points that pass between surfels, 0 to 1.
+    """Estimate the share of returns that are lost in the gaps between surfels.
 
     Parameters
     ----------
     positions
-        The points (n, 3), meters.
+        Points in meters. Shape (n, 3).
     scanners
-        Position of the scanner of each point (n, 3), meters; NaN where unknown.
+        Position of the scanner for each point in meters, or NaN if it is unknown. Shape (n, 3).
     corners
-        Corners of the surfels (v, 4, 3), meters.
+        Corners of the surfels in meters. Shape (v, 4, 3).
 
     Returns
     -------
-    The share, or None if positions of the scanner are not known, or are those of a moving sensor,
-    or if there are too few points.
+    float or None
+        Share of the returns, from 0 to 1. The share is None if the scanner positions are unknown,
+        if the sensor was moving, or if there are too few points.
     """
     known = np.flatnonzero(np.isfinite(scanners).all(axis=1))
-    places, owner = np.unique(np.round(scanners[known], 3), axis=0, return_inverse=True)
-    if not 0 < len(places) <= MAX_SCANNERS:
+    stations, owner = np.unique(np.round(scanners[known], 3), axis=0, return_inverse=True)
+    if not 0 < len(stations) <= MAX_SCANNERS:
         return None
     rng = np.random.default_rng(0)
     shares = [np.zeros(0)]
-    for number, scanner in enumerate(places):
+    for number, scanner in enumerate(stations):
         rows = known[owner.ravel() == number]
         count = max(1, round(_SAMPLE * len(rows) / len(known)))
         surfels = corners - scanner
-        tree = _tree(_directions(surfels.mean(axis=1)))
+        tree = _search_tree(_normalize(surfels.mean(axis=1)))
         for rays in _rays_between(positions[rows] - scanner, count, rng):
             nearest = _nearest(tree, rays.directions.reshape(-1, 3), min(_SURFELS, len(surfels)))
             shares.append(1 - rays.covered_by(surfels[nearest]).mean(axis=1))
@@ -62,24 +63,28 @@ def expected_loss(positions: Floats, scanners: Floats, corners: Floats) -> float
 
 
 class _Rays(NamedTuple):
-    """Rays from a scanner at zero, between its points."""
+    """Rays from a scanner at the origin in directions between its points."""
 
-    directions: Floats  # (k, _RAYS, 3), of length 1
-    nearest: Floats  # (k,): of the points around, meters
-    farthest: Floats  # (k,): of the points around, meters
+    directions: Floats  # (k, _RAYS, 3), unit vectors
+    nearest: Floats  # (k,), minimum range of the neighbors, meters
+    farthest: Floats  # (k,), maximum range of the neighbors, meters
 
     def covered_by(self, corners: Floats) -> Bools:
-        """Return whether rays (k, _RAYS) meet one of their surfels (k · _RAYS, s, 4, 3)."""
+        """Return whether each ray hits one of its surfels.
+
+        `corners` has shape (k * _RAYS, s, 4, 3) and contains s surfels for each ray. The result has
+        shape (k, _RAYS).
+        """
         directions = self.directions.reshape(-1, 1, 3)
         half_lengths = (corners[:, :, 1] - corners[:, :, 0]) / 2
         half_widths = (corners[:, :, 2] - corners[:, :, 1]) / 2
         centers = corners.mean(axis=2)
         normals = np.cross(half_lengths, half_widths)
-        with np.errstate(divide="ignore", invalid="ignore"):  # surfels without an area
-            distances = _dots(centers, normals) / _dots(directions, normals)
+        with np.errstate(divide="ignore", invalid="ignore"):  # degenerate surfels
+            distances = _dot(centers, normals) / _dot(directions, normals)
             offsets = distances[..., None] * directions - centers
-            along = _dots(offsets, half_lengths) / _dots(half_lengths, half_lengths)
-            across = _dots(offsets, half_widths) / _dots(half_widths, half_widths)
+            along = _dot(offsets, half_lengths) / _dot(half_lengths, half_lengths)
+            across = _dot(offsets, half_widths) / _dot(half_widths, half_widths)
             hit = (np.abs(along) <= 1) & (np.abs(across) <= 1)
             hit &= distances >= (1 - _SLACK) * self.nearest.repeat(_RAYS)[:, None]
             hit &= distances <= (1 + _SLACK) * self.farthest.repeat(_RAYS)[:, None]
@@ -88,48 +93,50 @@ class _Rays(NamedTuple):
 
 
 def _rays_between(points: Floats, count: int, rng: np.random.Generator) -> Iterator[_Rays]:
-    """Yield rays around about `count` of the points (n, 3) of a scanner at zero.
+    """Yield rays around about `count` random points of a scanner at the origin.
 
-    Rays near the edge of what the scanner saw, against the sky, are left out.
+    Points at the edge of the visible area, for example against the sky, are skipped. `points` has
+    shape (n, 3).
     """
     points = points[points.any(axis=1)]
     if len(points) < _NEIGHBORS:
         return
-    directions = _directions(points)
-    ranges = np.sqrt(_dots(points, points))
-    tree = _tree(directions)
-    # At random, because points in the order of firings repeat the same channels at even steps.
+    directions = _normalize(points)
+    ranges = np.sqrt(_dot(points, points))
+    tree = _search_tree(directions)
+    # Evenly spaced points would repeatedly sample the same channels, because points are ordered by
+    # firing.
     sampled = rng.permutation(directions)[:count]
     for start in range(0, len(sampled), _BLOCK):
-        middles = sampled[start : start + _BLOCK]
-        neighbors = _nearest(tree, middles, _NEIGHBORS)
-        offsets = directions[neighbors] - middles[:, None]
-        radii = np.sqrt(_dots(offsets, offsets).max(axis=1))
+        centers = sampled[start : start + _BLOCK]
+        neighbors = _nearest(tree, centers, _NEIGHBORS)
+        offsets = directions[neighbors] - centers[:, None]
+        radii = np.sqrt(_dot(offsets, offsets).max(axis=1))
         mean = offsets.mean(axis=1)
-        inside = np.flatnonzero(np.sqrt(_dots(mean, mean)) <= _CENTERED * radii)
-        # Half of the radius: neighbors are on all sides.
+        inside = np.flatnonzero(np.sqrt(_dot(mean, mean)) <= _CENTERED * radii)
+        # Rays within half of the radius have neighbors on all sides.
         steps = rng.normal(size=(len(inside), _RAYS, 3))
-        steps -= _dots(steps, middles[inside, None])[..., None] * middles[inside, None]
-        steps *= np.sqrt(rng.random((len(inside), _RAYS)) / _dots(steps, steps))[..., None]
-        rays = middles[inside, None] + radii[inside, None, None] / 2 * steps
+        steps -= _dot(steps, centers[inside, None])[..., None] * centers[inside, None]
+        steps *= np.sqrt(rng.random((len(inside), _RAYS)) / _dot(steps, steps))[..., None]
+        rays = centers[inside, None] + radii[inside, None, None] / 2 * steps
         around = ranges[neighbors[inside]]
-        yield _Rays(_directions(rays), around.min(axis=1), around.max(axis=1))
+        yield _Rays(_normalize(rays), around.min(axis=1), around.max(axis=1))
 
 
-def _directions(vectors: Floats) -> Floats:
-    """Return vectors (…, 3) of length 1, or zero for zero."""
-    lengths = np.sqrt(_dots(vectors, vectors))[..., None]
+def _normalize(vectors: Floats) -> Floats:
+    """Scale vectors to length 1. Zero vectors are not changed. Shape (..., 3)."""
+    lengths = np.sqrt(_dot(vectors, vectors))[..., None]
     return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)
 
 
-def _dots(first: Floats, second: Floats) -> Floats:
-    """Return the products of vectors along the last axis."""
+def _dot(first: Floats, second: Floats) -> Floats:
+    """Return the dot products of vectors along the last axis."""
     products: Floats = (first * second).sum(axis=-1)
     return products
 
 
-def _tree(points: Floats) -> Any:
-    """Return a search tree of Open3D for the nearest of points (n, 3)."""
+def _search_tree(points: Floats) -> Any:
+    """Return a nearest-neighbor search tree of Open3D. `points` has shape (n, 3)."""
     from open3d.core import Tensor, nns
 
     tree = nns.NearestNeighborSearch(Tensor(np.ascontiguousarray(points)))
@@ -137,10 +144,13 @@ def _tree(points: Floats) -> Any:
     return tree
 
 
-def _nearest(tree: Any, places: Floats, count: int) -> Ints:
-    """Return the indices (k, count) of the points of a tree nearest to places (k, 3)."""
+def _nearest(tree: Any, positions: Floats, count: int) -> Ints:
+    """Return the indices of the `count` nearest points in a tree.
+
+    `positions` has shape (k, 3), and the result has shape (k, count).
+    """
     from open3d.core import Tensor
 
-    indices, _ = tree.knn_search(Tensor(np.ascontiguousarray(places)), count)
+    indices, _ = tree.knn_search(Tensor(np.ascontiguousarray(positions)), count)
     found: Ints = indices.numpy()
     return found

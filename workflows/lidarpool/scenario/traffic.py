@@ -1,4 +1,7 @@
-"""Traffic of other programs: floating car data of SUMO, and vehicles as actors."""
+"""Traffic from simulations, whose vehicles and persons become actors.
+
+This module reads floating car data (FCD) of SUMO. `osi_traffic` reads traces of ASAM OSI.
+"""
 
 from __future__ import annotations
 
@@ -32,10 +35,10 @@ from lidarsim.schema.declared import Several, Text, TextOrTexts, Triple, about
 from lidarsim.words import fits, in_yaml, name_hint, plural, printable
 
 from .actor_motion import TimeUnitEntry, TrajectorySection
-from .ground import StandingSurfaces, follow_surfaces
+from .ground import SupportSurfaces, follow_surfaces
 from .sections import DeformingSection, Section
 
-HOST = "host"  # identity of the host vehicle of OSI, beside its number
+HOST = "host"  # alias for the ID of the host vehicle in an OSI trace
 
 MAX_ACTORS = 10_000
 
@@ -43,7 +46,7 @@ _MOVING = ("vehicle", "person", "container")
 
 _ROW = ("x", "y", "angle", "z", "slope")
 
-# Attributes that SUMO's documentation of --fcd-output defines, and that are not used here.
+# Attributes that are defined in the documentation of SUMO's --fcd-output, but not used here.
 _UNUSED = frozenset((
     "acceleration", "accelerationLat", "arrivalDelay", "blockTime", "boardingTime", "delay",
     "distance", "edge", "entryTime", "eventTime", "lane", "leaderGap", "leaderID", "leaderSpeed",
@@ -51,17 +54,19 @@ _UNUSED = frozenset((
     "stopDelay", "tag", "timeLoss", "vehicle", "waiting",
 ))  # fmt: skip
 
-_ROW_BYTES = 8 * (1 + len(_ROW))  # bytes of a time and its row
+_ROW_BYTES = 8 * (1 + len(_ROW))  # memory of a time and its row
 
-_ELEMENT_BYTES = 100  # bytes of an element of a packed file: a short element takes as long as these
+# Bytes that are counted for each element of a compressed file, because parsing a short element
+# takes as long as reading this many bytes.
+_ELEMENT_BYTES = 100
 
-_TRAVELLER_BYTES = 1000  # bytes of a vehicle or person without its rows
+_TRAVELER_BYTES = 1000  # memory of a vehicle or person without its rows
 
 _KNOWN = _UNUSED.union(_ROW, ("id", "type"))
 
 
 class VehicleSection(DeformingSection):
-    """Shapes of vehicles and persons, by type in SUMO or OSI."""
+    """Shape of the vehicles and persons of certain types in SUMO or OSI."""
 
     types: Annotated[
         TextOrTexts,
@@ -78,9 +83,9 @@ class VehicleSection(DeformingSection):
 
 
 class TrafficSection(Section):
-    """Vehicles and persons of a traffic simulation.
+    """Vehicles and persons from a traffic simulation.
 
-    They are actors while they are in the simulation.
+    Each vehicle or person is an actor while it is in the simulation.
     """
 
     file: Annotated[
@@ -121,8 +126,8 @@ class TrafficSection(Section):
         Literal["linear", "smooth"], about("interpolation of poses between time steps")
     ] = "linear"
 
-    def entry_of(self, vehicle_type: str) -> VehicleSection | None:
-        """Return the first entry that fits a type of vehicles, or None."""
+    def find_entry(self, vehicle_type: str) -> VehicleSection | None:
+        """Return the first entry that matches a vehicle type, or None if no entry matches."""
         for entry in self.vehicles:
             if any(fits(vehicle_type, pattern) for pattern in entry.types):
                 return entry
@@ -130,73 +135,77 @@ class TrafficSection(Section):
 
 
 class TrafficPassage(Protocol):
-    """A vehicle or person while it is in a simulation without a break."""
+    """An uninterrupted period in which a vehicle or person is in a simulation."""
 
     @property
     def name(self) -> str:
-        """Identity in the simulation."""
+        """ID of the vehicle or person in the simulation."""
 
     @property
     def kind(self) -> str:
-        """Type in the simulation."""
+        """Type of the vehicle or person in the simulation."""
 
     def entry(self, section: TrafficSection) -> VehicleSection | None:
-        """Return the entry with the shape.
+        """Return the entry that defines the shape.
 
-        None for a carrier of OSI without dimensions; LidarError if a vehicle of SUMO has none.
+        Return None for a platform without dimensions in an OSI trace. Raise LidarError if no entry
+        matches a vehicle in SUMO.
         """
 
     def track(
         self, section: TrafficSection, mesh: SceneMesh | None, origin: Floats, start_s: float
     ) -> Track:
-        """Return the local trajectory of a mesh, above `section.surfaces` if there are any."""
+        """Return the trajectory of the origin of a mesh, in local coordinates.
+
+        If `section.surfaces` is set, the heights are relative to these surfaces.
+        """
 
 
-class TravellerChoice(NamedTuple):
-    """The vehicles and persons of a simulation that are read.
+class TravelerFilter(NamedTuple):
+    """Selection of the vehicles and persons that are read from a simulation.
 
     Attributes
     ----------
     only
-        Identity of the only one; None for all.
+        ID of the only vehicle or person to read, or None to read all.
     without
-        Identity of one that is left out.
+        ID of a vehicle or person to skip, or None.
     """
 
     only: str | None = None
     without: str | None = None
 
-    def has(self, *identities: str) -> bool:
-        """Return whether one with these identities is read."""
+    def matches(self, *identities: str) -> bool:
+        """Return whether a vehicle or person with the given IDs is read."""
         if self.only is not None:
             return self.only in identities
         return self.without not in identities
 
 
 class TrafficContent(NamedTuple):
-    """Vehicles, persons and objects of a file of traffic between two times."""
+    """Vehicles, persons and objects in a traffic file between two times."""
 
-    passages: Sequence[TrafficPassage]  # passages in the order of their starts
-    counted: str  # number of vehicles and persons until the end, in words
-    left_out: Set[str] = frozenset()  # identities of those that were not to be read
-    notes: Sequence[str] = ()  # notes on what is left out
+    passages: Sequence[TrafficPassage]  # ordered by start
+    counted: str  # number of vehicles and persons until the last time, as text
+    left_out: Set[str] = frozenset()  # IDs of the vehicles and persons that the filter excluded
+    notes: Sequence[str] = ()  # notes on skipped objects
 
 
 @dataclass(frozen=True, eq=False)
-class Passage:
-    """Consecutive time steps of a vehicle or person."""
+class SumoPassage:
+    """Consecutive time steps with a vehicle or person in SUMO."""
 
     name: str
     kind: str
     times_s: array[float] = field(default_factory=lambda: array("d"))
-    rows: array[float] = field(default_factory=lambda: array("d"))  # `_ROW` at each time
+    rows: array[float] = field(default_factory=lambda: array("d"))  # values of `_ROW` at each time
 
     def entry(self, section: TrafficSection) -> VehicleSection:
-        """Return the first entry that fits the type.
+        """Return the first entry that matches the type.
 
-        Raises LidarError if no entry fits.
+        Raise LidarError if no entry matches.
         """
-        matching = section.entry_of(self.kind)
+        matching = section.find_entry(self.kind)
         if matching is not None:
             return matching
         raise LidarError(
@@ -208,34 +217,37 @@ class Passage:
     def track(
         self, section: TrafficSection, mesh: SceneMesh | None, origin: Floats, start_s: float
     ) -> Track:
-        """Return the local trajectory of a mesh, above `section.surfaces` if there are any."""
-        assert mesh is not None, "each has an entry"
+        """Return the trajectory of the origin of a mesh, in local coordinates.
+
+        If `section.surfaces` is set, the heights are relative to these surfaces.
+        """
+        assert mesh is not None, "every vehicle in SUMO has an entry with a shape"
         times = np.array(self.times_s) + section.offset_s
         x, y, angle, z, slope = np.array(self.rows).reshape(-1, len(_ROW)).T
         fronts = np.column_stack([x, y, z]) + section.translation
         if section.surfaces:
             fronts[:, 2] = section.translation[2]
             slope = 0 * slope
-        # Angles are clockwise from north, and slopes positive uphill.
+        # Angles are clockwise from north. Slopes are positive uphill.
         rotations = rotations_of(np.column_stack([90.0 - angle, -slope, np.zeros(len(x))]))
-        # SUMO's position is the middle of the front bumper.
+        # Positions in SUMO refer to the center of the front bumper.
         positions = fronts - rotations[:, :, 0] * mesh.vertices[:, 0].max() - origin
         smooth = section.interpolation == "smooth"
         return Track(times, positions, quaternions_of(rotations), smooth, start_s, beyond="absent")
 
 
 class TrafficClock:
-    """Converts the times of a file of traffic to seconds, one after the other.
-
-    Raises ValueError for times that must have another unit (`seconds_of`).
-    """
+    """Converter from the times in a traffic file, which are passed one by one, to seconds."""
 
     def __init__(self, time_unit: TimeUnit | None) -> None:
         self._time_unit = time_unit
-        self._times: list[float] = []  # the first time, and the last one
+        self._times: list[float] = []  # the first and the most recent time
 
     def seconds(self, time: float) -> float:
-        """Return the next time in seconds."""
+        """Return the next time in seconds.
+
+        Raise ValueError if the times are implausible in seconds (see `seconds_of`).
+        """
         if self._time_unit is not None:
             return time / SECONDS[self._time_unit]
         if self._times and not are_plausible(self._times[0], time):
@@ -244,14 +256,15 @@ class TrafficClock:
         return time
 
 
-# Days, hours, minutes and seconds, which SUMO writes with --human-readable-time.
+# Matches times with optional days, hours, minutes and seconds, which SUMO writes if it is run with
+# --human-readable-time.
 _READABLE_TIME = re.compile(r"(-?)(?:(\d+):)?(\d+):(\d\d):(\d\d(?:\.\d*)?)")
 
 
 def _readable_seconds(text: str) -> float | None:
-    """Return the seconds of a time such as 1:02:30:00.50, with days or without.
+    """Convert a time such as 1:02:30:00.50 to seconds. The number of days may be omitted.
 
-    Returns None for other texts.
+    Return None if the text has a different format.
     """
     match = _READABLE_TIME.fullmatch(text.strip())
     if match is None:
@@ -262,39 +275,38 @@ def _readable_seconds(text: str) -> float | None:
 
 
 class _PassageCollector:
-    """Collects passages from the elements of floating car data, time step by time step.
+    """Collector of passages from the elements of floating car data.
 
-    Rows before the first time are dropped, but for the last.
+    Of the rows before the first time, only the last is kept.
     """
 
     def __init__(
         self,
         section: TrafficSection,
         first_s: float,
-        choice: TravellerChoice,
+        travelers: TravelerFilter,
         allowance: Allowance,
     ) -> None:
-        self.passages: list[Passage] = []
-        self.left_out: set[str] = set()  # identities that are not in `choice`
-        # {(tag, identity): (last step, passage)}
-        self.travellers: dict[tuple[str, str], tuple[int, Passage]] = {}
+        self.passages: list[SumoPassage] = []
+        self.left_out: set[str] = set()  # IDs that the filter excludes
+        # {(tag, ID): (last time step, passage)}
+        self.travelers: dict[tuple[str, str], tuple[int, SumoPassage]] = {}
         self.step = -1
         self.time_s = -math.inf
         self._first_s = first_s
         self._time_unit = section.time_unit
         self._clock = TrafficClock(section.time_unit)
         self._ignore = section.ignore
-        self._choice = choice
+        self._filter = travelers
         self._allowance = allowance
         self._known_attributes = set(_KNOWN)
-        self._vehicle_xy: tuple[str, str] | None = None  # position of the time step's last vehicle
+        self._vehicle_xy: tuple[str, str] | None = None  # of the last vehicle in the time step
 
     def collect(self, elements: Iterable[tuple[str, Mapping[str, str]]], last_s: float) -> None:
-        """Collect from tags with attributes until a time.
+        """Collect the passages up to a time, including the first time step after that time.
 
-        Raises ValueError if they are not valid.
-
-        The first time step after the last time is needed as well.
+        `elements` yields the tag and the attributes of each element. Raise ValueError if they are
+        invalid.
         """
         for tag, attributes in elements:
             if tag == "timestep":
@@ -303,14 +315,14 @@ class _PassageCollector:
                 if previous_s > last_s:
                     break
             elif tag in _MOVING and self.step >= 0:
-                self.add(tag, attributes)
+                self.add_row(tag, attributes)
         if self.step < 0:
             raise ValueError("it has no time steps")
 
     def begin_step(self, text: str) -> None:
         """Begin a time step.
 
-        Raises ValueError if its time is not after the last time step's.
+        Raise ValueError if its time is not after the time of the previous time step.
         """
         time_s = _readable_seconds(text)
         if time_s is not None and self._time_unit is not None:
@@ -318,17 +330,17 @@ class _PassageCollector:
                 "its times are hours, minutes and seconds, so `time_unit` cannot be set"
             )
         if time_s is None:
-            time_s = self._clock.seconds(_number("a timestep", "time", text))
+            time_s = self._clock.seconds(_parse_number("a timestep", "time", text))
         if not self.time_s < time_s < math.inf:
             raise ValueError(f"the time {time_s} is not after the previous time")
         self.time_s = time_s
         self.step += 1
         self._vehicle_xy = None
 
-    def add(self, tag: str, attributes: Mapping[str, str]) -> None:
+    def add_row(self, tag: str, attributes: Mapping[str, str]) -> None:
         """Add the row of a vehicle or person.
 
-        Raises ValueError or KeyError if the row is not valid.
+        Raise ValueError or KeyError if the row is invalid.
         """
         if not attributes.keys() <= self._known_attributes:
             unknown = attributes.keys() - self._known_attributes
@@ -337,44 +349,44 @@ class _PassageCollector:
         xy = attributes["x"], attributes["y"]
         if tag == "vehicle":
             self._vehicle_xy = xy
-        elif xy == self._vehicle_xy:  # SUMO writes the riders of a vehicle after the vehicle
+        elif xy == self._vehicle_xy:  # SUMO writes the passengers of a vehicle after the vehicle
             return
-        if not self._choice.has(attributes["id"]):
+        if not self._filter.matches(attributes["id"]):
             if attributes["id"] not in self.left_out:
-                self._allowance.take(_TRAVELLER_BYTES)
+                self._allowance.take(_TRAVELER_BYTES)
             self.left_out.add(attributes["id"])
             return
         passage = self._passage(tag, attributes)
-        if self.time_s <= self._first_s:  # of earlier rows, only the last is needed
+        if self.time_s <= self._first_s:  # the previous rows are not needed
             del passage.times_s[:], passage.rows[:]
         else:
             self._allowance.take(_ROW_BYTES)
         identity = attributes["id"]
         named = f"{tag} {identity!r}"
-        row = [_number(named, key, attributes[key]) for key in _ROW[:3]]
-        row += [_number(named, key, attributes.get(key) or "0") for key in _ROW[3:]]
+        row = [_parse_number(named, key, attributes[key]) for key in _ROW[:3]]
+        row += [_parse_number(named, key, attributes.get(key) or "0") for key in _ROW[3:]]
         if not all(map(math.isfinite, row)):
             raise ValueError(f"{named} has no finite position at {self.time_s:g} s")
         passage.times_s.append(self.time_s)
         passage.rows.extend(row)
 
-    def _passage(self, tag: str, attributes: Mapping[str, str]) -> Passage:
+    def _passage(self, tag: str, attributes: Mapping[str, str]) -> SumoPassage:
         """Return the passage that an element continues, or a new passage."""
-        traveller = tag, attributes["id"]
-        last_step, passage = self.travellers.get(traveller, (-2, None))
+        traveler = tag, attributes["id"]
+        last_step, passage = self.travelers.get(traveler, (-2, None))
         # SUMO omits vehicles while they are teleported.
         if passage is None or last_step < self.step - 1:
-            self._allowance.take(_TRAVELLER_BYTES + len(attributes["id"]))
-            passage = Passage(attributes["id"], attributes.get("type") or tag)
+            self._allowance.take(_TRAVELER_BYTES + len(attributes["id"]))
+            passage = SumoPassage(attributes["id"], attributes.get("type") or tag)
             self.passages.append(passage)
-        self.travellers[traveller] = self.step, passage
+        self.travelers[traveler] = self.step, passage
         return passage
 
 
-def _number(element: str, key: str, text: str) -> float:
-    """Return the number in an attribute.
+def _parse_number(element: str, key: str, text: str) -> float:
+    """Return the value of an attribute.
 
-    Raises ValueError if the attribute is not a number.
+    Raise ValueError if the value is not a number.
     """
     try:
         return float(text)
@@ -389,24 +401,36 @@ def read_fcd(
     section: TrafficSection,
     first_s: float,
     last_s: float,
-    choice: TravellerChoice = TravellerChoice(),  # noqa: B008 - it never changes
+    travelers: TravelerFilter = TravelerFilter(),  # noqa: B008 - immutable
 ) -> TrafficContent:
-    """Read the vehicles and persons between two times, with the time steps before and after.
+    """Read the vehicles and persons between two times from floating car data of SUMO.
 
-    The file may be of any length: only these rows stay in memory, for which the size of the file is
-    an `Allowance`.
+    The rows include the last time step before and the first time step after this interval. The file
+    can have any length, because other rows are discarded while the file is read. An `Allowance`
+    that depends on the size of the file limits the memory for the remaining rows.
+
+    Parameters
+    ----------
+    path
+        Path of the file.
+    section
+        Section `traffic` of the scenario.
+    first_s, last_s
+        First and last time in seconds, relative to the clock of the file.
+    travelers
+        Vehicles and persons to read.
 
     Raises
     ------
     LidarError
-        If the file cannot be read, is not floating car data, has unknown attributes, or unpacks to
-        far more than its size.
+        If the file cannot be read, is not floating car data, has unknown attributes, or
+        decompresses to far more than its size.
     """
     try:
         allowance = Allowance(input_size(path), "Simulate a shorter time, or fewer vehicles")
-        collector = _PassageCollector(section, first_s, choice, allowance)
+        collector = _PassageCollector(section, first_s, travelers, allowance)
         with prefixed(path):
-            collector.collect(_elements(path), last_s)
+            collector.collect(_iter_elements(path), last_s)
     except (OSError, EOFError, zlib.error, ValueError, KeyError, expat.ExpatError) as error:
         raise LidarError(
             f"{path} cannot be read as floating car data of `sumo --fcd-output`: "
@@ -417,12 +441,12 @@ def read_fcd(
         for passage in collector.passages
         if len(passage.times_s) > 1 and passage.times_s[-1] >= first_s
     ]
-    count = len(collector.travellers)
+    count = len(collector.travelers)
     return TrafficContent(present, plural(count, "vehicle") + " and persons", collector.left_out)
 
 
 def _check_ignored(tag: str, names: Set[str], ignore: Sequence[str]) -> None:
-    """Raise ValueError for a name of an attribute that fits no pattern to ignore."""
+    """Raise ValueError if an attribute name does not match any pattern in `ignore`."""
     for name in sorted(names):
         if not any(fits(name, pattern) for pattern in ignore):
             raise ValueError(
@@ -431,10 +455,10 @@ def _check_ignored(tag: str, names: Set[str], ignore: Sequence[str]) -> None:
             )
 
 
-def _elements(path: Path) -> Iterator[tuple[str, Mapping[str, str]]]:
-    """Yield tags and attributes of the elements of an XML file, which is read in pieces.
+def _iter_elements(path: Path) -> Iterator[tuple[str, Mapping[str, str]]]:
+    """Yield the tag and attributes of each element in an XML file, which is read in chunks.
 
-    LidarError is raised for a .gz that unpacks to far more than its size.
+    Raise LidarError if a .gz file decompresses to far more than its size.
     """
     elements: list[tuple[str, Mapping[str, str]]] = []
     parser = expat.ParserCreate()
@@ -451,29 +475,37 @@ def _elements(path: Path) -> Iterator[tuple[str, Mapping[str, str]]]:
             elements.clear()
 
 
-def carrier_of(
+def platform_track(
     entry: TrajectorySection,
     section: TrafficSection,
     content: TrafficContent,
-    shape_of: Callable[[VehicleSection], SceneMesh],
-    standing: StandingSurfaces,
+    load_mesh: Callable[[VehicleSection], SceneMesh],
+    support: SupportSurfaces,
 ) -> Track:
-    """Return the local trajectory of the vehicle of the traffic that carries the sensors.
+    """Return the local trajectory of the vehicle in the traffic that carries the sensors.
 
-    Its frame is the frame of the vehicle's mesh. `content` has passages of that vehicle alone; the
-    other arguments are as for `actors_of`.
+    The platform frame is the frame of the mesh of the vehicle.
+
+    Parameters
+    ----------
+    entry
+        Section `trajectory` of the scenario, which names the vehicle.
+    section, load_mesh, support
+        As for `build_traffic_actors`.
+    content
+        Traffic with the passages of that vehicle only.
 
     Raises
     ------
     LidarError
-        If the vehicle is not in the simulation, has no shape, or is in the simulation for several
-        times and `entry` does not say for which.
+        If the vehicle is not in the simulation or has no shape, or if it is in the simulation
+        several times and `entry` does not select one of them.
     """
     tracks: list[Track] = []
     for passage in content.passages:
         shape = passage.entry(section)
-        mesh = None if shape is None else shape_of(shape)
-        tracks += _tracks_of(passage, section, mesh, standing, 0.0)
+        mesh = None if shape is None else load_mesh(shape)
+        tracks += _passage_tracks(passage, section, mesh, support, 0.0)
     if not tracks:
         known = sorted(content.left_out)
         hint = name_hint(entry.vehicle or "", known) if known else ""
@@ -499,52 +531,64 @@ def carrier_of(
     return replace(tracks[0], start_s=start_s, duration_s=entry.duration_s, beyond="refuse")
 
 
-def _tracks_of(
+def _passage_tracks(
     passage: TrafficPassage,
     section: TrafficSection,
     mesh: SceneMesh | None,
-    standing: StandingSurfaces,
+    support: SupportSurfaces,
     start_s: float,
 ) -> Sequence[Track]:
-    """Return the local trajectories of a passage: several if it leaves `section.surfaces`."""
-    track = passage.track(section, mesh, standing.origin, start_s)
+    """Return the local trajectories of a passage.
+
+    If the passage leaves `section.surfaces`, there is one trajectory for each part on the surfaces.
+    """
+    track = passage.track(section, mesh, support.origin, start_s)
     if section.surfaces:
-        return follow_surfaces(track, standing.of_objects(section.surfaces))
+        return follow_surfaces(track, support.select(section.surfaces))
     return [track]
 
 
-def actors_of(
+def build_traffic_actors(
     section: TrafficSection,
     passages: Sequence[TrafficPassage],
-    shape_of: Callable[[VehicleSection], SceneMesh],
-    standing: StandingSurfaces,
+    load_mesh: Callable[[VehicleSection], SceneMesh],
+    support: SupportSurfaces,
     start_s: float,
 ) -> list[tuple[Actor, VehicleSection]]:
-    """Make actors of passages, in a scene's local coordinates, each with its entry.
+    """Create actors from passages, in the local coordinates of a scene.
 
     Parameters
     ----------
-    shape_of
-        Returns the mesh of an entry.
-    standing
-        Surfaces of the scene, for `section.surfaces`; vehicles off these surfaces are not in the
-        scene.
+    section
+        Section `traffic` of the scenario.
+    passages
+        Passages of the vehicles and persons.
+    load_mesh
+        Function that returns the mesh of an entry.
+    support
+        Surfaces of the scene. If `section.surfaces` is set, vehicles are not in the scene while
+        they are not on these surfaces.
     start_s
-        Start of the survey.
+        Start of the survey in seconds.
+
+    Returns
+    -------
+    list of (Actor, VehicleSection)
+        Actors with the entries that define their shapes.
 
     Raises
     ------
     LidarError
-        If a type has no shape, or there are too many actors.
+        If no entry matches a type, or if there are too many actors.
     """
     actors: list[tuple[Actor, VehicleSection]] = []
     for passage in passages:
         entry = passage.entry(section)
-        assert entry is not None, "objects without a shape are no actors"
-        mesh = shape_of(entry)
-        tracks = _tracks_of(passage, section, mesh, standing, start_s)
+        assert entry is not None, "objects without a shape are skipped when the file is read"
+        mesh = load_mesh(entry)
+        tracks = _passage_tracks(passage, section, mesh, support, start_s)
         named = replace(mesh, name=f"{entry.name or passage.kind} ({passage.name})")
-        # Actors of an entry do not walk in step.
+        # Different animation offsets keep the actors of an entry from walking in step.
         share = zlib.crc32(passage.name.encode()) / 2**32
         offset_s = 0.0 if entry.animation is None else entry.animation.offset_s
         offset_s += 0.0 if mesh.animation is None else share * mesh.animation.duration_s
