@@ -1,4 +1,4 @@
-"""Sensor models by name: reading their data files, and making sensors."""
+"""Sensor models, which are read from data files, and the sensors that are created from them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _MAX_BEAMS = 1_000_000
 
 
 def _numbers(value: Any) -> Any:
-    """Expand {first, last, count} to evenly spaced numbers, both ends included."""
+    """Expand a mapping of first, last and count to evenly spaced numbers, including both ends."""
     if isinstance(value, dict):
         count = value.get("count")
         if isinstance(count, int) and count > _MAX_BEAMS:
@@ -61,22 +61,27 @@ def _numbers(value: Any) -> Any:
 
 Numbers = Annotated[tuple[float, ...], BeforeValidator(_numbers)]
 OffsetXYZ = tuple[float, float, float]
-# 55.296 is not exact in binary, nor 500/9 in decimal.
+# Neither a binary float nor a decimal is exact: 55.296 is not exact in binary, and 500/9 is not
+# exact in decimal.
 Exact = Annotated[Fraction, BeforeValidator(lambda value: Fraction(str(value)))]
 Positive = Annotated[float, Field(gt=0)]
 
 
 class BeamTable(_ModelSection):
-    """Beams in the maker's order, as in `Beams`."""
+    """Beams of a sensor model in the manufacturer's order.
+
+    Except for their units, the fields are those of `Beams`. All beams cross in a point at a
+    distance of `crossing_m` from the axis, if it is set.
+    """
 
     elevation_deg: Numbers = ()
     azimuth_deg: Numbers = ()
     time_us: Numbers = ()
     origin_m: OffsetXYZ | tuple[OffsetXYZ, ...] = ()
-    crossing_m: Annotated[float, Field(ge=0, le=1)] = 0.0  # see `origins`
+    crossing_m: Annotated[float, Field(ge=0, le=1)] = 0.0
 
     def beams(self) -> Beams:
-        """Return the beams, or a single beam straight ahead if the table has no elevations."""
+        """Create the beams, or a single forward beam if the table has no elevations."""
         count = len(self.elevation_deg)
         if not count:
             return Beams(np.zeros(1))
@@ -88,10 +93,11 @@ class BeamTable(_ModelSection):
         )
 
     def origins(self, count: int) -> Floats:
-        """Return the starts of `count` beams: (count, 3), meters, or (0, 3) without origins.
+        """Return the origins of `count` beams in meters.
 
-        Beams that cross in a point `crossing_m` ahead of the axis, at the height of the sensor's
-        center, start on the axis, above or below the center.
+        The result has shape (count, 3), or shape (0, 3) if the table has no origins. If
+        `crossing_m` is set, the beams start on the axis and cross in a point `crossing_m` in front
+        of the sensor origin.
         """
         if self.crossing_m:
             up, level = sin_cos(np.radians(self.elevation_deg))
@@ -102,7 +108,7 @@ class BeamTable(_ModelSection):
 
 
 class MirrorPart(_ModelSection):
-    """Motion of a mirror that sweeps lines, as in `Mirror`."""
+    """Motion of a mirror that sweeps lines, with the fields of `Mirror`."""
 
     motion: MirrorMotion
     width_deg: Width
@@ -110,7 +116,7 @@ class MirrorPart(_ModelSection):
 
 
 class RangePrecision(_ModelSection):
-    """Standard deviation of the ranges of a surface, at right angles."""
+    """Standard deviation of ranges on a perpendicular surface."""
 
     sigma_m: Positive
     range_m: Positive
@@ -118,7 +124,7 @@ class RangePrecision(_ModelSection):
 
 
 class Detection(_ModelSection):
-    """Range at which a share of the pulses on a surface, at right angles, return."""
+    """Range at which a fraction of the pulses on a perpendicular surface is detected."""
 
     range_m: Positive
     reflectance: Annotated[float, Field(gt=0, le=1)] = TARGET_REFLECTANCE
@@ -126,13 +132,13 @@ class Detection(_ModelSection):
 
     @property
     def threshold_m(self) -> float:
-        """Range at which a surface of 10 % reflectance returns half of the pulses."""
+        """Range at which half of the pulses on a surface with 10 % reflectance are detected."""
         range_m = self.range_m * math.sqrt(TARGET_REFLECTANCE / self.reflectance)
         energy = 1 + NormalDist().inv_cdf(self.probability) / THRESHOLD_SIGMAS
         return float(range_m * math.sqrt(max(energy, 0.0)))
 
 
-# Figures that a data sheet may state: {field of `Noise`: words}.
+# Values that a data sheet may specify. {field of `Noise`: phrase}
 STATED = {
     "range_m": "range precision",
     "detection_range_m": "detection range at a given reflectance",
@@ -142,12 +148,12 @@ STATED = {
 
 
 class Performance(_ModelSection):
-    """Figures of a data sheet on a sensor's noise and returns.
+    """Values from a data sheet that describe a sensor's noise and returns.
 
-    `SensorModel.datasheet` makes settings of them.
+    `SensorModel.datasheet` converts them to settings.
 
-    The precision of ranges is given either by the fields of `Noise`, with the same names, or for
-    two surfaces, which give its dependence on energy.
+    The range precision is specified either by fields with the same names as those of `Noise`, or by
+    `precision` for two surfaces, from which its dependence on energy is derived.
     """
 
     range_m: Annotated[float, Field(ge=0)] | None = None
@@ -156,39 +162,39 @@ class Performance(_ModelSection):
     precision: tuple[RangePrecision, RangePrecision] | None = None
     angle_deg: Annotated[float, Field(ge=0)] | None = None
     detection: Detection | None = None
-    false_alarms: Annotated[float, Field(ge=0, lt=0.5)] | None = None  # share of pulses
-    dropout: UnitShare = 0.0  # share of returns, whatever their energy
+    false_alarms: Annotated[float, Field(ge=0, lt=0.5)] | None = None  # fraction of pulses
+    dropout: UnitShare = 0.0  # fraction of returns that are lost, regardless of their energy
     mode: Mode = "strongest"
 
     @model_validator(mode="after")
     def _check_consistency(self) -> Performance:
-        """Check that the figures fit together."""
         if self.precision and (self.range_m or self.range_per_m or self.range_at_threshold_m):
             raise ValueError("precision cannot be combined with other range accuracy values.")
         for name in ("precision", "false_alarms", "range_at_threshold_m"):
             if getattr(self, name) and self.detection is None:
                 raise ValueError(f"{name} requires detection.")
-        self.noise(1.0)  # LidarError if figures are impossible
+        self.noise(1.0)  # raises LidarError for impossible values
         return self
 
     def noise(self, gate_s: float) -> Noise:
         """Return the noise of a sensor whose receiver waits `gate_s` seconds for returns."""
-        figures = self.model_dump(
-            include={field.name for field in fields(Noise)}, exclude_none=True
-        )
+        values = self.model_dump(include={field.name for field in fields(Noise)}, exclude_none=True)
         if self.detection is not None:
-            figures["detection_range_m"] = self.detection.threshold_m
+            values["detection_range_m"] = self.detection.threshold_m
             if self.precision is not None:
-                strong_m, weak_m = self._by_energy(self.detection.threshold_m)
-                figures |= {"range_m": strong_m, "range_at_threshold_m": weak_m}
+                strong_m, weak_m = self._range_sigmas_m(self.detection.threshold_m)
+                values |= {"range_m": strong_m, "range_at_threshold_m": weak_m}
         if self.false_alarms is not None:
-            figures["false_alarm_hz"] = -float(log1p(-self.false_alarms)) / gate_s
-        return Noise(**figures)
+            values["false_alarm_hz"] = -float(log1p(-self.false_alarms)) / gate_s
+        return Noise(**values)
 
-    def _by_energy(self, threshold_m: float) -> tuple[float, float]:
-        """Return the standard deviations of strong returns, and of returns at the threshold."""
+    def _range_sigmas_m(self, threshold_m: float) -> tuple[float, float]:
+        """Return the range standard deviations for strong returns and at the threshold.
+
+        `threshold_m` is `Detection.threshold_m`.
+        """
         assert self.precision is not None
-        # The threshold over the energy: it grows with the square of the range.
+        # Ratio of the threshold to the energy, which increases with the square of the range.
         weakness = [
             TARGET_REFLECTANCE / surface.reflectance * np.square(surface.range_m / threshold_m)
             for surface in self.precision
@@ -205,10 +211,7 @@ class Performance(_ModelSection):
 
 
 class PacketPart(_ModelSection):
-    """Packets of the maker, as in `PacketSettings`.
-
-    The format defines the identifiers.
-    """
+    """Packet format of the manufacturer, with the fields of `PacketSettings`."""
 
     format: str
     ports: dict[str, Annotated[int, Field(ge=1, le=65_535)]] = {}
@@ -216,7 +219,7 @@ class PacketPart(_ModelSection):
 
 
 class SensorModel(_ModelSection):
-    """Data file of a sensor, with the fields that `docs/how-to/sensor.md` describes."""
+    """Content of a sensor data file, whose fields are described in docs/how-to/sensor.md."""
 
     name: str
     sources: dict[str, str] = {}
@@ -232,7 +235,7 @@ class SensorModel(_ModelSection):
     mirror: MirrorPart | None = None
     prisms: tuple[Prism, ...] = ()
     turning_mirror: TurningMirror | None = None  # behind the prisms
-    typical: bool = False  # whether units differ, so that the rays are only similar to a unit's
+    typical: bool = False  # whether the ray pattern differs between units
     optics: Optics = Optics()
     performance: Performance | None = None
     listed: bool = False
@@ -240,7 +243,6 @@ class SensorModel(_ModelSection):
 
     @model_validator(mode="after")
     def _check_consistency(self) -> SensorModel:
-        """Check that the fields fit together."""
         if (self.firing_us is None) == (self.firings_per_turn is None):
             raise ValueError("Set exactly one of firing_us and firings_per_turn.")
         if self.range_m is not None and not 0 <= self.range_m[0] < self.range_m[1]:
@@ -259,18 +261,21 @@ class SensorModel(_ModelSection):
             raise ValueError(
                 "turning_mirror requires prisms. For a mirror that scans lines, use mirror."
             )
-        self.beams.beams()  # LidarError if beams are impossible
+        self.beams.beams()  # raises LidarError for impossible beams
         return self
 
     @property
     def needs_calibration(self) -> bool:
-        """Whether the rays of the model need a calibration file."""
+        """Whether the model requires a calibration file, because it does not define its rays."""
         return not (self.beams.elevation_deg or self.mirror or self.prisms)
 
     def datasheet(self) -> Datasheet:
-        """Return noise and returns by the data sheet.
+        """Return the noise and returns that the data sheet specifies.
 
-        Raises LidarError if the file has no performance.
+        Raises
+        ------
+        LidarError
+            If the data file does not specify the performance.
         """
         performance = self.performance
         if performance is None:
@@ -286,7 +291,10 @@ class SensorModel(_ModelSection):
         return Datasheet(noise, Returns(performance.mode, subrays=subrays), missing)
 
     def packet_settings(self, lasers: Ints) -> PacketSettings | None:
-        """Return the packets of a sensor, `lasers` being the maker's number of each channel."""
+        """Return the packet settings of a sensor, or None if the model has no packet format.
+
+        For each channel, `lasers` contains the index of its laser in the manufacturer's order.
+        """
         if self.packets is None:
             return None
         return PacketSettings(
@@ -294,10 +302,19 @@ class SensorModel(_ModelSection):
         )
 
     def firing_rates(self, rate_hz: float | None, columns: int | None) -> tuple[float, float]:
-        """Return the firings in a revolution, and the revolutions a second.
+        """Return the number of firings per revolution and the number of revolutions per second.
 
-        `rate_hz` and `columns` (firings in a revolution) take the place of the model's figures, if
-        they are not None.
+        Parameters
+        ----------
+        rate_hz
+            Revolutions per second. None selects the rate of the model.
+        columns
+            Number of firings per revolution. None selects the number of the model.
+
+        Raises
+        ------
+        LidarError
+            If `columns` is set, but the model has a constant firing interval.
         """
         rate = self.rate_hz if rate_hz is None else rate_hz
         if self.firing_us is not None:
@@ -312,12 +329,12 @@ class SensorModel(_ModelSection):
 
 
 def plugin_of_model(name: str | None) -> Plugin | None:
-    """Return the plug-in with a model of a name, or None.
+    """Return the plug-in that provides a sensor model, or None.
 
     Raises
     ------
     LidarError
-        If two plug-ins have models of the maker.
+        If two plug-ins provide models from the same manufacturer.
     """
     if not name or name.endswith(MODEL_FILES) or full_name(name) in model_names():
         return None
@@ -325,7 +342,7 @@ def plugin_of_model(name: str | None) -> Plugin | None:
 
 
 def plugin_model_file(name: str | None) -> Path | None:
-    """Return the data file of a plug-in's model, or None for a model of the package or of a file.
+    """Return the data file of a model from a plug-in, or None if the model has another source.
 
     Raises
     ------
@@ -340,14 +357,19 @@ def plugin_model_file(name: str | None) -> Path | None:
 
 
 def read_model(name: str | Path) -> SensorModel:
-    """Read a model by its name, from the package or a plug-in, or by the path of its file (.yaml).
+    """Read a sensor model from its data file.
 
-    The maker may be left out of the name of a model that comes with the package.
+    Parameters
+    ----------
+    name
+        Name of a model from the package or from a plug-in, or path of a data file (.yaml). The name
+        of a model from the package may omit the manufacturer.
 
     Raises
     ------
     LidarError
-        If no model has that name, its plug-in cannot be used, or the file is not of a sensor.
+        If the model does not exist, its plug-in cannot be used, or the file is not a valid sensor
+        model.
     """
     if str(name).endswith(MODEL_FILES):
         return _read(Path(name))
@@ -371,21 +393,18 @@ def read_model(name: str | Path) -> SensorModel:
 
 
 def _plain(name: str) -> str:
-    """Return the lower-case letters and digits of a name, such as vlp16 of «VLP-16»."""
+    """Return the letters and digits of a name in lower case, for example vlp16 for VLP-16."""
     return "".join(filter(str.isalnum, name.lower()))
 
 
 @cache
 def _built_in(name: str) -> SensorModel:
-    """Read a model that comes with the package."""
+    """Read a model that is included in the package."""
     return _read(BUILT_IN / f"{name}.yaml")
 
 
 def _read(path: Path | Traversable) -> SensorModel:
-    """Read the data file of a model.
-
-    Raises LidarError if the file cannot be used.
-    """
+    """Read the data file of a model, and raise LidarError if it is invalid."""
     with converted(f"{path} is not a valid sensor model"):
         text = read_input_text(path) if isinstance(path, Path) else path.read_text("utf-8")
         content = load_yaml(text)
@@ -394,15 +413,15 @@ def _read(path: Path | Traversable) -> SensorModel:
 
 
 class Datasheet(NamedTuple):
-    """Noise and returns of a sensor by its data sheet."""
+    """Noise and returns that a sensor's data sheet specifies."""
 
     noise: Noise
     returns: Returns
-    missing: tuple[str, ...]  # figures that the sheet does not state, with the fields for them
+    missing: tuple[str, ...]  # values that the data sheet lacks, with their fields
 
 
 def shown_noise(noise: Noise) -> str:
-    """Return the fields of noise that differ from their defaults, as in a scenario."""
+    """Return the noise fields that differ from their defaults, as written in a scenario."""
     shown = (
         f"{field.name}: {value:.4g}"
         for field in fields(noise)
@@ -510,15 +529,19 @@ def load_sensor(
 
 
 def _sensor_name(sensor_model: SensorModel, unit: Calibration | None) -> str:
-    """Return the name of a sensor for reports, with the source of its rays."""
+    """Return the name of a sensor for reports, including the origin of its ray pattern."""
     if unit is not None:
         return f"{sensor_model.name}, {unit.file}"
     return f"{sensor_model.name}, typical pattern" if sensor_model.typical else sensor_model.name
 
 
 def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
-    """Return the model whose beams are nearest to a unit's, else a model of the file alone."""
-    deviations_deg = {}  # {model: greatest difference between its elevations and the unit's}
+    """Return the model whose beams best match a calibration.
+
+    If no model matches, create a model from the calibration alone. Raise LidarError if the
+    calibration has no firing times.
+    """
+    deviations_deg = {}  # {model: maximum difference from the calibrated elevations}
     for name in model_names():
         if unit.beams is None or not name.startswith(f"{unit.maker}/"):
             continue
@@ -526,7 +549,7 @@ def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
         if len(model_deg) == len(unit.beams):
             unit_deg = np.degrees(unit.beams.elevation)
             deviations_deg[name] = float(np.abs(np.sort(unit_deg) - np.sort(model_deg)).max())
-    if deviations_deg and min(deviations_deg.values()) < 5:  # units of one model differ by far less
+    if deviations_deg and min(deviations_deg.values()) < 5:  # units of a model differ far less
         return read_model(min(deviations_deg, key=deviations_deg.__getitem__))
     head = {"firings_per_turn": columns} if columns and unit.maker is None else unit.head
     if not head:
@@ -540,13 +563,16 @@ def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
 def _listed(
     sensor_model: SensorModel, unit: Calibration, head: Spin, common_fields: dict[str, Any]
 ) -> ListedSensor:
-    """Return a sensor with a unit's list of rays, at the model's rate if the list has no times."""
+    """Create a sensor from a calibrated ray list.
+
+    If the list has no times, the rays are fired at the rate of the model.
+    """
     if unit.rays is None or (sensor_model.beams.elevation_deg and not sensor_model.prisms):
         raise LidarError(
             f"{unit.file} does not match {sensor_model.name}. One describes rays and the other "
             "describes beams."
         )
-    if not unit.head:  # a firing of the model has all beams, a firing of the list has one ray
+    if not unit.head:  # a firing of the model comprises all beams, and one of the list a single ray
         firings = head.firings_per_turn * len(sensor_model.beams.beams())
         head = replace(head, firings_per_turn=firings)
     interval_ns = 1e9 / (head.firings_per_turn * head.rate_hz)
@@ -565,10 +591,10 @@ def _listed(
 
 
 def _calibrated(sensor_model: SensorModel, unit: Calibration) -> Beams:
-    """Return the beams of a unit, fired at the times of its model."""
+    """Return calibrated beams, with times and origins from the model if the file has none."""
     beams = unit.beams
     table = sensor_model.beams
-    assert beams is not None  # a file has beams or rays
+    assert beams is not None  # a calibration has beams or rays
     expected = len(table.elevation_deg) or len(table.time_us)
     if expected not in (0, len(beams)):
         raise LidarError(

@@ -1,4 +1,4 @@
-"""Noise of a sensor: errors of ranges and angles, lost returns and false alarms."""
+"""Noise model of a sensor, with range and angle errors, lost returns and false alarms."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ from ..schema.value_texts import one_line
 
 # Detection threshold for signal plus noise, in standard deviations.
 THRESHOLD_SIGMAS = 5.0
-TARGET_REFLECTANCE = 0.1  # reflectance of stated ranges
-MAX_ALARMS = 20  # false alarms of a pulse on average: a ray has numbers for 255
+TARGET_REFLECTANCE = 0.1  # reflectance to which specified detection ranges refer
+# Maximum mean number of false alarms per pulse. Each ray has random numbers for 255 alarms.
+MAX_ALARMS = 20
 
 Meters = Annotated[float, Field(ge=0, le=1000)]
 Bias = Annotated[float, Field(ge=-1000, le=1000)]
@@ -196,5 +197,5 @@ class Noise:
         return any((*random, self.walk_m, self.channel_bias_m, self.warm_up_m))
 
     def named(self, name: str) -> Noise:
-        """Return a copy of the noise with a seed that also depends on the name of a sensor."""
+        """Return a copy whose seed also depends on the name of a sensor."""
         return replace(self, seed=named_seed(self.seed, name))
