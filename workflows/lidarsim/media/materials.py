@@ -641,9 +641,7 @@ class MaterialTable:
     semantic_class: NDArray[np.uint16]
     refractive_index: Floats  # refractive index inside the surface, or 0 without refraction
     attenuation: Floats  # attenuation inside the surface in 1/m
-    leaf_area: (
-        Floats  # leaf area density inside the surface in m²/m³; 0 without leaves, 1 for voxels
-    )
+    leaf_area: Floats  # leaf area density inside the surface in m²/m³, or 1 for voxels
     leaf_angle: Indices  # indices into `leaf_angles`
     leaf_angles: tuple[str | float, ...]
 

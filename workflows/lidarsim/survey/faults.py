@@ -1,4 +1,4 @@
-"""Faults of sensors, to test programs that read sensor data."""
+"""Sensor faults, for testing programs that process sensor data."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Channels = Annotated[Several[Annotated[int, Field(ge=0)]], Field(min_length=1)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Shift = Annotated[float, Field(ge=-1e6, le=1e6)]
 
-# {kind: fields that only this kind has}; sectors may be left out
+# Fields that only apply to one kind of fault. The angles of the sector are optional.
 _KIND_FIELDS: dict[str, tuple[str, ...]] = {
     "dirt": ("transmission", "azimuth_deg", "elevation_deg"),
     "dead_channels": ("channels",),
@@ -79,7 +79,7 @@ class Fault(FileSection):
 
     def __post_init__(self) -> None:
         check_fields(self)
-        for name, value in self.words().items():  # labels have them as JSON
+        for name, value in self.words().items():  # values must be JSON types for the labels
             if np.iterable(value) and not isinstance(value, str):
                 value = tuple(np.asarray([*value]).tolist())
             elif isinstance(value, np.number):
@@ -152,14 +152,21 @@ class Fault(FileSection):
 def check_faults(
     faults: Sequence[Fault], sensors: Mapping[str, Sensor], duration_ns: float
 ) -> None:
-    """Check that faults fit the sensors and the duration of a survey.
+    """Check that faults are compatible with the sensors and the duration of a survey.
 
-    `sensors` are {name: sensor}.
+    Parameters
+    ----------
+    faults
+        Faults of the survey.
+    sensors
+        Sensors by name.
+    duration_ns
+        Duration of the survey in nanoseconds.
 
     Raises
     ------
     LidarError
-        If a fault does not fit.
+        If a fault refers to a sensor or channel that does not exist, or starts at an invalid time.
     """
     for number, fault in enumerate(faults):
         with prefixed(f"faults[{number}]"):
@@ -167,7 +174,6 @@ def check_faults(
 
 
 def _check_fault(fault: Fault, sensors: Mapping[str, Sensor], duration_s: float) -> None:
-    """Check that a fault fits the sensors {name: sensor} and the duration of a survey."""
     faulty = [sensor for name, sensor in sensors.items() if fault.sensor in (None, name)]
     if not faulty:
         advice = " The survey has a single unnamed sensor. Remove sensor."

@@ -1,4 +1,4 @@
-"""A survey: sensors on a carrier, its trajectory, and the resulting scans."""
+"""Surveys, which define the sensors, the trajectory of their platform, and the scans."""
 
 from __future__ import annotations
 
@@ -40,25 +40,25 @@ from ..sensor.sensor import Sensor
 from ..words import joined, listed, plural, rounded, scans_in_words
 from .faults import Fault, FaultKind, check_faults
 
-STEPS = 36  # default at each pose: one revolution of most sensors
-MAX_STEPS = 10_000_000  # along a trajectory
+STEPS = 36  # default number of steps per pose, which is one revolution of most sensors
+MAX_STEPS = 10_000_000  # maximum number of steps along a trajectory
 StepCount = Annotated[int, Field(ge=1, le=MAX_STEPS)]
 OPTIONAL_NAMES = tuple(column.in_files for column in OPTIONAL)
-MAX_SENSORS = 255  # limit of the type of the column
-MAX_PARTICLES = 100  # particles that a pulse may return from
-MAX_RAYS = 1 << 32  # rays of a scan, which is cast in one call
-PRECISION_M = 0.01  # precision of points, if a sensor states no resolution
-START_FROM = datetime(2017, 1, 1, tzinfo=UTC)  # since when GPS and UTC have been 18 s apart
+MAX_SENSORS = 255  # limit of the column `sensor`
+MAX_PARTICLES = 100  # maximum mean number of particles that return light per pulse
+MAX_RAYS = 1 << 32  # maximum number of rays in a scan, which is cast in a single call
+PRECISION_M = 0.01  # precision of points if the resolution of the sensor is unknown
+START_FROM = datetime(2017, 1, 1, tzinfo=UTC)  # start of the current GPS-UTC offset of 18 s
 # EPSG code of the world's coordinate system.
 EpsgCode = Annotated[int, Field(ge=1024, le=32767)]
-MAX_DURATION_NS = 2.0**63  # limit of the type of the column time: 292 years
+MAX_DURATION_NS = 2.0**63  # limit of the column `time`, which is 292 years
 
 
 _ON_SENSORS = " To load a sensor model, use load_sensor('velodyne/vlp16')."
 
 
 def nanoseconds(moment: datetime) -> int:
-    """Return the nanoseconds from 1970-01-01 UTC to a time with a time zone."""
+    """Return the nanoseconds from 1970-01-01 UTC to a timezone-aware datetime."""
     return (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
 
 
@@ -145,16 +145,16 @@ class ScanSpec:
 
     def shifted(self, start_ns: int, ahead: int) -> ScanSpec:
         """Return a copy of the scan with another station start and another random number offset."""
-        spec = object.__new__(type(self))  # `replace` takes five times as long
+        spec = object.__new__(type(self))  # five times as fast as `replace`
         vars(spec).update(vars(self), start_ns=start_ns, ahead=ahead)
         return spec
 
 
 @dataclass(frozen=True, kw_only=True)
 class CloudOptions(FileSection):
-    """Selection of the hits that become points, and the columns of points.
+    """Options that select the points of a cloud and their columns.
 
-    In Python a column may also be a user's `Column`.
+    In Python, `columns` may also contain user-defined `Column` objects.
     """
 
     keep_every: Annotated[
@@ -184,7 +184,7 @@ class CloudOptions(FileSection):
     ] = "world"
     columns: Annotated[
         Sequence[str | Column],
-        written_as(Several[Literal[(*OPTIONAL_NAMES, *TABLE)]]),  # those always there, too
+        written_as(Several[Literal[(*OPTIONAL_NAMES, *TABLE)]]),  # includes the default columns
         about(
             "columns in addition to x, y, z, scan, channel and object: "
             + ", ".join(OPTIONAL_NAMES),
@@ -218,9 +218,9 @@ class CloudOptions(FileSection):
 class SensorSweeps(NamedTuple):
     """Sweeps of a sensor in a survey."""
 
-    firsts: Ints  # (s,): first scan
-    starts_ns: Floats  # (s,): start of the first firing, since the survey's start
-    stops_ns: Floats  # (s,): start of the last firing
+    firsts: Ints  # (s,), index of the first scan
+    starts_ns: Floats  # (s,), start of the first firing since the start of the survey
+    stops_ns: Floats  # (s,), start of the last firing since the start of the survey
 
 
 @dataclass(frozen=True)
@@ -326,7 +326,7 @@ class Survey(CloudOptions, Weather):
         check_faults(self.faults, sensors, self.duration_ns)
 
     def _repr_html_(self) -> str:
-        """Return the table of the main figures, and a picture if a package draws surveys."""
+        """Return a table of the main properties, and a picture if a package can draw surveys."""
         models = [
             f"{carried.name}: {carried.sensor.model}" if carried.name else carried.sensor.model
             for carried in self.carried
@@ -345,7 +345,7 @@ class Survey(CloudOptions, Weather):
         return table_of(rows.items()) + picture_of(self)
 
     def _fill_in(self, name: str, default: Returns | Noise) -> None:
-        """Set the returns or the noise of all sensors, if the survey has none."""
+        """Set the returns or noise to those of the sensors or the default, if they are not set."""
         if getattr(self, name) is not None:
             return
         if self.sensors:
@@ -359,14 +359,14 @@ class Survey(CloudOptions, Weather):
         self._set(**{name: default})
 
     def _set(self, **fields: Any) -> None:
-        """Set fields of the frozen survey."""
+        """Set fields although the survey is frozen."""
         for name, value in fields.items():
             object.__setattr__(self, name, value)
 
     def _trajectory(self) -> Trajectory:
-        """Return the trajectory, or the poses as stations.
+        """Return the trajectory, or create stations from the poses.
 
-        Raises LidarError for both or neither.
+        Raise LidarError if both or neither are set.
         """
         if self.trajectory is None:
             if not self.poses:
@@ -377,7 +377,7 @@ class Survey(CloudOptions, Weather):
         return self.trajectory
 
     def _check_names(self) -> None:
-        """Check that sensors have different names, and are not too many."""
+        """Check that sensor names are unique and that there are not too many sensors."""
         names = [carried.name for carried in self.sensors]
         if len(names) > MAX_SENSORS or len({*names}) < len(names):
             raise LidarError(
@@ -386,7 +386,7 @@ class Survey(CloudOptions, Weather):
             )
 
     def _check_values(self) -> None:
-        """Check that options fit together and to the sensors."""
+        """Check that the options are compatible with each other and with the sensors."""
         if self.epsg in WORLD_EPSG:
             raise LidarError(f"epsg is {self.epsg}, {OF_THE_WORLD}.")
         if self.navigation is not None:
@@ -397,7 +397,7 @@ class Survey(CloudOptions, Weather):
                 f"2026-11-21T10:00:00Z, but is {self.start}."
             )
         for carried, returns in zip(self.carried, self.returns_each, strict=True):
-            returns.divergence(carried.sensor.optics)  # LidarError for sub-rays without divergence
+            returns.divergence(carried.sensor.optics)  # raises LidarError if it is unknown
             self._check_waveform(carried.sensor, returns)
         for number, noise in enumerate(self.noise_each):
             _check_noise(noise, self.carried[number].sensor)
@@ -410,7 +410,7 @@ class Survey(CloudOptions, Weather):
                 self._check_air(number)
 
     def _check_waveform(self, sensor: Sensor, returns: Returns) -> None:
-        """Check that the samples of waveforms suit the pulse of a sensor, and LAS."""
+        """Check that the waveform samples are suitable for the pulse of a sensor and for LAS."""
         if returns.waveform != "none" or self.waveform_samples:
             sigma_ns = returns.system_ns(sensor.optics)
             min_samples = ceil(WINDOW_SIGMAS * sigma_ns / returns.sample_ns) + 2
@@ -427,7 +427,11 @@ class Survey(CloudOptions, Weather):
             )
 
     def _check_crosstalk(self, number: int) -> None:
-        """Check that the survey has several sensors, with a greatest range and a divergence."""
+        """Check that crosstalk to a sensor can be simulated.
+
+        Crosstalk requires several sensors, a maximum range for each of them, and the divergence of
+        the affected sensor.
+        """
         if len(self.carried) == 1:
             raise LidarError(
                 "noise.crosstalk requires at least two sensors, but this survey has one."
@@ -445,14 +449,14 @@ class Survey(CloudOptions, Weather):
             )
 
     def _check_air(self, number: int) -> None:
-        """Check that a sensor's returns from the air can be computed, and are not too many."""
+        """Check that a sensor's returns from the air can be simulated and are not too numerous."""
         carried = self.carried[number]
         sensor = carried.sensor
         name = f" of {carried.name}" if carried.name else ""
         if self.noise_each[number].detection_range_m is None:
             missing = "is not set" if carried.noise is None else "is not in its data sheet"
             guess_m = sensor.max_range_m / 2 if sensor.max_range_m < np.inf else 100
-            guess = f"{float(f'{guess_m:.3g}'):g}"  # never 1e+03, which YAML reads as text
+            guess = f"{float(f'{guess_m:.3g}'):g}"  # avoids 1e+03, which YAML reads as a string
             raise LidarError(
                 f"Returns from rain, snow, spray or dust require noise.detection_range_m{name}, "
                 f"the range at 10 % reflectance, which {missing}. Set it, or use half of the "
@@ -471,7 +475,7 @@ class Survey(CloudOptions, Weather):
             )
 
     def _check_duration(self, sensor: Sensor, steps: int) -> None:
-        """Check that a sensor's steps fit into the trajectory, its rays and times into numbers."""
+        """Check that the steps of a sensor fit into the trajectory and do not exceed any limit."""
         needed_s = _last_firing_ns(sensor, steps) / 1e9
         available_s = self.path.duration_ns / 1e9
         if needed_s > available_s:
@@ -496,7 +500,7 @@ class Survey(CloudOptions, Weather):
     @cached_property
     def path(self) -> Trajectory:
         """Trajectory of the platform, which has one station per pose if `poses` is set."""
-        assert self.trajectory is not None  # the poses have a trajectory by default
+        assert self.trajectory is not None  # set in __post_init__
         return self.trajectory
 
     @cached_property
@@ -576,7 +580,7 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def _firsts(self) -> list[int]:
-        """First scan of each sensor, and the number of scans."""
+        """Index of the first scan of each sensor, followed by the number of scans."""
         return [0, *accumulate(steps * self.path.stations for steps in self.steps_each)]
 
     @property
@@ -696,7 +700,8 @@ class Survey(CloudOptions, Weather):
             source = int(np.searchsorted(starts_ns, active[0].from_s * 1e9)) - 1
         if source == sweep:
             return spec
-        # The last sweep at a pose may have fewer scans: then scans are lost (`LossStep`).
+        # If the repeated sweep is the last one at a pose, it may have fewer scans than the sweep that
+        # it replaces. `LossStep` removes the returns of the surplus scans.
         older = min(int(firsts[source] + index - firsts[sweep]), int(firsts[source + 1]) - 1)
         repeats = int(firsts[source]), int(firsts[sweep])
         return replace(self.scan(older), scan=index, ahead=older - index, repeats=repeats)
@@ -719,7 +724,7 @@ class Survey(CloudOptions, Weather):
 
 
 def _check_noise(noise: Noise, sensor: Sensor) -> None:
-    """Check that noise suits a sensor, and that false alarms are not too many."""
+    """Check that the noise is compatible with a sensor and does not cause too many false alarms."""
     biases = noise.channel_bias_m
     channels = sensor.channels
     if isinstance(biases, Sequence) and len(biases) != channels:
@@ -745,20 +750,20 @@ def _check_noise(noise: Noise, sensor: Sensor) -> None:
 
 
 def firing_start_ns(sensor: Sensor, firing: int) -> float:
-    """Return the start of a firing, nanoseconds since the start of the station."""
+    """Return the start time of a firing in nanoseconds since the start of the station."""
     return float(sensor.begins_ns(np.array([firing], np.int64))[0])
 
 
 def _last_firing_ns(sensor: Sensor, steps: int) -> float:
-    """Return the start of the last firing of `steps` time steps, ns since the station's start."""
+    """Return the start time of the last firing in the first `steps` time steps.
+
+    The time is in nanoseconds since the start of the station.
+    """
     return firing_start_ns(sensor, sensor.firings(steps - 1)[1] - 1) + sensor.lead_ns
 
 
 def _poses(poses: Sequence[Any]) -> tuple[Pose, ...]:
-    """Return poses, where each may be x, y and z.
-
-    Raises LidarError if they are not a list of poses.
-    """
+    """Convert positions to poses, and raise LidarError if `poses` is not a list."""
     if isinstance(poses, str) or not isinstance(poses, Iterable):
         raise LidarError(
             f"poses must be a list of poses, such as [(0, 0, 1)], but is {shown(poses)}."
