@@ -30,7 +30,7 @@ LeafAngle = Annotated[
 ]
 
 
-def density(leaf_angle: str | float, angle: Floats) -> Floats:
+def leaf_angle_density(leaf_angle: str | float, angle: Floats) -> Floats:
     """Return the density of a leaf angle distribution, per radian.
 
     The integral of the density over leaf angles from 0 to π/2 is 1.
@@ -82,8 +82,8 @@ class _LightTable(NamedTuple):
     """Projection and brightness of leaves for several light directions."""
 
     cosine: Floats  # (361,), cosine of the angle between the light and the vertical, ascending
-    projection: Floats  # (361,), as returned by `projection`
-    brightness: Floats  # (361,), as returned by `brightness`
+    projection: Floats  # (361,), as returned by `mean_projection`
+    brightness: Floats  # (361,), as returned by `mean_brightness`
 
 
 @cache
@@ -91,7 +91,7 @@ def _light_table(leaf_angle: str | float) -> _LightTable:
     """Integrate the projection and brightness of leaves over the leaf angles."""
     cosine = sin(np.linspace(0, np.pi / 2, _NODES))[:, None]
     angle = (np.arange(_ANGLES, dtype=np.float64) + 0.5) * (np.pi / 2 / _ANGLES)
-    share = density(leaf_angle, angle)
+    share = leaf_angle_density(leaf_angle, angle)
     share /= share.sum()
     # The cosine of the angle between the light and the normal of a leaf is
     # `constant + amplitude * cos(azimuth)`.
@@ -108,7 +108,7 @@ def _light_table(leaf_angle: str | float) -> _LightTable:
     return _LightTable(cosine[:, 0], projected, bright / projected)
 
 
-def projection(leaf_angle: str | float, cosine: Floats) -> Floats:
+def mean_projection(leaf_angle: str | float, cosine: Floats) -> Floats:
     """Return the mean projected area of leaves as a fraction of their area.
 
     This is the G function of Ross (1981). `cosine` is the cosine of the angle between the light and
@@ -116,14 +116,14 @@ def projection(leaf_angle: str | float, cosine: Floats) -> Floats:
 
     Examples
     --------
-    >>> projection("spherical", np.array([0.0, 0.3, 1.0])).round(4).tolist()
+    >>> mean_projection("spherical", np.array([0.0, 0.3, 1.0])).round(4).tolist()
     [0.5, 0.5, 0.5]
     """
     table = _light_table(leaf_angle)
     return interp(cosine, table.cosine, table.projection)
 
 
-def brightness(leaf_angle: str | float, cosine: Floats) -> Floats:
+def mean_brightness(leaf_angle: str | float, cosine: Floats) -> Floats:
     """Return the mean cosine of the incidence angle of light on leaves.
 
     The probability that a leaf is hit is proportional to its projected area, so leaves that face

@@ -50,7 +50,7 @@ SemanticClass = Annotated[int, Field(ge=0, le=65_535)]
 Transparent = Literal["none", "pass"]
 
 
-def class_names_problem(names: Mapping[Any, Any]) -> str:
+def find_class_names_error(names: Mapping[Any, Any]) -> str:
     """Return an error message if a mapping from numbers to class names cannot be stored in files.
 
     The result is an empty string if the names are valid. Two classes must not have the same name.
@@ -67,7 +67,7 @@ def class_names_problem(names: Mapping[Any, Any]) -> str:
 
 
 def _validate_names(names: Any, handler: Callable[[Any], Any]) -> Any:
-    if isinstance(names, Mapping) and (problem := class_names_problem(names)):
+    if isinstance(names, Mapping) and (problem := find_class_names_error(names)):
         raise ValueError(problem)
     return handler(names)
 
@@ -75,7 +75,7 @@ def _validate_names(names: Any, handler: Callable[[Any], Any]) -> Any:
 ClassNames = Annotated[Mapping[SemanticClass, str], WrapValidator(_validate_names)]
 
 
-class Measured(NamedTuple):
+class MeasuredReflectance(NamedTuple):
     """Reflectance of a material in a public spectral library."""
 
     shares: tuple[float, float]  # at 905 and 1550 nm
@@ -84,11 +84,11 @@ class Measured(NamedTuple):
 
 
 @cache
-def reflectances() -> dict[str, Measured]:
+def reflectances() -> dict[str, MeasuredReflectance]:
     """Return the table of measured reflectances by material name."""
     text = (files("lidarsim.media") / "reflectances.csv").read_text("utf-8")
     return {
-        row["name"]: Measured(
+        row["name"]: MeasuredReflectance(
             (float(row["at_905_nm"]), float(row["at_1550_nm"])), row["library"], row["sample"]
         )
         for row in csv.DictReader(text.splitlines())
@@ -354,7 +354,7 @@ class Material(FileSection):
         """
         return float(self.specular_reflectance == "fresnel" or self.specular_reflectance or 0)
 
-    def named(self, name: str, materials: Collection[str] = ("",)) -> bool:
+    def applies_to(self, name: str, materials: Collection[str] = ("",)) -> bool:
         """Return True if this material applies to an object.
 
         `name` is the name of the object, and `materials` are the names that the materials of its
@@ -363,7 +363,7 @@ class Material(FileSection):
         return _fits(name, self.objects) and any(_fits(face, self.material) for face in materials)
 
     @property
-    def for_all(self) -> bool:
+    def applies_to_all(self) -> bool:
         """Whether this material applies to all faces of all objects."""
         return self.material is None and self.objects is not None and "*" in self.objects
 
@@ -389,7 +389,7 @@ def _materials_like(name: str, materials: Sequence[str]) -> str:
     )
 
 
-def rows_named(pattern: str, names: Sequence[str]) -> Indices:
+def match_names(pattern: str, names: Sequence[str]) -> Indices:
     """Return the indices of the names that are equal to or match a pattern with * and ?."""
     if not any(sign in pattern for sign in "*?["):
         return np.array([row for row, name in enumerate(names) if name == pattern], np.intp)
@@ -417,7 +417,7 @@ class SurfaceKinds:
     material: Sequence[str]
 
     @classmethod
-    def of_objects(cls, names: Sequence[str]) -> SurfaceKinds:
+    def from_objects(cls, names: Sequence[str]) -> SurfaceKinds:
         """Create one kind for each object, without materials from scene files."""
         return cls(names, np.arange(len(names)), ("",) * len(names))
 
@@ -429,7 +429,7 @@ class SurfaceKinds:
         """
         return np.searchsorted(self.object, np.arange(len(self.names) + 1))
 
-    def of_rows(self, object_indices: Indices) -> Indices:
+    def kinds_of_objects(self, object_indices: Indices) -> Indices:
         """Return the kinds of several objects, which are selected by index."""
         if len(self.object) == len(self.names):
             return object_indices
@@ -463,7 +463,7 @@ def first_matches(materials: Sequence[Material], kinds: SurfaceKinds) -> Indices
             if name:
                 kinds_by_material.setdefault(name, []).append(kind)
     for number, entry in enumerate(materials):
-        if entry.for_all and number + 1 < len(materials):
+        if entry.applies_to_all and number + 1 < len(materials):
             raise LidarError(
                 "materials: the first matching entry applies, so entries after number "
                 f'{number + 1}, {{objects: "*"}}, have no effect. Move it to the end.'
@@ -487,17 +487,17 @@ def _matching_kinds(
     matches: Indices | None = None
     if entry.objects is not None:
         rows = [
-            matching_rows(pattern, kinds.names, object_rows, "materials")
+            match_object_names(pattern, kinds.names, object_rows, "materials")
             for pattern in entry.objects
         ]
-        matches = kinds.of_rows(np.concatenate(rows))
+        matches = kinds.kinds_of_objects(np.concatenate(rows))
     if entry.material is None:
         assert matches is not None, "a material applies to objects, or to materials"
         return matches
     names = [*kinds_by_material]
     with_material: list[int] = []
     for pattern in entry.material:
-        rows_of_pattern = rows_named(pattern, names)
+        rows_of_pattern = match_names(pattern, names)
         if not len(rows_of_pattern):
             measured = f" For a measured reflectance, use spectrum: {pattern!r}."
             raise LidarError(
@@ -522,7 +522,7 @@ def _matching_kinds(
     return common
 
 
-def matching_rows(
+def match_object_names(
     pattern: str, names: Sequence[str], object_rows: Mapping[str, int], subject: str
 ) -> Indices:
     """Return the indices of the objects that match a pattern.
@@ -545,7 +545,7 @@ def matching_rows(
     """
     if pattern in object_rows and not any(sign in pattern for sign in "*?["):
         return np.array([object_rows[pattern]])
-    rows = rows_named(pattern, names)
+    rows = match_names(pattern, names)
     if not len(rows):
         raise LidarError(
             f"{subject} contains {pattern!r}, but no object has that "
@@ -554,7 +554,7 @@ def matching_rows(
     return rows
 
 
-def with_classes(
+def assign_classes(
     materials: Sequence[Material], classes: Mapping[int, Sequence[str]], kinds: SurfaceKinds
 ) -> list[Material]:
     """Assign semantic classes to objects by name, unless their materials already have a class.
@@ -582,8 +582,8 @@ def with_classes(
     insertions: list[list[Material]] = [[] for _ in materials]  # new entries before each entry
     for semantic_class, patterns in classes.items():
         for pattern in patterns:
-            rows = rows_named(pattern, kinds.names)
-            pattern_kinds = kinds.of_rows(rows)
+            rows = match_names(pattern, kinds.names)
+            pattern_kinds = kinds.kinds_of_objects(rows)
             for number in np.unique(first[pattern_kinds]).tolist():
                 entry = materials[number]
                 if number < 0 or entry.semantic_class:
@@ -599,7 +599,7 @@ def with_classes(
     return [entry for material, inserted in pairs for entry in (*inserted, material)]
 
 
-def with_class(
+def assign_class(
     materials: Sequence[Material], semantic_class: int, object_indices: Indices, kinds: SurfaceKinds
 ) -> list[Material]:
     """Assign a semantic class to the objects with the given indices.
@@ -612,7 +612,7 @@ def with_class(
         If a material does not apply to any kind.
     """
     first = first_matches(materials, kinds)
-    selected_kinds = kinds.of_rows(object_indices)
+    selected_kinds = kinds.kinds_of_objects(object_indices)
     entries: list[Material] = []
     for number in (*range(len(materials)), -1):
         object_rows = np.unique(
@@ -803,7 +803,7 @@ def fresnel(cosine: Any, index: Any = GLASS_INDEX) -> Any:
     return (perpendicular**2 + parallel**2) / 2
 
 
-def below_water(cosine: Any, reflectance: Any) -> Any:
+def wet_surface_factor(cosine: Any, reflectance: Any) -> Any:
     """Return the light from matte surfaces under a film of water, relative to dry surfaces.
 
     The result is ``T² / (n² (1 - p ρ))``. Light passes through the surface of the film twice, with
@@ -811,16 +811,16 @@ def below_water(cosine: Any, reflectance: Any) -> Any:
     diffuse light in the water is reflected back to the ground (Lekner and Dorf 1988, Ångström
     1925).
     """
-    return within_water(fresnel(cosine, WATER_INDEX), reflectance)
+    return water_film_factor(fresnel(cosine, WATER_INDEX), reflectance)
 
 
-def within_water(mirrored: Any, reflectance: Any) -> Any:
-    """Return the result of `below_water` for a known reflectance of the film of water."""
+def water_film_factor(mirrored: Any, reflectance: Any) -> Any:
+    """Return the result of `wet_surface_factor` for a known reflectance of the film of water."""
     through = (1 - mirrored) / WATER_INDEX
     return through * through / (1 - WATER_INWARDS * reflectance)
 
 
-def at_right_angles(distance: Any, extinction: float = 0.0) -> Any:
+def normal_incidence_energy(distance: Any, extinction: float = 0.0) -> Any:
     """Return the energy from perpendicular white surfaces at distances in meters."""
     distance = np.maximum(distance, NEAREST_M)
     nearer = np.square(REFERENCE_M / distance)

@@ -135,9 +135,9 @@ class Weather(FileSection):
         """Raindrops and snowflakes in the air, if there are any."""
         kinds = []
         if self.rain_mm_h:
-            kinds.append(rain(self.rain_mm_h))
+            kinds.append(raindrops(self.rain_mm_h))
         if self.snow_mm_h:
-            kinds.append(snow(self.snow_mm_h))
+            kinds.append(snowflakes(self.snow_mm_h))
         return tuple(kinds)
 
     def extinction_at(self, wavelength_nm: float) -> float:
@@ -146,12 +146,12 @@ class Weather(FileSection):
         for kind in self.particles:
             alpha += kind.extinction
         if self.dust_mg_m3:
-            alpha += dust(self.dust_mg_m3)[0]
+            alpha += dust_coefficients(self.dust_mg_m3)[0]
         return alpha
 
     def backscatter_at(self, wavelength_nm: float) -> float:
         """Return the backscatter coefficient of fog and dust at a wavelength, in 1/(m sr)."""
-        beta = dust(self.dust_mg_m3)[1]
+        beta = dust_coefficients(self.dust_mg_m3)[1]
         if self.fog_lidar_ratio_sr is not None:
             beta += extinction(self.visibility_km, wavelength_nm) / self.fog_lidar_ratio_sr
         return beta
@@ -178,7 +178,7 @@ class Particles(NamedTuple):
         squares = 2 / (slope * slope * slope) * (1 - exp_of(-x) * (1 + x + x * x / 2))
         return LARGE * math.pi / 4 * self.number * squares * 1e-6
 
-    def above(self, diameter_mm: Floats) -> Floats:
+    def number_above(self, diameter_mm: Floats) -> Floats:
         """Return the number of particles above each diameter, per m³.
 
         `diameter_mm` and the result have shape (n,).
@@ -187,7 +187,7 @@ class Particles(NamedTuple):
         return np.asarray(self.number / self.slope * (tail - exp_of(-self.slope * self.largest)))
 
 
-def rain(mm_h: float) -> Particles:
+def raindrops(mm_h: float) -> Particles:
     """Return the raindrops at a rain rate in mm/h (Marshall and Palmer 1948).
 
     According to geometrical optics, a drop reflects light at its front and, on the axis, at its
@@ -195,7 +195,7 @@ def rain(mm_h: float) -> Particles:
 
     Examples
     --------
-    >>> f"{1000 * rain(10.0).extinction:.2f}"  # 1/km
+    >>> f"{1000 * raindrops(10.0).extinction:.2f}"  # 1/km
     '1.56'
     """
     n = WATER_INDEX
@@ -205,7 +205,7 @@ def rain(mm_h: float) -> Particles:
     return Particles(8000.0, 4.1 * float(power(mm_h, -0.21)), RAIN_LARGEST_MM, reflectance)
 
 
-def snow(mm_h: float) -> Particles:
+def snowflakes(mm_h: float) -> Particles:
     """Return the flakes of dry snow at a snowfall rate (Gunn and Marshall 1958).
 
     The snowfall rate is that of the melted water, in mm/h. The size distribution refers to the
@@ -214,7 +214,7 @@ def snow(mm_h: float) -> Particles:
 
     Examples
     --------
-    >>> f"{1000 * snow(1.0).extinction:.2f}"  # 1/km
+    >>> f"{1000 * snowflakes(1.0).extinction:.2f}"  # 1/km
     '3.34'
     """
     widening = float(power(SNOW_DENSITY, -1 / 3))
@@ -224,7 +224,7 @@ def snow(mm_h: float) -> Particles:
     return Particles(number / widening, slope / widening, SNOW_LARGEST_MM, reflectance)
 
 
-def spray(g_m3: float) -> Particles:
+def spray_clumps(g_m3: float) -> Particles:
     """Return the clumps of drops in the spray behind a vehicle.
 
     `g_m3` is the mass of water in the air in g/m³. The extinction of the drops is twice their cross
@@ -238,12 +238,12 @@ def spray(g_m3: float) -> Particles:
     return unit_cloud._replace(number=alpha * LARGE / unit_cloud.extinction)
 
 
-def dust(mg_m3: float) -> tuple[float, float]:
+def dust_coefficients(mg_m3: float) -> tuple[float, float]:
     """Return the extinction in 1/m and the backscatter in 1/(m sr) of mineral dust.
 
     Examples
     --------
-    >>> alpha, beta = dust(100.0)
+    >>> alpha, beta = dust_coefficients(100.0)
     >>> f"{alpha:.3f} {beta:.4f}"
     '0.060 0.0010'
     """
@@ -251,7 +251,7 @@ def dust(mg_m3: float) -> tuple[float, float]:
     return alpha, alpha / DUST_LIDAR_RATIO_SR
 
 
-def reach(min_range_m: float, max_range_m: float) -> tuple[float, float]:
+def particle_range(min_range_m: float, max_range_m: float) -> tuple[float, float]:
     """Limit the range interval of a sensor to the ranges at which particles are simulated."""
     return max(min_range_m, NEAREST_M), min(max_range_m, FARTHEST_M)
 
@@ -283,7 +283,7 @@ class Air(NamedTuple):
     divergence: float
     overlap_m: float
 
-    def width(self, distance: Floats) -> Floats:
+    def beam_diameter(self, distance: Floats) -> Floats:
         """Return the beam diameter at each distance, in meters.
 
         `distance` and the result have shape (n,).
@@ -296,23 +296,23 @@ class Air(NamedTuple):
         transmission = exp(-2 * self.extinction * distance)
         return np.square(REFERENCE_M / effective_m) * np.maximum(transmission, MIN_TRANSMISSION)
 
-    def smallest(self, particles: Particles, energy: float, distance: Floats) -> Floats:
+    def min_diameter_mm(self, particles: Particles, energy: float, distance: Floats) -> Floats:
         """Return the diameter in millimeters of the smallest particle that returns an energy.
 
         `distance` is in meters, and has shape (n,) like the result. The diameter is infinite at
         distances at which no particle returns the energy.
         """
         share = energy / (particles.reflectance * self.white_energy(distance))
-        diameter_mm = 1000 * self.width(distance) * np.sqrt(share)
+        diameter_mm = 1000 * self.beam_diameter(distance) * np.sqrt(share)
         return np.where(share <= 1, diameter_mm, np.inf)
 
-    def rate(self, particles: Particles, energy: float, distance: Floats) -> Floats:
+    def particle_rate(self, particles: Particles, energy: float, distance: Floats) -> Floats:
         """Return the number of particles per meter of the beam that return at least an energy.
 
         `distance` is in meters, and has shape (n,) like the result.
         """
-        area = math.pi / 4 * np.square(self.width(distance))
-        return area * particles.above(self.smallest(particles, energy, distance))
+        area = math.pi / 4 * np.square(self.beam_diameter(distance))
+        return area * particles.number_above(self.min_diameter_mm(particles, energy, distance))
 
     def mean_particles(
         self, particles: Particles, energy: float, start_m: float, stop_m: float
@@ -322,9 +322,9 @@ class Air(NamedTuple):
         Only particles between the ranges `start_m` and `stop_m` are counted.
         """
         distance = geomspace(start_m, max(stop_m, start_m * 1.001), NODES)
-        return float(np.trapezoid(self.rate(particles, energy, distance), distance))
+        return float(np.trapezoid(self.particle_rate(particles, energy, distance), distance))
 
-    def cloud(self, backscatter: float, starts: Floats, stops: Floats) -> Floats:
+    def backscatter_energy(self, backscatter: float, starts: Floats, stops: Floats) -> Floats:
         """Return the energies that fog or dust returns from slabs that fill the beam.
 
         `starts` and `stops` are ranges in meters, and have shape (n,) like the result. The energies

@@ -14,7 +14,7 @@ from ..errors import LidarError
 from ..numerics.arrays import Floats, Ints
 from ..numerics.vectors import matmul, matvec
 from ..words import did_you_mean, joined, plural
-from .navigation import local_positions
+from .navigation import from_geodetic
 from .rotations import quaternions_of
 from .trajectory import Track
 
@@ -164,7 +164,7 @@ def _in_order(times_ns: Sequence[int], rows: Sequence[Sequence[float]]) -> tuple
     return times[~repeated], table[~repeated]
 
 
-def _topic_poses(bag: Reader, topic: str, pose_of: Callable[[Any], Any]) -> TimedPoses:
+def _topic_poses(bag: Reader, topic: str, get_pose: Callable[[Any], Any]) -> TimedPoses:
     """Return the poses of a topic with the timestamps of their headers."""
     stamps = []
     times = []
@@ -173,7 +173,7 @@ def _topic_poses(bag: Reader, topic: str, pose_of: Callable[[Any], Any]) -> Time
     for _, time_ns, message in messages_of(bag, [topic]):
         stamps.append(_stamp_ns(message.header))
         times.append(time_ns)
-        rows.append(_row_of(pose_of(message)))
+        rows.append(_row_of(get_pose(message)))
         frames.add(message.header.frame_id)
     if not rows:
         raise LidarError(f"topic {topic} has no messages.")
@@ -203,7 +203,7 @@ def _gnss_poses(
     times, table = _in_order(times_ns, fixes)
     origin_row = table[0] if origin is None else np.asarray(origin, np.float64)
     latitude, longitude, height = origin_row.tolist()
-    positions = local_positions(table, (latitude, longitude, height))
+    positions = from_geodetic(table, (latitude, longitude, height))
     orientations = _orientations(bag, kinds, imu)
     if orientations is None:
         return TimedPoses(times / 1e9, positions, None)

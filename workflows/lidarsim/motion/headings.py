@@ -15,7 +15,7 @@ import numpy as np
 from ..numerics.arrays import Bools, Floats, Indices
 from ..numerics.elementary import arctan2, interp, sin_cos
 from ..numerics.vectors import hypot
-from .spline import on_curve, rests
+from .spline import evaluate_curve, is_stationary
 
 # A platform turns within this distance before and after a corner. On a leg shorter than twice this
 # distance, the turn extends to the center of the leg.
@@ -177,7 +177,7 @@ class CurveHeadings:
     times_s
         Times of the knots. Shape (n,).
     knots
-        Positions and their first two derivatives, from `knots_of`. Shape (3, 3, n).
+        Positions and their first two derivatives, from `fit_knots`. Shape (3, 3, n).
     still
         Whether the curve is stationary at each knot. Shape (n,).
     travels
@@ -207,11 +207,11 @@ class CurveHeadings:
         count = len(steps)
         shares = np.array([_NEAR_END, 0.5, 1 - _NEAR_END])
         since = (steps[:, None] * shares).reshape(-1)
-        slopes = on_curve(knots, steps, np.arange(count).repeat(3), since, 1)[1]
+        slopes = evaluate_curve(knots, steps, np.arange(count).repeat(3), since, 1)[1]
         velocities = slopes[:2].T.reshape(count, 3, 2)
         moves = hypot(velocities[..., 0], velocities[..., 1]) > _SAME
         # Both ends of a pause are stationary, but so are the ends of a leg between two stops.
-        moves[rests(steps, np.diff(knots[0]) / steps)] = False
+        moves[is_stationary(steps, np.diff(knots[0]) / steps)] = False
         travels = moves.any(axis=1)
         rows = np.arange(count)
         first = velocities[rows, moves.argmax(axis=1)]
@@ -239,7 +239,7 @@ class CurveHeadings:
         near_start = np.where(self.still.take(segment), _NEAR_END * step, 0.0)
         near_stop = np.where(self.still.take(segment + 1), step - _NEAR_END * step, step)
         inside = since.clip(near_start, near_stop)
-        _, velocity, change = on_curve(self.knots[:, :2], steps, segment, inside, 2)
+        _, velocity, change = evaluate_curve(self.knots[:, :2], steps, segment, inside, 2)
         speed = hypot(*velocity)
         slow = np.flatnonzero(speed <= _SAME)
         velocity[:, slow] = self.first[segment[slow]].T

@@ -243,7 +243,7 @@ class ImuSamples(NamedTuple):
     forces: Floats
 
 
-class Fixes(NamedTuple):
+class GnssFixes(NamedTuple):
     """Consecutive positions of the antenna of a GNSS receiver."""
 
     times_ns: Ints  # (k,), since the start of the survey
@@ -361,7 +361,7 @@ class _Triad(NamedTuple):
         return rotate(truth, self.axes) + self.errors.next_errors(samples)
 
 
-def fixes(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[Fixes]:
+def gnss_fixes(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[GnssFixes]:
     """Yield the positions of the GNSS receiver on a drive in blocks of `block` positions."""
     navigation = drive.navigation
     path = drive.path
@@ -392,7 +392,7 @@ def fixes(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[Fixes]:
                 positions += _bridging_errors(
                     navigation.imu, errors.seed, number, since_s, end - begin
                 )
-        yield Fixes(np.rint(times).astype(np.int64), positions)
+        yield GnssFixes(np.rint(times).astype(np.int64), positions)
 
 
 def _bridging_errors(
@@ -527,7 +527,7 @@ class _Errors:
         )
 
 
-def geodetic(positions: Floats, origin: tuple[float, float, float]) -> Floats:
+def to_geodetic(positions: Floats, origin: tuple[float, float, float]) -> Floats:
     """Convert local positions to geodetic coordinates.
 
     The conversion uses WGS 84 geocentric coordinates and the latitude formula of Bowring (1985),
@@ -566,7 +566,7 @@ def _geocentric(
 ) -> tuple[Floats, Floats, Floats]:
     """Convert local positions to geocentric coordinates in meters, each of shape (k,).
 
-    The parameters are those of `geodetic`.
+    The parameters are those of `to_geodetic`.
     """
     sp, cp = sin_cos_of(math.radians(origin[0]))
     sl, cl = sin_cos_of(math.radians(origin[1]))
@@ -578,8 +578,8 @@ def _geocentric(
     return x, y, z
 
 
-def local_positions(coordinates: Floats, origin: tuple[float, float, float]) -> Floats:
-    """Convert geodetic coordinates to local positions, which is the inverse of `geodetic`.
+def from_geodetic(coordinates: Floats, origin: tuple[float, float, float]) -> Floats:
+    """Convert geodetic coordinates to local positions, which is the inverse of `to_geodetic`.
 
     Parameters
     ----------

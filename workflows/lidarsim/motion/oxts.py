@@ -65,7 +65,7 @@ def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Flo
         if len(numbers) != WIDTH:
             raise ValueError(f"data/{file.name} has {len(numbers)} numbers instead of {WIDTH}")
         rows.append([float(number) for number in numbers])
-    seconds = dates_of(read_input_text(folder / OXTS_TIMES))
+    seconds = parse_dates(read_input_text(folder / OXTS_TIMES))
     if seconds is None:
         raise ValueError(
             f"{OXTS_TIMES} contains rows that are not dates such as 2011-09-26 13:02:25.964"
@@ -74,7 +74,7 @@ def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Flo
     return seconds, *oxts_poses(np.array(rows), origin)
 
 
-def dates_of(text: str) -> Floats | None:
+def parse_dates(text: str) -> Floats | None:
     """Return the times in seconds since 1970 of a text with one date per line.
 
     The result is None if any line is not a date.

@@ -73,7 +73,7 @@ REFUSED_COLUMNS = {
 }
 
 
-def with_yaw(columns: Mapping[str, Floats]) -> dict[str, Floats]:
+def convert_heading(columns: Mapping[str, Floats]) -> dict[str, Floats]:
     """Return the columns of a table with the heading converted to yaw, in degrees.
 
     Raises
@@ -92,7 +92,7 @@ def with_yaw(columns: Mapping[str, Floats]) -> dict[str, Floats]:
     return angles
 
 
-def angles_of(columns: Mapping[str, Floats], count: int) -> Floats:
+def stack_angles(columns: Mapping[str, Floats], count: int) -> Floats:
     """Return yaw, pitch and roll in degrees, with zeros for missing columns.
 
     The result has shape (count, 3).

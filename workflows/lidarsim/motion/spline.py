@@ -19,7 +19,7 @@ from ..numerics.arrays import Bools, Floats, Indices
 _PAD = 32
 
 
-def knots_of(times: Floats, values: Floats) -> Floats:
+def fit_knots(times: Floats, values: Floats) -> Floats:
     """Return the values at the knots of a curve, and their first two derivatives.
 
     Parameters
@@ -36,7 +36,7 @@ def knots_of(times: Floats, values: Floats) -> Floats:
     """
     steps = np.diff(times)
     slopes = np.diff(values) / steps
-    resting = rests(steps, slopes)
+    resting = is_stationary(steps, slopes)
     still = np.append(resting, False) | np.append(False, resting)
     # The second derivatives on both sides of a knot are equal if its slope v[i] satisfies
     # v[i] + lower[i] v[i - 1] + upper[i] v[i + 1] = first[i].
@@ -59,7 +59,7 @@ def knots_of(times: Floats, values: Floats) -> Floats:
     return np.array([values, first, second])
 
 
-def rests(steps: Floats, slopes: Floats) -> Bools:
+def is_stationary(steps: Floats, slopes: Floats) -> Bools:
     """Return whether the curve is stationary between each pair of adjacent knots.
 
     Parameters
@@ -131,7 +131,7 @@ class _Polynomials(NamedTuple):
     quintic: Floats
 
 
-def on_curve(
+def evaluate_curve(
     knots: Floats, steps: Floats, segment: Indices, since: Floats, order: int = 0
 ) -> list[Floats]:
     """Evaluate a curve and its derivatives at several points.
@@ -139,7 +139,7 @@ def on_curve(
     Parameters
     ----------
     knots
-        Knots from `knots_of`. Shape (3, d, n).
+        Knots from `fit_knots`. Shape (3, d, n).
     steps
         Time from each knot to the next. Shape (n - 1,).
     segment

@@ -29,7 +29,7 @@ from .rotations import (
     rotations_between,
     rotations_of,
 )
-from .spline import knots_of, on_curve
+from .spline import evaluate_curve, fit_knots
 
 QUATERNION_SLACK = 1e-3  # tolerance for the norm of a quaternion, which is rounded in files
 # Tolerance for times, because double precision is coarser than a nanosecond for times since 1970.
@@ -126,7 +126,7 @@ class Pose(FileSection):
         return cls(coordinates, *np.degrees([yaw, pitch, roll]).tolist())
 
 
-def pose_of(name: str, value: Any) -> Pose:
+def as_pose(name: str, value: Any) -> Pose:
     """Convert a position to a pose, and return a pose unchanged.
 
     Parameters
@@ -586,7 +586,7 @@ class Track:
             return self.with_turns.poses(station, times_ns)
         segment, since, _ = self._segments_at(times_ns)
         if self.smooth:
-            (values,) = on_curve(*self._spline, segment, since)
+            (values,) = evaluate_curve(*self._spline, segment, since)
             if self._headings is not None:
                 return values.T, _level_rotations(self._headings.at(segment, since))
             quaternions = values[3:] / np.sqrt((values[3:] ** 2).sum(axis=0))
@@ -627,11 +627,11 @@ class Track:
             return self.with_turns.velocities(station, times_ns)
         segment, since, within = self._segments_at(times_ns)
         if self.smooth and self._headings is not None:
-            _, speeds = on_curve(*self._spline, segment, since, 1)
+            _, speeds = evaluate_curve(*self._spline, segment, since, 1)
             rates = np.zeros_like(speeds)
             rates[2] = self._headings.at(segment, since).rates
         elif self.smooth:
-            q, p = on_curve(*self._spline, segment, since, 1)
+            q, p = evaluate_curve(*self._spline, segment, since, 1)
             # The angular velocity is 2 p conjugate(q). The norm of q is arbitrary and may vary.
             vector_part = q[6] * p[3:6] - p[6] * q[3:6] - np.cross(p[3:6], q[3:6], axis=0)
             speeds = p[:3]
@@ -682,7 +682,7 @@ class Track:
 
     @cached_property
     def _spline(self) -> tuple[Floats, Floats]:
-        """Knots of positions and quaternions, and steps in seconds, as arguments of `on_curve`.
+        """Knots of positions and quaternions, and steps in seconds, for `evaluate_curve`.
 
         The knots have shape (3, d, k), where d is 7, or 3 without quaternions. The steps have shape
         (k - 1,). The sign of each quaternion is chosen so that it is close to the previous one.
@@ -692,7 +692,7 @@ class Track:
         if quaternions is not None:
             flips = np.cumsum((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0)
             groups.append(quaternions.T * (1.0 - 2 * np.append(0, flips % 2)))
-        knots = [knots_of(self.times_s, group) for group in groups]
+        knots = [fit_knots(self.times_s, group) for group in groups]
         return np.concatenate(knots, axis=1), np.diff(self.times_s)
 
     @cached_property
@@ -803,7 +803,7 @@ class TrackBatch:
             array.flags.writeable = False
         return cls(times_s, positions, rows, beyond, segments)
 
-    def segments_of(self, numbers: ArrayLike) -> Segments:
+    def select_segments(self, numbers: ArrayLike) -> Segments:
         """Return the segments of several tracks, in the order of their indices in `numbers`."""
         steps = len(self.times_s) - 1
         columns = (np.asarray(numbers)[:, None] * steps + np.arange(steps)).reshape(-1)
@@ -839,10 +839,10 @@ class _BatchTrack(Track):
     @cached_property
     def segments(self) -> Segments:
         """Coefficients of the linear segments between the poses."""
-        return self.batch.segments_of([self.number])
+        return self.batch.select_segments([self.number])
 
 
-def batch_of(trajectory: Trajectory) -> TrackBatch | None:
+def find_batch(trajectory: Trajectory) -> TrackBatch | None:
     """Return the batch that contains a track, or None for other trajectories.
 
     An actor on a track in a batch is always in the scene.

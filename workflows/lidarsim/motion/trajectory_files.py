@@ -19,7 +19,7 @@ from ..numerics.arrays import Floats
 from ..numerics.vectors import rotate
 from ..schema.checks import check_fits, check_list
 from .bag_trajectories import read_bag
-from .oxts import OXTS_TIMES, WIDTH, dates_of, find_oxts, oxts_files, oxts_poses, read_oxts
+from .oxts import OXTS_TIMES, WIDTH, find_oxts, oxts_files, oxts_poses, parse_dates, read_oxts
 from .pose_columns import (
     ANGLES,
     POSE_TABLES,
@@ -27,8 +27,8 @@ from .pose_columns import (
     QUATERNION,
     REFUSED_COLUMNS,
     TIME,
-    angles_of,
-    with_yaw,
+    convert_heading,
+    stack_angles,
 )
 from .rotations import check_rotations, quaternions_of, rotations_of
 from .trajectory import QUATERNION_SLACK, Beyond, Track
@@ -142,11 +142,11 @@ def load_trajectory(
     timing = TimeOptions(times, time_unit)
     try:
         if path.is_dir() or is_bag(path) or format in ("oxts", "bag"):
-            kind, poses = _of_container(path, format, timing, topic, origin)
+            kind, poses = _read_container(path, format, timing, topic, origin)
         else:
             _refuse_topic(topic)
             text = read_text(path)
-            kind, poses = _of_text(text, format, timing, columns or {}, ignore, origin)
+            kind, poses = _parse_text(text, format, timing, columns or {}, ignore, origin)
         if (columns or ignore) and kind != "csv":
             raise ValueError(
                 f"columns and ignore require a table with a header, but the format is {kind}"
@@ -165,7 +165,7 @@ def load_trajectory(
             beyond=beyond,
         )
         if camera_axes or (camera_axes is None and kind == "kitti"):
-            track = _from_camera(track)
+            track = _convert_from_camera(track)
         return track
     except (OSError, ValueError, LidarError) as error:
         note = _HELIOS if path.suffix.lower() == ".trj" else ""
@@ -190,7 +190,7 @@ def read_kitti_poses(path: Path) -> Floats | None:
     try:
         text = read_text(path)
         has_header = find_header(text.splitlines(), _is_pose_column) is not None
-        rows = np.empty((0, 0)) if has_header else _numbers(text)
+        rows = np.empty((0, 0)) if has_header else _parse_numbers(text)
     except (OSError, ValueError, LidarError):  # `load_trajectory` reports the error
         return None
     if rows.shape[1] != _KITTI_WIDTH:
@@ -203,7 +203,7 @@ def read_kitti_poses(path: Path) -> Floats | None:
     return matrices
 
 
-def files_of_trajectory(path: Path) -> list[Path]:
+def list_trajectory_files(path: Path) -> list[Path]:
     """Return the files of a trajectory, which are the path itself or the files in its folder."""
     if not path.is_dir():
         return [path]
@@ -219,7 +219,7 @@ def _refuse_topic(topic: str | None) -> None:
         raise ValueError("topic requires a bag, but this file is not a bag")
 
 
-def _of_container(
+def _read_container(
     path: Path,
     kind: TrajectoryFormat | None,
     timing: TimeOptions,
@@ -242,14 +242,14 @@ def _of_container(
         poses = PoseTable(*read_oxts(folder, origin))
         return "oxts", poses._replace(seconds=_seconds_of_dates(poses.seconds, timing.unit))
     if path.is_file() and kind == "oxts":
-        return _of_text(read_text(path), kind, timing, {}, (), origin)
+        return _parse_text(read_text(path), kind, timing, {}, (), origin)
     raise ValueError(
         "a folder must be a KITTI folder with timestamps.txt and data, or a ROS 2 bag with "
         f"metadata.yaml{'' if kind is None else f', but format is {kind}'}"
     )
 
 
-def _of_text(
+def _parse_text(
     text: str,
     kind: TrajectoryFormat | None,
     timing: TimeOptions,
@@ -266,11 +266,11 @@ def _of_text(
         # The values in TUM rows are separated by spaces, and the header may be in a comment.
         in_remark = header is not None and header.comment and header.separator is None
         bare = {"time_s": "s"} if in_remark or kind == "tum" else {}
-        return "csv", _table(text, columns, ignore, bare, timing.unit)
-    return _of_rows(_numbers(text), kind, timing, origin)
+        return "csv", _parse_table(text, columns, ignore, bare, timing.unit)
+    return _parse_rows(_parse_numbers(text), kind, timing, origin)
 
 
-def _of_rows(
+def _parse_rows(
     rows: Floats,
     kind: TrajectoryFormat | None,
     timing: TimeOptions,
@@ -308,9 +308,9 @@ def _seconds_in_file(path: Path, unit: TimeUnit | None) -> Floats:
     """Return the times in seconds from a file with a number or a date in each row."""
     try:
         text = read_text(path)
-        dates = dates_of(text)
+        dates = parse_dates(text)
         has_dates = dates is not None and len(dates) > 0
-        times = dates if has_dates else _numbers(text, 1)[:, 0]
+        times = dates if has_dates else _parse_numbers(text, 1)[:, 0]
     except ValueError as error:
         raise ValueError(f"{path} has no times: {message_of(error)}") from error
     assert times is not None  # set from either dates or numbers
@@ -336,7 +336,7 @@ def _is_pose_column(cell: str) -> bool:
     )
 
 
-def _numbers(text: str, columns: int | None = None) -> Floats:
+def _parse_numbers(text: str, columns: int | None = None) -> Floats:
     """Return the rows of numbers in a text, and skip comments that start with #.
 
     The rows must have `columns` numbers, if it is set.
@@ -358,7 +358,7 @@ def _numbers(text: str, columns: int | None = None) -> Floats:
     return rows
 
 
-def _table(
+def _parse_table(
     text: str,
     names: Mapping[str, str],
     ignore: Sequence[str],
@@ -376,7 +376,7 @@ def _table(
         rotation_columns = quaternion if any(name in columns for name in quaternion) else ()
         return ("time_s", "x", "y", "z", *rotation_columns)
 
-    columns = with_yaw(
+    columns = convert_heading(
         read_table(
             text,
             (TIME, *POSITION, *QUATERNION, *ANGLES),
@@ -405,11 +405,11 @@ def _table(
             f"{angles[0]} to face the direction of travel"
         )
     return PoseTable(
-        seconds, positions, quaternions_of(rotations_of(angles_of(columns, len(seconds))))
+        seconds, positions, quaternions_of(rotations_of(stack_angles(columns, len(seconds))))
     )
 
 
-def _from_camera(track: Track) -> Track:
+def _convert_from_camera(track: Track) -> Track:
     """Convert poses from a camera frame to a platform frame."""
     positions = rotate(track.positions, _CAMERA)
     if track.quaternions is None:

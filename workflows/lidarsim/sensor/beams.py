@@ -62,7 +62,7 @@ class Beams:
             ("time_ns", (count,)),
             ("origin", (count, 3)),
         ):
-            object.__setattr__(self, name, _table(name, getattr(self, name), shape))
+            object.__setattr__(self, name, _as_table(name, getattr(self, name), shape))
 
     def __len__(self) -> int:
         return len(self.elevation)
@@ -81,7 +81,7 @@ class Beams:
         half = np.radians(vertical_fov_deg) / 2
         return cls(np.linspace(-half, half, layers) if layers > 1 else np.zeros(1))
 
-    def turning(self, radians_per_ns: float) -> Beams:
+    def with_rotation(self, radians_per_ns: float) -> Beams:
         """Return the beams for a head that rotates counterclockwise during a firing.
 
         Each beam is rotated by the angle that the head covers until the beam is fired. The ray
@@ -93,7 +93,7 @@ class Beams:
         origin = np.column_stack([cos * x - sin * y, sin * x + cos * y, z])
         return Beams(self.elevation, self.azimuth + angle, self.time_ns, origin)
 
-    def lowest_first(self) -> Beams:
+    def sort_by_elevation(self) -> Beams:
         """Return the same beams sorted by elevation, with the lowest beam as channel 0."""
         order = np.argsort(self.elevation, kind="stable")
         return Beams(*(a[order] for a in (self.elevation, self.azimuth, self.time_ns, self.origin)))
@@ -224,7 +224,7 @@ class Spin:
         turned = 2 * np.pi * self._within(firings) / self.firings_per_turn
         return np.radians(self.zero_deg) + (-turned if self.clockwise else turned)
 
-    def within(self, start: float, share: float) -> Mirror:
+    def restrict_to(self, start: float, share: float) -> Mirror:
         """Return a head that fires only during a part of each revolution.
 
         Time 0 and firing 0 are at the start of this part. A time step contains the same share of
@@ -312,7 +312,7 @@ class Mirror(Spin):
         return np.radians(self.zero_deg) + (-turned if self.clockwise else turned)
 
 
-def _table(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
+def _as_table(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
     """Convert values to a read-only float64 array of a given shape, with zeros if it is empty."""
     array = as_array(f"Beams.{name}", values).copy()
     if not array.size:

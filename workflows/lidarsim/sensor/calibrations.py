@@ -100,16 +100,16 @@ def read_calibration(path: Path) -> Calibration:
         if path.suffix.lower() not in (".yaml", ".yml", ".json", ".csv"):
             rays = read_rays(path)
             if rays is not None:
-                return _calibration_of(path.name, rays)
+                return _calibration_from_rays(path.name, rays)
         text = read_text(path)
         if path.suffix.lower() in (".yaml", ".yml"):
-            return _velodyne(path.name, load_yaml(text))
+            return _parse_velodyne(path.name, load_yaml(text))
         if path.suffix.lower() == ".json":
-            return _ouster(path.name, json.loads(text))
-        return _table(path.name, text)
+            return _parse_ouster(path.name, json.loads(text))
+        return _parse_table(path.name, text)
 
 
-def _velodyne(name: str, data: Any) -> Calibration:
+def _parse_velodyne(name: str, data: Any) -> Calibration:
     """Create a calibration from the content of a Velodyne YAML file.
 
     The geometry follows rawdata.cc in ros-drivers/velodyne.
@@ -147,7 +147,7 @@ _OUSTER_ORIGINS_MM = {"OS-0-": 27.67, "OS-1-": 15.806, "OS-2-": 13.762}
 _OUSTER_FIRST_MM = 12.163
 
 
-def _ouster(name: str, data: Any) -> Calibration:
+def _parse_ouster(name: str, data: Any) -> Calibration:
     """Create a calibration from Ouster metadata of any firmware version.
 
     The geometry follows the Ouster sensor manual. Ouster measures ranges from the rotation axis,
@@ -212,11 +212,11 @@ def _ouster_window(
     """
     configuration = _ouster_section(data, "config_params", data)
     if (limits := layout.get("column_window")) is not None:
-        first, last = _limits("column_window", limits, columns - 1)
+        first, last = _parse_limits("column_window", limits, columns - 1)
         count = (last - first) % columns + 1
         start = first
     elif (limits := configuration.get("azimuth_window")) is not None:
-        right, left = _limits("azimuth_window", limits, 360_000)
+        right, left = _parse_limits("azimuth_window", limits, 360_000)
         if left - right in (0, 360_000):
             return None
         start = -(-columns * (360_000 - left) // 360_000) % columns
@@ -226,7 +226,7 @@ def _ouster_window(
     return None if count == columns else (start / columns, count / columns)
 
 
-def _limits(name: str, limits: Any, maximum: int) -> tuple[int, int]:
+def _parse_limits(name: str, limits: Any, maximum: int) -> tuple[int, int]:
     """Return the two limits of a window.
 
     Raise ValueError if `limits` is not a pair of integers between 0 and `maximum`.
@@ -278,7 +278,7 @@ def _ouster_origin_mm(data: dict[str, Any], beam: dict[str, Any]) -> Floats:
     return np.asarray(origin_mm, np.float64)
 
 
-def _calibration_of(name: str, rays: RayList) -> Calibration:
+def _calibration_from_rays(name: str, rays: RayList) -> Calibration:
     """Create a calibration from rays, with a time for each ray."""
     rays = rays.with_times()
     assert rays.times_ns is not None  # set by with_times
@@ -306,20 +306,20 @@ _HESAI_COLUMNS = ["elevation", "azimuth"]  # columns after the first, which is C
 _HESAI_CHECKSUM = re.compile(r"^[0-9a-f]{64}[,\s]*\Z", re.IGNORECASE | re.MULTILINE)
 
 
-def _cells(line: str) -> list[str]:
+def _split_cells(line: str) -> list[str]:
     """Return the comma-separated cells of a line in lower case."""
     return [word.strip().lower() for word in line.split(",")]
 
 
-def _table(name: str, text: str) -> Calibration:
+def _parse_table(name: str, text: str) -> Calibration:
     """Create a calibration from comma-separated text, whose header determines the format."""
     if is_ray_table(text):
-        return _calibration_of(name, rays_of_text(text))
+        return _calibration_from_rays(name, rays_of_text(text))
     if is_livox(text):
-        return _livox(name, text)
-    header = _cells(text.partition("\n")[0])
+        return _parse_livox(name, text)
+    header = _split_cells(text.partition("\n")[0])
     if header[0] == _HESAI_MARK or header[1:] == _HESAI_COLUMNS:
-        return _hesai(name, text)
+        return _parse_hesai(name, text)
     if "elevation_deg" in header:
         names = ("elevation_deg", "azimuth_deg", "time_us", "x_m", "y_m", "z_m")
         unknown = [word for word in header if word not in names]
@@ -350,12 +350,12 @@ def _table(name: str, text: str) -> Calibration:
     return Calibration(name, "robosense", Beams(elevation, -azimuth))
 
 
-def _hesai(name: str, text: str) -> Calibration:
+def _parse_hesai(name: str, text: str) -> Calibration:
     """Create a calibration from Hesai angle corrections, from either a sensor or a manual."""
     lines = text.splitlines()
-    skip = 2 if _cells(lines[0])[0] == _HESAI_MARK else 1
+    skip = 2 if _split_cells(lines[0])[0] == _HESAI_MARK else 1
     header = lines[skip - 1] if len(lines) >= skip else ""
-    if _cells(header)[1:] != _HESAI_COLUMNS:
+    if _split_cells(header)[1:] != _HESAI_COLUMNS:
         raise ValueError(
             f"the line after {_HESAI_MARK} must be Channel,Elevation,Azimuth, but is "
             f"{printable(header, 60)!r}"
@@ -367,7 +367,7 @@ def _hesai(name: str, text: str) -> Calibration:
     return Calibration(name, "hesai", Beams(elevation, -azimuth))
 
 
-def _livox(name: str, text: str) -> Calibration:
+def _parse_livox(name: str, text: str) -> Calibration:
     """Create a calibration from a Livox ray list."""
     rays = rays_of_livox(text)
     if rays.times_ns is None:

@@ -167,7 +167,7 @@ class Beam:
 
 
 @cache
-def neighbors(count: int) -> Indices:
+def neighboring_subrays(count: int) -> Indices:
     """Return the pairs of neighboring sub-rays.
 
     Two sub-rays are neighbors if no other sub-ray lies in the circle whose diameter connects them

@@ -99,10 +99,10 @@ def export_sensor(
     if row.describes:
         rays = RayList(np.zeros((0, 3)))
         duration_s = _duration_ns(sensor, seconds, revolutions) / 1e9
-        left_out = write(path, sensor, duration_s, _left_out(sensor, row))
+        left_out = write(path, sensor, duration_s, _missing_properties(sensor, row))
     else:
         rays = fired_rays(sensor, seconds=seconds, revolutions=revolutions)
-        lost = _left_out(sensor, row)
+        lost = _missing_properties(sensor, row)
         if not rays.repeats:
             assert rays.cycle_ns is not None  # rays of a sensor have a cycle
             lost.append(
@@ -126,7 +126,7 @@ def fired_rays(
         If both `seconds` and `revolutions` are set, or if there are more than `MAX_RAYS` rays.
     """
     duration_ns = _duration_ns(sensor, seconds, revolutions)
-    count = _firings_before(sensor, duration_ns)
+    count = _count_firings(sensor, duration_ns)
     firings = np.arange(count)
     times_ns = sensor.times_ns(firings).reshape(-1) - round(sensor.start_ns)
     order = np.argsort(times_ns, kind="stable")
@@ -167,7 +167,7 @@ def _light(optics: Optics) -> Light:
     return Light(optics.wavelength_nm, optics.pulse_ns, None)
 
 
-def _firings_before(sensor: Sensor, duration_ns: float) -> int:
+def _count_firings(sensor: Sensor, duration_ns: float) -> int:
     """Return the number of firings that start in the first `duration_ns` nanoseconds.
 
     Raise LidarError if these firings have more than `MAX_RAYS` rays.
@@ -217,7 +217,7 @@ def _repeats(sensor: Sensor, count: int) -> bool:
     return bool(abs(count - max(round(count / per_turn), 1) * per_turn) < 1)
 
 
-def _left_out(sensor: Sensor, row: SensorFormat) -> list[str]:
+def _missing_properties(sensor: Sensor, row: SensorFormat) -> list[str]:
     """Return phrases for the properties of a sensor that a format cannot store."""
     has = {
         "times": True,

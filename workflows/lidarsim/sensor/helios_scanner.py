@@ -102,7 +102,7 @@ def write(path: Path, sensor: Sensor, duration_s: float, left_out: Sequence[str]
     LidarError
         If HELIOS++ has no optics that correspond to the sensor. The message states the reason.
     """
-    scanner = _scanner_of(sensor, duration_s)
+    scanner = _create_scanner(sensor, duration_s)
     lost = [*left_out, *scanner.left_out, *_lost_light(sensor), *_lost_rate(scanner)]
     name = re.sub(r"[^\w.-]+", "_", sensor.model).strip("_.").lower() or "lidar"
     lines = [
@@ -114,7 +114,7 @@ def write(path: Path, sensor: Sensor, duration_s: float, left_out: Sequence[str]
         "<document>",
         *_scanner_lines(name, sensor, scanner),
         f'  <scannerSettings id="{name}" active="true" pulseFreq_hz="{scanner.pulse_hz}"'
-        f"{_attributes(scanner.settings)}/>",
+        f"{_format_attributes(scanner.settings)}/>",
         "</document>",
     ]
     write_complete_text(path, "\n".join(lines) + "\n")
@@ -135,7 +135,7 @@ def _scanner_lines(name: str, sensor: Sensor, scanner: _Scanner) -> list[str]:
         **scanner.limits,
     }
     head = f'  <scanner id="{name}" name={quoteattr(sensor.model)} optics="{scanner.optics}"'
-    lines = [f"{head}{_attributes(numbers)}>"]
+    lines = [f"{head}{_format_attributes(numbers)}>"]
     if "headRotatePerSecMax_deg" in scanner.limits:
         lines.append('    <headRotateAxis x="0" y="0" z="1"/>')
     if len(scanner.channels) == 1:
@@ -152,9 +152,9 @@ def _scanner_lines(name: str, sensor: Sensor, scanner: _Scanner) -> list[str]:
 
 def _emitter_lines(indent: str, channel: _Channel) -> Iterable[str]:
     """Yield the lines that describe the emitter of a channel."""
-    yield f'{indent}<beamOrigin x="0" y="0" z="{_number(channel.height_m)}">'
+    yield f'{indent}<beamOrigin x="0" y="0" z="{_format_number(channel.height_m)}">'
     for axis, angle_deg in _fixed_axis_angles(channel.rotation):
-        yield f'{indent}  <rot axis="{axis}" angle_deg="{_number(angle_deg)}"/>'
+        yield f'{indent}  <rot axis="{axis}" angle_deg="{_format_number(angle_deg)}"/>'
     yield f"{indent}</beamOrigin>"
     if channel.incident is not None:
         x, y, z = channel.incident.tolist()
@@ -177,12 +177,12 @@ def _fixed_axis_angles(rotation: Floats) -> list[tuple[str, float]]:
     return [(axis, angle_deg) for axis, angle_deg in angles if abs(angle_deg) > 1e-12]
 
 
-def _attributes(numbers: dict[str, float]) -> str:
+def _format_attributes(numbers: dict[str, float]) -> str:
     """Format numbers as XML attributes, each with a leading space."""
-    return "".join(f' {name}="{_number(value)}"' for name, value in numbers.items())
+    return "".join(f' {name}="{_format_number(value)}"' for name, value in numbers.items())
 
 
-def _number(value: float) -> str:
+def _format_number(value: float) -> str:
     """Format a number, without a decimal point for integers, because HELIOS++ rejects 1.0."""
     return str(int(value)) if value == int(value) else repr(float(value))
 
@@ -221,31 +221,33 @@ def _lost_rate(scanner: _Scanner) -> Iterable[str]:
         )
 
 
-def _scanner_of(sensor: Sensor, duration_s: float) -> _Scanner:
+def _create_scanner(sensor: Sensor, duration_s: float) -> _Scanner:
     """Create the HELIOS++ scanner that corresponds to a sensor.
 
     Raise LidarError if HELIOS++ has no such optics.
     """
     if isinstance(sensor, PrismSensor):
-        return _prisms(sensor, duration_s)
+        return _prism_scanner(sensor, duration_s)
     kind = type(sensor)
     if isinstance(sensor, ListedSensor):
-        raise _refusal(
+        raise _unsupported(
             sensor, "the sensor is a list of rays, but HELIOS++ scanners have deflecting optics"
         )
     if kind not in (Sensor, LineSensor) or type(sensor.head) not in (Spin, Mirror):
         part = sensor if kind not in (Sensor, LineSensor) else sensor.head
-        raise _refusal(sensor, f"HELIOS++ has no optics that correspond to {type(part).__name__}")
+        raise _unsupported(
+            sensor, f"HELIOS++ has no optics that correspond to {type(part).__name__}"
+        )
     if isinstance(sensor.head, Mirror):
-        return _mirror(sensor, sensor.head, duration_s)
+        return _mirror_scanner(sensor, sensor.head, duration_s)
     assert isinstance(sensor.head, Spin)
     if kind is LineSensor:
-        raise _refusal(sensor, "its head rotates about x, but HELIOS++ heads rotate about z")
-    line = _line_of_beams(sensor, sensor.head, duration_s)
-    return line or _spinning_head(sensor, sensor.head, duration_s)
+        raise _unsupported(sensor, "its head rotates about x, but HELIOS++ heads rotate about z")
+    line = _line_scanner(sensor, sensor.head, duration_s)
+    return line or _multichannel_scanner(sensor, sensor.head, duration_s)
 
 
-def _refusal(sensor: Sensor, reason: str) -> LidarError:
+def _unsupported(sensor: Sensor, reason: str) -> LidarError:
     """Create an error that states why a sensor cannot be written as a HELIOS++ scanner."""
     return LidarError(
         f"{sensor.model} cannot be written as a HELIOS++ scanner: {reason}. {_ADVICE}"
@@ -255,7 +257,7 @@ def _refusal(sensor: Sensor, reason: str) -> LidarError:
 def _whole_hz(sensor: Sensor, exact_hz: float) -> int:
     """Round a pulse rate to an integer, and raise LidarError if the result is 0."""
     if exact_hz < 0.5:
-        raise _refusal(
+        raise _unsupported(
             sensor,
             f"it fires {rounded(exact_hz)} times per second, but pulseFreq_hz must be a whole "
             "number",
@@ -263,7 +265,9 @@ def _whole_hz(sensor: Sensor, exact_hz: float) -> int:
     return round(exact_hz)
 
 
-def _head(head: Spin, pulse_hz: float, pulses_per_firing: int, duration_s: float) -> _Scanner:
+def _rotating_scanner(
+    head: Spin, pulse_hz: float, pulses_per_firing: int, duration_s: float
+) -> _Scanner:
     """Create a scanner that rotates like a sensor's head and does not have channels yet."""
     speed = 360 / head.firings_per_turn * pulse_hz / pulses_per_firing
     total_deg = 360 * head.rate_hz * duration_s
@@ -282,21 +286,21 @@ def _head(head: Spin, pulse_hz: float, pulses_per_firing: int, duration_s: float
     )
 
 
-def _spinning_head(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner:
+def _multichannel_scanner(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner:
     """Create a scanner with a rotating head, a stationary mirror and a channel for each beam.
 
     HELIOS++ defines its Velodyne VLP-16 in the same way. A stationary mirror is at angle 0, but its
     scan angle must be greater than 0, because otherwise no pulses leave the device.
     """
     if sensor.channels > MAX_CHANNELS:
-        raise _refusal(
+        raise _unsupported(
             sensor,
             f"its {sensor.channels:,} beams are not evenly spaced, and more than {MAX_CHANNELS:,} "
             "channels cannot be written",
         )
     exact_hz = head.firings_per_turn * head.rate_hz
     pulse_hz = _whole_hz(sensor, exact_hz)
-    scanner = _head(head, pulse_hz, 1, duration_s)
+    scanner = _rotating_scanner(head, pulse_hz, 1, duration_s)
     scanner.exact_hz = exact_hz
     scan_angles = {"scanAngleMax_deg": 1, "scanAngleEffectiveMax_deg": 1}
     scanner.limits |= scan_angles | {"scanFreqMin_Hz": 0, "scanFreqMax_Hz": 0}
@@ -354,7 +358,7 @@ def _even_line(beams: Beams, radians_per_ns: float) -> _EvenLine | None:
     return _EvenLine(float(elevations_deg[0]), float(azimuths_deg[0]), step_deg, step_ns)
 
 
-def _line_of_beams(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner | None:
+def _line_scanner(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner | None:
     """Create a scanner whose mirror sweeps one line per firing.
 
     The result is None if the beams do not form an evenly spaced line.
@@ -369,7 +373,7 @@ def _line_of_beams(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner | 
         return None  # the mirror would rotate more than once per line
     exact_hz = pulses_per_line * firing_hz
     pulse_hz = _whole_hz(sensor, exact_hz)
-    scanner = _head(head, pulse_hz, pulses_per_line, duration_s)
+    scanner = _rotating_scanner(head, pulse_hz, pulses_per_line, duration_s)
     scanner.exact_hz = exact_hz
     middle_deg = _set_line(scanner, line.step_deg, count, pulses_per_line, pulse_hz)
     tilt_deg = line.lowest_deg + line.step_deg * (count - 1) / 2 - middle_deg
@@ -407,26 +411,26 @@ def _set_line(
     return (first_deg + last_deg) / 2
 
 
-def _mirror(sensor: Sensor, head: Mirror, duration_s: float) -> _Scanner:
+def _mirror_scanner(sensor: Sensor, head: Mirror, duration_s: float) -> _Scanner:
     """Create a scanner whose mirror sweeps lines with a single beam.
 
     Raise LidarError if HELIOS++ has no corresponding mirror.
     """
     beams = sensor.beams
     if len(beams) > 1 or abs(beams.elevation[0]) > 1e-9 or beams.origin.any():
-        raise _refusal(
+        raise _unsupported(
             sensor,
             "its mirror must deflect a single beam, centered and perpendicular to the mirror axis",
         )
     if head.motion == "sine":
-        raise _refusal(
+        raise _unsupported(
             sensor,
             "its mirror oscillates sinusoidally, but a HELIOS++ mirror oscillates at constant "
             "speed",
         )
     count = head.period
     if count is None or count < _MIN_LINE:
-        raise _refusal(
+        raise _unsupported(
             sensor,
             f"it fires {head.firings_per_turn:g} times per line, which is not a whole number",
         )
@@ -439,7 +443,7 @@ def _mirror(sensor: Sensor, head: Mirror, duration_s: float) -> _Scanner:
     sign = -1 if head.clockwise else 1
     if head.motion == "triangle":
         if head.duty != 1:
-            raise _refusal(
+            raise _unsupported(
                 sensor,
                 f"its mirror has a duty cycle of {head.duty:g}, but HELIOS++ mirrors do not pause",
             )
@@ -466,19 +470,21 @@ def _mirror(sensor: Sensor, head: Mirror, duration_s: float) -> _Scanner:
     return scanner
 
 
-def _prisms(sensor: PrismSensor, duration_s: float) -> _Scanner:
+def _prism_scanner(sensor: PrismSensor, duration_s: float) -> _Scanner:
     """Create a scanner with Risley prisms.
 
     Raise LidarError if HELIOS++ does not support the prisms.
     """
     if sensor.mirror is not None:
-        raise _refusal(sensor, "it has a mirror behind its prisms, which HELIOS++ does not support")
+        raise _unsupported(
+            sensor, "it has a mirror behind its prisms, which HELIOS++ does not support"
+        )
     if len(sensor.prisms) > MAX_PRISMS:
-        raise _refusal(
+        raise _unsupported(
             sensor, f"it has {len(sensor.prisms)} prisms, but HELIOS++ supports {MAX_PRISMS}"
         )
     if not isinstance(sensor.head, Spin):
-        raise _refusal(
+        raise _unsupported(
             sensor, f"HELIOS++ has no timing that corresponds to {type(sensor.head).__name__}"
         )
     exact_hz = sensor.head.firings_per_turn * sensor.head.rate_hz
@@ -503,7 +509,7 @@ def _prisms(sensor: PrismSensor, duration_s: float) -> _Scanner:
     # HELIOS++ prisms start at angle 0, so the whole device is rotated to the first prism's phase.
     device = _about_x(np.radians(phases_deg[0]))
     rotation = _FRAME @ device @ _OPTICS.T
-    incident = sensor.ahead @ (_OPTICS @ device.T).T
+    incident = sensor.beam_directions @ (_OPTICS @ device.T).T
     scanner.channels = [_Channel(rotation, incident=vector) for vector in incident]
     return scanner
 

@@ -44,7 +44,7 @@ class _ModelSection(BaseModel):
 _MAX_BEAMS = 1_000_000
 
 
-def _numbers(value: Any) -> Any:
+def _expand_numbers(value: Any) -> Any:
     """Expand a mapping of first, last and count to evenly spaced numbers, including both ends."""
     if isinstance(value, dict):
         count = value.get("count")
@@ -59,7 +59,7 @@ def _numbers(value: Any) -> Any:
     return value
 
 
-Numbers = Annotated[tuple[float, ...], BeforeValidator(_numbers)]
+Numbers = Annotated[tuple[float, ...], BeforeValidator(_expand_numbers)]
 OffsetXYZ = tuple[float, float, float]
 # Neither a binary float nor a decimal is exact: 55.296 is not exact in binary, and 500/9 is not
 # exact in decimal.
@@ -107,7 +107,7 @@ class BeamTable(_ModelSection):
         return np.repeat(origin, count, axis=0) if len(origin) == 1 else origin
 
 
-class MirrorPart(_ModelSection):
+class MirrorSection(_ModelSection):
     """Motion of a mirror that sweeps lines, with the fields of `Mirror`."""
 
     motion: MirrorMotion
@@ -210,7 +210,7 @@ class Performance(_ModelSection):
         return float(np.sqrt(s - slope * x)), float(np.sqrt(slope))
 
 
-class PacketPart(_ModelSection):
+class PacketSection(_ModelSection):
     """Packet format of the manufacturer, with the fields of `PacketSettings`."""
 
     format: str
@@ -232,14 +232,14 @@ class SensorModel(_ModelSection):
     rates_hz: tuple[Positive, Positive] | None = None
     range_m: tuple[float, float] | None = None
     beams: BeamTable = BeamTable()
-    mirror: MirrorPart | None = None
+    mirror: MirrorSection | None = None
     prisms: tuple[Prism, ...] = ()
     turning_mirror: TurningMirror | None = None  # behind the prisms
     typical: bool = False  # whether the ray pattern differs between units
     optics: Optics = Optics()
     performance: Performance | None = None
     listed: bool = False
-    packets: PacketPart | None = None
+    packets: PacketSection | None = None
 
     @model_validator(mode="after")
     def _check_consistency(self) -> SensorModel:
@@ -328,7 +328,7 @@ class SensorModel(_ModelSection):
         return self.firings_per_turn if columns is None else columns, rate
 
 
-def plugin_of_model(name: str | None) -> Plugin | None:
+def find_model_plugin(name: str | None) -> Plugin | None:
     """Return the plug-in that provides a sensor model, or None.
 
     Raises
@@ -349,7 +349,7 @@ def plugin_model_file(name: str | None) -> Path | None:
     LidarError
         If the plug-in cannot be used.
     """
-    plugin = plugin_of_model(name)
+    plugin = find_model_plugin(name)
     if plugin is None or name is None:
         return None
     file = maker_folder(plugin) / f"{name.partition('/')[2]}.yaml"
@@ -376,14 +376,14 @@ def read_model(name: str | Path) -> SensorModel:
     models = model_names()
     name = full_name(str(name))
     if name in models:
-        return _built_in(name)
-    plugin = plugin_of_model(name)
+        return _read_built_in(name)
+    plugin = find_model_plugin(name)
     if plugin is not None:
         folder = maker_folder(plugin)
         models = (*models, *names_in(folder))
         if name in models:
             return _read(folder / f"{name.partition('/')[2]}.yaml")
-    similar = [model for model in models if _plain(name) in _plain(model)][:3]
+    similar = [model for model in models if _normalize(name) in _normalize(model)][:3]
     hint = f" Did you mean {' or '.join(map(repr, similar))}?" if similar else ""
     names = [*models, *(model.partition("/")[2] for model in models)]
     raise LidarError(
@@ -392,13 +392,13 @@ def read_model(name: str | Path) -> SensorModel:
     )
 
 
-def _plain(name: str) -> str:
+def _normalize(name: str) -> str:
     """Return the letters and digits of a name in lower case, for example vlp16 for VLP-16."""
     return "".join(filter(str.isalnum, name.lower()))
 
 
 @cache
-def _built_in(name: str) -> SensorModel:
+def _read_built_in(name: str) -> SensorModel:
     """Read a model that is included in the package."""
     return _read(BUILT_IN / f"{name}.yaml")
 
@@ -420,7 +420,7 @@ class Datasheet(NamedTuple):
     missing: tuple[str, ...]  # values that the data sheet lacks, with their fields
 
 
-def shown_noise(noise: Noise) -> str:
+def format_noise(noise: Noise) -> str:
     """Return the noise fields that differ from their defaults, as written in a scenario."""
     shown = (
         f"{field.name}: {value:.4g}"
@@ -484,7 +484,7 @@ def load_sensor(
     if model is not None:
         sensor_model = read_model(model)
     elif unit is not None:
-        sensor_model = _model_of(unit, columns)
+        sensor_model = _match_model(unit, columns)
     else:
         raise LidarError("A sensor requires a model, a calibration or both.")
     if unit is not None:
@@ -509,11 +509,11 @@ def load_sensor(
         common_fields |= {"noise": sheet.noise, "returns": sheet.returns}
     head = Spin(firings, step_deg, rate, sensor_model.clockwise, sensor_model.zero_deg)
     if unit is not None and unit.window is not None:
-        head = head.within(*unit.window)
+        head = head.restrict_to(*unit.window)
     if unit is not None and (unit.rays is not None or sensor_model.listed or sensor_model.prisms):
         common_fields["packets"] = sensor_model.packet_settings(np.arange(1))
-        return _listed(sensor_model, unit, head, common_fields)
-    beams = sensor_model.beams.beams() if unit is None else _calibrated(sensor_model, unit)
+        return _create_listed_sensor(sensor_model, unit, head, common_fields)
+    beams = sensor_model.beams.beams() if unit is None else _calibrate_beams(sensor_model, unit)
     if sensor_model.prisms:
         common_fields["packets"] = sensor_model.packet_settings(np.arange(len(beams)))
         mirror = sensor_model.turning_mirror
@@ -522,10 +522,10 @@ def load_sensor(
         mirror_fields = sensor_model.mirror.model_dump()
         head = Mirror(firings, step_deg, rate, head.clockwise, head.zero_deg, **mirror_fields)
     else:
-        beams = beams.turning(head.radians_per_ns)
+        beams = beams.with_rotation(head.radians_per_ns)
     kind = LineSensor if sensor_model.axis == "x" else Sensor
     common_fields["packets"] = sensor_model.packet_settings(laser_order(beams.elevation))
-    return kind(beams.lowest_first(), head, **common_fields)
+    return kind(beams.sort_by_elevation(), head, **common_fields)
 
 
 def _sensor_name(sensor_model: SensorModel, unit: Calibration | None) -> str:
@@ -535,7 +535,7 @@ def _sensor_name(sensor_model: SensorModel, unit: Calibration | None) -> str:
     return f"{sensor_model.name}, typical pattern" if sensor_model.typical else sensor_model.name
 
 
-def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
+def _match_model(unit: Calibration, columns: int | None) -> SensorModel:
     """Return the model whose beams best match a calibration.
 
     If no model matches, create a model from the calibration alone. Raise LidarError if the
@@ -560,7 +560,7 @@ def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
     return SensorModel(name=unit.sensor or (unit.maker or "beams").title(), sources={}, **head)
 
 
-def _listed(
+def _create_listed_sensor(
     sensor_model: SensorModel, unit: Calibration, head: Spin, common_fields: dict[str, Any]
 ) -> ListedSensor:
     """Create a sensor from a calibrated ray list.
@@ -590,7 +590,7 @@ def _listed(
     )
 
 
-def _calibrated(sensor_model: SensorModel, unit: Calibration) -> Beams:
+def _calibrate_beams(sensor_model: SensorModel, unit: Calibration) -> Beams:
     """Return calibrated beams, with times and origins from the model if the file has none."""
     beams = unit.beams
     table = sensor_model.beams

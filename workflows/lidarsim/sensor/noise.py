@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from ..errors import LidarError
-from ..media.materials import at_right_angles
+from ..media.materials import normal_incidence_energy
 from ..numerics.random_numbers import named_seed
 from ..schema.checks import check_fields
 from ..schema.declared import AngleDeg, Seed, Several, UnitShare, about, allowed
@@ -178,15 +178,15 @@ class Noise:
         """Energy at which half of the returns are detected, or 0 if there is no detection range."""
         if self.detection_range_m is None:
             return 0.0
-        return float(TARGET_REFLECTANCE * at_right_angles(self.detection_range_m))
+        return float(TARGET_REFLECTANCE * normal_incidence_energy(self.detection_range_m))
 
     @property
-    def full(self) -> float:
+    def saturation_energy(self) -> float:
         """Energy at which the receiver saturates, or infinity if it never saturates."""
         return inf if self.saturation is None else self.saturation * self.threshold
 
     @property
-    def loses(self) -> bool:
+    def loses_returns(self) -> bool:
         """Whether returns can be lost."""
         return self.dropout > 0 or self.detection_range_m is not None
 
@@ -196,6 +196,6 @@ class Noise:
         random = self.range_m, self.range_per_m, self.range_at_threshold_m
         return any((*random, self.walk_m, self.channel_bias_m, self.warm_up_m))
 
-    def named(self, name: str) -> Noise:
+    def for_sensor(self, name: str) -> Noise:
         """Return a copy whose seed also depends on the name of a sensor."""
         return replace(self, seed=named_seed(self.seed, name))

@@ -89,22 +89,22 @@ class PrismSensor(Sensor):
         count = len(firings)
         key = (int(firings[0]), count) if count else (0, 0)
         if not count or count * self.channels > _MAX_KEPT_RAYS or (np.diff(firings) != 1).any():
-            return self._computed_directions(firings)
+            return self._compute_directions(firings)
         kept = _KEPT_DIRECTIONS.setdefault(self, {})
         directions = kept.get(key)
         if directions is None:
-            directions = self._computed_directions(firings)
+            directions = self._compute_directions(firings)
             directions.flags.writeable = False
             for oldest in [*kept][: max(0, len(kept) + 1 - _KEPT_SWEEPS)]:
                 kept.pop(oldest, None)  # another thread may have removed the sweep
             kept[key] = directions
         return directions
 
-    def _computed_directions(self, firings: Ints) -> Floats:
+    def _compute_directions(self, firings: Ints) -> Floats:
         """Compute the result of `directions` with Snell's law."""
         minutes = self.head.times_ns(firings) / 60e9
         flat = np.array([1.0, 0, 0])[:, None, None]
-        ray = np.repeat(self.ahead.T[:, None, :], len(firings), axis=1)
+        ray = np.repeat(self.beam_directions.T[:, None, :], len(firings), axis=1)
         for prism in self.prisms:
             # Reduce the angle to one revolution, because the cosine of a large angle is imprecise.
             angle = 2 * np.pi * ((prism.rpm * minutes + prism.phase_deg / 360) % 1)
@@ -118,12 +118,12 @@ class PrismSensor(Sensor):
                 inclined[1:] *= -1
             faces = (inclined, flat) if prism.inclined_first else (flat, inclined)
             for face, ratio in zip(faces, (1 / prism.index, prism.index), strict=True):
-                ray = _refracted(ray, face, ratio)
+                ray = _refract(ray, face, ratio)
         if self.mirror is not None:
-            ray = self._reflected(ray, minutes)
+            ray = self._reflect(ray, minutes)
         return np.ascontiguousarray(ray.transpose(1, 2, 0))
 
-    def _reflected(self, rays: Floats, minutes: Floats) -> Floats:
+    def _reflect(self, rays: Floats, minutes: Floats) -> Floats:
         """Reflect rays at the mirror, and make its axis the z axis.
 
         The rays and the result have shape (3, k, c). The times of the firings in minutes have
@@ -148,7 +148,7 @@ _KEPT_SWEEPS = 16
 _MAX_KEPT_RAYS = 1 << 16  # maximum number of rays in a cached sweep, which takes 1.5 MB
 
 
-def _refracted(rays: Floats, normals: Floats, ratio: float) -> Floats:
+def _refract(rays: Floats, normals: Floats, ratio: float) -> Floats:
     """Refract rays at a face with Snell's law.
 
     The rays and the result have shape (3, k, c). `ratio` is the refractive index before the face

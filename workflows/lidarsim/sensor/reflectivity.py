@@ -21,7 +21,7 @@ class ByteScale(NamedTuple):
     reflectance: float  # reflectance at `code`
     max_reflectance: float  # reflectance at code 255
 
-    def codes(self, reflectance: Floats) -> Bytes:
+    def encode(self, reflectance: Floats) -> Bytes:
         """Encode reflectances as bytes.
 
         Reflectances above the end of the scale have the code 255. Both arrays have shape (n,).
@@ -30,8 +30,8 @@ class ByteScale(NamedTuple):
         code = self.code * np.minimum(share, 1) + log(np.maximum(share, 1)) / self._step
         return np.rint(np.minimum(code, 255)).astype(np.uint8)
 
-    def reflectances(self, codes: Bytes) -> Floats:
-        """Decode bytes to reflectances, which inverts `codes` except for rounding.
+    def decode(self, codes: Bytes) -> Floats:
+        """Decode bytes to reflectances, which inverts `encode` except for rounding.
 
         Both arrays have shape (n,).
         """

@@ -337,7 +337,7 @@ class Sensor:
         For `firings` of shape (k,), the result has shape (k, channels, 3). Directions are unit
         vectors.
         """
-        return self._rotated(firings, self.ahead)
+        return self._rotate(firings, self.beam_directions)
 
     def origins(self, firings: Ints) -> Floats | None:
         """Return the ray origins of several firings in the sensor frame, in meters.
@@ -347,10 +347,10 @@ class Sensor:
         """
         if not self.beams.origin.any():
             return None
-        return self._rotated(firings, self.beams.origin)
+        return self._rotate(firings, self.beams.origin)
 
     @cached_property
-    def ahead(self) -> Floats:
+    def beam_directions(self) -> Floats:
         """Unit vectors along the beams in the head frame at azimuth 0.
 
         The shape is (channels, 3).
@@ -383,7 +383,7 @@ class Sensor:
         """Rotation matrix from the head frame to the sensor frame, or None for the identity."""
         return None
 
-    def _rotated(self, firings: Ints, vectors: Floats) -> Floats:
+    def _rotate(self, firings: Ints, vectors: Floats) -> Floats:
         """Rotate one vector per beam with the head, for several firings.
 
         For `vectors` of shape (c, 3) and `firings` of shape (k,), the result has shape (k, c, 3).

@@ -113,7 +113,7 @@ class Rig:
             rays = _Rays(None)
             if by_head:
                 origin = sensor.beams.origin if sensor.center is None else None
-                pattern = Pattern(sensor.ahead, origin, step=sensor.ring_step)
+                pattern = Pattern(sensor.beam_directions, origin, step=sensor.ring_step)
                 rays = _Rays(pattern, by_head=True)
             elif repeats:
                 rays = _Rays(self._pattern_of_firings(number, 0, sensor.period or 0))

@@ -25,10 +25,10 @@ from ..columns.table import (
 )
 from ..environment.notebook import picture_of, table_of
 from ..errors import ArgumentError, LidarError
-from ..media.materials import ClassNames, Material, class_names_problem
-from ..media.weather import EXIT_M, FAINTEST, Air, Weather, reach
+from ..media.materials import ClassNames, Material, find_class_names_error
+from ..media.weather import EXIT_M, FAINTEST, Air, Weather, particle_range
 from ..motion.navigation import Navigation, check_navigation
-from ..motion.trajectory import CENTER, Pose, Stations, Trajectory, check_trajectory_type, pose_of
+from ..motion.trajectory import CENTER, Pose, Stations, Trajectory, as_pose, check_trajectory_type
 from ..numerics.arrays import Floats, Ints
 from ..schema.checks import check_fields, check_type
 from ..schema.declared import FILLED_IN, FileSection, Names, Several, about, written_as
@@ -299,7 +299,7 @@ class Survey(CloudOptions, Weather):
         check_type("sensor", self.sensor, Sensor, advice=_ON_SENSORS)
         check_fields(self)
         check_type("classes", self.classes, Mapping)
-        if problem := class_names_problem(self.classes):
+        if problem := find_class_names_error(self.classes):
             raise ArgumentError(f"classes: {problem}")
         if self.trajectory is not None:
             check_trajectory_type("trajectory", self.trajectory)
@@ -521,7 +521,9 @@ class Survey(CloudOptions, Weather):
     @cached_property
     def noise_each(self) -> tuple[Noise, ...]:
         """Noise of each sensor, with a seed that depends on the name of the sensor."""
-        return tuple((carried.noise or self.noise).named(carried.name) for carried in self.carried)
+        return tuple(
+            (carried.noise or self.noise).for_sensor(carried.name) for carried in self.carried
+        )
 
     @cached_property
     def stored_columns(self) -> tuple[Column, ...]:
@@ -550,7 +552,7 @@ class Survey(CloudOptions, Weather):
         sensor = self.carried[number].sensor
         min_energy = FAINTEST * self.noise_each[number].threshold
         air = self.air(number)
-        span = reach(sensor.min_range_m, sensor.max_range_m)
+        span = particle_range(sensor.min_range_m, sensor.max_range_m)
         return sum(air.mean_particles(kind, min_energy, *span) for kind in self.particles)
 
     @cached_property
@@ -670,7 +672,7 @@ class Survey(CloudOptions, Weather):
         start = station * self.station_ns
         return ScanSpec(index, station, lidar.firings(step), start, sensor, lidar.channels)
 
-    def faults_of(self, sensor: int, *kinds: FaultKind) -> dict[int, Fault]:
+    def sensor_faults(self, sensor: int, *kinds: FaultKind) -> dict[int, Fault]:
         """Return the faults of the given kinds that affect a sensor.
 
         The keys are indices into `faults`.
@@ -690,18 +692,18 @@ class Survey(CloudOptions, Weather):
         every worker selects the same scan.
         """
         spec = self.scan(index)
-        frozen = self.faults_of(spec.sensor, "frozen").values()
+        frozen = self.sensor_faults(spec.sensor, "frozen").values()
         if not frozen:
             return spec
         firsts, starts_ns, _ = self.sweeps_each[spec.sensor]
         sweep = int(np.searchsorted(firsts, index, "right")) - 1
         source = sweep
-        while active := [fault for fault in frozen if fault.during(starts_ns[source])]:
+        while active := [fault for fault in frozen if fault.is_active(starts_ns[source])]:
             source = int(np.searchsorted(starts_ns, active[0].from_s * 1e9)) - 1
         if source == sweep:
             return spec
-        # If the repeated sweep is the last one at a pose, it may have fewer scans than the sweep that
-        # it replaces. `LossStep` removes the returns of the surplus scans.
+        # The repeated sweep may have fewer scans if it is the last at a pose. `LossStep` then drops
+        # the returns of the surplus scans.
         older = min(int(firsts[source] + index - firsts[sweep]), int(firsts[source + 1]) - 1)
         repeats = int(firsts[source]), int(firsts[sweep])
         return replace(self.scan(older), scan=index, ahead=older - index, repeats=repeats)
@@ -768,4 +770,4 @@ def _poses(poses: Sequence[Any]) -> tuple[Pose, ...]:
         raise LidarError(
             f"poses must be a list of poses, such as [(0, 0, 1)], but is {shown(poses)}."
         )
-    return tuple(pose_of("poses", pose) for pose in poses)
+    return tuple(as_pose("poses", pose) for pose in poses)

@@ -156,7 +156,7 @@ class Follower:
             rigid transform.
         """
         sensor_pose = _matrices(pose, 1)
-        self._place(_matrices(matrices, len(self._bodies)))
+        self._move_bodies(_matrices(matrices, len(self._bodies)))
         origin = self._frozen.origin
         path = StaticPose(sensor_pose[0, :3, 3] - origin, sensor_pose[0, :3, :3])
         return self._frozen.sweep(path, number=number)
@@ -186,8 +186,8 @@ class Follower:
             rigid transform.
         """
         sensor_poses = _matrices(poses, None)
-        self._place(_matrices(matrices, len(self._bodies)))
-        return self._frozen.ranges(_local(sensor_poses, self._frozen.origin), number=number)
+        self._move_bodies(_matrices(matrices, len(self._bodies)))
+        return self._frozen.ranges(_to_local(sensor_poses, self._frozen.origin), number=number)
 
     def step(self, time_s: float, pose: ArrayLike, matrices: ArrayLike = ()) -> list[Cloud]:
         """Record a time step of the world, and return the sweeps completed since the last step.
@@ -230,7 +230,7 @@ class Follower:
         if self._steps and step.time_s == self._steps[-1].time_s:
             self._steps.pop()
         self._steps.append(step)
-        return list(self._ended_sweeps())
+        return list(self._completed_sweeps())
 
     def reset(self) -> None:
         """Discard all recorded steps, so that the next step starts a new first sweep."""
@@ -239,7 +239,7 @@ class Follower:
         self._number = 0
         self._span_s = None
 
-    def _ended_sweeps(self) -> Iterator[Cloud]:
+    def _completed_sweeps(self) -> Iterator[Cloud]:
         """Yield the sweeps whose last beam was fired before or at the last step."""
         while True:
             if self._span_s is None:
@@ -251,10 +251,10 @@ class Follower:
             times_s, poses, matrices = map(np.array, zip(*self._steps, strict=True))
             origin = self._moving.origin
             if self._bodies:
-                by_body = _local(matrices.transpose(1, 0, 2, 3), origin)
+                by_body = _to_local(matrices.transpose(1, 0, 2, 3), origin)
                 self._moving.move(self._body_names, by_body, times_s=times_s)
             # The first pose is held, because the scanner also requires the pose at time 0.
-            (path,) = Track.from_matrices(times_s, _local(poses, origin)[None], "hold")
+            (path,) = Track.from_matrices(times_s, _to_local(poses, origin)[None], "hold")
             yield self._moving.sweep(path, number=self._number)
             self._number += 1
             self._span_s = None
@@ -264,16 +264,16 @@ class Follower:
         while len(self._steps) > 2 and self._steps[1].time_s <= start_s:
             self._steps.popleft()
 
-    def _place(self, matrices: Floats) -> None:
+    def _move_bodies(self, matrices: Floats) -> None:
         """Move the instances whose matrices have changed."""
         changed = np.flatnonzero((matrices != self._matrices).any(axis=(1, 2)))
         if len(changed):
             names = [self._body_names[row] for row in changed]
-            self._frozen.move(names, _local(matrices[changed], self._frozen.origin))
+            self._frozen.move(names, _to_local(matrices[changed], self._frozen.origin))
             self._matrices = matrices.copy()
 
 
-def _local(matrices: Floats, origin: Floats) -> Floats:
+def _to_local(matrices: Floats, origin: Floats) -> Floats:
     """Convert matrices from world coordinates to local coordinates with the given origin."""
     if not origin.any():
         return matrices

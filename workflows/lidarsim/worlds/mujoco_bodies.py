@@ -16,7 +16,7 @@ from ..scene.colors import LINEAR, Colors, as_bytes, as_srgb
 from ..scene.face_materials import FaceMaterials
 from ..scene.scene_mesh import SceneMesh, stacked
 from ..words import name_hint, plural
-from .mujoco_geoms import PLANE_M, SAG_M, GeomMesh, mesh_of_geom
+from .mujoco_geoms import PLANE_M, SAG_M, GeomMesh, create_geom_mesh
 
 _COLOR_TEXTURE_ROLE = 1  # mjTEXROLE_RGB, a column index of mat_texid
 
@@ -40,7 +40,7 @@ class ModelBodies(NamedTuple):
 class BodySelection(NamedTuple):
     """Selection of the bodies and geoms that are visible to a lidar, and options for their meshes.
 
-    The options `sag_m` and `plane_m` are those of `mesh_of_geom`.
+    The options `sag_m` and `plane_m` are those of `create_geom_mesh`.
     """
 
     groups: Sequence[int]  # visible geom groups
@@ -51,7 +51,7 @@ class BodySelection(NamedTuple):
     plane_m: float = PLANE_M
 
 
-def number_of(model: Any, kind: str, name: str | int) -> int:
+def find_id(model: Any, kind: str, name: str | int) -> int:
     """Return the ID of a body, geom or site, or -1 if it does not exist.
 
     `name` is either a name or an ID.
@@ -73,7 +73,7 @@ def names_of(model: Any, kind: str) -> list[str]:
     return [name or f"{kind} {number}" for number, name in enumerate(names)]
 
 
-def required_number(model: Any, kind: str, name: str | int) -> int:
+def require_id(model: Any, kind: str, name: str | int) -> int:
     """Return the ID of a body or site.
 
     Raises
@@ -81,13 +81,13 @@ def required_number(model: Any, kind: str, name: str | int) -> int:
     LidarError
         If the body or site does not exist.
     """
-    number = number_of(model, kind, name)
+    number = find_id(model, kind, name)
     if number < 0:
         raise LidarError(_unknown(name, kind, names_of(model, kind)))
     return number
 
 
-def excluded(model: Any, names: Iterable[str | int]) -> tuple[list[int], list[int]]:
+def find_excluded(model: Any, names: Iterable[str | int]) -> tuple[list[int], list[int]]:
     """Return the IDs of excluded bodies and of excluded geoms.
 
     Parameters
@@ -105,8 +105,8 @@ def excluded(model: Any, names: Iterable[str | int]) -> tuple[list[int], list[in
     bodies = []
     geoms = []
     for name in names:
-        body = number_of(model, "body", name)
-        geom = number_of(model, "geom", name) if isinstance(name, str) else -1
+        body = find_id(model, "body", name)
+        geom = find_id(model, "geom", name) if isinstance(name, str) else -1
         if body < 0 and geom < 0:
             known = [*names_of(model, "body"), *names_of(model, "geom")]
             raise LidarError(_unknown(name, "body or geom", known))
@@ -119,14 +119,14 @@ def _unknown(name: str | int, kind: str, known: list[str]) -> str:
     return f"The model has no {kind} {name!r}.{name_hint(str(name), known)}"
 
 
-def bodies_of(model: Any, choice: BodySelection) -> ModelBodies:
+def create_bodies(model: Any, choice: BodySelection) -> ModelBodies:
     """Create the meshes of the bodies that have visible geoms.
 
     Bodies that are welded to the world are static, except for mocap bodies. All other bodies move.
     Completely transparent geoms are omitted, because MuJoCo's ray casting ignores them, too. Flexes
     and skins are also omitted.
     """
-    geoms = seen_geoms(model, choice)
+    geoms = visible_geoms(model, choice)
     groups = [[geom] for geom in geoms]
     if choice.objects == "body":
         by_body: dict[int, list[int]] = {}
@@ -158,7 +158,7 @@ def _static_bodies(model: Any) -> Any:
     return (np.asarray(model.body_weldid) == 0) & (np.asarray(model.body_mocapid) < 0)
 
 
-def seen_geoms(model: Any, choice: BodySelection) -> list[int]:
+def visible_geoms(model: Any, choice: BodySelection) -> list[int]:
     """Return the IDs of the geoms that are visible to a lidar."""
     colors = _colors(model)
     seen = np.isin(model.geom_group, choice.groups) & (colors[:, 3] > 0)
@@ -218,7 +218,7 @@ def _mesh_of_geoms(
 
 def _placed_geom(model: Any, geom: int, choice: BodySelection) -> GeomMesh:
     """Create the mesh of a geom in the frame of its body."""
-    shape = mesh_of_geom(model, geom, choice.sag_m, choice.plane_m)
+    shape = create_geom_mesh(model, geom, choice.sag_m, choice.plane_m)
     points = rotate(shape.vertices, _rotation(model.geom_quat[geom]))
     return GeomMesh(points + np.asarray(model.geom_pos[geom], np.float64), shape.faces)
 
@@ -262,7 +262,7 @@ def _rest_pose(model: Any, body: int) -> tuple[Floats, Floats]:
     return rotation, position
 
 
-def soft_bodies(model: Any) -> str:
+def describe_soft_bodies(model: Any) -> str:
     """Describe how many flexes and skins a model has, because they are invisible to a lidar.
 
     The result is an empty string if the model has none.

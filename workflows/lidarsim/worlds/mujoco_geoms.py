@@ -45,7 +45,7 @@ class GeomMesh(NamedTuple):
     faces: Ints  # (f, 3)
 
 
-def mesh_of_geom(model: Any, geom: int, sag_m: float, plane_m: float = PLANE_M) -> GeomMesh:
+def create_geom_mesh(model: Any, geom: int, sag_m: float, plane_m: float = PLANE_M) -> GeomMesh:
     """Create the triangle mesh of a geom.
 
     Parameters
@@ -74,14 +74,14 @@ def mesh_of_geom(model: Any, geom: int, sag_m: float, plane_m: float = PLANE_M) 
         case GeomType.HFIELD:
             return height_field(model, int(model.geom_dataid[geom]))
         case GeomType.SPHERE:
-            return _geom_mesh(capsule(radius, 0, segments(radius, sag_m), "ball"))
+            return _geom_mesh(capsule(radius, 0, count_segments(radius, sag_m), "ball"))
         case GeomType.CAPSULE:
-            return _geom_mesh(capsule(radius, 2 * half, segments(radius, sag_m), "capsule"))
+            return _geom_mesh(capsule(radius, 2 * half, count_segments(radius, sag_m), "capsule"))
         case GeomType.ELLIPSOID:
-            ball = capsule(1, 0, segments(float(size.max()), sag_m), "ball")
+            ball = capsule(1, 0, count_segments(float(size.max()), sag_m), "ball")
             return GeomMesh(ball.vertices * size, ball.faces)
         case GeomType.CYLINDER:
-            return _geom_mesh(cylinder(radius, 2 * half, segments(radius, sag_m), "cylinder"))
+            return _geom_mesh(cylinder(radius, 2 * half, count_segments(radius, sag_m), "cylinder"))
         case GeomType.BOX:
             cube = box("box", (2.0, 2.0, 2.0))
             return GeomMesh((cube.vertices - [0, 0, 1]) * size, cube.faces)
@@ -90,7 +90,7 @@ def mesh_of_geom(model: Any, geom: int, sag_m: float, plane_m: float = PLANE_M) 
     raise LidarError(f"Geom {geom} has the unknown type {kind}. The known types are {[*GeomType]}.")
 
 
-def segments(radius: float, sag_m: float) -> int:
+def count_segments(radius: float, sag_m: float) -> int:
     """Return the number of sides of a polygon that approximates a circle.
 
     The centers of the sides are at most `sag_m` from the circle, unless the number of sides is

@@ -14,7 +14,14 @@ from ..numerics.arrays import Floats, Floats32, Indices
 from ..sensor import Sensor
 from ..survey.survey import Mounted
 from .follower import Follower
-from .mujoco_bodies import BodySelection, Objects, bodies_of, excluded, required_number, soft_bodies
+from .mujoco_bodies import (
+    BodySelection,
+    Objects,
+    create_bodies,
+    describe_soft_bodies,
+    find_excluded,
+    require_id,
+)
 from .mujoco_geoms import SAG_M
 
 _log = logging.getLogger(__name__)
@@ -85,7 +92,7 @@ class MujocoScanner:
         self._is_single = isinstance(names, str | int)
         listed: Any = [names] if self._is_single else names
         self._frames: Indices = np.array(
-            [required_number(model, self._kind, name) for name in listed], np.intp
+            [require_id(model, self._kind, name) for name in listed], np.intp
         )
         mount_bodies = self._frames
         if self._kind == "site":
@@ -94,13 +101,13 @@ class MujocoScanner:
             raise LidarError(f"objects must be 'body' or 'geom', but is {objects!r}.")
         if not sag_m > 0:
             raise LidarError(f"sag_m must be greater than 0, but is {sag_m}.")
-        excluded_bodies, excluded_geoms = excluded(model, exclude)
+        excluded_bodies, excluded_geoms = find_excluded(model, exclude)
         # A lidar that is mounted on the world, body 0, still sees the world.
         unseen = [*excluded_bodies, *(body for body in mount_bodies.tolist() if body)]
         selection = BodySelection(tuple(groups), unseen, excluded_geoms, objects, sag_m)
-        if soft := soft_bodies(model):
+        if soft := describe_soft_bodies(model):
             _log.warning("the model has %s, which the lidar ignores", soft)
-        bodies = bodies_of(model, selection)
+        bodies = create_bodies(model, selection)
         self._bodies: Indices = np.array([item.body for item in bodies.moving], np.intp)
         if not bodies.static and not bodies.moving:
             raise LidarError(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ...media.materials import NEAR_NM, Material, MaterialTable, at_right_angles
+from ...media.materials import NEAR_NM, Material, MaterialTable, normal_incidence_energy
 from ...numerics.arrays import Bools, Floats, Integers, Ints, Ints32, UInts32, owned
 from ...numerics.vectors import rotate_into_frames
 from ...scene.colors import GRAY, Lookup, join_colors, luminance, packed
@@ -300,4 +300,4 @@ class SceneSurfaces:
         table = self.at_wavelength(sensor_light.wavelength_nm)
         bright = luminance(colors) if table.textured and colors is not None else None
         scattered = table.scattered(self.kinds(triangle), cosine, bright)
-        return np.asarray(scattered * at_right_angles(distance, sensor_light.extinction))
+        return np.asarray(scattered * normal_incidence_energy(distance, sensor_light.extinction))

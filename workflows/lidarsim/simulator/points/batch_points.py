@@ -12,7 +12,7 @@ from raybeam import Pattern
 from ...columns.table import Column
 from ...columns.waveforms import column_type
 from ...errors import LidarError
-from ...media.materials import at_right_angles
+from ...media.materials import normal_incidence_energy
 from ...numerics.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, UInts32
 from ...numerics.elementary import arccos, arcsin, arctan2
 from ...numerics.random_numbers import normal
@@ -139,8 +139,8 @@ class BatchPoints:
         if spec.repeats is not None:
             repeated_start_ns, current_start_ns = map(self.survey.begins_ns, spec.repeats)
             stamp = stamp + round(current_start_ns - repeated_start_ns)
-        jumps = self.survey.faults_of(spec.sensor, "time_jump").values()
-        return sum((jump.jumps_ns(stamp) for jump in jumps), stamp)
+        jumps = self.survey.sensor_faults(spec.sensor, "time_jump").values()
+        return sum((jump.time_errors_ns(stamp) for jump in jumps), stamp)
 
     @property
     def _actor_times_ns(self) -> Ints:
@@ -483,13 +483,13 @@ class BatchPoints:
     @property
     def reflectivity(self) -> Bytes:
         """Clipped energy, corrected for the loss with distance, on the manufacturer's scale."""
-        remaining = at_right_angles(self.pulse_returns.distance)
-        return SCALES[self.sensor.optics.reflectivity].codes(self._clipped_energy / remaining)
+        remaining = normal_incidence_energy(self.pulse_returns.distance)
+        return SCALES[self.sensor.optics.reflectivity].encode(self._clipped_energy / remaining)
 
     @property
     def reflectance(self) -> Floats:
         """Intensity, corrected for the losses due to distance and air."""
-        remaining = at_right_angles(
+        remaining = normal_incidence_energy(
             self.pulse_returns.distance, self.survey.extinction(self.sensor)
         )
         # In dense fog or dust, no light returns from the distance of a false alarm.

@@ -34,7 +34,7 @@ class DirtStep(PulseStep):
         for fault in self.setup.faults("dirt").values():
             in_spot = _in_spot(fault, x, y, z)
             if fault.from_s or fault.to_s is not None:
-                in_spot &= fault.during(batch.firings.times(beams))
+                in_spot &= fault.is_active(batch.firings.times(beams))
             transmission[in_spot] *= required(fault.transmission)
         transmission = transmission.repeat(batch.subrays_per_beam)
         hits = returns._replace(energy=required(returns.energy) * transmission.take(returns.ray))
@@ -90,7 +90,9 @@ class LossStep(PulseStep):
             if fault.packet is None:
                 lost_channels[row, required(fault.channels)] = True
             else:
-                lost_firings[row] = fault.drops(firings.numbers, seed, spec.station, fault_number)
+                lost_firings[row] = fault.find_dropped(
+                    firings.numbers, seed, spec.station, fault_number
+                )
         row_indices = np.empty(len(returns.ray), np.int64)
         ray = owned(returns.ray, np.int64)
         count = fault_loops.remaining(
