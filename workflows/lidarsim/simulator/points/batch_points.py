@@ -473,7 +473,9 @@ class BatchPoints:
     @property
     def _clipped_energy(self) -> Floats:
         """Received energy, clipped at saturation."""
-        return np.minimum(self.intensity, self.survey.noise_each[self.specs[0].sensor].full)
+        return np.minimum(
+            self.intensity, self.survey.noise_each[self.specs[0].sensor].saturation_energy
+        )
 
     @property
     def signal(self) -> NDArray[np.uint16]:
