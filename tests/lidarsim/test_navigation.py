@@ -46,7 +46,7 @@ class Moving:
     navigation: Navigation
     path: object
     duration_ns: float
-    carrier: str = ""
+    platform_name: str = ""
 
 
 def standing(seconds, **navigation):
@@ -284,7 +284,10 @@ def test_pieces_do_not_matter():
         assert len(pieces) > 10 * len(whole)
         for name in whole[0]._fields:
             assert joined(whole, name).tobytes() == joined(pieces, name).tobytes()
-        for change in ({"navigation": replace(survey.navigation, seed=10)}, {"carrier": "left"}):
+        for change in (
+            {"navigation": replace(survey.navigation, seed=10)},
+            {"platform_name": "left"},
+        ):
             other = joined(samples(replace(survey, **change)), whole[0]._fields[1])
             assert joined(whole, whole[0]._fields[1]).tobytes() != other.tobytes()
 

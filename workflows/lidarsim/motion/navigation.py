@@ -266,7 +266,7 @@ class InstrumentedDrive(Protocol):
         """Duration in nanoseconds."""
 
     @property
-    def carrier(self) -> str:
+    def platform_name(self) -> str:
         """Name of the platform, from which the seeds of its instruments are derived."""
 
 
@@ -302,7 +302,7 @@ def imu_samples(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[ImuSam
     if navigation is None or navigation.imu is None:
         return
     imu = navigation.imu
-    seed = named_seed(navigation.seed, drive.carrier)
+    seed = named_seed(navigation.seed, drive.platform_name)
     gyroscopes = _Triad.from_imu(imu, "gyroscope", seed)
     accelerometers = _Triad.from_imu(imu, "accelerometer", seed)
     count = math.floor(drive.duration_ns * imu.rate_hz / 1e9 + 1e-6)
@@ -369,7 +369,7 @@ def gnss_fixes(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[GnssFix
         return
     gnss = navigation.gnss
     errors = _Errors(
-        named_seed(named_seed(navigation.seed, drive.carrier), "gnss"),
+        named_seed(named_seed(navigation.seed, drive.platform_name), "gnss"),
         1 / gnss.rate_hz,
         np.array([gnss.horizontal_m, gnss.horizontal_m, gnss.vertical_m]),
         np.array([gnss.drift_horizontal_m, gnss.drift_horizontal_m, gnss.drift_vertical_m]),

@@ -68,7 +68,7 @@ class StraightLines(NamedTuple):
         [6.0, 0.0]
         """
         total = np.zeros(len(self.starts_s))
-        covered_to = -np.inf  # so that overlapping spans count once
+        covered_to = -np.inf  # avoids counting overlapping spans twice
         for start, stop in sorted(spans_s):
             first = np.maximum(self.starts_s, max(start, covered_to))
             total += np.maximum(np.minimum(self.stops_s, stop) - first, 0)

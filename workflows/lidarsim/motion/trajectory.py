@@ -37,7 +37,7 @@ CLOCK_S = 1e-6
 # Tolerance for the last beams, which are fired shortly after the pose of the last firing.
 _FIRING_S = 1e-3
 
-_STEP_NS = 5e5  # half of the interval of difference quotients
+_STEP_NS = 5e5  # half the interval of the difference quotients
 
 ALWAYS = (-np.inf, np.inf)
 

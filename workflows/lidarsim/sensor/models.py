@@ -61,8 +61,8 @@ def _expand_numbers(value: Any) -> Any:
 
 Numbers = Annotated[tuple[float, ...], BeforeValidator(_expand_numbers)]
 OffsetXYZ = tuple[float, float, float]
-# Neither a binary float nor a decimal is exact: 55.296 is not exact in binary, and 500/9 is not
-# exact in decimal.
+# Fractions are exact, whereas a float cannot represent 55.296 exactly, and a decimal number cannot
+# represent 500/9.
 Exact = Annotated[Fraction, BeforeValidator(lambda value: Fraction(str(value)))]
 Positive = Annotated[float, Field(gt=0)]
 
@@ -162,7 +162,8 @@ class Performance(_ModelSection):
     precision: tuple[RangePrecision, RangePrecision] | None = None
     angle_deg: Annotated[float, Field(ge=0)] | None = None
     detection: Detection | None = None
-    false_alarms: Annotated[float, Field(ge=0, lt=0.5)] | None = None  # fraction of pulses
+    # Fraction of pulses with a false alarm.
+    false_alarms: Annotated[float, Field(ge=0, lt=0.5)] | None = None
     dropout: UnitShare = 0.0  # fraction of returns that are lost, regardless of their energy
     mode: Mode = "strongest"
 

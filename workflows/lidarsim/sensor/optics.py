@@ -24,7 +24,8 @@ LIGHT_M_NS = 0.299792458  # speed of light in vacuum; the speed in air is 0.03 %
 FWHM = sqrt(8 * log_of(2.0))  # full width at half maximum of a Gaussian, in standard deviations
 # Width of a return in a waveform, in standard deviations of the system waveform.
 WINDOW_SIGMAS = 10
-# Beyond this many standard deviations, a return is 4e-6 of its maximum at most and is set to 0.
+# Number of standard deviations beyond which a return is set to 0, because it is less than 4e-6 of
+# its maximum.
 CUT = WINDOW_SIGMAS / 2
 # Product of a Gaussian receiver's -3 dB bandwidth and the standard deviation of its response.
 _RESPONSE = sqrt(log_of(2.0)) / (2 * pi)

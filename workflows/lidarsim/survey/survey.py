@@ -509,7 +509,7 @@ class Survey(CloudOptions, Weather):
         return tuple(self.sensors) or (Mounted(self.sensor),)
 
     @property
-    def carrier(self) -> str:
+    def platform_name(self) -> str:
         """Name of the first sensor, which determines the seeds of the platform's instruments."""
         return self.carried[0].name
 
