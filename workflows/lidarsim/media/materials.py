@@ -328,7 +328,7 @@ class Material(FileSection):
                 "leaf_area_density in m²/m³, such as 0.8."
             )
 
-    def share(self, wavelength_nm: float) -> float:
+    def diffuse_reflectance(self, wavelength_nm: float) -> float:
         """Return the fraction of the light that is scattered at a wavelength.
 
         If `reflectance` is "texture", the result applies to faces without a color.
@@ -692,7 +692,9 @@ class MaterialTable:
             entries[first[row]].check_leaves(name, bool(has_voxels[row]))
         leaf_area[has_voxels] = 1.0
         return cls(
-            reflectance=np.array([m.share(wavelength_nm) for m in entries], np.float64)[first],
+            reflectance=np.array(
+                [m.diffuse_reflectance(wavelength_nm) for m in entries], np.float64
+            )[first],
             scale=np.array(textured, np.float64)[first],
             roughness=np.array([m.roughness or 0.0 for m in entries])[first],
             metalness=np.array([m.metalness for m in entries])[first],
@@ -722,7 +724,7 @@ class MaterialTable:
         """Whether the reflectance of any surface depends on its color."""
         return bool(self.scale.any())
 
-    def shares(self, kind_indices: Integers, luminance: Floats | None) -> Floats:
+    def diffuse_reflectances(self, kind_indices: Integers, luminance: Floats | None) -> Floats:
         """Return the fraction of the light that surfaces scatter.
 
         Parameters
@@ -745,7 +747,7 @@ class MaterialTable:
             shares = bright if self.scale.all() else np.where(scale > 0, bright, shares)
         return shares
 
-    def scattered(
+    def relative_energy(
         self, kind_indices: Integers, cosine: Floats, luminance: Floats | None = None
     ) -> Floats:
         """Return the light that surfaces return, relative to a perpendicular white surface.
@@ -765,7 +767,7 @@ class MaterialTable:
         array
             Relative light for each surface. Shape (n,).
         """
-        shares = self.shares(kind_indices, luminance)
+        shares = self.diffuse_reflectances(kind_indices, luminance)
         back = shares * np.where(self.retro[kind_indices], RETRO_GAIN, cosine)
         if self.roughness.any():
             rough = np.flatnonzero(self.roughness[kind_indices])
@@ -773,11 +775,13 @@ class MaterialTable:
             diffuse = shares[rough]
             front = POLISHED * (1 - metal) + diffuse * metal
             back[rough] *= 1 - metal
-            back[rough] += front * gloss(cosine[rough], self.roughness[kind_indices[rough]])
+            back[rough] += front * glossy_reflection(
+                cosine[rough], self.roughness[kind_indices[rough]]
+            )
         return back
 
 
-def gloss(cosine: Floats, roughness: Floats) -> Floats:
+def glossy_reflection(cosine: Floats, roughness: Floats) -> Floats:
     """Return the light that a rough surface reflects specularly, relative to a white diffuser.
 
     The microfacets have the GGX distribution of Walter et al. (2007) with Smith shadowing. As in

@@ -20,7 +20,7 @@ from .spline import evaluate_curve, is_stationary
 # A platform turns within this distance before and after a corner. On a leg shorter than twice this
 # distance, the turn extends to the center of the leg.
 CORNER_M = 1.0
-STAND_S = 1.0  # maximum time in which a stationary platform turns to its next heading
+STATIONARY_TURN_S = 1.0  # maximum time in which a stationary platform turns to its next heading
 
 _SAME = 1e-9  # horizontal distances in m and speeds in m/s below this value are considered zero
 _ROOM = 1.001  # legs that are hardly longer than two corners are divided at their center
@@ -83,9 +83,11 @@ def _turns_between_legs(times_s: Floats, positions: Floats) -> _Turns:
     corner_s = CORNER_M * np.diff(times_s) / np.where(is_long, lengths, 1.0)
     starts = np.where(is_long[before], arrive - corner_s[before], middles[before])
     stops = np.where(is_long[after], leave + corner_s[after], middles[after])
-    stands = after > before + 1
-    starts[stands] = np.where(leave - arrive > STAND_S * _ROOM, leave - STAND_S, arrive)[stands]
-    stops[stands] = leave[stands]
+    pauses = after > before + 1
+    starts[pauses] = np.where(
+        leave - arrive > STATIONARY_TURN_S * _ROOM, leave - STATIONARY_TURN_S, arrive
+    )[pauses]
+    stops[pauses] = leave[pauses]
     yaws = arctan2(legs[moving, 1], legs[moving, 0])
     return _nonzero_turns(starts, stops, yaws)
 
@@ -107,7 +109,7 @@ class Heading(NamedTuple):
     rates: Floats  # (k,), rad/s
 
 
-class _Stands(NamedTuple):
+class _Stops(NamedTuple):
     """Intervals in which a platform is stationary, with its headings on arrival and departure.
 
     The first interval ends when the platform starts to travel, and the last interval starts when it
@@ -119,7 +121,7 @@ class _Stands(NamedTuple):
     yaws: Floats  # (n, 2), radians
 
     @classmethod
-    def between(cls, times_s: Floats, travels: Bools, first: Floats, last: Floats) -> _Stands:
+    def between(cls, times_s: Floats, travels: Bools, first: Floats, last: Floats) -> _Stops:
         """Create the stationary intervals between the segments in which a platform travels.
 
         Parameters
@@ -155,8 +157,8 @@ class _Stands(NamedTuple):
         """Return the headings at times at which the platform is stationary. Shape (k,)."""
         row = np.clip(np.searchsorted(self.arrivals_s, times_s, "right") - 1, 0, None)
         stops_s = self.departures_s.take(row)
-        duration = np.minimum(stops_s - self.arrivals_s.take(row), STAND_S)
-        duration = np.where(duration > 0, duration, STAND_S)
+        duration = np.minimum(stops_s - self.arrivals_s.take(row), STATIONARY_TURN_S)
+        duration = np.where(duration > 0, duration, STATIONARY_TURN_S)
         first, last = self.yaws.take(row, axis=0).T
         change = last - first
         change = change - 2 * np.pi * np.round(change / (2 * np.pi))
@@ -185,7 +187,7 @@ class CurveHeadings:
         Shape (n - 1,).
     first
         First horizontal velocity above zero after each knot. Shape (n - 1, 2).
-    stands
+    stops
         Intervals in which the platform is stationary or moves vertically.
     """
 
@@ -194,7 +196,7 @@ class CurveHeadings:
     still: Bools
     travels: Bools
     first: Floats
-    stands: _Stands
+    stops: _Stops
 
     @classmethod
     def from_knots(cls, times_s: Floats, knots: Floats) -> CurveHeadings:
@@ -216,8 +218,8 @@ class CurveHeadings:
         rows = np.arange(count)
         first = velocities[rows, moves.argmax(axis=1)]
         last = velocities[rows, 2 - moves[:, ::-1].argmax(axis=1)]
-        stands = _Stands.between(times_s, travels, first, last)
-        return cls(times_s, knots, still, travels, first, stands)
+        stops = _Stops.between(times_s, travels, first, last)
+        return cls(times_s, knots, still, travels, first, stops)
 
     def at(self, segment: Indices, since: Floats) -> Heading:
         """Return the headings at `since` seconds after the knots with the indices `segment`.
@@ -228,8 +230,8 @@ class CurveHeadings:
         if self.travels.all():
             return tangent
         travels = self.travels.take(segment)
-        standing = self.stands.at(self.times_s.take(segment) + since)
-        pairs = zip(tangent, standing, strict=True)
+        stationary = self.stops.at(self.times_s.take(segment) + since)
+        pairs = zip(tangent, stationary, strict=True)
         return Heading(*(np.where(travels, one, other) for one, other in pairs))
 
     def _tangent(self, segment: Indices, since: Floats) -> Heading:

@@ -191,7 +191,7 @@ class Noise:
         return self.dropout > 0 or self.detection_range_m is not None
 
     @property
-    def moves_ranges(self) -> bool:
+    def has_range_errors(self) -> bool:
         """Whether measured ranges differ from the true ranges."""
         random = self.range_m, self.range_per_m, self.range_at_threshold_m
         return any((*random, self.walk_m, self.channel_bias_m, self.warm_up_m))

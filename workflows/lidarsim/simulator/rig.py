@@ -258,7 +258,9 @@ class Rig:
         groups = np.array([spec.firings[0] - first for spec in specs]) * channels
         if self._device is not None:
             return self._device.returns(specs, pattern, poses, window, groups)
-        first_key = specs[0].scan + specs[0].ahead  # scan number in the keys of random numbers
+        first_key = (
+            specs[0].scan + specs[0].random_offset
+        )  # scan number in the keys of random numbers
         scanned = self.pulse_casters[number].scan(
             first_key, pattern, poses, window, groups, firings, tally=tally
         )
@@ -363,7 +365,7 @@ class Rig:
         returns = (
             self.pulse_casters[specs[0].sensor]
             .scan(
-                specs[0].scan + specs[0].ahead + first_scan,
+                specs[0].scan + specs[0].random_offset + first_scan,
                 pattern,
                 poses,
                 (0, len(image)),

@@ -509,7 +509,7 @@ class Scanner:
         """Return the scans of revolution `number`, and the delay of its start in nanoseconds.
 
         The random numbers are those of the revolution that follows `revolutions_ahead` later
-        (`ScanSpec.ahead`).
+        (`ScanSpec.random_offset`).
         """
         check_fits("number", number, SweepNumber)
         check_fits("start_s", start_s, StartSeconds)

@@ -122,7 +122,7 @@ class ScanSpec:
         Index of the sensor.
     channels
         Number of channels of the sensor.
-    ahead
+    random_offset
         Offset that is added to `scan` to obtain the index that selects the random numbers.
     repeats
         For a scan of a frozen sensor, the first scan of the sweep that is repeated, and the first
@@ -135,7 +135,7 @@ class ScanSpec:
     start_ns: int = 0
     sensor: int = 0
     channels: int = 1
-    ahead: int = 0
+    random_offset: int = 0
     repeats: tuple[int, int] | None = None
 
     @property
@@ -143,10 +143,10 @@ class ScanSpec:
         """Number of rays in this scan."""
         return (self.firings[1] - self.firings[0]) * self.channels
 
-    def shifted(self, start_ns: int, ahead: int) -> ScanSpec:
+    def shifted(self, start_ns: int, random_offset: int) -> ScanSpec:
         """Return a copy of the scan with another station start and another random number offset."""
         spec = object.__new__(type(self))  # five times as fast as `replace`
-        vars(spec).update(vars(self), start_ns=start_ns, ahead=ahead)
+        vars(spec).update(vars(self), start_ns=start_ns, random_offset=random_offset)
         return spec
 
 
@@ -706,7 +706,7 @@ class Survey(CloudOptions, Weather):
         # the returns of the surplus scans.
         older = min(int(firsts[source] + index - firsts[sweep]), int(firsts[source + 1]) - 1)
         repeats = int(firsts[source]), int(firsts[sweep])
-        return replace(self.scan(older), scan=index, ahead=older - index, repeats=repeats)
+        return replace(self.scan(older), scan=index, random_offset=older - index, repeats=repeats)
 
     def scans(self) -> Iterator[ScanSpec]:
         """Return an iterator over all scans in order."""

@@ -642,7 +642,7 @@ def _sensor_sweeps(survey: Survey, number: int) -> _SensorSweeps:
         positions.append(carrier_positions + carrier_rotations @ np.array(mount.position))
         rotations.append(carrier_rotations @ mount.rotation_matrix)
     specs = [survey.sent_scan(scan) for scan in firsts.tolist()]
-    cast_scans = np.array([spec.scan + spec.ahead for spec in specs])  # repeated if frozen
+    cast_scans = np.array([spec.scan + spec.random_offset for spec in specs])  # repeated if frozen
     first_steps = (cast_scans - firsts[0]) % survey.steps_each[number]
     return _SensorSweeps(np.concatenate(positions), np.concatenate(rotations), first_steps)
 

@@ -517,7 +517,7 @@ class BatchPoints:
         noise = self.survey.noise_each[self.specs[0].sensor]
         if noise.velocity_m_s:
             # A frozen sensor sends an older scan again, including its random numbers.
-            scan = self.scan.astype(np.int64) + self.specs[0].ahead
+            scan = self.scan.astype(np.int64) + self.specs[0].random_offset
             errors = normal(noise.seed, VELOCITY, scan, self.ray, self.return_number)
             velocity = velocity + noise.velocity_m_s * errors
         return velocity

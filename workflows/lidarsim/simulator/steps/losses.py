@@ -79,8 +79,10 @@ class LossStep(PulseStep):
         seed = self.setup.noise.seed
         # First scans of the sweep that a frozen sensor sends again, and of the sweep that it
         # replaces.
-        first_sent_again, first_replaced = spec.repeats or (spec.ahead, 0)
-        if spec.ahead != first_sent_again - first_replaced:  # the repeated sweep has no such scan
+        first_sent_again, first_replaced = spec.repeats or (spec.random_offset, 0)
+        if (
+            spec.random_offset != first_sent_again - first_replaced
+        ):  # the repeated sweep has no such scan
             return returns.take(np.zeros(0, np.intp))
         faults = self.setup.faults("dead_channels", "dropped_packets")
         spans = np.array([fault.span_ns for fault in faults.values()]).reshape(-1, 2)
