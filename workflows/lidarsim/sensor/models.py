@@ -107,7 +107,7 @@ class BeamTable(_ModelSection):
         return np.repeat(origin, count, axis=0) if len(origin) == 1 else origin
 
 
-class MirrorSection(_ModelSection):
+class MirrorSpec(_ModelSection):
     """Motion of a mirror that sweeps lines, with the fields of `Mirror`."""
 
     motion: MirrorMotion
@@ -211,7 +211,7 @@ class Performance(_ModelSection):
         return float(np.sqrt(s - slope * x)), float(np.sqrt(slope))
 
 
-class PacketSection(_ModelSection):
+class PacketSpec(_ModelSection):
     """Packet format of the manufacturer, with the fields of `PacketSettings`."""
 
     format: str
@@ -233,14 +233,14 @@ class SensorModel(_ModelSection):
     rates_hz: tuple[Positive, Positive] | None = None
     range_m: tuple[float, float] | None = None
     beams: BeamTable = BeamTable()
-    mirror: MirrorSection | None = None
+    mirror: MirrorSpec | None = None
     prisms: tuple[Prism, ...] = ()
     turning_mirror: TurningMirror | None = None  # behind the prisms
     typical: bool = False  # whether the ray pattern differs between units
     optics: Optics = Optics()
     performance: Performance | None = None
     listed: bool = False
-    packets: PacketSection | None = None
+    packets: PacketSpec | None = None
 
     @model_validator(mode="after")
     def _check_consistency(self) -> SensorModel:
