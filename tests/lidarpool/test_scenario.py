@@ -714,7 +714,7 @@ def test_materials_returns_noise_and_weather_become_those_of_the_survey():
     assert survey.visibility_km == 2
     assert survey.precision_m == 0.001, "the sensor's"
     table = MaterialTable.build(
-        survey.materials, SurfaceKinds.of_objects(["Sphere", "Vase", "Bowl", "Van"])
+        survey.materials, SurfaceKinds.from_objects(["Sphere", "Vase", "Bowl", "Van"])
     )
     assert table.semantic_class.tolist() == [7, 0, 0, 9], "an actor's own class"
     assert table.reflectance.tolist() == [0.3, 0, 0, 0], "with the rest of its material"

@@ -567,7 +567,7 @@ def test_a_scenario_has_its_robot_and_its_sensor_on_a_link(folder):
     (carried,) = survey.carried
     assert np.allclose(carried.mount.position, (-0.36, 0, 1.076))
     assert carried.mount.yaw_deg == pytest.approx(90)
-    kinds = {name: next(m for m in survey.materials if m.named(name)) for name in actors}
+    kinds = {name: next(m for m in survey.materials if m.applies_to(name)) for name in actors}
     assert kinds["Rover/rear_left_wheel"].reflectance == 0.1
     assert {kinds[name].semantic_class == 7 for name in actors if "Rover/" in name} == {True}
     assert kinds["Arm/base_link"].semantic_class != 7

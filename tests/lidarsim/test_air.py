@@ -28,7 +28,7 @@ from lidarsim import SceneMesh
 from lidarsim import box as cuboid
 from lidarsim.columns.table import CAUSES
 from lidarsim.media.materials import extinction
-from lidarsim.media.weather import EXIT_M, dust, rain, snow, spray
+from lidarsim.media.weather import EXIT_M, dust_coefficients, raindrops, snowflakes, spray_clumps
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps.particles import highest_probabilities
 
@@ -75,23 +75,23 @@ def same(one, other):
 def test_rain_takes_what_was_published(mm_h):
     """Of Marshall and Palmer's drops: 1.45 R^0.64 dB/km by Ulbrich and Atlas (1985)."""
     published = 1.45 * mm_h**0.64 * math.log(10) / 10  # 1/km
-    assert 1000 * rain(mm_h).extinction == pytest.approx(published, rel=0.1)
+    assert 1000 * raindrops(mm_h).extinction == pytest.approx(published, rel=0.1)
     by_hand = math.pi * 8000e-6 / (4.1 * mm_h**-0.21) ** 3  # 2 · π/4 · N0 · 2/Λ³
     # By hand it is that of drops of all sizes; the largest drop has 6 mm.
-    assert rain(mm_h).extinction == pytest.approx(by_hand, rel=3e-3)
+    assert raindrops(mm_h).extinction == pytest.approx(by_hand, rel=3e-3)
 
 
 @pytest.mark.parametrize("mm_h", [0.5, 1.0, 3.0])
 def test_snow_falls_as_fast_as_flakes_do(mm_h):
     """The water in the air of Gunn and Marshall, and what reaches the ground: 1 m/s."""
-    kind = snow(mm_h)
+    kind = snowflakes(mm_h)
     density = 0.1
     water = density * math.pi / 6 * kind.number * 6 / kind.slope**4 * 1e-9  # m³ in m³
     assert mm_h / 1000 / 3600 / water == pytest.approx(1.0, rel=0.08)
 
 
 def test_dust_takes_and_returns_in_proportion_to_its_mass():
-    assert dust(10.0) == pytest.approx((0.006, 0.006 / 60))
+    assert dust_coefficients(10.0) == pytest.approx((0.006, 0.006 / 60))
     found = cast([wall("W", 60)], dust_mg_m3=2, noise=Noise(detection_range_m=50))
     assert found["intensity"][0] == pytest.approx(0.5 / 36 * math.exp(-2 * 0.0012 * 60))
 
@@ -101,8 +101,8 @@ def test_what_the_air_takes_is_not_in_the_reflectance():
     # What returns from less than half of the range is too little to be detected.
     noise = Noise(detection_range_m=20)
     clear, dull = (cast([wall("W", 12)], noise=noise, **some) for some in ({}, weather))
-    wet = [one.extinction for one in (rain(10), snow(0.1))]
-    alpha = extinction(0.5, 905) + sum(wet) + dust(1)[0]
+    wet = [one.extinction for one in (raindrops(10), snowflakes(0.1))]
+    alpha = extinction(0.5, 905) + sum(wet) + dust_coefficients(1)[0]
     assert dull["reflectance"][0] == pytest.approx(clear["reflectance"][0])
     assert clear["intensity"][0] * math.exp(-24 * alpha) == pytest.approx(dull["intensity"][0])
 
@@ -148,7 +148,7 @@ def expected(number, slope, largest_mm, reflectance, alpha, edges, brighter=0.0)
 @pytest.mark.parametrize("brighter", [0.0, 1.5])
 def test_numbers_of_returns_against_range(weather, rays, given, brighter):
     """Within four standard deviations in each range, and in all of them together."""
-    kind = rain(50) if "rain_mm_h" in weather else snow(0.4)
+    kind = raindrops(50) if "rain_mm_h" in weather else snowflakes(0.4)
     edges = np.array([0.5, 2, 4, 6, 8, 10, 12, 16, 24])
     found = cast(sensor=beams(rays), **weather)
     assert (found["cause"] == AIR).all() and (found["object"] == -1).all()
@@ -243,7 +243,7 @@ def test_numbers_of_returns_from_spray():
     count = 25_000
     found = sprayed(car(), sensor=beams(count))
     assert (found["cause"] == SPRAY).all() and (found["object"] == -1).all()
-    kind = spray(200.0)
+    kind = spray_clumps(200.0)
     dense = 0.5 * (SPEED / 25) ** 2 * math.exp(-0.2 / 0.4)  # it left what is 3 m behind 0.2 s ago
     edges = np.linspace(7, 9, 5)
     given = kind.number * dense, kind.slope, kind.largest, kind.reflectance

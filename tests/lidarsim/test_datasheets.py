@@ -102,7 +102,7 @@ def test_a_scenario_takes_the_data_sheet_with_one_word_and_its_own_figures_befor
     assert noise.detection_range_m == sheet.noise.detection_range_m
     assert returns == Returns()
     ((noise, _),) = carried(sensor={"model": "ouster/os1-64"})
-    assert not noise.loses
+    assert not noise.loses_returns
 
 
 def test_a_file_that_states_its_performance_is_used_with_it_unless_it_shall_be_ideal(tmp_path):
@@ -125,7 +125,7 @@ def test_a_file_that_states_its_performance_is_used_with_it_unless_it_shall_be_i
     for survey in (Survey(sensor, **at), Survey(sensors=[Mounted(sensor)], **at)):
         assert (survey.noise_each, survey.returns_each) == ((sheet.noise,), (sheet.returns,))
     both = Survey(sensors=[Mounted(sensor, name="a"), Mounted(named, name="b")], **at)
-    assert both.noise_each == (sheet.noise.named("a"), Noise().named("b"))
+    assert both.noise_each == (sheet.noise.for_sensor("a"), Noise().for_sensor("b"))
     for given in ({"sensor": sensor}, {"sensors": [Mounted(sensor)]}):
         assert Survey(**given, **at, noise=other).noise_each == (other,)
     assert load_sensor(file, performance="ideal").noise is None and named.noise is None

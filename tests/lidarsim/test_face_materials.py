@@ -149,7 +149,7 @@ def test_the_first_entry_that_fits_a_face_counts(house):
         (3, 1): [ENTRIES[0], Material("*", semantic_class=1)],
     }
     for (glass, brick), entries in orders.items():
-        entries = [*entries] if entries[-1].for_all else [*entries, ENTRIES[2]]
+        entries = [*entries] if entries[-1].applies_to_all else [*entries, ENTRIES[2]]
         cloud = cloud_of(scene, survey(entries))
         assert set(cloud["class"][cloud["material"] == 1].tolist()) == {glass}
         assert set(cloud["class"][cloud["material"] == 0].tolist()) == {brick}

@@ -9,7 +9,7 @@ from tests.shapes import CPU, beam_along_x, cast, level, made, quad, wall
 
 from lidarpool import Beams, LidarError, Material, Noise, Returns, Scene, Sensor, Spin, Survey
 from lidarsim.columns.table import CAUSES
-from lidarsim.media.materials import WATER_INDEX, below_water, fresnel
+from lidarsim.media.materials import WATER_INDEX, fresnel, wet_surface_factor
 from lidarsim.scene.colors import Colors
 
 COLUMNS = ("range", "reflectance", "class", "cause", "return_number")
@@ -161,8 +161,8 @@ def test_bad_mirrors(values, message):
 def test_light_on_wet_ground_is_mirrored_returned_or_absorbed(degrees, dry):
     """Over a half space; of what is between ground and film, by its albedo (Lekner and Dorf)."""
     steps = (np.arange(20_000) + 0.5) / 20_000 * math.pi / 2
-    there = below_water(np.cos(np.radians([degrees])), np.full(1, dry))
-    back = below_water(np.cos(steps), np.full(len(steps), dry))
+    there = wet_surface_factor(np.cos(np.radians([degrees])), np.full(1, dry))
+    back = wet_surface_factor(np.cos(steps), np.full(len(steps), dry))
     out = np.sqrt(there * back) * dry * 2 * np.sin(steps) * np.cos(steps)
     mirrored = fresnel(np.cos(np.radians([degrees])), WATER_INDEX)[0]
     inwards = 1 - 0.9344 / WATER_INDEX**2  # a mean reflection of 6.56 % outside
@@ -188,7 +188,7 @@ def test_a_wet_road_is_darker_and_mirrors(backend, wet, down_deg):
     dry = road(0.0, down_deg, backend)
     assert (dry["object"] == 0).all() and (dry["cause"] == 0).all()
     steep = np.array([math.sin(math.radians(down_deg))])
-    darker = 1 - wet + wet * below_water(steep, np.full(1, 0.2))[0]
+    darker = 1 - wet + wet * wet_surface_factor(steep, np.full(1, 0.2))[0]
     own = found["cause"] == 0
     assert found["reflectance"][own] == pytest.approx(darker * dry["reflectance"], rel=1e-3)
     ghosts = np.flatnonzero(~own)
@@ -222,7 +222,7 @@ def test_wet_roads_vanish_at_grazing_angles_before_dry_ones():
 def test_a_film_stays_on_what_faces_up(mesh, ratio):
     dry, wet = (cast([mesh], beam_along_x(), wet=wet, **ALL)["reflectance"][0] for wet in (0, 1))
     steep = np.array([3 / math.hypot(3, 6)])
-    share = below_water(steep, np.full(1, 0.5))[0] if ratio else 1
+    share = wet_surface_factor(steep, np.full(1, 0.5))[0] if ratio else 1
     assert wet / dry == pytest.approx(share)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from lidarpool import LidarError, Pose, Track
 from lidarsim.motion.rotations import check_rotations, matrices, quaternions_of, rotations_of
-from lidarsim.motion.trajectory import batch_of, presence_ns, velocities
+from lidarsim.motion.trajectory import find_batch, presence_ns, velocities
 
 
 def product(p, q):
@@ -143,13 +143,13 @@ def test_a_straight_track_turns_evenly_about_one_axis(form):
     turns /= np.linalg.norm(turns, axis=1)[:, None]
     if form == "track":
         track = Track(times, places, turns)
-        assert batch_of(track) is None
+        assert find_batch(track) is None
     else:
         poses = np.tile(np.eye(4), (2, 4, 1, 1))
         poses[1, :, :3, :3] = [matrix_of(q) for q in turns]
         poses[1, :, :3, 3] = places
         other, track = Track.from_matrices(times, poses)
-        assert batch_of(track) is batch_of(other) is not None
+        assert find_batch(track) is find_batch(other) is not None
         assert np.array_equal(other.poses(0, np.zeros(1))[1], [np.eye(3)])
     assert track.duration_ns == 3e9 and presence_ns(track) == (-np.inf, np.inf)
     for k, part in ((0, 0.0), (0, 0.3), (1, 0.0), (1, 0.9), (2, 0.5), (2, 1.0)):

@@ -30,7 +30,7 @@ from lidarpool.clouds.writing import ExportSpec
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.motion.navigation import fixes, geodetic, imu_samples
+from lidarsim.motion.navigation import gnss_fixes, imu_samples, to_geodetic
 from lidarsim.motion.rotations import matrices
 from lidarsim.motion.trajectory import Stations
 from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
@@ -46,7 +46,7 @@ class Moving:
     navigation: Navigation
     path: object
     duration_ns: float
-    carrier: str = ""
+    platform_name: str = ""
 
 
 def standing(seconds, **navigation):
@@ -147,7 +147,7 @@ def test_errors_of_positions():
         rate_hz=10, horizontal_m=0.03, vertical_m=0.1, drift_horizontal_m=0.5, drift_vertical_m=1,
         drift_time_s=50,
     )  # fmt: skip
-    found = joined(fixes(standing(20_000, gnss=gnss)), "positions")
+    found = joined(gnss_fixes(standing(20_000, gnss=gnss)), "positions")
     assert found.shape == (200_001, 3)
     drift = markov(0.5, 50)
     for axes, white, drifting in (([0, 1], 0.03, drift), ([2], 0.1, lambda tau: 4 * drift(tau))):
@@ -189,7 +189,7 @@ def test_positions_drift_during_outages_and_return():
         Imu(accelerometer_bias=0.02, accelerometer_noise_density=0.05),
     ):
         runs = [standing(40, imu=imu, gnss=gnss, seed=seed) for seed in range(500)]
-        errors = np.concatenate([joined(fixes(run), "positions") for run in runs], axis=1)
+        errors = np.concatenate([joined(gnss_fixes(run), "positions") for run in runs], axis=1)
         t = np.clip(np.arange(81) / 2 - 10, 0, 15)
         bias = imu.accelerometer_bias
         walk = imu.accelerometer_noise_density
@@ -204,7 +204,7 @@ def test_positions_drift_during_outages_and_return():
 
 def test_without_an_imu_outages_have_no_positions():
     times = joined(
-        fixes(standing(40, gnss=Gnss(rate_hz=2, outages=[(10, 25), (30, 31)]))), "times_ns"
+        gnss_fixes(standing(40, gnss=Gnss(rate_hz=2, outages=[(10, 25), (30, 31)]))), "times_ns"
     )
     seconds = np.arange(81) / 2
     out = ((seconds >= 10) & (seconds < 25)) | ((seconds >= 30) & (seconds < 31))
@@ -278,13 +278,16 @@ def test_pieces_do_not_matter():
     path = tumbling(True)
     imu = replace(imu, scale=1e-3, misalignment_deg=0.1)
     survey = Moving(Navigation(imu=imu, gnss=gnss, seed=9), path, path.duration_ns)
-    for samples in (imu_samples, fixes):
+    for samples in (imu_samples, gnss_fixes):
         whole = [*samples(survey)]
         pieces = [*samples(survey, 7)]
         assert len(pieces) > 10 * len(whole)
         for name in whole[0]._fields:
             assert joined(whole, name).tobytes() == joined(pieces, name).tobytes()
-        for change in ({"navigation": replace(survey.navigation, seed=10)}, {"carrier": "left"}):
+        for change in (
+            {"navigation": replace(survey.navigation, seed=10)},
+            {"platform_name": "left"},
+        ):
             other = joined(samples(replace(survey, **change)), whole[0]._fields[1])
             assert joined(whole, whole[0]._fields[1]).tobytes() != other.tobytes()
 
@@ -293,7 +296,7 @@ def test_latitudes_of_east_north_and_up():
     origin = (48.7758, 9.1829, 290.0)
     warp = pytest.importorskip("rasterio.warp")
     enu = np.array([[0, 0, 0], [1000, 2000, 50], [-30_000, 40_000, 3000], [5, -5, -200.0]])
-    found = geodetic(enu, origin)
+    found = to_geodetic(enu, origin)
     np.testing.assert_allclose(found[0], origin, atol=1e-9)
     latitude, longitude, height = (column.tolist() for column in found.T)
     centered = np.array(warp.transform("EPSG:4979", "EPSG:4978", longitude, latitude, height)).T
@@ -430,4 +433,4 @@ def test_what_does_not_fit():
     ):
         Imu(gyroscope_noise_density=-1)
     assert not [*imu_samples(SimpleNamespace(navigation=None, path=None, duration_ns=1e9))]
-    assert len([*itertools.islice(fixes(standing(1, imu=Imu())), 1)]) == 0
+    assert len([*itertools.islice(gnss_fixes(standing(1, imu=Imu())), 1)]) == 0

@@ -26,8 +26,8 @@ from lidarpool import (
     Survey,
     Track,
 )
-from lidarsim.media.weather import Weather, rain, snow
-from lidarsim.motion.navigation import fixes, imu_samples
+from lidarsim.media.weather import Weather, raindrops, snowflakes
+from lidarsim.motion.navigation import gnss_fixes, imu_samples
 from lidarsim.numerics.random_numbers import Purpose, named_seed, raw, starts
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps import particle_loops, pulse_loops, random_loops, spray_loops
@@ -139,12 +139,12 @@ def test_no_random_number_is_used_twice(monkeypatch):
     draws = Draws()
     watch_arrays(monkeypatch, draws)
     watch_loops(monkeypatch, draws)
-    kinds = rain(20.0), snow(1.0), rain(5.0)
+    kinds = raindrops(20.0), snowflakes(1.0), raindrops(5.0)
     monkeypatch.setattr(Weather, "particles", property(lambda _: kinds))
     scene, survey = everything()
     for returns in Rig(scene, survey, "numpy").cast(0, survey.scan_count):
         assert len(returns.radial_velocity) > 1000
-    assert len([*imu_samples(survey), *fixes(survey)]) == 2
+    assert len([*imu_samples(survey), *gnss_fixes(survey)]) == 2
     assert {*Purpose.declared.values()} == draws.bits.keys(), "all are tried"
     each = {purpose: np.concatenate(bits) for purpose, bits in draws.bits.items()}
     # Windows of one waveform share samples, returns of a channel its error, those of a packet its

@@ -445,8 +445,8 @@ def test_lost_packets_are_not_sent_and_lost_columns_are_not_valid():
     frames = plain_frames(payloads, metadata)
     seed = sweeps.fired.seeds[0]
     firings = np.arange(1280)
-    lost = faults[0].drops(firings, seed, 0, 0)
-    lost |= faults[1].drops(firings, seed, 0, 1) & (firings >= 512)
+    lost = faults[0].find_dropped(firings, seed, 0, 0)
+    lost |= faults[1].find_dropped(firings, seed, 0, 1) & (firings >= 512)
     np.testing.assert_array_equal(frames.valid.ravel()[:1280], ~lost)
     sent = (~lost).reshape(-1, 16).any(axis=1)
     assert len(payloads) == sent.sum() < 60

@@ -11,7 +11,7 @@ from tests.lidarsim.reference import Hit
 from tests.shapes import quad
 
 from lidarpool import Beams, Material, Noise, Optics, Returns, Scene, Sensor, Spin, Survey
-from lidarsim.media.weather import Air, spray
+from lidarsim.media.weather import Air, spray_clumps
 from lidarsim.numerics.random_numbers import Purpose, named_seed, raw, starts
 from lidarsim.sensor.disc import Beam
 from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
@@ -325,7 +325,7 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
     rng = np.random.default_rng(8)
     count = 300
     noise = Noise(detection_range_m=100.0, seed=9)
-    kind = spray(50.0)
+    kind = spray_clumps(50.0)
     air = Air(0.0, 0.01, 0.003, 10.0)
     mean, tables = seen_by_range(air, kind, noise.threshold / 2, 0.5, 150.0)
     beam = np.sort(rng.integers(0, count, 500))

@@ -483,7 +483,7 @@ def test_scanners_of_helios_come_back_as_the_same_sensor(name, tmp_path):
     sensor, left_out = HELIOS_SENSORS[name]
     sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
     if name == "line":
-        turning = sensor.beams.turning(sensor.head.radians_per_ns)
+        turning = sensor.beams.with_rotation(sensor.head.radians_per_ns)
         sensor = replace(sensor, beams=turning)
     file = export_sensor(sensor, tmp_path / "lidar.xml", format="helios")
     assert file.left_out == left_out and not len(file.rays)

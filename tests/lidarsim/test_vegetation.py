@@ -26,7 +26,7 @@ from lidarpool import (
     Track,
 )
 from lidarsim import SceneMesh
-from lidarsim.media.leaves import NAMES, brightness, density, projection
+from lidarsim.media.leaves import NAMES, leaf_angle_density, mean_brightness, mean_projection
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps.light_in_media import random_depths
 
@@ -67,26 +67,26 @@ def test_leaves_that_no_ray_meets_change_nothing():
 def test_densities_are_of_all_leaves_and_projections_of_a_sphere_of_light_are_a_half(leaf_angle):
     """The mean projection of flat leaves over all directions of light is 1/2, however inclined."""
     angle = (np.arange(20_000) + 0.5) * (math.pi / 2 / 20_000)
-    assert density(leaf_angle, angle).mean() * math.pi / 2 == pytest.approx(1, rel=1e-6)
+    assert leaf_angle_density(leaf_angle, angle).mean() * math.pi / 2 == pytest.approx(1, rel=1e-6)
     cosine = (np.arange(20_000) + 0.5) / 20_000
-    assert projection(leaf_angle, cosine).mean() == pytest.approx(0.5, rel=1e-3)
+    assert mean_projection(leaf_angle, cosine).mean() == pytest.approx(0.5, rel=1e-3)
 
 
 def test_projections_of_known_leaves():
     cosine = np.linspace(0, 1, 11)
-    assert projection("spherical", cosine) == pytest.approx(0.5, rel=1e-5)
-    assert brightness("spherical", cosine) == pytest.approx(2 / 3, rel=1e-5)
+    assert mean_projection("spherical", cosine) == pytest.approx(0.5, rel=1e-5)
+    assert mean_brightness("spherical", cosine) == pytest.approx(2 / 3, rel=1e-5)
     # Straight down: the mean cosine of the angles, integrated by hand.
     straight = {"planophile": 8 / 3, "erectophile": 4 / 3, "plagiophile": 32 / 15, "uniform": 2}
     for name, value in straight.items():
-        assert projection(name, np.ones(1))[0] == pytest.approx(value / math.pi, rel=1e-4)
+        assert mean_projection(name, np.ones(1))[0] == pytest.approx(value / math.pi, rel=1e-4)
     # Campbell's own approximation of his integral is right to 1 %.
     for x in (0.1, 0.5, 1.0, 2.0, 10.0):
         approximate = np.sqrt((x * cosine) ** 2 + 1 - cosine**2) / (
             x + 1.774 * (x + 1.182) ** -0.733
         )
-        assert projection(x, cosine) == pytest.approx(approximate, rel=0.01)
-    assert projection(20.0, cosine[1:]) == pytest.approx(cosine[1:], rel=0.15), "nearly flat"
+        assert mean_projection(x, cosine) == pytest.approx(approximate, rel=0.01)
+    assert mean_projection(20.0, cosine[1:]) == pytest.approx(cosine[1:], rel=0.15), "nearly flat"
 
 
 # -- Beer and Lambert ----------------------------------------------------------------------------
@@ -103,7 +103,7 @@ def test_gaps_of_a_canopy_are_those_of_its_leaf_area_index(leaf_angle, nadir_deg
     materials = [Material("Leaves", leaf_area_density=0.6, leaf_angle=leaf_angle), GROUND]
     found = cast([canopy, floor], rays(nadir_deg=nadir_deg), (0.3, 0.1, 10), materials=materials)
     cosine = math.cos(math.radians(nadir_deg))
-    tau = projection(leaf_angle, np.array([cosine]))[0] * 1.8 / cosine
+    tau = mean_projection(leaf_angle, np.array([cosine]))[0] * 1.8 / cosine
     assert gap(found) == pytest.approx(math.exp(-tau), rel=0.01)
     # Depths of the leaves that were met follow the exponential between both surfaces.
     depth = np.sort(found["range"][found["object"] == 0] - 7 / cosine) * cosine / 3
@@ -130,12 +130,12 @@ def test_leaves_of_crowns_that_overlap_are_met_in_proportion_to_their_density():
         for k, kind in enumerate(kinds)
     ]
     found = cast(meshes, rays(10_000, 0.0), (0, 0, 10), materials=materials)
-    shares = np.array([projection(kind, np.ones(1))[0] for kind in kinds]) * [0.5, 1.5, 2.5]
+    shares = np.array([mean_projection(kind, np.ones(1))[0] for kind in kinds]) * [0.5, 1.5, 2.5]
     shares /= shares.sum()
     count = len(found["object"])
     off = np.bincount(found["object"], minlength=3) - count * shares
     assert (np.abs(off) < 4 * np.sqrt(count * shares * (1 - shares))).all()
-    bright = np.array([brightness(kind, np.ones(1))[0] for kind in kinds])[found["object"]]
+    bright = np.array([mean_brightness(kind, np.ones(1))[0] for kind in kinds])[found["object"]]
     assert np.allclose(found["intensity"], 0.5 * bright * (10 / found["range"]) ** 2, 1e-5, 0)
 
 
@@ -145,7 +145,7 @@ def test_leaves_are_as_bright_as_they_face_the_light():
     leaves = Material("Leaves", 0.5, leaf_area_density=1.0, leaf_angle="planophile")
     found = cast([canopy, floor], rays(2000, 0.0), (0, 0, 10), materials=[leaves, GROUND])
     on = found["object"] == 0
-    bright = brightness("planophile", np.ones(1))[0]
+    bright = mean_brightness("planophile", np.ones(1))[0]
     expected = 0.5 * bright * (10 / found["range"][on]) ** 2
     assert found["intensity"][on] == pytest.approx(expected, rel=1e-5)
     # Of the whole cone, the mean over sub-rays is the gap's: each meets leaves by itself.
@@ -153,7 +153,7 @@ def test_leaves_are_as_bright_as_they_face_the_light():
     cone = cast(
         [canopy, floor], rays(4000, 0.0), (0, 0, 10), materials=[leaves, GROUND], returns=beam
     )
-    tau = projection("planophile", np.ones(1))[0] * 3
+    tau = mean_projection("planophile", np.ones(1))[0] * 3
     ground = cone["intensity"][cone["object"] == 1].sum() / 4000
     assert ground == pytest.approx(math.exp(-tau) * 0.3 * (10 / 11) ** 2, rel=0.02)
     assert cone["returns"].max() > 2
@@ -283,7 +283,7 @@ def test_a_wood_of_crowns_that_overlap_anyhow():
             c = start @ start - 1
             root = np.sqrt(np.maximum(b * b - a * c, 0))
             chord = np.maximum((root - b) / a, 0) - np.maximum((-root - b) / a, 0)
-            tau += projection(kind, np.abs(ahead[:, 2])) * thick * chord
+            tau += mean_projection(kind, np.abs(ahead[:, 2])) * thick * chord
         gaps = np.exp(-tau)
         assert len(batch.object) == len(ahead)
         off += (batch.object == 24).sum() - gaps.sum()

@@ -27,7 +27,7 @@ from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim import SceneMesh
-from lidarsim.media.leaves import projection
+from lidarsim.media.leaves import mean_projection
 from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.scene_mesh import Voxels
@@ -80,7 +80,7 @@ def optical_depth(grid, start, way, kind="spherical", steps=200_000, reach=60.0)
         cell = np.floor((start + s[:, None] * one - low) / size).astype(int)
         there = ((cell >= 0) & (cell < density.shape)).all(axis=1)
         area = density[tuple(cell[there].T)].sum() * reach / steps
-        out.append(area * projection(kind, np.abs(one[2:]))[0])
+        out.append(area * mean_projection(kind, np.abs(one[2:]))[0])
     return np.array(out)
 
 
@@ -233,7 +233,7 @@ def test_gaps_and_depths_of_layers_follow_beer_and_lambert(tmp_path, backend):
     sensor = rays(nadir_deg=40.0)
     slant = 1 / math.cos(math.radians(40))
     found = cast([mesh, floor], sensor, (-5, 0.02, 10), backend=backend, materials=materials)
-    crossing = projection("erectophile", np.array([1 / slant]))[0] * slant
+    crossing = mean_projection("erectophile", np.array([1 / slant]))[0] * slant
     assert (found["object"] == 1).mean() == pytest.approx(
         math.exp(-crossing * profile.sum()), rel=0.01
     )

@@ -94,14 +94,14 @@ def counts(axes: Any, weather: dict[str, Any], farthest_m: float) -> None:
     middle = np.linspace(edges[0], farthest_m, 400)
     size = np.linspace(0, kind.largest, 1500)[1:]
     # Of the light, at most as much as one that fills the beam.
-    share = np.minimum(size / (1000 * air.width(middle[:, None])), 1) ** 2
+    share = np.minimum(size / (1000 * air.beam_diameter(middle[:, None])), 1) ** 2
     signal = kind.reflectance * air.white_energy(middle[:, None]) * share / noise.threshold
     grid = np.linspace(-3, 12, 3001)
     detected = np.interp(
         THRESHOLD_SIGMAS * (signal - 1), grid, [NormalDist().cdf(x) for x in grid]
     ) * (signal >= FAINTEST)
     density = kind.number * np.exp(-kind.slope * size) * (size[1] - size[0])
-    rate = math.pi / 4 * air.width(middle) ** 2 * (detected * density).sum(axis=1)
+    rate = math.pi / 4 * air.beam_diameter(middle) ** 2 * (detected * density).sum(axis=1)
     bin_m = edges[1] - edges[0]
     axes.plot(middle, rate * survey.ray_count * bin_m, color=CURVE, lw=1.6, label="closed form")
     axes.set(xlim=(0, farthest_m), xlabel="range (m)")
@@ -135,7 +135,7 @@ def energies(axes: Any, weather: dict[str, Any]) -> None:
     axes.plot(distance, attenuated, color=CURVE, lw=1.4, label="surface of 50 %, here")
     scatters = survey.backscatter_at(survey.sensor.optics.wavelength_nm)
     half = 0.299792458 * survey.sensor.optics.pulse_ns / 2
-    from_air = survey.air(0).cloud(scatters, distance - half / 2, distance + half / 2)
+    from_air = survey.air(0).backscatter_energy(scatters, distance - half / 2, distance + half / 2)
     axes.plot(distance, from_air, color=OBJECT_COLORS[1], lw=1.8, label="half a pulse of the air")
     axes.axhline(NOISE.threshold, color=MUTED, lw=1, ls="--", label="detection threshold")
     axes.set(xscale="log", yscale="log", xlim=(0.5, 100), ylim=(1e-4, 300))

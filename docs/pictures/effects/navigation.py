@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidarpool import Gnss, Imu, Navigation, Survey
-from lidarsim.motion.navigation import fixes, imu_samples
+from lidarsim.motion.navigation import gnss_fixes, imu_samples
 from lidarview.render import theme
 
 DRAWS = "effect-navigation.png"
@@ -61,7 +61,7 @@ def outage(axes: Any, still: SimpleNamespace) -> None:
     for seed in range(40):
         navigation = Navigation(imu=imu, gnss=gnss, seed=seed)
         run = SimpleNamespace(**vars(still) | {"navigation": navigation, "duration_ns": 35e9})
-        (block,) = fixes(run)
+        (block,) = gnss_fixes(run)
         axes.plot(block.times_ns / 1e9, block.positions[:, 0], color=theme.SENSOR, lw=0.5)
     t = np.clip(np.linspace(0, 35, 701) - 10, 0, 15)
     sigma = np.hypot(0.01 * t**2 / 2, 0.02 * np.sqrt(t**3 / 3))
@@ -114,7 +114,7 @@ def picture(path: Path) -> None:
         ylim=(total.min() * to_hour / 6, None),
     )
     gyroscopes.set_title("gyroscopes of a stationary vehicle", fontsize=9)
-    position_errors = np.concatenate([block.positions for block in fixes(still)])
+    position_errors = np.concatenate([block.positions for block in gnss_fixes(still)])
     hours = np.arange(len(position_errors)) / GNSS.rate_hz / 3600
     colors = {"east": "#4477aa", "north": "#44aa77", "up": "#ee7733"}
     for axis, (name, color) in enumerate(colors.items()):

@@ -61,7 +61,7 @@ def _separable_distance(name: str, plate_m: float) -> tuple[float, float]:
         meshes = [wall(name, plate_m, y=(-50, 0.0)), wall("Wall", plate_m + behind)]
         columns = cast_scan(meshes, fixed_beams(1), NOISE, **options)
         lower_m, upper_m = (lower_m, behind) if len(columns["range"]) == 2 else (behind, upper_m)
-    return columns["intensity"][0] / NOISE.full, upper_m
+    return columns["intensity"][0] / NOISE.saturation_energy, upper_m
 
 
 def picture(path: Path) -> None:
@@ -72,9 +72,11 @@ def picture(path: Path) -> None:
     for wall_m, color in ((8.0, RED), (31.6, BLUE), (50.0, GRAY)):
         range_m, signal = _waveform(wall_m, NOISE)
         label = f"white wall at {wall_m:g} m"
-        pulse.plot(range_m - wall_m, signal / NOISE.full, color=color, lw=1.5, label=label)
+        pulse.plot(
+            range_m - wall_m, signal / NOISE.saturation_energy, color=color, lw=1.5, label=label
+        )
         range_m, signal = _waveform(wall_m, replace(NOISE, saturation=None))
-        pulse.plot(range_m - wall_m, signal / NOISE.full, color=color, lw=0.8, ls="--")
+        pulse.plot(range_m - wall_m, signal / NOISE.saturation_energy, color=color, lw=0.8, ls="--")
     pulse.set(
         ylim=(-0.1, 2.2),
         xlim=(-1.5, 1.5),
@@ -92,7 +94,7 @@ def picture(path: Path) -> None:
         for wall_m in ranges_m:
             options = {"materials": MATERIALS[name], "columns": COLUMNS}
             columns = cast_scan([wall(name, wall_m)], fixed_beams(1), NOISE, **options)
-            over_saturation = columns["intensity"] / NOISE.full
+            over_saturation = columns["intensity"] / NOISE.saturation_energy
             widths.plot(over_saturation, columns["pulse_width"], "o", ms=5, color=color)
             waves = Returns(waveform="peaks")
             columns = cast_scan(

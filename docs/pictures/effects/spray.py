@@ -24,7 +24,7 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarsim.media.weather import spray
+from lidarsim.media.weather import spray_clumps
 from lidarsim.scene.actors import box
 
 DRAWS = "effect-spray.png"
@@ -106,10 +106,10 @@ def picture(path: Path) -> None:
         shares.append((cloud(rear, across)["cause"] == SPRAY).sum() / count)
     axes = views["right"]
     axes.plot(behind, shares, "o", ms=4, color=BLUE, label="simulated")
-    kind = spray(20.0)
+    kind = spray_clumps(20.0)
     air = across.air(0)
     span = np.linspace(8 - 1.25, 8 + 1.25, 200)
-    full_rate = float(np.trapezoid(air.rate(kind, NOISE.threshold, span), span))
+    full_rate = float(np.trapezoid(air.particle_rate(kind, NOISE.threshold, span), span))
     distance_m = np.linspace(0, 28, 1000)
     age = np.ceil(distance_m / (SPEED / 10)) / 10
     curve = full_rate * np.exp(-age / 0.4) * (age <= 1.3)

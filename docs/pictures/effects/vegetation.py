@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from lidarpool import Beams, Material, Noise, Scene, SceneMesh, Sensor, Spin, Survey
-from lidarsim.media.leaves import projection
+from lidarsim.media.leaves import mean_projection
 from lidarsim.simulator.rig import Rig
 from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLORS
 
@@ -105,13 +105,13 @@ def picture(path: Path) -> None:
     tilts = np.arange(0, 81, 10.0)
     for kind, color in KINDS.items():
         cosine = np.cos(np.radians(zeniths))
-        tau = projection(kind, cosine) * DENSITY * HIGH / cosine
+        tau = mean_projection(kind, cosine) * DENSITY * HIGH / cosine
         shade = OBJECT_COLORS[color]
         gaps.plot(zeniths, np.exp(-tau), color=shade, lw=1.2, label=f"{kind}: exp(−G·LAI / cos θ)")
         simulated = [np.isnan(canopy(kind, tilt)).mean() for tilt in tilts]
         gaps.plot(tilts, simulated, "o", ms=4.5, mfc="none", color=shade, label="simulated")
         depth = canopy(kind, 40.0)
-        slope = projection(kind, np.array([math.cos(math.radians(40))]))[0]
+        slope = mean_projection(kind, np.array([math.cos(math.radians(40))]))[0]
         slope *= DENSITY * HIGH / math.cos(math.radians(40))
         counts, edges = np.histogram(depth[np.isfinite(depth)], 24, (0, 1))
         depths.stairs(counts / RAYS * 24, edges * HIGH, color=shade, lw=1)

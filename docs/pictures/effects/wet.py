@@ -10,7 +10,7 @@ from docs.pictures.effects._receiver import BLUE, GRAY, RED, cloud, points, wall
 from matplotlib.figure import Figure
 
 from lidarpool import Beams, Material, Noise, Returns, Scene, SceneMesh, Sensor, Spin, Survey
-from lidarsim.media.materials import WATER_INDEX, below_water, fresnel
+from lidarsim.media.materials import WATER_INDEX, fresnel, wet_surface_factor
 
 DRAWS = "effect-wet.png"
 ROAD = 0.2
@@ -63,7 +63,7 @@ def picture(path: Path) -> None:
     dry = ROAD * np.cos(angle)
     axes = views["right"]
     axes.plot(np.degrees(angle), dry, color=GRAY, label="dry: ρ cos θ")
-    wet = dry * below_water(np.cos(angle), np.full(len(angle), ROAD))
+    wet = dry * wet_surface_factor(np.cos(angle), np.full(len(angle), ROAD))
     axes.plot(np.degrees(angle), wet, color=BLUE, label="wet: ρ cos θ T² / (n² (1 − p ρ))")
     mirrored = fresnel(np.cos(angle), WATER_INDEX) ** 2
     axes.plot(np.degrees(angle), mirrored, color=RED, label="ghost of a white wall: F²")

@@ -611,7 +611,7 @@ def _list_models() -> None:
 def _show_model(name: str) -> None:
     """Print the properties of a model and their sources."""
     from lidarsim.schema.model_names import model_names, plugin_model_names
-    from lidarsim.sensor.models import read_model, shown_noise
+    from lidarsim.sensor.models import format_noise, read_model
 
     described = read_model(name)
     click.echo(described.name)
@@ -630,7 +630,7 @@ def _show_model(name: str) -> None:
                 + ("with performance: datasheet" if built_in else "unless performance is ideal"),
             )
         )
-        lines.append(("noise", shown_noise(sheet.noise)))
+        lines.append(("noise", format_noise(sheet.noise)))
         lines.append(("returns", f"mode: {sheet.returns.mode}, subrays: {sheet.returns.subrays}"))
         lines += [("unknown", ", ".join(sheet.missing))] if sheet.missing else []
     for figure, words in lines:

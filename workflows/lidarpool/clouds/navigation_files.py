@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsim.motion.navigation import fixes, geodetic, imu_samples
+from lidarsim.motion.navigation import gnss_fixes, imu_samples, to_geodetic
 from lidarsim.numerics.arrays import Floats
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.instruments import IMU_FILE, Instruments
@@ -81,7 +81,7 @@ def _gnss_lines(survey: Survey, origin: Floats) -> Iterator[str]:
     yield ",".join(_POSITION if to_geodetic is None else (*_POSITION, *_GEODETIC)) + "\n"
     form = "%d" + ",%.4f" * 3
     form += ("" if to_geodetic is None else ",%.9f,%.9f,%.4f") + "\n"
-    for times, positions in fixes(survey):
+    for times, positions in gnss_fixes(survey):
         world = positions + origin
         columns = [*world.T, *(() if to_geodetic is None else to_geodetic(world).T)]
         rows = zip(times.tolist(), *(column.tolist() for column in columns), strict=True)
@@ -97,7 +97,7 @@ def _to_geodetic(survey: Survey) -> Callable[[Floats], Floats] | None:
     gnss = survey.navigation and survey.navigation.gnss
     if gnss and gnss.origin is not None:
         origin = gnss.origin
-        return lambda world: geodetic(world, origin)
+        return lambda world: to_geodetic(world, origin)
     if survey.epsg is None:
         return None
     transform = import_module("rasterio.warp").transform

@@ -145,7 +145,7 @@ class WebDataset(MultiFileFormat):
         if "material" in columns:
             description["materials"] = sweeps.materials
         if faults := sweeps.faults_in(number):
-            description["faults"] = [fault.words() for fault in faults]
+            description["faults"] = [fault.to_dict() for fault in faults]
         files = {f"{name}.npy": _npy(array) for name, array in arrays.items()}
         files["json"] = json.dumps(description).encode()
         key = f"{self.names[sweeps.sensor[number]]}-{sweeps.numbers[number]:06}"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lidarscenes.procedural.floor import SLAB_M
 from lidarsim.errors import LidarError
-from lidarsim.media.materials import rows_named
+from lidarsim.media.materials import match_names
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import triangle_areas
@@ -314,7 +314,7 @@ def _target_mask(names: Sequence[str], targets: Sequence[str]) -> Bools:
     """
     mask = np.full(len(names), not targets)
     for pattern in targets:
-        rows = rows_named(pattern, names)
+        rows = match_names(pattern, names)
         if not len(rows):
             raise LidarError(
                 f"The target {pattern!r} does not match any object.{name_hint(pattern, names)}"

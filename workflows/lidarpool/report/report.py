@@ -158,7 +158,7 @@ def _describe_parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
         "steps": survey.steps_each[0],
         "materials": len(survey.materials),
         "navigation": None if survey.navigation is None else asdict(survey.navigation),
-        **({"faults": [fault.words() for fault in survey.faults]} if survey.faults else {}),
+        **({"faults": [fault.to_dict() for fault in survey.faults]} if survey.faults else {}),
         **options,
         "start": None if survey.start is None else survey.start.isoformat(),
     }

@@ -334,8 +334,8 @@ def _timing_notes(prepared: PreparedScenario) -> Iterator[str]:
             )
     end = np.array([prepared.survey.duration_ns])
     for number, (_, starts, _) in enumerate(survey.sweeps_each):
-        for index, fault in survey.faults_of(number, "frozen").items():
-            if not fault.during(starts).any():
+        for index, fault in survey.sensor_faults(number, "frozen").items():
+            if not fault.is_active(starts).any():
                 sensor = survey.carried[number].name or "the sensor"
                 yield (
                     f"`faults[{index}]` does not freeze {sensor}, because no sweep starts during "

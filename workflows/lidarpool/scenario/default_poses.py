@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from lidarscenes.procedural.floor import floor_and_ceiling, surface_heights, triangles_in_box
 from lidarscenes.procedural.surroundings import PlacementChecker, is_obstructed, is_open
-from lidarsim.media.materials import rows_named
+from lidarsim.media.materials import match_names
 from lidarsim.motion.trajectory import Pose
 from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.scene import Scene
@@ -217,7 +217,7 @@ def _select_objects(scene: Scene, patterns: Sequence[str]) -> Scene | None:
     """
     if not patterns:
         return None
-    objects = np.concatenate([rows_named(pattern, scene.names) for pattern in patterns])
+    objects = np.concatenate([match_names(pattern, scene.names) for pattern in patterns])
     selected = np.isin(scene.face_object, objects)
     if not selected.any():
         return None

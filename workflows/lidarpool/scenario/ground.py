@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from lidarsim.errors import LidarError
-from lidarsim.media.materials import rows_named
+from lidarsim.media.materials import match_names
 from lidarsim.motion.rotations import quaternions_of
 from lidarsim.motion.trajectory import Track
 from lidarsim.numerics.arrays import Floats, Indices, Ints32
@@ -53,7 +53,7 @@ class SupportSurfaces:
                 "The scene has no surface to place objects on. Add `scene.files`, or "
                 "`scene.ground` and a rectangle as `within`."
             )
-        rows = [rows_named(name, scene.names) for name in names]
+        rows = [match_names(name, scene.names) for name in names]
         for name, matches in zip(names, rows, strict=True):
             if not len(matches):
                 raise LidarError(

@@ -17,7 +17,13 @@ import numpy as np
 
 from lidarscenes.robots.robot import Robot
 from lidarsim.errors import LidarError, Mistakes, prefixed
-from lidarsim.media.materials import Material, SurfaceKinds, rows_named, with_class, with_classes
+from lidarsim.media.materials import (
+    Material,
+    SurfaceKinds,
+    assign_class,
+    assign_classes,
+    match_names,
+)
 from lidarsim.media.weather import Weather
 from lidarsim.motion.trajectory import CENTER, Pose, Track
 from lidarsim.numerics.arrays import Floats
@@ -487,12 +493,14 @@ def _materials(
                 if number == semantic_class
             ]
         )
-        materials = with_class(materials or [default_material], semantic_class, vehicle_rows, kinds)
+        materials = assign_class(
+            materials or [default_material], semantic_class, vehicle_rows, kinds
+        )
     if findings.classes:
         class_patterns = {
             number: findings.class_patterns(number) for number in findings.class_names
         }
-        materials = with_classes(materials or [default_material], class_patterns, kinds)
+        materials = assign_classes(materials or [default_material], class_patterns, kinds)
     return materials
 
 
@@ -515,7 +523,7 @@ def _classed_objects(scenario: Scenario, scene: Scene) -> list[_ClassedObject]:
             continue
         patterns = {entry.name: [escape(entry.name)]}
         numbered = f"{escape(entry.name)}.[0-9]*"  # all copies except the first, such as Tree.2
-        if isinstance(entry, CopiesSection) and len(rows_named(numbered, scene.names)):
+        if isinstance(entry, CopiesSection) and len(match_names(numbered, scene.names)):
             patterns[entry.name].append(numbered)
         elif isinstance(entry, ActorSection) and entry.robot:
             links = [a.name for a in scene.actors if a.name.startswith(f"{entry.name}/")]
@@ -534,8 +542,12 @@ def _with_object_class(
     Before each entry that applies to the object, an entry with the same properties and the class is
     inserted, which only applies to the object.
     """
-    object_rows = np.concatenate([rows_named(pattern, kinds.names) for pattern in classed.patterns])
-    object_materials = {kinds.material[kind] for kind in kinds.of_rows(object_rows).tolist()}
+    object_rows = np.concatenate(
+        [match_names(pattern, kinds.names) for pattern in classed.patterns]
+    )
+    object_materials = {
+        kinds.material[kind] for kind in kinds.kinds_of_objects(object_rows).tolist()
+    }
     changes: dict[str, Any] = {
         "objects": classed.patterns,
         "semantic_class": classed.semantic_class,
@@ -544,10 +556,10 @@ def _with_object_class(
     for material in materials:
         # The first matching entry applies to a face. An entry for a single copy, such as Tree.7,
         # does not match the name of the object. It stays before the new entry and still applies.
-        if material.named(classed.name, object_materials):
+        if material.applies_to(classed.name, object_materials):
             result.append(replace(material, **changes))
         result.append(material)
-    if not any(entry.material is None and entry.named(classed.name) for entry in materials):
+    if not any(entry.material is None and entry.applies_to(classed.name) for entry in materials):
         result.append(replace(Material("*"), **changes))
     return result
 

@@ -20,7 +20,7 @@ from lidarsim.media.materials import ClassNames, Material
 from lidarsim.media.weather import Weather
 from lidarsim.motion.navigation import Navigation
 from lidarsim.motion.trajectory import CENTER
-from lidarsim.motion.trajectory_files import files_of_trajectory
+from lidarsim.motion.trajectory_files import list_trajectory_files
 from lidarsim.scene.files.mesh_formats import endings, format_of
 from lidarsim.schema.declared import Several, Text, about, by_text
 from lidarsim.schema.error_sentences import sentences
@@ -419,7 +419,7 @@ class Scenario(Section):
         paths += filter(None, map(plugin_model_file, models))
         for trajectory in trajectories:
             if trajectory and trajectory.file:
-                paths += files_of_trajectory(self.path(trajectory.file))
+                paths += list_trajectory_files(self.path(trajectory.file))
         return tuple(dict.fromkeys(paths))
 
     def message_prefix(self, file: Path) -> str:

@@ -19,7 +19,13 @@ from lidarscenes.robots.urdf import load_robot
 from lidarsim.errors import LidarError, Mistakes, message_of, prefixed
 from lidarsim.io.tables import NUMBERS, Quantity, read_table
 from lidarsim.io.textfile import read_text
-from lidarsim.motion.pose_columns import ANGLES, POSITION, REFUSED_COLUMNS, angles_of, with_yaw
+from lidarsim.motion.pose_columns import (
+    ANGLES,
+    POSITION,
+    REFUSED_COLUMNS,
+    convert_heading,
+    stack_angles,
+)
 from lidarsim.motion.rotations import rotations_of
 from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.actors import Actor, box, join_meshes
@@ -577,7 +583,7 @@ class _CopyPoses(NamedTuple):
 
 def _read_copies(path: Path, table: CopyTable) -> _CopyPoses:
     try:
-        columns = with_yaw(
+        columns = convert_heading(
             read_table(
                 read_text(path),
                 _COPY_COLUMNS,
@@ -604,7 +610,7 @@ def _read_copies(path: Path, table: CopyTable) -> _CopyPoses:
         return np.stack([columns.get(name, np.full(count, default)) for name in names], axis=1)
 
     scales = columns_of(("scale",) * 3 if "scale" in columns else _SCALE_NAMES, 1.0)
-    return _CopyPoses(columns_of(_POSITION_NAMES, np.nan), angles_of(columns, count), scales)
+    return _CopyPoses(columns_of(_POSITION_NAMES, np.nan), stack_angles(columns, count), scales)
 
 
 def _scatter_copies(scatter: Scatter, name: str, support: SupportSurfaces) -> _CopyPoses:

@@ -13,7 +13,7 @@ import numpy as np
 from lidarsim.columns.cloud import Cloud
 from lidarsim.errors import LidarError
 from lidarsim.motion.rotations import quaternions_of
-from lidarsim.motion.trajectory import Pose, Trajectory, pose_of, presence_ns
+from lidarsim.motion.trajectory import Pose, Trajectory, as_pose, presence_ns
 from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.actors import Actor
 from lidarsim.schema.checks import check_type
@@ -228,7 +228,7 @@ def is_present(actor: Actor, time_ns: float) -> bool:
 def pose_at(pose: Any, time_ns: float) -> Pose:
     """Return the pose of a trajectory at a time, or a pose unchanged."""
     is_trajectory = hasattr(pose, "poses")
-    return pose.pose(0, time_ns) if is_trajectory else pose_of("pose", pose)
+    return pose.pose(0, time_ns) if is_trajectory else as_pose("pose", pose)
 
 
 def _position_and_quaternion(pose: Pose, origin: Floats) -> tuple[Floats, Floats]:

@@ -24,7 +24,7 @@ from lidarsim.scene.files.scene_graph import MeshFileError, ReadOptions
 from lidarsim.scene.object_names import unique_names
 from lidarsim.scene.transform import affine
 from lidarsim.words import printable
-from lidarsim.worlds.mujoco_bodies import BodySelection, names_of, seen_geoms
+from lidarsim.worlds.mujoco_bodies import BodySelection, names_of, visible_geoms
 
 from ..writers.lidar_scenario import Lidar, rounded, write_scenario
 from .model_file import MujocoOptions, body_matrix, body_object_names, load_model
@@ -254,7 +254,7 @@ def _differences(model: Any, groups: dict[_Group, list[int]]) -> list[str]:
     ]
     all_groups = np.unique(model.geom_group)
     further = sorted({*all_groups.tolist()} - {*MujocoOptions().groups})
-    if further and seen_geoms(model, BodySelection(further, (), (), "body")):
+    if further and visible_geoms(model, BodySelection(further, (), (), "body")):
         numbers = ", ".join(map(str, further))
         lines.append(
             f"rangefinder hits on geoms of {'groups' if len(further) > 1 else 'group'} {numbers} "

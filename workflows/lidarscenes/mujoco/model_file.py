@@ -38,13 +38,13 @@ from lidarsim.schema.declared import Several, Text, about
 from lidarsim.words import listed, name_hint, printable
 from lidarsim.worlds.mujoco_bodies import (
     BodySelection,
-    bodies_of,
-    excluded,
+    create_bodies,
+    describe_soft_bodies,
+    find_excluded,
     names_of,
-    seen_geoms,
-    soft_bodies,
+    visible_geoms,
 )
-from lidarsim.worlds.mujoco_geoms import SAG_M, GeomType, segments
+from lidarsim.worlds.mujoco_geoms import SAG_M, GeomType, count_segments
 
 from ..files.child_process import ReaderProcess
 from .model_sources import check_sources
@@ -140,8 +140,8 @@ def body_object_names(model: Any, options: ReadOptions) -> dict[int, str]:
 
     Bodies without an object, and the world body, are missing.
     """
-    bodies, geoms = excluded(model, options.own.exclude)
-    seen = seen_geoms(model, _choice(model, options.own, bodies, geoms))
+    bodies, geoms = find_excluded(model, options.own.exclude)
+    seen = visible_geoms(model, _choice(model, options.own, bodies, geoms))
     content = placed_content(_placed(model, options))
     names = [printable(item.name) for item in content.meshes]
     # If names repeat, the last object belongs to the body, because geoms of the world come first.
@@ -153,7 +153,7 @@ def body_object_names(model: Any, options: ReadOptions) -> dict[int, str]:
 
 def _placed(model: Any, options: ReadOptions) -> list[PlacedNode]:
     """Return the meshes of the bodies of a model, at their poses in the initial state."""
-    bodies, geoms = excluded(model, options.own.exclude)
+    bodies, geoms = find_excluded(model, options.own.exclude)
     choice = _choice(model, options.own, bodies, geoms)
     named = _named_geoms_of_world(model)
     others = np.arange(1, len(model.body_parentid)).tolist()
@@ -167,7 +167,7 @@ def _placed(model: Any, options: ReadOptions) -> list[PlacedNode]:
     meshes: dict[int, SceneMesh] = {}  # {id of the triangles: mesh}
     nodes = []
     for part in (world, inner):
-        parts = bodies_of(model, part)
+        parts = create_bodies(model, part)
         nodes += [
             PlacedNode(_stripped(mesh, options), np.eye(4), mesh.name) for mesh in parts.static
         ]
@@ -186,7 +186,7 @@ def _choice(
     """
     plane_m = max(_MIN_PLANE_M, _PLANE_SIZES * min(model.extent_m, 1e6))
     choice = BodySelection(options.groups, bodies, geoms, "body", plane_m=plane_m)
-    seen = np.array(seen_geoms(model, choice), np.int64)
+    seen = np.array(visible_geoms(model, choice), np.int64)
     if len(seen) > MAX_NODES:
         raise MeshFileError(
             f"has {len(seen):,} geoms, and the limit is {MAX_NODES:,}. Divide the model"
@@ -215,9 +215,9 @@ def _round_triangles(kind: int, size: Floats, sag_m: float) -> int:
     match kind:
         case GeomType.SPHERE | GeomType.CAPSULE | GeomType.ELLIPSOID:
             radius = float(size.max() if kind == GeomType.ELLIPSOID else size[0])
-            return segments(radius, sag_m) ** 2
+            return count_segments(radius, sag_m) ** 2
         case GeomType.CYLINDER:
-            return 4 * segments(float(size[0]), sag_m)
+            return 4 * count_segments(float(size[0]), sag_m)
     return 0
 
 
@@ -249,7 +249,7 @@ def _notes(model: Any, options: ReadOptions) -> list[str]:
     """Return notes on content that is not in the scene, as clauses that follow the file name."""
     notes = (
         [f"contains soft bodies, which were skipped: {soft}"]
-        if (soft := soft_bodies(model))
+        if (soft := describe_soft_bodies(model))
         else []
     )
     if model.warnings:

@@ -1,1 +1,1 @@
-"""What light meets: materials of surfaces, leaves, weather."""
+"""Materials of surfaces, leaves, and weather, which determine how light is scattered."""

@@ -1,7 +1,7 @@
-"""Leaves by the angles of their surfaces: the light that they intercept, and their brightness.
+"""Leaf angle distributions, and the light that leaves intercept and scatter.
 
-Leaves are small, flat, and turned to all points of the compass. The angle of a leaf is the angle of
-its normal from the vertical.
+Leaves are small and flat, and their azimuths are uniformly distributed. The leaf angle is the angle
+between the normal of a leaf and the vertical.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ LeafAngles = Literal[
     "spherical", "planophile", "erectophile", "plagiophile", "extremophile", "uniform"
 ]
 NAMES: tuple[str, ...] = LeafAngles.__args__  # type: ignore[attr-defined]
-_NODES = 361  # number of angles of light in the table, from 0 to 90 degrees
-_ANGLES = 500  # number of angles of leaves in the integrals
+_NODES = 361  # number of light directions in the table, from 0 to 90 degrees
+_ANGLES = 500  # number of leaf angles in the integrals
 
 
 LeafAngle = Annotated[
@@ -30,13 +30,26 @@ LeafAngle = Annotated[
 ]
 
 
-def density(leaf_angle: str | float, angle: Floats) -> Floats:
-    """Return the share of the leaf area per radian, at leaf angles (n,) from 0 to π/2: (n,).
+def leaf_angle_density(leaf_angle: str | float, angle: Floats) -> Floats:
+    """Return the density of a leaf angle distribution, per radian.
 
-    The integral over leaf angles is 1. Names are the distributions of de Wit (1965), as
-    trigonometric functions after Bunnik (1978). With "spherical", normals point evenly in all
-    directions. A number is the parameter of Campbell (1990), for normals distributed as on an
-    ellipsoid: the ratio of its horizontal axis to the vertical axis; 1 is spherical.
+    The integral of the density over leaf angles from 0 to π/2 is 1.
+
+    Parameters
+    ----------
+    leaf_angle
+        Name of a distribution of de Wit (1965), in the trigonometric form of Bunnik (1978), or
+        parameter of the ellipsoidal distribution of Campbell (1990). In a "spherical" distribution,
+        the normals are uniformly distributed over all directions. In an ellipsoidal distribution,
+        they are distributed as on an ellipsoid. The parameter is the ratio of its horizontal axis
+        to its vertical axis, and 1 is equivalent to "spherical".
+    angle
+        Leaf angles in radians, from 0 to π/2. Shape (n,).
+
+    Returns
+    -------
+    array
+        Density for each angle. Shape (n,).
     """
     sine, cosine = sin_cos(angle)
     if leaf_angle == "spherical":
@@ -66,25 +79,27 @@ def density(leaf_angle: str | float, angle: Floats) -> Floats:
 
 
 class _LightTable(NamedTuple):
-    """Projection and brightness of leaves, by the direction of light."""
+    """Projection and brightness of leaves for several light directions."""
 
-    cosine: Floats  # (361,): of the light's angle from the vertical, ascending from 0 to 1
-    projection: Floats  # (361,), from `projection`
-    brightness: Floats  # (361,), from `brightness`
+    cosine: Floats  # (361,), cosine of the angle between the light and the vertical, ascending
+    projection: Floats  # (361,), as returned by `mean_projection`
+    brightness: Floats  # (361,), as returned by `mean_brightness`
 
 
 @cache
 def _light_table(leaf_angle: str | float) -> _LightTable:
-    """Integrate the projection and brightness of leaves over their angles."""
+    """Integrate the projection and brightness of leaves over the leaf angles."""
     cosine = sin(np.linspace(0, np.pi / 2, _NODES))[:, None]
     angle = (np.arange(_ANGLES, dtype=np.float64) + 0.5) * (np.pi / 2 / _ANGLES)
-    share = density(leaf_angle, angle)
+    share = leaf_angle_density(leaf_angle, angle)
     share /= share.sum()
-    # Cosine between light and a leaf's normal: `constant + amplitude * cos(azimuth)`.
+    # The cosine of the angle between the light and the normal of a leaf is
+    # `constant + amplitude * cos(azimuth)`.
     leaf_sine, leaf_cosine = sin_cos(angle)
     constant = cosine * leaf_cosine
     amplitude = np.sqrt(np.maximum(1 - cosine**2, 0)) * leaf_sine
-    # Its mean size over all azimuths (Ross 1981): beyond `edge_on`, light meets the lower side.
+    # The mean absolute value over all azimuths follows Ross (1981). At azimuths beyond `edge_on`,
+    # the light hits the lower side of the leaf.
     edge_on = arccos(-np.minimum(constant / np.maximum(amplitude, 1e-300), 1))
     mean = (constant * (2 * edge_on - np.pi) + 2 * amplitude * sin(edge_on)) / np.pi
     square = constant**2 + amplitude**2 / 2
@@ -93,27 +108,30 @@ def _light_table(leaf_angle: str | float) -> _LightTable:
     return _LightTable(cosine[:, 0], projected, bright / projected)
 
 
-def projection(leaf_angle: str | float, cosine: Floats) -> Floats:
-    """Return the mean projection of leaves, as a share of their area: (n,).
+def mean_projection(leaf_angle: str | float, cosine: Floats) -> Floats:
+    """Return the mean projected area of leaves as a fraction of their area.
 
-    This is the G function of Ross (1981); `cosine` (n,) is the cosine of the light's angle from
-    the vertical, 0 to 1.
+    This is the G function of Ross (1981). `cosine` is the cosine of the angle between the light and
+    the vertical, from 0 to 1. `cosine` and the result have shape (n,).
 
     Examples
     --------
-    >>> projection("spherical", np.array([0.0, 0.3, 1.0])).round(4).tolist()
+    >>> mean_projection("spherical", np.array([0.0, 0.3, 1.0])).round(4).tolist()
     [0.5, 0.5, 0.5]
     """
     table = _light_table(leaf_angle)
     return interp(cosine, table.cosine, table.projection)
 
 
-def brightness(leaf_angle: str | float, cosine: Floats) -> Floats:
-    """Return the mean cosine between light and the normals of the leaves that light hits: (n,).
+def mean_brightness(leaf_angle: str | float, cosine: Floats) -> Floats:
+    """Return the mean cosine of the incidence angle of light on leaves.
 
-    `cosine` (n,) is the cosine of the light's angle from the vertical, 0 to 1. A leaf is hit in
-    proportion to its projection, so leaves that face the light count more: the mean is two thirds
-    for "spherical", in any direction.
+    The probability that a leaf is hit is proportional to its projected area, so leaves that face
+    the light have a larger weight. The mean for a "spherical" distribution is two thirds in every
+    direction.
+
+    `cosine` is the cosine of the angle between the light and the vertical, from 0 to 1. `cosine`
+    and the result have shape (n,).
     """
     table = _light_table(leaf_angle)
     return interp(cosine, table.cosine, table.brightness)

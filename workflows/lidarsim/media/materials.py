@@ -1,4 +1,4 @@
-"""Materials by the names of objects and of their materials, energies of returns, weather."""
+"""Materials of surfaces, their assignment to objects by name, and the light that they return."""
 
 from __future__ import annotations
 
@@ -25,34 +25,35 @@ from ..schema.value_texts import one_line, shown
 from ..words import did_you_mean, name_hint
 from .leaves import LeafAngle
 
-REFERENCE_M = 10.0  # energy is 1 for a white surface hit at right angles from here
-REFLECTANCE = 0.5  # default reflectance: between asphalt (0.1 to 0.2) and white paint (0.8)
-# Engineer grade sheeting, ASTM D4956 type I white: 70 cd/lx/m², of a white diffuser 1/π.
+REFERENCE_M = 10.0  # distance at which a perpendicular white surface returns an energy of 1
+REFLECTANCE = 0.5  # default reflectance, between asphalt (0.1 to 0.2) and white paint (0.8)
+# Engineer grade sheeting, ASTM D4956 type I white, reflects 70 cd/lx/m² instead of the 1/π cd/lx/m²
+# of a white diffuser.
 RETRO_GAIN = 220.0
 GLASS_INDEX = 1.5
-# Of water, from 905 to 1550 nm (Hale and Querry 1973: 1.328 to 1.318).
-_KOSCHMIEDER = 3.91  # logarithm of 50: over this visibility, 2 % of the contrast is left
-# Meteorological optical range, over which 5 % is left, as a share of that visibility.
+_KOSCHMIEDER = 3.91  # logarithm of 50, for the visibility at which 2 % of the contrast remains
+# Ratio of the meteorological optical range, at which 5 % of the light remains, to that visibility.
 MOR_SHARE = 2.995732273553991 / _KOSCHMIEDER
+# Refractive index of water from 905 to 1550 nm (Hale and Querry 1973: 1.328 to 1.318).
 WATER_INDEX = 1.328
-# Share of diffuse light in water that the water's surface reflects, 1 - (1 - r) / n², where r is
-# the mean of Fresnel's reflection outside, over a half space (Lekner and Dorf 1988).
+# Fraction of diffuse light in water that is reflected at the surface, 1 - (1 - r) / n², where r is
+# the mean of the external Fresnel reflection over a hemisphere (Lekner and Dorf 1988).
 WATER_INWARDS = 0.4702
-NEAREST_M = 1e-3  # energies do not grow below this distance
-# wavelengths of the table of reflectances
+NEAREST_M = 1e-3  # energies do not increase below this distance
+# Wavelengths in the reflectance table.
 NEAR_NM = 905.0
 FAR_NM = 1550.0
-POLISHED = 0.04  # share that plastics, paints and wet surfaces reflect at right angles, n = 1.5
-DARKEST = 1e-3  # least reflectance of a color, so that every hit is a return
+POLISHED = 0.04  # reflection of plastic, paint and wet surfaces at normal incidence (n = 1.5)
+DARKEST = 1e-3  # minimum reflectance of a color, so that every hit results in a return
 
 SemanticClass = Annotated[int, Field(ge=0, le=65_535)]
 Transparent = Literal["none", "pass"]
 
 
-def class_names_problem(names: Mapping[Any, Any]) -> str:
-    """Return why names of classes, {number: name}, cannot be stored in files, or an empty string.
+def find_class_names_error(names: Mapping[Any, Any]) -> str:
+    """Return an error message if a mapping from numbers to class names cannot be stored in files.
 
-    Two classes must not have the same name.
+    The result is an empty string if the names are valid. Two classes must not have the same name.
     """
     for number, name in names.items():
         valid = type(number) is int and 0 <= number <= 65_535 and isinstance(name, str)
@@ -66,7 +67,7 @@ def class_names_problem(names: Mapping[Any, Any]) -> str:
 
 
 def _validate_names(names: Any, handler: Callable[[Any], Any]) -> Any:
-    if isinstance(names, Mapping) and (problem := class_names_problem(names)):
+    if isinstance(names, Mapping) and (problem := find_class_names_error(names)):
         raise ValueError(problem)
     return handler(names)
 
@@ -74,7 +75,7 @@ def _validate_names(names: Any, handler: Callable[[Any], Any]) -> Any:
 ClassNames = Annotated[Mapping[SemanticClass, str], WrapValidator(_validate_names)]
 
 
-class Measured(NamedTuple):
+class MeasuredReflectance(NamedTuple):
     """Reflectance of a material in a public spectral library."""
 
     shares: tuple[float, float]  # at 905 and 1550 nm
@@ -83,11 +84,11 @@ class Measured(NamedTuple):
 
 
 @cache
-def reflectances() -> dict[str, Measured]:
-    """Return the table of reflectances: {name of a material: measurement}."""
+def reflectances() -> dict[str, MeasuredReflectance]:
+    """Return the table of measured reflectances by material name."""
     text = (files("lidarsim.media") / "reflectances.csv").read_text("utf-8")
     return {
-        row["name"]: Measured(
+        row["name"]: MeasuredReflectance(
             (float(row["at_905_nm"]), float(row["at_1550_nm"])), row["library"], row["sample"]
         )
         for row in csv.DictReader(text.splitlines())
@@ -101,8 +102,8 @@ class Material(FileSection):
     A material selects objects by name, faces by the name of their material in the scene file, or
     faces by both. If several materials apply to a face, the first one is used.
 
-    The reflectance is the diffuse reflectance at the wavelength of the sensor. A share of the light
-    that is not scattered is reflected specularly. The rest is transmitted, or absorbed if
+    The reflectance is the diffuse reflectance at the wavelength of the sensor. A fraction of the
+    light that is not scattered is reflected specularly. The rest is transmitted, or absorbed if
     `transparent` is "none".
 
     Raises
@@ -230,10 +231,7 @@ class Material(FileSection):
         self._check_medium()
 
     def _set_names(self, field_name: str) -> None:
-        """Replace a name by a tuple of names.
-
-        Raises LidarError for no or empty names.
-        """
+        """Convert one or more names in a field to a tuple, and raise LidarError for empty names."""
         value = getattr(self, field_name)
         if value is None:
             return
@@ -243,7 +241,6 @@ class Material(FileSection):
         object.__setattr__(self, field_name, names)
 
     def _check_reflectance(self) -> None:
-        """Check that reflectance, spectrum and scale fit together."""
         if self.spectrum is not None:
             if self.spectrum not in (spectra := reflectances()):
                 hint = _materials_like(self.spectrum, [*spectra])
@@ -260,7 +257,7 @@ class Material(FileSection):
             raise LidarError("scale is a factor of colors and requires reflectance: texture.")
 
     def _check_roughness(self) -> None:
-        """Check that only a matt, opaque surface has a gloss."""
+        """Check that only opaque surfaces without other specular reflection have a roughness."""
         if self.roughness is None and self.metalness:
             raise LidarError(
                 "metalness requires roughness. Set it to a value from 0.1 (polished) to 1 (matte)."
@@ -273,7 +270,7 @@ class Material(FileSection):
             )
 
     def _check_medium(self) -> None:
-        """Check that mirrored and passing light, the medium within a surface and leaves agree."""
+        """Check that specular reflection, transmission, refraction and leaves can be combined."""
         mirrors = self.specular_reflectance
         if mirrors is not None and (mirrors == "fresnel") != (self.transparent == "pass"):
             raise LidarError(
@@ -294,7 +291,10 @@ class Material(FileSection):
 
     @property
     def _suits_leaves(self) -> bool:
-        """Whether leaves can have this material, which only scatters light and needs no colors."""
+        """Whether the material is suitable for leaves, which only scatter light diffusely.
+
+        The reflectance of leaves cannot depend on a texture.
+        """
         scatters_otherwise = self.transparent != "none" or self.retro or self.roughness is not None
         return (
             not (scatters_otherwise or self.specular_reflectance) and self.reflectance != "texture"
@@ -328,14 +328,15 @@ class Material(FileSection):
                 "leaf_area_density in m²/m³, such as 0.8."
             )
 
-    def share(self, wavelength_nm: float) -> float:
-        """Return the share of the light that is scattered at a wavelength.
+    def diffuse_reflectance(self, wavelength_nm: float) -> float:
+        """Return the fraction of the light that is scattered at a wavelength.
 
         If `reflectance` is "texture", the result applies to faces without a color.
         """
         if self.spectrum is not None:
             at_905_nm, at_1550_nm = reflectances()[self.spectrum].shares
-            # The nearer measurement: between both wavelengths, leaves absorb more than at either.
+            # Use the nearest measurement instead of interpolating, because leaves absorb more light
+            # between these wavelengths than at either of them.
             return at_905_nm if wavelength_nm < (NEAR_NM + FAR_NM) / 2 else at_1550_nm
         if self.reflectance == "texture":
             return min(1.0, self.scale * REFLECTANCE)
@@ -347,14 +348,14 @@ class Material(FileSection):
 
     @property
     def specular(self) -> float:
-        """Specular reflectance at normal incidence, as a share of the light that is not scattered.
+        """Specular reflectance at normal incidence, as a fraction of the light not scattered.
 
         The value is 1 if `specular_reflectance` is "fresnel".
         """
         return float(self.specular_reflectance == "fresnel" or self.specular_reflectance or 0)
 
-    def named(self, name: str, materials: Collection[str] = ("",)) -> bool:
-        """Return whether this material applies to an object.
+    def applies_to(self, name: str, materials: Collection[str] = ("",)) -> bool:
+        """Return True if this material applies to an object.
 
         `name` is the name of the object, and `materials` are the names that the materials of its
         faces have in the scene file.
@@ -362,23 +363,23 @@ class Material(FileSection):
         return _fits(name, self.objects) and any(_fits(face, self.material) for face in materials)
 
     @property
-    def for_all(self) -> bool:
+    def applies_to_all(self) -> bool:
         """Whether this material applies to all faces of all objects."""
         return self.material is None and self.objects is not None and "*" in self.objects
 
 
 def _fits(name: str, patterns: str | Sequence[str] | None) -> bool:
-    """Return whether a name fits a pattern.
-
-    None fits all names.
-    """
+    """Return True if a name matches any of the patterns, or if the patterns are None."""
     return patterns is None or any(
         name == pattern or fnmatchcase(name, pattern) for pattern in patterns
     )
 
 
 def _materials_like(name: str, materials: Sequence[str]) -> str:
-    """Return a hint with the materials that contain a word, else the most similar, else all."""
+    """Return a hint for a misspelled spectrum.
+
+    The hint lists the spectra that contain the name, the most similar spectrum, or all spectra.
+    """
     containing = [material for material in materials if name.lower() in material.lower()]
     if len(containing) > 1:
         return f" Available spectra: {'; '.join(containing)}."
@@ -388,8 +389,8 @@ def _materials_like(name: str, materials: Sequence[str]) -> str:
     )
 
 
-def rows_named(pattern: str, names: Sequence[str]) -> Indices:
-    """Return the rows of the names that equal or fit a pattern with * and ?."""
+def match_names(pattern: str, names: Sequence[str]) -> Indices:
+    """Return the indices of the names that are equal to or match a pattern with * and ?."""
     if not any(sign in pattern for sign in "*?["):
         return np.array([row for row, name in enumerate(names) if name == pattern], np.intp)
     fits = re.compile(translate(pattern)).match
@@ -398,16 +399,17 @@ def rows_named(pattern: str, names: Sequence[str]) -> Indices:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceKinds:
-    """Kinds of surfaces: a kind for each object, or for each material of an object.
+    """Kinds of surfaces in a scene, one for each material of each object.
 
     Parameters
     ----------
     names
         Names of all objects.
     object
-        int (k,), ascending: row of `names` for each kind. Each object has at least one kind.
+        Index into `names` for each kind, in ascending order. Each object has at least one kind.
+        Shape (k,), int.
     material
-        Names (k,) of the materials in the scene's files; "" for none.
+        Name of each kind's material in the scene file, or an empty string. Length k.
     """
 
     names: Sequence[str]
@@ -415,17 +417,20 @@ class SurfaceKinds:
     material: Sequence[str]
 
     @classmethod
-    def of_objects(cls, names: Sequence[str]) -> SurfaceKinds:
-        """Return a kind for each object, without materials."""
+    def from_objects(cls, names: Sequence[str]) -> SurfaceKinds:
+        """Create one kind for each object, without materials from scene files."""
         return cls(names, np.arange(len(names)), ("",) * len(names))
 
     @cached_property
     def first(self) -> Indices:
-        """First kind of each object, and the number of kinds: (objects + 1,)."""
+        """Index of the first kind of each object, followed by the number of kinds.
+
+        The shape is (objects + 1,).
+        """
         return np.searchsorted(self.object, np.arange(len(self.names) + 1))
 
-    def of_rows(self, object_indices: Indices) -> Indices:
-        """Return the kinds of objects, by the objects' rows (m,)."""
+    def kinds_of_objects(self, object_indices: Indices) -> Indices:
+        """Return the kinds of several objects, which are selected by index."""
         if len(self.object) == len(self.names):
             return object_indices
         starts = self.first[object_indices]
@@ -434,18 +439,21 @@ class SurfaceKinds:
         return np.concatenate([np.zeros(0, np.intp), *ranges])
 
     def describe(self, kind: int) -> str:
-        """Return the name of a kind for errors, with its object and its material."""
+        """Return the object and material of a kind for error messages."""
         name = repr(self.names[self.object[kind]])
         return f"{name}, material {self.material[kind]!r}" if self.material[kind] else name
 
 
 def first_matches(materials: Sequence[Material], kinds: SurfaceKinds) -> Indices:
-    """Return the number of the first material that applies to each kind, -1 for none: (k,).
+    """Return the index of the first material that applies to each kind, or -1 if none applies.
+
+    The result has shape (k,).
 
     Raises
     ------
     LidarError
-        If a material applies to no kind, or to all kinds although materials follow.
+        If a material does not apply to any kind, or if a material that is not the last applies to
+        all kinds.
     """
     first = np.full(len(kinds.object), -1)
     object_rows = {name: row for row, name in enumerate(kinds.names)}
@@ -455,7 +463,7 @@ def first_matches(materials: Sequence[Material], kinds: SurfaceKinds) -> Indices
             if name:
                 kinds_by_material.setdefault(name, []).append(kind)
     for number, entry in enumerate(materials):
-        if entry.for_all and number + 1 < len(materials):
+        if entry.applies_to_all and number + 1 < len(materials):
             raise LidarError(
                 "materials: the first matching entry applies, so entries after number "
                 f'{number + 1}, {{objects: "*"}}, have no effect. Move it to the end.'
@@ -471,29 +479,25 @@ def _matching_kinds(
     object_rows: Mapping[str, int],
     kinds_by_material: Mapping[str, Sequence[int]],
 ) -> Indices:
-    """Return the kinds that a material applies to.
+    """Return the kinds to which a material applies.
 
-    `object_rows` are {name of an object: row}, `kinds_by_material` {name of a material: kinds}.
-
-    Raises
-    ------
-    LidarError
-        If a name fits no object or no material of the scene.
+    `object_rows` maps object names to their indices, and `kinds_by_material` maps material names to
+    kinds. Raise LidarError if a name does not match any object or material in the scene.
     """
     matches: Indices | None = None
     if entry.objects is not None:
         rows = [
-            matching_rows(pattern, kinds.names, object_rows, "materials")
+            match_object_names(pattern, kinds.names, object_rows, "materials")
             for pattern in entry.objects
         ]
-        matches = kinds.of_rows(np.concatenate(rows))
+        matches = kinds.kinds_of_objects(np.concatenate(rows))
     if entry.material is None:
         assert matches is not None, "a material applies to objects, or to materials"
         return matches
     names = [*kinds_by_material]
     with_material: list[int] = []
     for pattern in entry.material:
-        rows_of_pattern = rows_named(pattern, names)
+        rows_of_pattern = match_names(pattern, names)
         if not len(rows_of_pattern):
             measured = f" For a measured reflectance, use spectrum: {pattern!r}."
             raise LidarError(
@@ -518,28 +522,30 @@ def _matching_kinds(
     return common
 
 
-def matching_rows(
+def match_object_names(
     pattern: str, names: Sequence[str], object_rows: Mapping[str, int], subject: str
 ) -> Indices:
-    """Return the rows of the objects that fit a pattern.
+    """Return the indices of the objects that match a pattern.
 
     Parameters
     ----------
     pattern
         Name of an object, or a pattern with * and ?.
-    names, object_rows
-        Names of all objects, and {name: row}.
+    names
+        Names of all objects.
+    object_rows
+        Mapping from the names to their indices.
     subject
-        What names the objects, for the error: «materials».
+        Name of the setting that contains the pattern, for the error message, such as "materials".
 
     Raises
     ------
     LidarError
-        If no object fits.
+        If no object matches.
     """
     if pattern in object_rows and not any(sign in pattern for sign in "*?["):
         return np.array([object_rows[pattern]])
-    rows = rows_named(pattern, names)
+    rows = match_names(pattern, names)
     if not len(rows):
         raise LidarError(
             f"{subject} contains {pattern!r}, but no object has that "
@@ -548,24 +554,36 @@ def matching_rows(
     return rows
 
 
-def with_classes(
+def assign_classes(
     materials: Sequence[Material], classes: Mapping[int, Sequence[str]], kinds: SurfaceKinds
 ) -> list[Material]:
-    """Return materials with classes for objects by their names, where a material has no class.
+    """Assign semantic classes to objects by name, unless their materials already have a class.
 
-    `classes` are {class: patterns}.
+    Parameters
+    ----------
+    materials
+        Materials in the order of their precedence.
+    classes
+        Mapping from classes to patterns for the names of objects.
+    kinds
+        Kinds of surfaces in the scene.
+
+    Returns
+    -------
+    list of Material
+        The materials, with additional entries for the objects.
 
     Raises
     ------
     LidarError
-        If a material applies to no kind.
+        If a material does not apply to any kind.
     """
     first = first_matches(materials, kinds)
     insertions: list[list[Material]] = [[] for _ in materials]  # new entries before each entry
     for semantic_class, patterns in classes.items():
         for pattern in patterns:
-            rows = rows_named(pattern, kinds.names)
-            pattern_kinds = kinds.of_rows(rows)
+            rows = match_names(pattern, kinds.names)
+            pattern_kinds = kinds.kinds_of_objects(rows)
             for number in np.unique(first[pattern_kinds]).tolist():
                 entry = materials[number]
                 if number < 0 or entry.semantic_class:
@@ -581,18 +599,20 @@ def with_classes(
     return [entry for material, inserted in pairs for entry in (*inserted, material)]
 
 
-def with_class(
+def assign_class(
     materials: Sequence[Material], semantic_class: int, object_indices: Indices, kinds: SurfaceKinds
 ) -> list[Material]:
-    """Return materials with a class for objects, by their rows (m,), and otherwise unchanged.
+    """Assign a semantic class to the objects with the given indices.
+
+    The result contains the materials and additional entries for the objects.
 
     Raises
     ------
     LidarError
-        If a material applies to no kind.
+        If a material does not apply to any kind.
     """
     first = first_matches(materials, kinds)
-    selected_kinds = kinds.of_rows(object_indices)
+    selected_kinds = kinds.kinds_of_objects(object_indices)
     entries: list[Material] = []
     for number in (*range(len(materials)), -1):
         object_rows = np.unique(
@@ -609,20 +629,20 @@ def with_class(
 
 @dataclass(frozen=True, eq=False)
 class MaterialTable:
-    """Materials of kinds of surfaces: arrays with a value for each kind."""
+    """Material properties of surfaces, as arrays with one value per kind of surface."""
 
     reflectance: Floats
-    scale: Floats  # factor of the luminance of colors; 0 where the reflectance is a number
-    roughness: Floats  # 0 for no gloss
+    scale: Floats  # factor for the luminance of colors, or 0 if the reflectance is a number
+    roughness: Floats  # 0 for surfaces without gloss
     metalness: Floats
     retro: Bools
     passes: Bools
-    specular: Floats  # share of the light not scattered that is mirrored at right angles
+    specular: Floats  # specular reflectance at normal incidence, from `Material.specular`
     semantic_class: NDArray[np.uint16]
-    refractive_index: Floats  # within; 0 where light goes straight on
-    attenuation: Floats  # within, 1/m
-    leaf_area: Floats  # density within, m²/m³; 0 for no leaves, 1 for voxels
-    leaf_angle: Indices  # rows of `leaf_angles`
+    refractive_index: Floats  # refractive index inside the surface, or 0 without refraction
+    attenuation: Floats  # attenuation inside the surface in 1/m
+    leaf_area: Floats  # leaf area density inside the surface in m²/m³, or 1 for voxels
+    leaf_angle: Indices  # indices into `leaf_angles`
     leaf_angles: tuple[str | float, ...]
 
     @classmethod
@@ -633,16 +653,24 @@ class MaterialTable:
         wavelength_nm: float = NEAR_NM,
         voxels: Bools | None = None,
     ) -> MaterialTable:
-        """Return the materials of kinds of surfaces: the first that applies to a kind counts.
+        """Create the table from the first material that applies to each kind.
 
-        `voxels` (objects,) says whether objects have voxels, and so separate leaves; None if no
-        object has voxels.
+        Parameters
+        ----------
+        materials
+            Materials in the order of their precedence.
+        kinds
+            Kinds of surfaces in the scene.
+        wavelength_nm
+            Wavelength of the sensor in nanometers.
+        voxels
+            Whether each object contains leaf voxels, or None if no object does. Shape (objects,).
 
         Raises
         ------
         LidarError
-            If a name fits no object or material, some but not all kinds have a material, or the
-            material of an object with leaves is not for leaves.
+            If a name does not match any object or material, if only some kinds have a material, or
+            if the material of an object with leaves is not suitable for leaves.
         """
         first = first_matches(materials, kinds)
         unmatched = np.flatnonzero(first < 0)
@@ -664,7 +692,9 @@ class MaterialTable:
             entries[first[row]].check_leaves(name, bool(has_voxels[row]))
         leaf_area[has_voxels] = 1.0
         return cls(
-            reflectance=np.array([m.share(wavelength_nm) for m in entries], np.float64)[first],
+            reflectance=np.array(
+                [m.diffuse_reflectance(wavelength_nm) for m in entries], np.float64
+            )[first],
             scale=np.array(textured, np.float64)[first],
             roughness=np.array([m.roughness or 0.0 for m in entries])[first],
             metalness=np.array([m.metalness for m in entries])[first],
@@ -681,23 +711,34 @@ class MaterialTable:
 
     @property
     def leafy(self) -> Bools:
-        """Whether surfaces are full of leaves: (k,)."""
+        """Whether each kind of surface contains leaves. Shape (k,)."""
         return self.leaf_area > 0
 
     @property
     def refracts(self) -> Bools:
-        """Whether light is refracted at surfaces: (k,)."""
+        """Whether each kind of surface refracts light. Shape (k,)."""
         return self.refractive_index > 0
 
     @property
     def textured(self) -> bool:
-        """Whether the reflectance of any surface is its color."""
+        """Whether the reflectance of any surface depends on its color."""
         return bool(self.scale.any())
 
-    def shares(self, kind_indices: Integers, luminance: Floats | None) -> Floats:
-        """Return the share of light that surfaces scatter, by their kinds (n,): (n,).
+    def diffuse_reflectances(self, kind_indices: Integers, luminance: Floats | None) -> Floats:
+        """Return the fraction of the light that surfaces scatter.
 
-        `luminance` (n,) is the luminance of the hit colors, if the table is `textured`.
+        Parameters
+        ----------
+        kind_indices
+            Kind of each surface. Shape (n,).
+        luminance
+            Luminance of the color at each hit, which is required if the table is `textured`. Shape
+            (n,).
+
+        Returns
+        -------
+        array
+            Fraction for each surface. Shape (n,).
         """
         shares = self.reflectance[kind_indices]
         if luminance is not None:
@@ -706,16 +747,27 @@ class MaterialTable:
             shares = bright if self.scale.all() else np.where(scale > 0, bright, shares)
         return shares
 
-    def scattered(
+    def relative_energy(
         self, kind_indices: Integers, cosine: Floats, luminance: Floats | None = None
     ) -> Floats:
-        """Return the share of light that surfaces return, by their kinds (n,): (n,).
+        """Return the light that surfaces return, relative to a perpendicular white surface.
 
-        The share is 1 for a white surface hit at right angles. `cosine` (n,) is the cosine of the
-        angle of incidence; `luminance` (n,) is the luminance of the hit colors, if the table is
-        `textured`.
+        Parameters
+        ----------
+        kind_indices
+            Kind of each surface. Shape (n,).
+        cosine
+            Cosine of the angle of incidence. Shape (n,).
+        luminance
+            Luminance of the color at each hit, which is required if the table is `textured`. Shape
+            (n,).
+
+        Returns
+        -------
+        array
+            Relative light for each surface. Shape (n,).
         """
-        shares = self.shares(kind_indices, luminance)
+        shares = self.diffuse_reflectances(kind_indices, luminance)
         back = shares * np.where(self.retro[kind_indices], RETRO_GAIN, cosine)
         if self.roughness.any():
             rough = np.flatnonzero(self.roughness[kind_indices])
@@ -723,16 +775,19 @@ class MaterialTable:
             diffuse = shares[rough]
             front = POLISHED * (1 - metal) + diffuse * metal
             back[rough] *= 1 - metal
-            back[rough] += front * gloss(cosine[rough], self.roughness[kind_indices[rough]])
+            back[rough] += front * glossy_reflection(
+                cosine[rough], self.roughness[kind_indices[rough]]
+            )
         return back
 
 
-def gloss(cosine: Floats, roughness: Floats) -> Floats:
-    """Return the light that facets of a rough surface mirror back, relative to a white diffuser.
+def glossy_reflection(cosine: Floats, roughness: Floats) -> Floats:
+    """Return the light that a rough surface reflects specularly, relative to a white diffuser.
 
-    Facets are distributed after Walter et al. 2007 (GGX), with shadowing after Smith, and the width
-    is the square of the roughness, as in glTF 2.0. With light and receiver in one direction, the
-    light is π D G / (4 cos θ). Multiply it by the reflection at right angles.
+    The microfacets have the GGX distribution of Walter et al. (2007) with Smith shadowing. As in
+    glTF 2.0, the width of the distribution is the square of the roughness. Because the light source
+    and the receiver are in the same direction, the light is π D G / (4 cos θ). It must be
+    multiplied by the reflectance at normal incidence.
     """
     width = np.square(roughness**2)
     square = cosine**2
@@ -741,10 +796,10 @@ def gloss(cosine: Floats, roughness: Floats) -> Floats:
 
 
 def fresnel(cosine: Any, index: Any = GLASS_INDEX) -> Any:
-    """Return the share of unpolarized light that a surface reflects (Fresnel's equations).
+    """Return the fraction of unpolarized light that a surface reflects, from Fresnel's equations.
 
-    `index` is the refractive index behind the surface over the index before it. Where `index` is
-    below 1 and the cosine is small, all light is reflected.
+    `index` is the refractive index behind the surface divided by the index in front of it. If it is
+    less than 1, all light is reflected at grazing angles.
     """
     inside = np.sqrt(np.maximum(1 - (1 - cosine**2) / (index * index), 0.0))
     perpendicular = (cosine - index * inside) / (cosine + index * inside)
@@ -752,27 +807,25 @@ def fresnel(cosine: Any, index: Any = GLASS_INDEX) -> Any:
     return (perpendicular**2 + parallel**2) / 2
 
 
-def below_water(cosine: Any, reflectance: Any) -> Any:
-    """Return the light from matt surfaces below a film of water, relative to dry surfaces: (n,).
+def wet_surface_factor(cosine: Any, reflectance: Any) -> Any:
+    """Return the light from matte surfaces under a film of water, relative to dry surfaces.
 
-    ``T² / (n² (1 - p ρ))``: light passes the film's surface twice, with Fresnel's transmittance T;
-    in the water it is spread by n², and the share p is sent back to the ground (Lekner and Dorf
-    1988, Ångström 1925).
+    The result is ``T² / (n² (1 - p ρ))``. Light passes through the surface of the film twice, with
+    the Fresnel transmittance T. Its solid angle changes by the factor n², and a fraction p of the
+    diffuse light in the water is reflected back to the ground (Lekner and Dorf 1988, Ångström
+    1925).
     """
-    return within_water(fresnel(cosine, WATER_INDEX), reflectance)
+    return water_film_factor(fresnel(cosine, WATER_INDEX), reflectance)
 
 
-def within_water(mirrored: Any, reflectance: Any) -> Any:
-    """Return the light from matt surfaces below a film of water that mirrors a share of light.
-
-    The light is relative to dry surfaces, as in `below_water`.
-    """
+def water_film_factor(mirrored: Any, reflectance: Any) -> Any:
+    """Return the result of `wet_surface_factor` for a known reflectance of the film of water."""
     through = (1 - mirrored) / WATER_INDEX
     return through * through / (1 - WATER_INWARDS * reflectance)
 
 
-def at_right_angles(distance: Any, extinction: float = 0.0) -> Any:
-    """Return the energy from white surfaces hit at right angles, by distance in meters."""
+def normal_incidence_energy(distance: Any, extinction: float = 0.0) -> Any:
+    """Return the energy from perpendicular white surfaces at distances in meters."""
     distance = np.maximum(distance, NEAREST_M)
     nearer = np.square(REFERENCE_M / distance)
     return nearer * exp(-2 * extinction * distance) if extinction else nearer
@@ -784,15 +837,16 @@ def extinction(visibility_km: float | None, wavelength_nm: float) -> float:
     Parameters
     ----------
     visibility_km
-        Meteorological optical range in kilometers, over which 5 % of the light is left
-        (WMO-No. 8; ICAO Annex 3). None is clear air without extinction.
+        Meteorological optical range in kilometers, over which the light is attenuated to 5 %
+        (WMO-No. 8; ICAO Annex 3). None stands for clear air without extinction.
     wavelength_nm
         Wavelength of the laser in nanometers.
 
     Notes
     -----
-    Kruse, McGlauchlin and McQuistan (1962) give the wavelength dependence by the visibility of
-    Koschmieder (1924), at a contrast of 2 %, which is 1.31 times as long in the same air.
+    The wavelength dependence follows Kruse, McGlauchlin and McQuistan (1962). Their formula uses
+    the visibility of Koschmieder (1924) at a contrast of 2 %, which is 1.31 times the
+    meteorological optical range.
 
     Examples
     --------

@@ -1,8 +1,8 @@
-"""Weather: extinction of a pulse's light in the air, and back-scatter from it.
+"""Weather, which attenuates pulses and returns light from the air.
 
-Fog and dust are too fine to be seen one by one: they have an extinction and a back-scatter. Drops
-of rain and flakes of snow are seen one by one, by their size and position in the beam. Light is
-scattered once.
+Fog and dust are modeled as continuous media with an extinction and a backscatter coefficient.
+Raindrops and snowflakes are modeled individually, with their sizes and positions in the beam. Only
+single scattering is considered.
 """
 
 from __future__ import annotations
@@ -23,38 +23,38 @@ from ..schema.value_texts import one_line
 from .materials import REFERENCE_M, WATER_INDEX, extinction
 
 RAIN_LARGEST_MM = 6.0  # larger drops break up (Pruppacher and Klett 1997)
-SNOW_DENSITY = 0.1  # relative to water: dry snow, between 0.01 and 0.2 (Hahner et al. 2022)
+SNOW_DENSITY = 0.1  # density of dry snow relative to water (Hahner et al. 2022: 0.01 to 0.2)
 SNOW_LARGEST_MM = 20.0  # Hahner et al. 2022
-SNOW_LIDAR_RATIO_SR = 25.0  # value of ice clouds (Young and Vaughan 2009)
+SNOW_LIDAR_RATIO_SR = 25.0  # lidar ratio of ice clouds (Young and Vaughan 2009)
 DUST_M2_G = 0.6  # mass extinction of mineral dust (Ansmann et al. 2019: 0.57 to 0.63)
 DUST_LIDAR_RATIO_SR = 60.0  # Haarig et al. 2022: 46 to 50 at 532 nm, 57 to 69 at 1064 nm
-# β = 0.046 / MOR (Rasshofer et al. 2011; Hahner et al. 2021), and α = ln 20 / MOR. Fog of clean
-# droplets returns more: DROPS_LIDAR_RATIO_SR.
+# Ratio of the extinction α = ln 20 / MOR to the backscatter β = 0.046 / MOR, where MOR is the
+# visibility (Rasshofer et al. 2011; Hahner et al. 2021). Fog of clean droplets returns more light.
 FOG_LIDAR_RATIO_SR = 65.0
-DROPS_LIDAR_RATIO_SR = 18.8  # value of clean droplets (O'Connor et al. 2004)
-# diameters; of clumps, the mean
-SPRAY_DROP_MM = 0.2
-CLUMP_MM = 20.0
-CLUMP_LARGEST_MM = 100.0
-EXIT_M = 0.01  # the beam's diameter at the sensor, if it is unknown: 5 to 13 mm
-NODES = 4096  # ranges at which tables and integrals are made
-# Share of the detection threshold below which particles are left out: 0.6 % of the particles that
-# return half of the threshold are detected. Leaving the fainter particles out misses 2 % of the
-# returns from rain, and 0.3 % of the returns from snow.
+DROPS_LIDAR_RATIO_SR = 18.8  # lidar ratio of clean droplets (O'Connor et al. 2004)
+SPRAY_DROP_MM = 0.2  # diameter of the drops in spray
+CLUMP_MM = 20.0  # mean diameter of the clumps of drops in spray
+CLUMP_LARGEST_MM = 100.0  # maximum diameter of a clump
+EXIT_M = 0.01  # default beam diameter at the sensor; typical values are 5 to 13 mm
+NODES = 4096  # number of ranges in tables and integrals
+# Particles that return less than this fraction of the detection threshold are not simulated. Of the
+# particles that return half of the threshold, 0.6 % are detected. The simulation therefore misses
+# 2 % of the returns from rain and 0.3 % of the returns from snow.
 FAINTEST = 0.5
-# ranges between which particles are simulated
+# Particles are simulated between these ranges.
 NEAREST_M = 0.1
 FARTHEST_M = 1e4
-MIN_TRANSMISSION = 1e-200  # limit for the light, so that divisions by an energy are finite
-LARGE = 2.0  # extinction of a large particle, in its cross-sections: half of it by diffraction
+MIN_TRANSMISSION = 1e-200  # avoids division by zero energy
+# Ratio of a large particle's extinction to its cross section, half of which is due to diffraction.
+LARGE = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Weather(FileSection):
-    """Extinction of the air, and returns from the air.
+    """Weather conditions, which attenuate light and return light from the air.
 
-    Rain, snow and dust need `Noise.detection_range_m`, which decides what a sensor detects. Fog
-    attenuates light without it, too, but returns none then.
+    Rain, snow and dust require `Noise.detection_range_m`, which determines the returns that a
+    sensor detects. Without a detection range, fog attenuates light but does not return any.
     """
 
     visibility_km: Annotated[
@@ -127,40 +127,42 @@ class Weather(FileSection):
 
     @property
     def fog_returns_light(self) -> bool:
-        """Whether fog may return light, to sensors with a detection range."""
+        """Whether fog may return light to sensors with a detection range."""
         return self.visibility_km is not None and self.fog_lidar_ratio_sr is not None
 
     @property
     def particles(self) -> tuple[Particles, ...]:
-        """Kinds of particles in the air: drops and flakes."""
+        """Raindrops and snowflakes in the air, if there are any."""
         kinds = []
         if self.rain_mm_h:
-            kinds.append(rain(self.rain_mm_h))
+            kinds.append(raindrops(self.rain_mm_h))
         if self.snow_mm_h:
-            kinds.append(snow(self.snow_mm_h))
+            kinds.append(snowflakes(self.snow_mm_h))
         return tuple(kinds)
 
     def extinction_at(self, wavelength_nm: float) -> float:
-        """Return the extinction of the air at a wavelength, 1/m."""
+        """Return the extinction coefficient of the air at a wavelength, in 1/m."""
         alpha = extinction(self.visibility_km, wavelength_nm)
         for kind in self.particles:
             alpha += kind.extinction
         if self.dust_mg_m3:
-            alpha += dust(self.dust_mg_m3)[0]
+            alpha += dust_coefficients(self.dust_mg_m3)[0]
         return alpha
 
     def backscatter_at(self, wavelength_nm: float) -> float:
-        """Return the backscatter of fog and dust at a wavelength, 1/(m sr)."""
-        beta = dust(self.dust_mg_m3)[1]
+        """Return the backscatter coefficient of fog and dust at a wavelength, in 1/(m sr)."""
+        beta = dust_coefficients(self.dust_mg_m3)[1]
         if self.fog_lidar_ratio_sr is not None:
             beta += extinction(self.visibility_km, wavelength_nm) / self.fog_lidar_ratio_sr
         return beta
 
 
 class Particles(NamedTuple):
-    """Drops or flakes, ``number * exp(-slope * D)`` by diameter D, up to the largest diameter.
+    """Size distribution and reflectance of raindrops, snowflakes or clumps of spray.
 
-    A particle returns as much light as a matt disc of its cross-section and `reflectance`.
+    The number of particles per volume and diameter D is ``number * exp(-slope * D)`` up to the
+    largest diameter. A particle returns the same amount of light as a matte disc with the same
+    cross section and `reflectance`.
     """
 
     number: float  # 1/(m³ mm)
@@ -170,27 +172,30 @@ class Particles(NamedTuple):
 
     @property
     def extinction(self) -> float:
-        """Extinction, 1/m, in proportion to the cross-sections of the particles."""
+        """Extinction coefficient in 1/m, which is proportional to the total cross section."""
         slope = self.slope
         x = self.slope * self.largest
         squares = 2 / (slope * slope * slope) * (1 - exp_of(-x) * (1 + x + x * x / 2))
         return LARGE * math.pi / 4 * self.number * squares * 1e-6
 
-    def above(self, diameter_mm: Floats) -> Floats:
-        """Return the density of particles above diameters (n,), 1/m³: (n,)."""
+    def number_above(self, diameter_mm: Floats) -> Floats:
+        """Return the number of particles above each diameter, per m³.
+
+        `diameter_mm` and the result have shape (n,).
+        """
         tail = exp(-self.slope * np.minimum(diameter_mm, self.largest))
         return np.asarray(self.number / self.slope * (tail - exp_of(-self.slope * self.largest)))
 
 
-def rain(mm_h: float) -> Particles:
-    """Return the drops of a rain of `mm_h` millimeters an hour (Marshall and Palmer 1948).
+def raindrops(mm_h: float) -> Particles:
+    """Return the raindrops at a rain rate in mm/h (Marshall and Palmer 1948).
 
-    A drop mirrors light at its front and, on the axis, at its back, by geometrical optics: with
-    Fresnel's r = ((n-1)/(n+1))², its reflectance is (r + r (1-r)² (n/(2-n))²) / 4.
+    According to geometrical optics, a drop reflects light at its front and, on the axis, at its
+    back. With Fresnel's r = ((n-1)/(n+1))², its reflectance is (r + r (1-r)² (n/(2-n))²) / 4.
 
     Examples
     --------
-    >>> f"{1000 * rain(10.0).extinction:.2f}"  # 1/km
+    >>> f"{1000 * raindrops(10.0).extinction:.2f}"  # 1/km
     '1.56'
     """
     n = WATER_INDEX
@@ -200,15 +205,16 @@ def rain(mm_h: float) -> Particles:
     return Particles(8000.0, 4.1 * float(power(mm_h, -0.21)), RAIN_LARGEST_MM, reflectance)
 
 
-def snow(mm_h: float) -> Particles:
-    """Return the flakes of dry snow, by its melted water in mm/h (Gunn and Marshall 1958).
+def snowflakes(mm_h: float) -> Particles:
+    """Return the flakes of dry snow at a snowfall rate (Gunn and Marshall 1958).
 
-    The flakes are distributed as the drops that they melt to; a flake of density 0.1 is 2.15 times
-    as wide as its drop. The reflectance follows from the lidar ratio of ice.
+    The snowfall rate is that of the melted water, in mm/h. The size distribution refers to the
+    drops into which the flakes melt. A flake with a relative density of 0.1 is 2.15 times as wide
+    as its drop. The reflectance is derived from the lidar ratio of ice.
 
     Examples
     --------
-    >>> f"{1000 * snow(1.0).extinction:.2f}"  # 1/km
+    >>> f"{1000 * snowflakes(1.0).extinction:.2f}"  # 1/km
     '3.34'
     """
     widening = float(power(SNOW_DENSITY, -1 / 3))
@@ -218,11 +224,12 @@ def snow(mm_h: float) -> Particles:
     return Particles(number / widening, slope / widening, SNOW_LARGEST_MM, reflectance)
 
 
-def spray(g_m3: float) -> Particles:
-    """Return the clumps of drops behind a vehicle, by the mass of the water in the air, g/m³.
+def spray_clumps(g_m3: float) -> Particles:
+    """Return the clumps of drops in the spray behind a vehicle.
 
-    The extinction of drops is twice their cross-sections. Drops are in clumps that are assumed to
-    be opaque; an opaque cloud of drops returns half of the inverse lidar ratio.
+    `g_m3` is the mass of water in the air in g/m³. The extinction of the drops is twice their cross
+    section. The drops form clumps, which are assumed to be opaque. The backscatter from an opaque
+    cloud of drops is half of the inverse lidar ratio.
     """
     alpha = LARGE * 1.5e-3 * g_m3 / SPRAY_DROP_MM
     unit_cloud = Particles(
@@ -231,12 +238,12 @@ def spray(g_m3: float) -> Particles:
     return unit_cloud._replace(number=alpha * LARGE / unit_cloud.extinction)
 
 
-def dust(mg_m3: float) -> tuple[float, float]:
-    """Return the extinction, 1/m, and the back-scatter, 1/(m sr), of mineral dust.
+def dust_coefficients(mg_m3: float) -> tuple[float, float]:
+    """Return the extinction in 1/m and the backscatter in 1/(m sr) of mineral dust.
 
     Examples
     --------
-    >>> alpha, beta = dust(100.0)
+    >>> alpha, beta = dust_coefficients(100.0)
     >>> f"{alpha:.3f} {beta:.4f}"
     '0.060 0.0010'
     """
@@ -244,62 +251,84 @@ def dust(mg_m3: float) -> tuple[float, float]:
     return alpha, alpha / DUST_LIDAR_RATIO_SR
 
 
-def reach(min_range_m: float, max_range_m: float) -> tuple[float, float]:
-    """Return the shortest and the longest range of particles, meters, for a sensor's ranges."""
+def particle_range(min_range_m: float, max_range_m: float) -> tuple[float, float]:
+    """Limit the range interval of a sensor to the ranges at which particles are simulated."""
     return max(min_range_m, NEAREST_M), min(max_range_m, FARTHEST_M)
 
 
 class Air(NamedTuple):
-    """Air along the beams of a sensor. Energies are relative: 1 for a white surface at 10 m.
+    """Air along the beams of a sensor.
 
-    The beam is evenly bright and round. Nearer than `overlap_m` the receiver sees the part
-    (R / overlap_m)² of the beam, as a receiver does that is focused at a long range: the received
-    energy is constant there (Harms, Lahmann and Weitkamp 1978).
+    Energies are relative to the energy from a white surface at a distance of 10 m. The beam is
+    round and uniformly bright.
+
+    At a range R below `overlap_m`, the receiver sees the fraction (R / overlap_m)² of the beam, as
+    for a receiver that is focused at a long range. The received energy is constant at these ranges
+    (Harms, Lahmann and Weitkamp 1978).
+
+    Attributes
+    ----------
+    extinction
+        Extinction coefficient in 1/m.
+    exit_m
+        Diameter of the beam in meters where it leaves the sensor.
+    divergence
+        Full divergence angle in radians.
+    overlap_m
+        Minimum range in meters at which the receiver sees the entire beam.
     """
 
-    extinction: float  # 1/m
-    exit_m: float  # diameter of the beam where it leaves the sensor, meters
-    divergence: float  # full angle, radians
-    overlap_m: float  # nearest range where the receiver sees the beam completely
+    extinction: float
+    exit_m: float
+    divergence: float
+    overlap_m: float
 
-    def width(self, distance: Floats) -> Floats:
-        """Return the diameters of the beam at distances (n,), meters: (n,)."""
+    def beam_diameter(self, distance: Floats) -> Floats:
+        """Return the beam diameter at each distance, in meters.
+
+        `distance` and the result have shape (n,).
+        """
         return np.asarray(hypot(self.exit_m, self.divergence * distance))
 
     def white_energy(self, distance: Any) -> Any:
-        """Return the energy of a white disc that fills the beam, at distances in meters."""
+        """Return the energy from a white disc that fills the beam, at distances in meters."""
         effective_m = np.maximum(distance, max(self.overlap_m, 1e-3))
         transmission = exp(-2 * self.extinction * distance)
         return np.square(REFERENCE_M / effective_m) * np.maximum(transmission, MIN_TRANSMISSION)
 
-    def smallest(self, particles: Particles, energy: float, distance: Floats) -> Floats:
-        """Return the diameters of particles that return an energy, millimeters: (n,).
+    def min_diameter_mm(self, particles: Particles, energy: float, distance: Floats) -> Floats:
+        """Return the diameter in millimeters of the smallest particle that returns an energy.
 
-        `distance` (n,) is in meters; the diameter is inf where no particle returns the energy.
+        `distance` is in meters, and has shape (n,) like the result. The diameter is infinite at
+        distances at which no particle returns the energy.
         """
         share = energy / (particles.reflectance * self.white_energy(distance))
-        diameter_mm = 1000 * self.width(distance) * np.sqrt(share)
+        diameter_mm = 1000 * self.beam_diameter(distance) * np.sqrt(share)
         return np.where(share <= 1, diameter_mm, np.inf)
 
-    def rate(self, particles: Particles, energy: float, distance: Floats) -> Floats:
-        """Return the number of particles in the beam that return at least an energy: (n,), 1/m."""
-        area = math.pi / 4 * np.square(self.width(distance))
-        return area * particles.above(self.smallest(particles, energy, distance))
+    def particle_rate(self, particles: Particles, energy: float, distance: Floats) -> Floats:
+        """Return the number of particles per meter of the beam that return at least an energy.
+
+        `distance` is in meters, and has shape (n,) like the result.
+        """
+        area = math.pi / 4 * np.square(self.beam_diameter(distance))
+        return area * particles.number_above(self.min_diameter_mm(particles, energy, distance))
 
     def mean_particles(
         self, particles: Particles, energy: float, start_m: float, stop_m: float
     ) -> float:
         """Return the mean number of particles in a beam that return at least an energy.
 
-        Particles are counted from `start_m` to `stop_m`, ranges in meters.
+        Only particles between the ranges `start_m` and `stop_m` are counted.
         """
         distance = geomspace(start_m, max(stop_m, start_m * 1.001), NODES)
-        return float(np.trapezoid(self.rate(particles, energy, distance), distance))
+        return float(np.trapezoid(self.particle_rate(particles, energy, distance), distance))
 
-    def cloud(self, backscatter: float, starts: Floats, stops: Floats) -> Floats:
-        """Return the energies (n,) that fog or dust returns from slabs that fill the beam.
+    def backscatter_energy(self, backscatter: float, starts: Floats, stops: Floats) -> Floats:
+        """Return the energies that fog or dust returns from slabs that fill the beam.
 
-        `starts` and `stops` (n,) are ranges in meters; energies are means by Simpson's rule.
+        `starts` and `stops` are ranges in meters, and have shape (n,) like the result. The energies
+        are integrated with Simpson's rule.
         """
         middle = (starts + stops) / 2
         slab = stops - starts

@@ -1,4 +1,4 @@
-"""Poses and trajectories, their files, and what instruments measure of them."""
+"""Poses and trajectories, their files, and the IMU and GNSS receiver of a platform."""
 
 from .navigation import Gnss, Imu, Navigation
 from .trajectory import Pose, StaticPose, Stations, Track, Trajectory

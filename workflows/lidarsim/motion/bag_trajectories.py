@@ -1,4 +1,4 @@
-"""Trajectories in bags of ROS 2: topics of poses, of GNSS receivers with an IMU, and of frames."""
+"""Reader for trajectories in ROS 2 bags, from pose, GNSS, IMU and tf topics."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..errors import LidarError
 from ..numerics.arrays import Floats, Ints
 from ..numerics.vectors import matmul, matvec
 from ..words import did_you_mean, joined, plural
-from .navigation import local_positions
+from .navigation import from_geodetic
 from .rotations import quaternions_of
 from .trajectory import Track
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
 
 Origin = Sequence[float] | None
-# {type of messages: the pose in a message}
+# Functions that return the pose in a message, by message type.
 _POSES: dict[str, Callable[[Any], Any]] = {
     "nav_msgs/msg/Odometry": lambda message: message.pose.pose,
     "geometry_msgs/msg/PoseStamped": lambda message: message.pose,
@@ -33,16 +33,26 @@ _GNSS = "sensor_msgs/msg/NavSatFix"
 _IMU = "sensor_msgs/msg/Imu"
 _FRAMES = "tf2_msgs/msg/TFMessage"
 _STATIC = "/tf_static"
-_MAX_DIFFERENCE = 1e-6  # largest difference between the numbers of a pose that is sent twice
+_MAX_DIFFERENCE = 1e-6  # maximum difference between two copies of a pose that was sent twice
 _READABLE_TYPES = ", ".join([*_POSES, _GNSS, _FRAMES])
 
 
 class TimedPoses(NamedTuple):
-    """Poses of a carrier."""
+    """Timed poses of a platform.
 
-    seconds: Floats  # (k,): by the clock of the bag
-    positions: Floats  # (k, 3): meters
-    quaternions: Floats | None  # (k, 4): x, y, z, w; None if the bag has none
+    Attributes
+    ----------
+    seconds
+        Times in seconds, on the clock of the bag. Shape (k,).
+    positions
+        Positions in meters. Shape (k, 3).
+    quaternions
+        Quaternions (x, y, z, w), or None if the bag has no orientations. Shape (k, 4).
+    """
+
+    seconds: Floats
+    positions: Floats
+    quaternions: Floats | None
 
 
 @dataclass
@@ -60,19 +70,19 @@ def read_bag(path: Path, topic: str | None, origin: Origin) -> TimedPoses:
     Parameters
     ----------
     path
-        An .mcap or .db3, or the folder of a bag.
+        Path of an .mcap or .db3 file, or of the folder of a bag.
     topic
-        A topic of a type of `_POSES`, or of NavSatFix; topics of NavSatFix and Imu, separated by a
-        space; or, for a frame of /tf, «/tf:FRAME». None if the bag has poses of one topic or
-        frame.
+        Topic with Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped or NavSatFix
+        messages, a NavSatFix topic and an Imu topic separated by a space, or "/tf:FRAME" for a
+        frame. With None, the bag must contain poses of a single topic or frame.
     origin
-        For NavSatFix: latitude and longitude, degrees, and height, meters, of the world's zero.
-        None for the first fix.
+        For NavSatFix messages, the world origin as latitude and longitude in degrees, and height in
+        meters. The default is the first fix.
 
     Raises
     ------
     LidarError
-        If the bag cannot be read, or the topic is not clear.
+        If the bag cannot be read, or if the topic does not exist or is ambiguous.
     """
     with opened_bag(path, "the bag") as bag:
         message_types = {connection.topic: connection.msgtype for connection in bag.connections}
@@ -85,10 +95,10 @@ def read_bag(path: Path, topic: str | None, origin: Origin) -> TimedPoses:
             chosen = base_topic
         else:
             edges = _edges_of(bag, message_types)
-            if base_topic == "/tf" and frame in edges:  # even if only a frame above moves
+            if base_topic == "/tf" and frame in edges:  # even if only an ancestor frame moves
                 return _frame_poses(edges, frame)
             labels = [*pose_topics, *(f"/tf:{name}" for name in _moving_frames(edges))]
-            chosen = _chosen(labels, topic)
+            chosen = _choose_label(labels, topic)
             if chosen.startswith("/tf:"):
                 return _frame_poses(edges, chosen.removeprefix("/tf:"))
         if message_types[chosen] == _GNSS:
@@ -96,10 +106,11 @@ def read_bag(path: Path, topic: str | None, origin: Origin) -> TimedPoses:
         return _topic_poses(bag, chosen, _POSES[message_types[chosen]])
 
 
-def _chosen(labels: Sequence[str], topic: str | None) -> str:
-    """Return the only label, or the only frame if the topic is /tf.
+def _choose_label(labels: Sequence[str], topic: str | None) -> str:
+    """Return the label to read if no topic was requested by its exact name.
 
-    Raises LidarError if several fit.
+    The result is the only label, or the only frame if the topic is /tf. Raise LidarError if there
+    is no unique match.
     """
     frames = [label for label in labels if label.startswith("/tf:")]
     if topic == "/tf" and len(frames) == 1:
@@ -119,7 +130,7 @@ def _chosen(labels: Sequence[str], topic: str | None) -> str:
 
 
 def _row_of(pose: Any) -> list[float]:
-    """Return x, y, z (meters) and the quaternion x, y, z, w of a Pose or a Transform message."""
+    """Return x, y and z and the quaternion (x, y, z, w) of a Pose or Transform message."""
     position = pose.position if hasattr(pose, "position") else pose.translation
     orientation = pose.orientation if hasattr(pose, "orientation") else pose.rotation
     return [
@@ -134,12 +145,15 @@ def _row_of(pose: Any) -> list[float]:
 
 
 def _stamp_ns(header: Any) -> int:
-    """Return the time stamp of a message's header, nanoseconds."""
+    """Return the timestamp of a message header in nanoseconds."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
 def _in_order(times_ns: Sequence[int], rows: Sequence[Sequence[float]]) -> tuple[Ints, Floats]:
-    """Return times (k,) and rows (k, n) in the order of time, without rows that are sent twice."""
+    """Return times and rows sorted by time, without duplicates of rows that were sent twice.
+
+    The times have shape (k,), and the rows have shape (k, n).
+    """
     times = np.array(times_ns, np.int64)
     table = np.array(rows, np.float64)
     order = np.argsort(times, kind="stable")
@@ -150,8 +164,8 @@ def _in_order(times_ns: Sequence[int], rows: Sequence[Sequence[float]]) -> tuple
     return times[~repeated], table[~repeated]
 
 
-def _topic_poses(bag: Reader, topic: str, pose_of: Callable[[Any], Any]) -> TimedPoses:
-    """Return the poses of a topic, by the stamps of their headers."""
+def _topic_poses(bag: Reader, topic: str, get_pose: Callable[[Any], Any]) -> TimedPoses:
+    """Return the poses of a topic with the timestamps of their headers."""
     stamps = []
     times = []
     rows = []
@@ -159,13 +173,13 @@ def _topic_poses(bag: Reader, topic: str, pose_of: Callable[[Any], Any]) -> Time
     for _, time_ns, message in messages_of(bag, [topic]):
         stamps.append(_stamp_ns(message.header))
         times.append(time_ns)
-        rows.append(_row_of(pose_of(message)))
+        rows.append(_row_of(get_pose(message)))
         frames.add(message.header.frame_id)
     if not rows:
         raise LidarError(f"topic {topic} has no messages.")
     if len(frames) > 1:
         raise LidarError(f"topic {topic} has poses in several frames: {', '.join(sorted(frames))}.")
-    # Programs that set no stamps leave zeros.
+    # Programs that do not set the timestamps leave zeros.
     times_ns, table = _in_order(stamps if any(stamps) else times, rows)
     return TimedPoses(times_ns / 1e9, table[:, :3], table[:, 3:])
 
@@ -173,7 +187,7 @@ def _topic_poses(bag: Reader, topic: str, pose_of: Callable[[Any], Any]) -> Time
 def _gnss_poses(
     bag: Reader, kinds: Mapping[str, str], topic: str, imu: str, origin: Origin
 ) -> TimedPoses:
-    """Return positions of a GNSS receiver, with the orientations of an IMU if the bag has any."""
+    """Return the positions of a GNSS receiver, with orientations of an IMU if the bag has any."""
     times_ns = []
     fixes = []
     for _, _, fix in messages_of(bag, [topic]):
@@ -189,7 +203,7 @@ def _gnss_poses(
     times, table = _in_order(times_ns, fixes)
     origin_row = table[0] if origin is None else np.asarray(origin, np.float64)
     latitude, longitude, height = origin_row.tolist()
-    positions = local_positions(table, (latitude, longitude, height))
+    positions = from_geodetic(table, (latitude, longitude, height))
     orientations = _orientations(bag, kinds, imu)
     if orientations is None:
         return TimedPoses(times / 1e9, positions, None)
@@ -201,13 +215,16 @@ def _gnss_poses(
 
 
 def _orientations(bag: Reader, kinds: Mapping[str, str], imu: str) -> tuple[Ints, Floats] | None:
-    """Return times (k,), ns, and rows (k, 7) with orientations of an IMU, or None without any."""
+    """Return the times in nanoseconds and the orientations of an IMU, or None without any.
+
+    The times have shape (k,). The rows have shape (k, 7) and contain zero positions.
+    """
     topics = [topic for topic, kind in kinds.items() if kind == _IMU]
     if imu and imu not in topics:
         raise LidarError(f"it has no IMU topic {imu!r}.{did_you_mean(imu, topics)}")
     measured: dict[str, tuple[list[int], list[list[float]]]] = {}
     for topic, _, message in messages_of(bag, [imu] if imu else topics):
-        if message.orientation_covariance[0] != -1:  # an IMU without orientation, by its definition
+        if message.orientation_covariance[0] != -1:  # -1 marks an IMU without orientation
             orientation = message.orientation
             times, rows = measured.setdefault(topic, ([], []))
             times.append(_stamp_ns(message.header))
@@ -225,7 +242,7 @@ def _orientations(bag: Reader, kinds: Mapping[str, str], imu: str) -> tuple[Ints
 
 
 def _edges_of(bag: Reader, kinds: Mapping[str, str]) -> dict[str, _Edge]:
-    """Return {frame: poses in its parent frame} of all topics of frames."""
+    """Return the poses of each frame in its parent frame, from all tf topics."""
     edges: dict[str, _Edge] = {}
     topics = [topic for topic, kind in kinds.items() if kind == _FRAMES]
     for topic, _, message in messages_of(bag, topics):
@@ -247,7 +264,7 @@ def _edges_of(bag: Reader, kinds: Mapping[str, str]) -> dict[str, _Edge]:
 
 
 def _chain(edges: Mapping[str, _Edge], frame: str) -> list[_Edge]:
-    """Return the edges from a frame upwards to the root."""
+    """Return the edges from a frame up to the root."""
     chain = []
     visited = set[str]()
     while frame in edges:
@@ -260,7 +277,10 @@ def _chain(edges: Mapping[str, _Edge], frame: str) -> list[_Edge]:
 
 
 def _moving_frames(edges: Mapping[str, _Edge]) -> list[str]:
-    """Return the frames whose poses in the parent frame change, else frames with several poses."""
+    """Return the frames that move relative to their parent frame.
+
+    If no frame moves, return the frames with several poses.
+    """
     repeated = [frame for frame, edge in edges.items() if len(set(edge.times_ns)) > 1]
     changing = [
         frame for frame in repeated if any(row != edges[frame].rows[0] for row in edges[frame].rows)
@@ -269,9 +289,10 @@ def _moving_frames(edges: Mapping[str, _Edge]) -> list[str]:
 
 
 def _frame_poses(edges: Mapping[str, _Edge], frame: str) -> TimedPoses:
-    """Return the poses of a frame in the root of its tree.
+    """Return the poses of a frame in the root frame of its tree.
 
-    The times are the times of the lowest frame that moves, while all frames above have poses.
+    The times are those of the first moving frame on the way to the root, limited to the interval in
+    which all its moving ancestors have poses.
     """
     chain = _chain(edges, frame)
     tables = [_in_order(edge.times_ns, edge.rows) for edge in chain]
@@ -295,9 +316,21 @@ def _frame_poses(edges: Mapping[str, _Edge], frame: str) -> TimedPoses:
 
 
 def _edge_poses(edge_times: Ints, rows: Floats, times: Ints) -> tuple[Floats, Floats]:
-    """Return positions (k, 3) and rotations (k, 3, 3) at times (k,), ns.
+    """Interpolate the poses of an edge at times within its own times.
 
-    The times are within `edge_times` (n,), ns, the times of `rows` (n, 7).
+    Parameters
+    ----------
+    edge_times
+        Times of the rows in nanoseconds. Shape (n,).
+    rows
+        Positions and quaternions. Shape (n, 7).
+    times
+        Requested times in nanoseconds. Shape (k,).
+
+    Returns
+    -------
+    tuple
+        Positions (k, 3) and rotation matrices (k, 3, 3).
     """
     if len(edge_times) == 1:  # a static frame
         edge_times = edge_times + np.arange(2)

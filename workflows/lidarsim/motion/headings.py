@@ -1,8 +1,8 @@
-"""Headings of carriers that face their direction of travel, because their poses have no angles.
+"""Headings of platforms that face their direction of travel, because their poses have no angles.
 
-A heading is the direction of the horizontal velocity. It is undefined while a carrier stands still
-or moves vertically: the carrier then keeps its heading, and turns to its next one in the last
-second. Straight legs meet at corners, where the carrier turns evenly.
+The heading is the direction of the horizontal velocity. It is undefined while a platform is
+stationary or moves vertically. The platform then keeps its heading, and turns to the next heading
+in the last second. At the corners between straight legs, the platform turns at a constant rate.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ import numpy as np
 from ..numerics.arrays import Bools, Floats, Indices
 from ..numerics.elementary import arctan2, interp, sin_cos
 from ..numerics.vectors import hypot
-from .spline import on_curve, rests
+from .spline import evaluate_curve, is_stationary
 
-# A carrier turns within this distance before and after a corner, or from the middle of one leg to
-# the middle of the next if a leg is shorter than twice the distance.
+# A platform turns within this distance before and after a corner. On a leg shorter than twice this
+# distance, the turn extends to the center of the leg.
 CORNER_M = 1.0
-STAND_S = 1.0  # longest time in which a carrier that stands turns to its next heading
+STATIONARY_TURN_S = 1.0  # maximum time in which a stationary platform turns to its next heading
 
-_SAME = 1e-9  # horizontal distances, meters, and speeds, m/s, below which nothing moves
-_ROOM = 1.001  # legs hardly longer than two corners are divided in the middle
-_NEAR_END = 2.0**-10  # share of a step next to a stop, where velocities are mostly rounding
+_SAME = 1e-9  # horizontal distances in m and speeds in m/s below this value are considered zero
+_ROOM = 1.001  # legs that are hardly longer than two corners are divided at their center
+_NEAR_END = 2.0**-10  # fraction of a step near a stop in which rounding errors affect velocities
 
 
 class _Turns(NamedTuple):
-    """Changes of heading, one after the other."""
+    """Consecutive changes of the heading."""
 
     starts_s: Floats  # (n,), ascending
-    stops_s: Floats  # (n,): at most the next start
-    yaws: Floats  # (n + 1,), radians: before, between and after the turns
+    stops_s: Floats  # (n,), not after the next start
+    yaws: Floats  # (n + 1,), radians, before, between and after the turns
 
 
 class HeadedPoses(NamedTuple):
-    """Poses of a carrier on straight legs, at the given times and where its turns begin and end."""
+    """Poses of a platform on straight legs, including the start and the end of each turn."""
 
     times_s: Floats  # (n,)
     positions: Floats  # (n, 3), meters
@@ -44,14 +44,14 @@ class HeadedPoses(NamedTuple):
 
 
 def headed_poses(times_s: Floats, positions: Floats) -> HeadedPoses:
-    """Return the poses of a level carrier that travels from position to position on straight legs.
+    """Return the poses of a level platform that travels on straight legs between positions.
 
     Parameters
     ----------
     times_s
-        (k,), ascending.
+        Times in seconds, in ascending order. Shape (k,).
     positions
-        (k, 3), meters.
+        Positions in meters. Shape (k, 3).
     """
     turns = _turns_between_legs(times_s, positions)
     times = np.unique(np.concatenate([times_s, turns.starts_s, turns.stops_s]))
@@ -67,7 +67,7 @@ def headed_poses(times_s: Floats, positions: Floats) -> HeadedPoses:
 
 
 def _turns_between_legs(times_s: Floats, positions: Floats) -> _Turns:
-    """Return the turns at the corners of straight legs."""
+    """Return the turns at the corners between straight legs."""
     legs = np.diff(positions[:, :2], axis=0)
     lengths = hypot(*legs.T)
     moving = np.flatnonzero(lengths > _SAME)
@@ -77,21 +77,23 @@ def _turns_between_legs(times_s: Floats, positions: Floats) -> _Turns:
     after = moving[1:]
     arrive = times_s[before + 1]
     leave = times_s[after]
-    # Expressions that are equal for both ends of a leg: turns never overlap by a rounding.
+    # Both ends of a leg use the same expressions, so that turns never overlap due to rounding.
     middles = (times_s[:-1] + times_s[1:]) / 2
     is_long = lengths > 2 * CORNER_M * _ROOM
     corner_s = CORNER_M * np.diff(times_s) / np.where(is_long, lengths, 1.0)
     starts = np.where(is_long[before], arrive - corner_s[before], middles[before])
     stops = np.where(is_long[after], leave + corner_s[after], middles[after])
-    stands = after > before + 1
-    starts[stands] = np.where(leave - arrive > STAND_S * _ROOM, leave - STAND_S, arrive)[stands]
-    stops[stands] = leave[stands]
+    pauses = after > before + 1
+    starts[pauses] = np.where(
+        leave - arrive > STATIONARY_TURN_S * _ROOM, leave - STATIONARY_TURN_S, arrive
+    )[pauses]
+    stops[pauses] = leave[pauses]
     yaws = arctan2(legs[moving, 1], legs[moving, 0])
-    return _without_straight(starts, stops, yaws)
+    return _nonzero_turns(starts, stops, yaws)
 
 
-def _without_straight(starts: Floats, stops: Floats, yaws: Floats) -> _Turns:
-    """Return the turns that change the heading, by the shorter way."""
+def _nonzero_turns(starts: Floats, stops: Floats, yaws: Floats) -> _Turns:
+    """Return the turns that change the heading, each in the shorter direction."""
     changes = np.diff(yaws)
     changes -= 2 * np.pi * np.round(changes / (2 * np.pi))
     turning = np.abs(changes) > 1e-12
@@ -107,11 +109,11 @@ class Heading(NamedTuple):
     rates: Floats  # (k,), rad/s
 
 
-class _Stands(NamedTuple):
-    """Times at which a carrier stands still, with its headings on arrival and departure.
+class _Stops(NamedTuple):
+    """Intervals in which a platform is stationary, with its headings on arrival and departure.
 
-    The first row is before the carrier first travels, and the last row is after it last does, even
-    if these take no time.
+    The first interval ends when the platform starts to travel, and the last interval starts when it
+    stops for the last time. Both intervals exist even if they have no duration.
     """
 
     arrivals_s: Floats  # (n,), ascending
@@ -119,15 +121,17 @@ class _Stands(NamedTuple):
     yaws: Floats  # (n, 2), radians
 
     @classmethod
-    def between(cls, times_s: Floats, travels: Bools, first: Floats, last: Floats) -> _Stands:
-        """Return where a carrier stands that travels after some of the knots at times (n,).
+    def between(cls, times_s: Floats, travels: Bools, first: Floats, last: Floats) -> _Stops:
+        """Create the stationary intervals between the segments in which a platform travels.
 
         Parameters
         ----------
+        times_s
+            Times of the knots. Shape (n,).
         travels
-            (n - 1,): whether it travels after each knot.
+            Whether the platform travels between each knot and the next. Shape (n - 1,).
         first, last
-            (n - 1, 2): its first and last velocity until the next knot.
+            First and last horizontal velocity between each knot and the next. Shape (n - 1, 2).
         """
         moving = np.flatnonzero(travels)
         if not len(moving):
@@ -150,11 +154,11 @@ class _Stands(NamedTuple):
         )
 
     def at(self, times_s: Floats) -> Heading:
-        """Return the headings at times (k,) at which the carrier stands."""
+        """Return the headings at times at which the platform is stationary. Shape (k,)."""
         row = np.clip(np.searchsorted(self.arrivals_s, times_s, "right") - 1, 0, None)
         stops_s = self.departures_s.take(row)
-        duration = np.minimum(stops_s - self.arrivals_s.take(row), STAND_S)
-        duration = np.where(duration > 0, duration, STAND_S)
+        duration = np.minimum(stops_s - self.arrivals_s.take(row), STATIONARY_TURN_S)
+        duration = np.where(duration > 0, duration, STATIONARY_TURN_S)
         first, last = self.yaws.take(row, axis=0).T
         change = last - first
         change = change - 2 * np.pi * np.round(change / (2 * np.pi))
@@ -168,22 +172,23 @@ class _Stands(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CurveHeadings:
-    """Headings of a carrier on a smooth curve: the curve's tangent, seen from above.
+    """Headings of a platform on a smooth curve, which follow the horizontal tangent of the curve.
 
     Attributes
     ----------
     times_s
-        (n,): times of the knots.
+        Times of the knots. Shape (n,).
     knots
-        (3, 3, n): of `knots_of`, positions and their first two derivatives.
+        Positions and their first two derivatives, from `fit_knots`. Shape (3, 3, n).
     still
-        (n,): whether the curve stands still at a knot.
+        Whether the curve is stationary at each knot. Shape (n,).
     travels
-        (n - 1,): whether the carrier moves horizontally after a knot, so that it has a tangent.
+        Whether the platform moves horizontally after each knot, so that the tangent is defined.
+        Shape (n - 1,).
     first
-        (n - 1, 2): horizontal velocities where the carrier sets out after each knot.
-    stands
-        Where the carrier stands still, or moves vertically.
+        First horizontal velocity above zero after each knot. Shape (n - 1, 2).
+    stops
+        Intervals in which the platform is stationary or moves vertically.
     """
 
     times_s: Floats
@@ -191,46 +196,52 @@ class CurveHeadings:
     still: Bools
     travels: Bools
     first: Floats
-    stands: _Stands
+    stops: _Stops
 
     @classmethod
     def from_knots(cls, times_s: Floats, knots: Floats) -> CurveHeadings:
-        """Return the headings on a curve through knots (3, 3, n) at times (n,)."""
+        """Create the headings of a curve from its knots and their times.
+
+        The knots have shape (3, 3, n), and the times have shape (n,).
+        """
         steps = np.diff(times_s)
         still: Bools = np.asarray(~knots[1:].any(axis=(0, 1)))
         count = len(steps)
         shares = np.array([_NEAR_END, 0.5, 1 - _NEAR_END])
         since = (steps[:, None] * shares).reshape(-1)
-        slopes = on_curve(knots, steps, np.arange(count).repeat(3), since, 1)[1]
+        slopes = evaluate_curve(knots, steps, np.arange(count).repeat(3), since, 1)[1]
         velocities = slopes[:2].T.reshape(count, 3, 2)
         moves = hypot(velocities[..., 0], velocities[..., 1]) > _SAME
-        # Both ends are still: of a pause, but also of a leg from one stop to the next.
-        moves[rests(steps, np.diff(knots[0]) / steps)] = False
+        # Both ends of a pause are stationary, but so are the ends of a leg between two stops.
+        moves[is_stationary(steps, np.diff(knots[0]) / steps)] = False
         travels = moves.any(axis=1)
         rows = np.arange(count)
         first = velocities[rows, moves.argmax(axis=1)]
         last = velocities[rows, 2 - moves[:, ::-1].argmax(axis=1)]
-        stands = _Stands.between(times_s, travels, first, last)
-        return cls(times_s, knots, still, travels, first, stands)
+        stops = _Stops.between(times_s, travels, first, last)
+        return cls(times_s, knots, still, travels, first, stops)
 
     def at(self, segment: Indices, since: Floats) -> Heading:
-        """Return the headings `since` (k,) seconds after the knots `segment` (k,)."""
+        """Return the headings at `since` seconds after the knots with the indices `segment`.
+
+        Both arrays have shape (k,).
+        """
         tangent = self._tangent(segment, since)
         if self.travels.all():
             return tangent
         travels = self.travels.take(segment)
-        standing = self.stands.at(self.times_s.take(segment) + since)
-        pairs = zip(tangent, standing, strict=True)
+        stationary = self.stops.at(self.times_s.take(segment) + since)
+        pairs = zip(tangent, stationary, strict=True)
         return Heading(*(np.where(travels, one, other) for one, other in pairs))
 
     def _tangent(self, segment: Indices, since: Floats) -> Heading:
-        """Return the headings on steps where the carrier travels."""
+        """Return the headings on segments in which the platform travels."""
         steps = np.diff(self.times_s)
         step = steps.take(segment)
         near_start = np.where(self.still.take(segment), _NEAR_END * step, 0.0)
         near_stop = np.where(self.still.take(segment + 1), step - _NEAR_END * step, step)
         inside = since.clip(near_start, near_stop)
-        _, velocity, change = on_curve(self.knots[:, :2], steps, segment, inside, 2)
+        _, velocity, change = evaluate_curve(self.knots[:, :2], steps, segment, inside, 2)
         speed = hypot(*velocity)
         slow = np.flatnonzero(speed <= _SAME)
         velocity[:, slow] = self.first[segment[slow]].T

@@ -1,14 +1,15 @@
-"""IMU and GNSS receiver of a carrier, and their errors, which drift.
+"""Simulation of the IMU and the GNSS receiver of a platform, including drift.
 
-Truth comes from the carrier's trajectory: what an inertial measurement unit reports are means over
-its sampling interval, so that sums of its samples are the carrier's rotations and changes of
-velocity, whatever the trajectory does in between. Errors are added: white noise, a Gauss-Markov
-process of first order for a bias that wanders about zero, and a random walk for a bias that wanders
-off
-(IEEE Std 952-1997, annex C; Farrell 2008, chapter 4; Woodman 2007). Parameters are named as in the
-`imu.yaml` of kalibr, whose model is the first and the last of the three.
+True values are computed from the trajectory of the platform. The samples of an inertial measurement
+unit (IMU) are means over the sampling interval. Their sums are therefore exactly the rotations and
+velocity changes of the platform, regardless of how it moves between two samples.
 
-The rotation of the Earth and its curvature are left out.
+Three kinds of errors are added to the true values: white noise, a first-order Gauss-Markov process
+for a bias that fluctuates about zero, and a random walk for a bias that drifts away (IEEE Std
+952-1997, annex C; Farrell 2008, chapter 4; Woodman 2007). The parameters have the same names as in
+Kalibr's `imu.yaml`. Kalibr models the white noise and the random walk.
+
+The rotation and the curvature of the Earth are neglected.
 """
 
 from __future__ import annotations
@@ -41,16 +42,16 @@ DRIVEN = Purpose(42, "bias steps of an instrument")
 WALK = Purpose(43, "random walk steps of an instrument")
 SKEW = Purpose(44, "scale factors and misalignments of the axes of an instrument")
 OUTAGE = Purpose(45, "drift during GNSS outages")
-BLOCK = 1 << 14  # samples in a block
-RETURNS_IN_S = 1.0  # after an outage, its error falls to 37 % in this time
+BLOCK = 1 << 14  # number of samples in a block
+RETURNS_IN_S = 1.0  # time in which the error decays to 37 % after an outage
 
 Latitude = Annotated[float, Field(ge=-90, le=90)]
 Longitude = Annotated[float, Field(ge=-360, le=360)]
 GeodeticPosition = Annotated[
     tuple[Latitude, Longitude, Annotated[float, Field(ge=-1e5, le=1e6)]], Strict(False)
 ]
-TurnNoise = Annotated[float, Field(ge=0, le=100)]  # noise of a gyroscope
-SpeedNoise = Annotated[float, Field(ge=0, le=1000)]  # noise of an accelerometer
+TurnNoise = Annotated[float, Field(ge=0, le=100)]  # gyroscope noise
+SpeedNoise = Annotated[float, Field(ge=0, le=1000)]  # accelerometer noise
 Deviation = Annotated[float, Field(ge=0, le=1e6)]  # meters
 Correlation = Annotated[float, Field(ge=0.001, le=1e9)]  # seconds
 Skew = Annotated[float, Field(ge=0, le=10)]  # degrees
@@ -225,47 +226,58 @@ class Navigation(FileSection):
 
 
 class ImuSamples(NamedTuple):
-    """Consecutive samples of an IMU, in the frame of the IMU."""
+    """Consecutive samples of an IMU in the IMU frame.
 
-    times_ns: Ints  # (k,): end of the interval, since the survey's start
-    rates: Floats  # (k, 3): mean angular velocities over the interval before, rad/s
-    forces: Floats  # (k, 3): mean specific forces, m/s^2: at rest, upwards, gravity
+    Attributes
+    ----------
+    times_ns
+        Ends of the sampling intervals in nanoseconds since the start of the survey. Shape (k,).
+    rates
+        Mean angular velocities in the sampling intervals, in rad/s. Shape (k, 3).
+    forces
+        Mean specific forces in m/s^2, which point up when the platform is at rest. Shape (k, 3).
+    """
+
+    times_ns: Ints
+    rates: Floats
+    forces: Floats
 
 
-class Fixes(NamedTuple):
-    """Consecutive positions of a GNSS receiver's antenna."""
+class GnssFixes(NamedTuple):
+    """Consecutive positions of the antenna of a GNSS receiver."""
 
-    times_ns: Ints  # (k,): since the survey's start
-    positions: Floats  # (k, 3): meters, scene coordinates
+    times_ns: Ints  # (k,), since the start of the survey
+    positions: Floats  # (k, 3), meters, scene coordinates
 
 
 class InstrumentedDrive(Protocol):
-    """The properties of a survey that the samples of instruments follow from."""
+    """Properties of a survey that determine the samples of its instruments."""
 
     @property
     def navigation(self) -> Navigation | None:
-        """Instruments on the carrier, if any."""
+        """Instruments on the platform, or None."""
 
     @property
     def path(self) -> Trajectory:
-        """Trajectory of the carrier."""
+        """Trajectory of the platform."""
 
     @property
     def duration_ns(self) -> float:
         """Duration in nanoseconds."""
 
     @property
-    def carrier(self) -> str:
-        """Name of the carrier, for the seeds of its instruments."""
+    def platform_name(self) -> str:
+        """Name of the platform, from which the seeds of its instruments are derived."""
 
 
 def check_navigation(navigation: Navigation, path: Trajectory, epsg: int | None) -> None:
-    """Check that instruments can be on a carrier, in a coordinate system.
+    """Check that instruments can be simulated for a trajectory and a coordinate system.
 
     Raises
     ------
     LidarError
-        If the carrier jumps between poses, or geodetic positions need a missing package.
+        If the platform jumps between poses, or if geodetic positions require a package that is not
+        installed.
     """
     if path.stations > 1:
         raise LidarError(
@@ -281,18 +293,18 @@ def check_navigation(navigation: Navigation, path: Trajectory, epsg: int | None)
 
 
 def imu_samples(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[ImuSamples]:
-    """Yield the samples of the IMU on a drive, `block` samples at a time.
+    """Yield the samples of the IMU on a drive in blocks of `block` samples.
 
-    A sample ends at each whole multiple of its interval within the drive. Samples do not depend on
-    `block`.
+    A sample ends at each multiple of the sampling interval within the drive. Samples do not depend
+    on `block`.
     """
     navigation = drive.navigation
     if navigation is None or navigation.imu is None:
         return
     imu = navigation.imu
-    seed = named_seed(navigation.seed, drive.carrier)
-    gyroscopes = _Triad.of_imu(imu, "gyroscope", seed)
-    accelerometers = _Triad.of_imu(imu, "accelerometer", seed)
+    seed = named_seed(navigation.seed, drive.platform_name)
+    gyroscopes = _Triad.from_imu(imu, "gyroscope", seed)
+    accelerometers = _Triad.from_imu(imu, "accelerometer", seed)
     count = math.floor(drive.duration_ns * imu.rate_hz / 1e9 + 1e-6)
     for first in range(0, count, block):
         samples = np.arange(first, min(first + block, count))
@@ -305,7 +317,7 @@ def imu_samples(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[ImuSam
 
 
 def _true_samples(path: Trajectory, imu: Imu, gravity_m_s2: float, samples: Ints) -> ImuSamples:
-    """Return the samples of an ideal IMU on a trajectory, by their numbers (k,)."""
+    """Return the samples with the indices `samples` of an ideal IMU on a trajectory."""
     ends_ns: Floats = np.append(samples, samples[-1] + 1) * 1e9 / imu.rate_hz
     motion = _mounted_motion(path, imu.mount, ends_ns)
     middles = (ends_ns[1:] + ends_ns[:-1]) / 2
@@ -318,14 +330,17 @@ def _true_samples(path: Trajectory, imu: Imu, gravity_m_s2: float, samples: Ints
 
 
 class _Triad(NamedTuple):
-    """Three gyroscopes or accelerometers of an IMU."""
+    """The three gyroscopes or the three accelerometers of an IMU."""
 
     errors: _Errors
-    axes: Floats | None  # (3, 3): their skewed and scaled axes in the frame of the IMU
+    axes: Floats | None  # (3, 3), misaligned and scaled axes in the IMU frame
 
     @classmethod
-    def of_imu(cls, imu: Imu, name: str, seed: int) -> _Triad:
-        """Return the «gyroscope»s or the «accelerometer»s of an IMU."""
+    def from_imu(cls, imu: Imu, name: str, seed: int) -> _Triad:
+        """Create the gyroscopes or accelerometers of an IMU.
+
+        `name` is either "gyroscope" or "accelerometer".
+        """
         names = ("noise_density", "bias", "bias_time_s", "random_walk")
         seed = named_seed(seed, name)
         density, bias, time_s, walk = (getattr(imu, f"{name}_{suffix}") for suffix in names)
@@ -339,19 +354,22 @@ class _Triad(NamedTuple):
         return cls(errors, np.eye(3) + sigma * skews)
 
     def measure(self, truth: Floats, samples: Ints) -> Floats:
-        """Return the measurements (k, 3) of true values (k, 3), the next samples (k,)."""
+        """Return true values with the errors of the next samples.
+
+        For `samples` of shape (k,), `truth` and the result have shape (k, 3).
+        """
         return rotate(truth, self.axes) + self.errors.next_errors(samples)
 
 
-def fixes(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[Fixes]:
-    """Yield the positions of the GNSS receiver on a drive, `block` positions at a time."""
+def gnss_fixes(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[GnssFixes]:
+    """Yield the positions of the GNSS receiver on a drive in blocks of `block` positions."""
     navigation = drive.navigation
     path = drive.path
     if navigation is None or navigation.gnss is None:
         return
     gnss = navigation.gnss
     errors = _Errors(
-        named_seed(named_seed(navigation.seed, drive.carrier), "gnss"),
+        named_seed(named_seed(navigation.seed, drive.platform_name), "gnss"),
         1 / gnss.rate_hz,
         np.array([gnss.horizontal_m, gnss.horizontal_m, gnss.vertical_m]),
         np.array([gnss.drift_horizontal_m, gnss.drift_horizontal_m, gnss.drift_vertical_m]),
@@ -374,24 +392,34 @@ def fixes(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[Fixes]:
                 positions += _bridging_errors(
                     navigation.imu, errors.seed, number, since_s, end - begin
                 )
-        yield Fixes(np.rint(times).astype(np.int64), positions)
+        yield GnssFixes(np.rint(times).astype(np.int64), positions)
 
 
 def _bridging_errors(
     imu: Imu, seed: int, number: int, since_s: Floats, duration_s: float
 ) -> Floats:
-    """Return the errors of positions (k, 3) while an IMU bridges an outage, and after the outage.
+    """Return the position errors during and after an outage that is bridged by an IMU.
 
-    A bias b grows to b t^2 / 2, a velocity random walk N to N sqrt(t^3 / 3) (Groves 2013).
+    After the time t, the error is b t^2 / 2 for a bias b, and N sqrt(t^3 / 3) for a velocity random
+    walk N (Groves 2013).
 
     Parameters
     ----------
+    imu
+        The IMU that bridges the outage.
+    seed
+        Seed for the random numbers.
     number
-        Number of the outage, for the random numbers.
+        Index of the outage, on which the random numbers depend.
     since_s
-        (k,): seconds since the start of the outage.
+        Time in seconds since the start of the outage. Shape (k,).
     duration_s
-        Duration of the outage.
+        Duration of the outage in seconds.
+
+    Returns
+    -------
+    array
+        Errors in meters. Shape (k, 3).
     """
     elapsed = np.clip(since_s, 0, duration_s)[:, None]
     remaining = exp(np.minimum(duration_s - since_s, 0) / RETURNS_IN_S)[:, None]
@@ -404,13 +432,13 @@ def _bridging_errors(
 class _Motion(NamedTuple):
     """Motion of an instrument, in the scene frame."""
 
-    positions: Floats  # (k, 3): meters
+    positions: Floats  # (k, 3), meters
     rotations: Floats  # (k, 3, 3)
-    velocities: Floats  # (k, 3): m/s
+    velocities: Floats  # (k, 3), m/s
 
 
 def _mounted_motion(path: Trajectory, mount: Pose, times_ns: Floats) -> _Motion:
-    """Return the motion of an instrument on a carrier at times (k,), nanoseconds."""
+    """Return the motion of an instrument on a platform at several times."""
     times_ns = np.minimum(times_ns, path.duration_ns)
     positions, rotations = full_poses(path, 0, times_ns)
     speeds, rates = velocities(path, 0, times_ns)
@@ -423,9 +451,10 @@ def _mounted_motion(path: Trajectory, mount: Pose, times_ns: Floats) -> _Motion:
 
 
 def _rotation_vectors(earlier: Floats, later: Floats) -> Floats:
-    """Return the rotation vectors (k, 3), radians, from `earlier` to `later` rotations (k, 3, 3).
+    """Return the rotation vectors between pairs of rotations, in radians.
 
-    The vectors are in the frames of the earlier rotations.
+    The rotations have shape (k, 3, 3). The vectors have shape (k, 3) and are in the frames of the
+    earlier rotations.
     """
     change = matmul(earlier.transpose(0, 2, 1), later)
     sines = rotation_sines(change)
@@ -439,18 +468,18 @@ def _rotation_vectors(earlier: Floats, later: Floats) -> Floats:
 class _Errors:
     """White noise, a Gauss-Markov process and a random walk along three axes.
 
-    Both processes are sums over hashes from the first sample on, in one order: samples must be
-    requested in order, in blocks of any size.
+    Samples must be requested in order, because both processes accumulate random numbers from the
+    first sample on. The sizes of the blocks do not affect the results.
     """
 
     def __init__(
         self,
         seed: int,
         step_s: float,
-        white: Floats,  # (3,): standard deviation of a sample
-        bias: Floats,  # (3,): standard deviation of the Gauss-Markov process
+        white: Floats,  # (3,), standard deviation of a sample
+        bias: Floats,  # (3,), standard deviation of the Gauss-Markov process
         bias_time_s: float,
-        walk: Floats,  # (3,): standard deviation of the random walk after a second
+        walk: Floats,  # (3,), standard deviation of the random walk after one second
     ) -> None:
         self.seed = seed
         self._white = white
@@ -462,14 +491,17 @@ class _Errors:
         self._walked: Floats = np.zeros(3)
 
     def next_errors(self, samples: Ints) -> Floats:
-        """Return the errors of the next samples (k,), by their numbers: (k, 3)."""
+        """Return the errors of the next samples.
+
+        For sample indices of shape (k,), the result has shape (k, 3).
+        """
         errors = np.zeros((len(samples), 3))
         if self._white.any():
             errors += self._white * self._normal(WHITE, samples)
         if self._bias.any():
             noise = self._normal(DRIVEN, samples)
             noise[samples > 0] *= self._driven
-            noise[samples == 0] *= self._bias  # the process has run for long before the drive
+            noise[samples == 0] *= self._bias  # the process is stationary from the first sample on
             persistence = self._persistence
             for axis in range(3):
                 biases = accumulate(
@@ -488,31 +520,36 @@ class _Errors:
         return errors
 
     def _normal(self, purpose: Purpose, samples: Ints) -> Floats:
-        """Return normal deviates for samples (k,) along each axis: (k, 3)."""
+        """Return a standard normal deviate for each sample and axis."""
         high_bits, low_bits = np.divmod(samples, 1 << 32)
         return np.stack(
             [normal(self.seed, purpose, high_bits, low_bits, axis) for axis in range(3)], axis=1
         )
 
 
-def geodetic(positions: Floats, origin: tuple[float, float, float]) -> Floats:
-    """Return latitudes and longitudes, degrees, and ellipsoidal heights, meters: (k, 3).
+def to_geodetic(positions: Floats, origin: tuple[float, float, float]) -> Floats:
+    """Convert local positions to geodetic coordinates.
 
-    Through geocentric coordinates of WGS 84; Bowring's (1985) latitude is exact to 1e-9 degrees
-    below a height of 10 km.
+    The conversion uses WGS 84 geocentric coordinates and the latitude formula of Bowring (1985),
+    which is exact to 1e-9 degrees below a height of 10 km.
 
     Parameters
     ----------
     positions
-        (k, 3): meters east, north and up of the origin.
+        Positions in meters to the east, north and up from the origin. Shape (k, 3).
     origin
-        Latitude and longitude, degrees, and ellipsoidal height, meters.
+        Latitude and longitude in degrees and ellipsoidal height in meters.
+
+    Returns
+    -------
+    array
+        Latitudes and longitudes in degrees and ellipsoidal heights in meters. Shape (k, 3).
     """
     x, y, z = _geocentric(positions, origin)
     level = hypot(x, y)
     semi_minor = _A * math.sqrt(1 - _E2)
     distance = hypot(z, level)
-    # First the reduced latitude, then the geodetic latitude.
+    # The geodetic latitude is computed from the reduced latitude.
     slope = (semi_minor * z) / (_A * level) * (1 + _E2 / (1 - _E2) * semi_minor / distance)
     cos = 1 / np.sqrt(1 + slope * slope)
     sin = slope * cos
@@ -527,10 +564,9 @@ def geodetic(positions: Floats, origin: tuple[float, float, float]) -> Floats:
 def _geocentric(
     positions: Floats, origin: tuple[float, float, float]
 ) -> tuple[Floats, Floats, Floats]:
-    """Return geocentric x, y and z (k,), meters, of positions (k, 3) in meters.
+    """Convert local positions to geocentric coordinates in meters, each of shape (k,).
 
-    Positions are east, north and up of the origin: latitude and longitude, degrees, and ellipsoidal
-    height, meters.
+    The parameters are those of `to_geodetic`.
     """
     sp, cp = sin_cos_of(math.radians(origin[0]))
     sl, cl = sin_cos_of(math.radians(origin[1]))
@@ -542,15 +578,20 @@ def _geocentric(
     return x, y, z
 
 
-def local_positions(coordinates: Floats, origin: tuple[float, float, float]) -> Floats:
-    """Return positions east, north and up of an origin (k, 3), meters, the inverse of `geodetic`.
+def from_geodetic(coordinates: Floats, origin: tuple[float, float, float]) -> Floats:
+    """Convert geodetic coordinates to local positions, which is the inverse of `to_geodetic`.
 
     Parameters
     ----------
     coordinates
-        (k, 3): latitudes and longitudes, degrees, and ellipsoidal heights, meters.
+        Latitudes and longitudes in degrees and ellipsoidal heights in meters. Shape (k, 3).
     origin
-        Latitude and longitude, degrees, and ellipsoidal height, meters.
+        Latitude and longitude in degrees and ellipsoidal height in meters.
+
+    Returns
+    -------
+    array
+        Positions in meters to the east, north and up from the origin. Shape (k, 3).
     """
     (sp, cp), (sl, cl) = (sin_cos_of(math.radians(angle)) for angle in origin[:2])
     x, y, z = (_cartesian(coordinates) - _cartesian(np.array([origin], np.float64))).T
@@ -560,7 +601,7 @@ def local_positions(coordinates: Floats, origin: tuple[float, float, float]) -> 
 
 
 def _cartesian(coordinates: Floats) -> Floats:
-    """Return geocentric coordinates (k, 3), meters, of latitudes, longitudes and heights (k, 3)."""
+    """Convert geodetic to geocentric coordinates in meters, both of shape (k, 3)."""
     latitude, longitude, height = coordinates.T
     sp, cp = sin_cos(np.radians(latitude))
     sl, cl = sin_cos(np.radians(longitude))
@@ -569,7 +610,7 @@ def _cartesian(coordinates: Floats) -> Floats:
     return np.column_stack([level * cl, level * sl, (radius * (1 - _E2) + height) * sp])
 
 
-# WGS 84: semi-major axis in meters, flattening, and square of the eccentricity.
+# Semi-major axis in meters, flattening, and squared eccentricity of WGS 84.
 _A = 6378137.0
 _F = 1 / 298.257223563
 _E2 = _F * (2 - _F)

@@ -1,9 +1,10 @@
-"""Folders «oxts» of the KITTI data set: positions and angles of an OXTS inertial navigation system.
+"""Reader for the oxts folders of the KITTI data set, recorded by an inertial navigation system.
 
-Each file has a row of 30 numbers: latitude and longitude in degrees, altitude in meters, and roll,
-pitch and yaw in radians (dataformat.txt of KITTI's development kit). Yaw is counter-clockwise from
-east, pitch positive nose down and roll positive right side down, as of `Pose`; the unit's axes are
-x ahead, y left and z up.
+Each file contains a row of 30 numbers. The row starts with latitude and longitude in degrees,
+altitude in meters, and roll, pitch and yaw in radians, as described in dataformat.txt of KITTI's
+development kit. As in `Pose`, yaw is counterclockwise from east, pitch is positive with the nose
+down, and roll is positive with the right side down. The axes of the unit are x forward, y left and
+z up.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ from ..numerics.elementary import log, sin_cos
 from ..numerics.elementary_scalars import sin_cos_of
 from .rotations import quaternions_of, rotations_of
 
-WIDTH = 30  # numbers of a row
+WIDTH = 30  # number of values in a row
 _RADIUS_M = 6378137.0  # radius of KITTI's Mercator projection
 OXTS_TIMES = "timestamps.txt"
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d*)?")
 
 
 def find_oxts(path: Path) -> Path | None:
-    """Return the folder «oxts» at or in a path, or None."""
+    """Return the oxts folder at or inside a path, or None."""
     for folder in (path, path / "oxts", path.parent if path.name == "data" else path):
         if (folder / "data").is_dir() and (folder / OXTS_TIMES).is_file():
             return folder
@@ -36,22 +37,24 @@ def find_oxts(path: Path) -> Path | None:
 
 
 def oxts_files(folder: Path) -> list[Path]:
-    """Return the files of a folder «oxts», each with a row, in the order of their numbers."""
+    """Return the data files of an oxts folder in the order of their numbers."""
     return sort_by_number((folder / "data").glob("*.txt"))
 
 
 def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Floats, Floats]:
-    """Read a folder with «data» and «timestamps.txt».
+    """Read an oxts folder, which contains timestamps.txt and the folder data.
 
     Returns
     -------
-    seconds since 1970 (k,), positions east, north and up of the origin (k, 3), meters, and
-    quaternions (k, 4), x, y, z, w.
+    tuple
+        Times (k,) in seconds since 1970, positions (k, 3) in meters to the east, north and up from
+        the origin, and quaternions (x, y, z, w) of shape (k, 4).
 
     Raises
     ------
     ValueError
-        If the folder has no rows, a row has another number of values, or times do not fit.
+        If the folder has no rows, a row does not have 30 values, or the times do not match the
+        rows.
     """
     files = oxts_files(folder)
     if not files:
@@ -62,7 +65,7 @@ def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Flo
         if len(numbers) != WIDTH:
             raise ValueError(f"data/{file.name} has {len(numbers)} numbers instead of {WIDTH}")
         rows.append([float(number) for number in numbers])
-    seconds = dates_of(read_input_text(folder / OXTS_TIMES))
+    seconds = parse_dates(read_input_text(folder / OXTS_TIMES))
     if seconds is None:
         raise ValueError(
             f"{OXTS_TIMES} contains rows that are not dates such as 2011-09-26 13:02:25.964"
@@ -71,8 +74,11 @@ def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Flo
     return seconds, *oxts_poses(np.array(rows), origin)
 
 
-def dates_of(text: str) -> Floats | None:
-    """Return the seconds since 1970 (k,) of the dates in a text, one a line, or None for others."""
+def parse_dates(text: str) -> Floats | None:
+    """Return the times in seconds since 1970 of a text with one date per line.
+
+    The result is None if any line is not a date.
+    """
     lines = [line.strip() for line in text.split("\n") if line.strip()]
     if not all(_DATE.fullmatch(line) for line in lines):
         return None
@@ -80,16 +86,27 @@ def dates_of(text: str) -> Floats | None:
 
 
 def oxts_poses(rows: Floats, origin: Sequence[float] | None) -> tuple[Floats, Floats]:
-    """Return positions east, north and up of an origin (k, 3), meters, and quaternions (k, 4).
-
-    Positions are in KITTI's Mercator projection, whose scale is true at the latitude of the origin.
+    """Convert rows of oxts files to positions and quaternions.
 
     Parameters
     ----------
     rows
-        (k, 30): rows of the files.
+        Rows of the files. Shape (k, 30).
     origin
-        Latitude and longitude, degrees, and altitude, meters; by default of the first row.
+        Latitude and longitude in degrees and altitude in meters of the origin. The default is the
+        position in the first row.
+
+    Returns
+    -------
+    tuple
+        Positions (k, 3) in meters to the east, north and up from the origin, and quaternions
+        (k, 4). Positions are in KITTI's Mercator projection, whose scale is true at the latitude of
+        the origin.
+
+    Raises
+    ------
+    ValueError
+        If a row has an invalid latitude or longitude.
     """
     latitude, longitude, altitude = rows[:, :3].T
     if not ((np.abs(latitude) < 90) & (np.abs(longitude) <= 360)).all():
@@ -97,13 +114,13 @@ def oxts_poses(rows: Floats, origin: Sequence[float] | None) -> tuple[Floats, Fl
     origin_row = rows[0, :3] if origin is None else np.asarray(origin, np.float64)
     scale = sin_cos_of(np.radians(float(origin_row[0])))[1]
 
-    def projected(latitude: Floats, longitude: Floats) -> Floats:
-        """Return meters east and north (k, 2) of a latitude and longitude in degrees (k,)."""
+    def project(latitude: Floats, longitude: Floats) -> Floats:
+        """Convert degrees of shape (k,) to meters to the east and north, with shape (k, 2)."""
         sine, cosine = sin_cos((90.0 + latitude) * (np.pi / 360.0))
         north = log(sine / cosine)
         return scale * _RADIUS_M * np.stack([np.radians(longitude), north], axis=-1)
 
-    level = projected(latitude, longitude) - projected(origin_row[0], origin_row[1])
+    level = project(latitude, longitude) - project(origin_row[0], origin_row[1])
     positions = np.column_stack([level, altitude - origin_row[2]])
     angles_deg = np.degrees(rows[:, [5, 4, 3]])
     return positions, quaternions_of(rotations_of(angles_deg))

@@ -1,4 +1,4 @@
-"""Columns of tables of poses: their spellings, units and conventions."""
+"""Spellings, units and conventions of the columns in pose tables."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from ..io.tables import DEGREES, METERS, NUMBERS, Quantity, TableFormat
 from ..io.time_units import SECONDS
 from ..numerics.arrays import Floats
 
-# Prefixes that programs write before x, y and z of a position, and before the letters of a
-# quaternion.
+# Prefixes of the position components x, y and z, and of the quaternion components.
 _POSITIONS = (
     "", "p", "t", "pos", "position", "translation", "pose_position", "pose_pose_position",
     "transform_translation", "p_RS_R",
@@ -23,38 +22,40 @@ _QUATERNIONS = (
 
 
 def _spelled(prefixes: tuple[str, ...], axis: str, *spellings: str) -> tuple[str, ...]:
-    """Return the spellings of an axis: with each prefix, and further `spellings`."""
+    """Return the spellings of an axis with each prefix, followed by `spellings`."""
     return *(f"{prefix}_{axis}" for prefix in prefixes), *spellings
 
 
-# Quantity; its spellings (case, spaces, underscores, hyphens and dots do not count); units that a
-# header may state, the first of them for returned values; the unit of a header without unit.
+# Spellings are compared without case, spaces, underscores, hyphens and dots. The first unit is that
+# of the returned values. The last argument is the default unit, or None if a unit is required.
 TIME = Quantity("time_s", ("time", "t", "timestamp", "stamp"), SECONDS, None)
-# World coordinates of the scene: z is up. Of compass directions, x is east and y north.
+# World coordinates with x to the east, y to the north and z up.
 POSITION = (
     Quantity("x", _spelled(_POSITIONS, "x", "easting", "east"), METERS, "m"),
     Quantity("y", _spelled(_POSITIONS, "y", "northing", "north"), METERS, "m"),
     Quantity("z", _spelled(_POSITIONS, "z", "height", "up"), METERS, "m"),
 )
-# Rotation from the carrier frame (x ahead, y left, z up) to the world frame.
+# Rotation from the platform frame (x forward, y left, z up) to the world frame.
 QUATERNION = tuple(
     Quantity(f"q{axis}", _spelled(_QUATERNIONS, axis), NUMBERS, "") for axis in "xyzw"
 )
-# yaw: counter-clockwise from x, about z; pitch: about the new y, positive nose down; roll: about
-# the new x, positive right side down. In this order, as of `Pose`.
+# As in `Pose`, yaw is counterclockwise from x about z, pitch is about the new y and positive with
+# the nose down, and roll is about the new x and positive with the right side down. The rotations
+# are applied in this order.
 YAW = Quantity("yaw_deg", ("yaw",), DEGREES, None)
 PITCH = Quantity("pitch_deg", ("pitch",), DEGREES, None)
 ROLL = Quantity("roll_deg", ("roll",), DEGREES, None)
-# Of a compass: clockwise from north (y), so that yaw is 90 degrees less heading. Pitch beside it is
-# positive nose up, as inertial navigation systems report both. A compass has degrees; without a
-# stated unit, one value has to be too large for radians.
+# A compass heading is clockwise from north (y), so that yaw is 90 degrees minus the heading. In a
+# table with a heading, pitch is positive with the nose up, as in the output of inertial navigation
+# systems. If the header has no unit, the heading is in degrees, and at least one value must be too
+# large for radians.
 HEADING = Quantity("heading_deg", ("heading",), DEGREES, "deg", evident_above=2 * np.pi)
 ANGLES = (YAW, PITCH, ROLL, HEADING)
 
 POSE_TABLES = (
-    # Ground truth of the EuRoC MAV and TUM VI data sets; velocities, and biases of the IMU.
+    # Ground truth of the EuRoC MAV and TUM VI data sets, whose velocities and biases are ignored.
     TableFormat("EuRoC", "p_RS_R_x", {"time_s": "ns"}, ("v_RS_R_?", "b_w_RS_S_?", "b_a_RS_S_?")),
-    # The TUM RGB-D benchmark: # timestamp tx ty tz qx qy qz qw
+    # Header of the TUM RGB-D benchmark: # timestamp tx ty tz qx qy qz qw
     TableFormat("TUM", "tx", {"time_s": "s"}),
 )
 
@@ -72,13 +73,13 @@ REFUSED_COLUMNS = {
 }
 
 
-def with_yaw(columns: Mapping[str, Floats]) -> dict[str, Floats]:
-    """Return the columns of a table with yaw in place of a heading, degrees.
+def convert_heading(columns: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Return the columns of a table with the heading converted to yaw, in degrees.
 
     Raises
     ------
     ValueError
-        If the table has both.
+        If the table has both a heading and a yaw.
     """
     angles = dict(columns)
     if "heading_deg" not in angles:
@@ -91,7 +92,10 @@ def with_yaw(columns: Mapping[str, Floats]) -> dict[str, Floats]:
     return angles
 
 
-def angles_of(columns: Mapping[str, Floats], count: int) -> Floats:
-    """Return yaw, pitch and roll in degrees (count, 3), zero where a table lacks them."""
+def stack_angles(columns: Mapping[str, Floats], count: int) -> Floats:
+    """Return yaw, pitch and roll in degrees, with zeros for missing columns.
+
+    The result has shape (count, 3).
+    """
     zero = np.zeros(count)
     return np.stack([columns.get(quantity.name, zero) for quantity in (YAW, PITCH, ROLL)], axis=1)

@@ -1,4 +1,4 @@
-"""Rotations: matrices, quaternions, and angles as users give them."""
+"""Rotation matrices, quaternions, and conversion from yaw, pitch and roll."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from ..numerics.arrays import Floats
 from ..numerics.elementary import arctan2, sin_cos
 from ..numerics.vectors import cross, determinant, dot, matmul_of_components, norm
 
-_ROUNDS = 8  # rounds of the power iteration: rotations are rounded by 2e-3 at most
+# Number of power iterations, which is sufficient for matrices with rounding errors up to 2e-3.
+_ROUNDS = 8
 
 
 def rotations_of(angles_deg: Floats) -> Floats:
-    """Return the rotations (k, 3, 3) of yaw, pitch and roll in degrees (k, 3), in aerospace order.
+    """Convert yaw, pitch and roll in degrees, in aerospace order, to rotation matrices.
 
-    Angles (3,) give one rotation (3, 3).
+    Angles of shape (k, 3) result in matrices of shape (k, 3, 3), and angles of shape (3,) in a
+    single matrix of shape (3, 3).
     """
     angles = np.radians(angles_deg.T)
     (sy, sp, sr), (cy, cp, cr) = sin_cos(angles)
@@ -32,18 +34,23 @@ def rotations_of(angles_deg: Floats) -> Floats:
 
 
 def check_rotations(rotations: Floats, slack: float = 1e-6) -> None:
-    """Check that matrices (k, 3, 3) of poses are rotations.
+    """Check that the matrices of poses are rotation matrices.
 
-    Products of their columns may differ by `slack` from the products of a rotation's columns.
+    Parameters
+    ----------
+    rotations
+        Matrices of shape (k, 3, 3).
+    slack
+        Tolerance for the dot products of the columns, which are 0 or 1 in a rotation matrix.
 
     Raises
     ------
     LidarError
-        If a matrix mirrors or deforms.
+        If a matrix reflects or deforms.
     """
     rows = np.ascontiguousarray(rotations.transpose(1, 2, 0))
     products = matmul_of_components(rows.transpose(1, 0, 2), rows)
-    # Written so that NaN is an error.
+    # The comparison is also false for NaN.
     rigid = np.asarray((np.abs(products - np.eye(3)[:, :, None]) <= slack).all(axis=(0, 1)))
     right_handed = determinant(rotations) > 0
     bad = np.flatnonzero(~(rigid & right_handed))
@@ -58,13 +65,21 @@ def check_rotations(rotations: Floats, slack: float = 1e-6) -> None:
 
 
 def rotation_sines(rotations: Floats) -> Floats:
-    """Return the axes of rotations (k, 3, 3), times twice the sines of their angles: (k, 3)."""
+    """Return the unit rotation axes, multiplied by twice the sine of the rotation angle.
+
+    For rotations of shape (k, 3, 3), the result has shape (k, 3).
+    """
     differences = [rotations[:, k, j] - rotations[:, j, k] for j, k in ((1, 2), (2, 0), (0, 1))]
     return np.stack(differences, axis=1)
 
 
 def rotation_terms(rotations: Floats, axes: Floats) -> Floats:
-    """Return the terms (3, 9, s) of rotations (3, 3, s) that go on about unit axes (3, s)."""
+    """Return the coefficients of Rodrigues' formula for rotations that continue about an axis.
+
+    For rotations of shape (3, 3, s) and unit axes of shape (3, s), the result `terms` has shape
+    (3, 9, s). After a further rotation by the angle a, the matrix is
+    ``terms[0] + sin(a) * terms[1] + cos(a) * terms[2]``.
+    """
     x, y, z = axes
     zero = np.zeros_like(x)
     cross_matrix = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
@@ -74,9 +89,19 @@ def rotation_terms(rotations: Floats, axes: Floats) -> Floats:
 
 
 def rotations_between(first: Floats, last: Floats, durations_s: Floats) -> tuple[Floats, Floats]:
-    """Return the axes (3, s) and rates (s,), rad/s, of rotations between quaternions (4, s).
+    """Return the axes and rates of constant rotations between pairs of quaternions.
 
-    Axes are in the frame of the first pose. A rotation takes its duration (s,), seconds.
+    Parameters
+    ----------
+    first, last
+        Quaternions at the start and the end of each rotation. Shape (4, s).
+    durations_s
+        Durations in seconds. Shape (s,).
+
+    Returns
+    -------
+    tuple
+        Unit axes (3, s) in the frame of the first pose, and rates (s,) in rad/s.
     """
     p = first[:3]
     q = last[:3]
@@ -99,7 +124,10 @@ def matrices(quaternions: Floats) -> Floats:
 
 
 def matrices_by_component(quaternions: Floats) -> Floats:
-    """Return the rotation matrices (3, 3, k) of unit quaternions x, y, z, w (4, k)."""
+    """Convert unit quaternions to rotation matrices, with the components along the first axes.
+
+    The quaternions (x, y, z, w) have shape (4, k), and the matrices have shape (3, 3, k).
+    """
     x, y, z, w = quaternions
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -110,11 +138,14 @@ def matrices_by_component(quaternions: Floats) -> Floats:
 
 
 def quaternions_of(rotations: Floats) -> Floats:
-    """Return unit quaternions x, y, z, w (k, 4) of matrices (k, 3, 3), which may be rounded.
+    """Convert rotation matrices, which may have rounding errors, to unit quaternions.
 
-    A quaternion is the eigenvector of the greatest eigenvalue (Bar-Itzhack, 2000), by power
-    iteration: plus one, the smaller eigenvalues are about as small as the matrices are rounded, and
-    zero for exact rotations.
+    The matrices have shape (k, 3, 3), and the quaternions (x, y, z, w) have shape (k, 4).
+
+    The quaternion is the eigenvector of the largest eigenvalue of a 4 x 4 matrix (Bar-Itzhack,
+    2000). The power iteration converges quickly because the identity is added to this matrix. The
+    other eigenvalues are then 0 for exact rotations, and similar in size to the rounding errors
+    otherwise.
     """
     matrix = np.ascontiguousarray(rotations.transpose(1, 2, 0))
     table = np.zeros((4, 4, len(rotations)))

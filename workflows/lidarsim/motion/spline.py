@@ -1,8 +1,9 @@
-"""Twice continuously differentiable curves through values, which stand still at stops.
+"""Twice continuously differentiable curves that interpolate values and are stationary at stops.
 
-Between two times a value is a polynomial of fifth degree. Its first and second derivatives at both
-ends are the derivatives of the cubic spline, which the curve then equals, and zero at stops. Sums,
-products, quotients and roots have one order, so that every processor computes the same bits.
+Between two knots, a curve is a polynomial of degree five. The first and second derivatives at its
+ends are zero at stops and those of the cubic spline elsewhere, so that the curve is identical to
+the cubic spline away from stops. All operations are performed in a fixed order, so that the results
+are bitwise identical on every processor.
 """
 
 from __future__ import annotations
@@ -13,20 +14,32 @@ import numpy as np
 
 from ..numerics.arrays import Bools, Floats, Indices
 
-_PAD = 32  # empty equations before the first and after the last: the last distance of reduction
+# Number of empty equations before the first and after the last, as required by the last step of the
+# cyclic reduction.
+_PAD = 32
 
 
-def knots_of(times: Floats, values: Floats) -> Floats:
-    """Return values (d, n) at times (n,) and their first two derivatives: (3, d, n).
+def fit_knots(times: Floats, values: Floats) -> Floats:
+    """Return the values at the knots of a curve, and their first two derivatives.
 
-    The d values stop together.
+    Parameters
+    ----------
+    times
+        Times of the knots, in ascending order. Shape (n,).
+    values
+        Components of the curve. All of them stop at the same knots. Shape (d, n).
+
+    Returns
+    -------
+    array
+        Values, first derivatives and second derivatives. Shape (3, d, n).
     """
     steps = np.diff(times)
     slopes = np.diff(values) / steps
-    resting = rests(steps, slopes)
+    resting = is_stationary(steps, slopes)
     still = np.append(resting, False) | np.append(False, resting)
-    # Equal second derivatives on both sides of a knot, of its slope v[i]:
-    # v[i] + lower[i] v[i - 1] + upper[i] v[i + 1] = first[i]
+    # The second derivatives on both sides of a knot are equal if its slope v[i] satisfies
+    # v[i] + lower[i] v[i - 1] + upper[i] v[i + 1] = first[i].
     rows = np.zeros((2 + len(values), _PAD + len(times) + _PAD))
     equations = rows[:, _PAD:-_PAD]
     lower = equations[0]
@@ -46,15 +59,20 @@ def knots_of(times: Floats, values: Floats) -> Floats:
     return np.array([values, first, second])
 
 
-def rests(steps: Floats, slopes: Floats) -> Bools:
-    """Return whether values rest (n - 1,) during the steps (n - 1,) between times.
+def is_stationary(steps: Floats, slopes: Floats) -> Bools:
+    """Return whether the curve is stationary between each pair of adjacent knots.
 
-    `slopes` (d, n - 1) are the mean slopes in each step.
+    Parameters
+    ----------
+    steps
+        Time between adjacent knots. Shape (n - 1,).
+    slopes
+        Mean slope of each component between adjacent knots. Shape (d, n - 1).
     """
     speeds = np.sqrt((slopes * slopes).sum(axis=0))
-    resting = speeds * steps <= 1e-9  # meters, or halves of radians
-    # Steps ten times as long as their neighbor, and as slow, are pauses without values. A curve
-    # with the neighbor's speed would swing far out in a pause.
+    resting = speeds * steps <= 1e-9  # in meters, or half radians for quaternions
+    # A step that is ten times as long and ten times as slow as its neighbor is treated as a pause
+    # without knots. Otherwise, the speed of the neighbor would cause a large overshoot.
     for step, neighbor in ((np.s_[1:], np.s_[:-1]), (np.s_[:-1], np.s_[1:])):
         longer = steps[step] > 10 * steps[neighbor]
         resting[step] |= longer & (10 * speeds[step] < speeds[neighbor])
@@ -62,7 +80,11 @@ def rests(steps: Floats, slopes: Floats) -> Bools:
 
 
 def _end_slopes(times: Floats, values: Floats) -> Floats:
-    """Return the slopes (d,), at the first time, of the cubics through values (d, 4) (Newton)."""
+    """Return the slopes at the first time of cubic polynomials through four values.
+
+    The polynomials are in Newton form. `values` has shape (d, 4), or fewer columns for a short
+    curve, and the result has shape (d,).
+    """
     slopes = np.zeros(len(values))
     differences = values
     factor = 1.0
@@ -74,11 +96,12 @@ def _end_slopes(times: Floats, values: Floats) -> Floats:
 
 
 def _reduce(equations: Floats) -> None:
-    """Solve padded tridiagonal equations (2 + d, n) in place, by cyclic reduction (Hockney, 1965).
+    """Solve padded tridiagonal equations in place by cyclic reduction (Hockney, 1965).
 
-    Row 0 is the factor of the unknown before, row 1 of the unknown after; the others are the right
-    sides, and then the solutions. The factors, 1/2 at most, are squared in each step, and at last
-    are below a rounding.
+    `equations` has shape (2 + d, n). Rows 0 and 1 contain the coefficients of the previous and the
+    next unknown. The other rows contain the right-hand sides, which are replaced by the solutions.
+    The coefficients are at most 1/2 and are squared in each step, so that they are negligible after
+    the last step.
     """
     count = equations.shape[1] - 2 * _PAD
     lower = equations[0, _PAD:-_PAD]
@@ -95,7 +118,10 @@ def _reduce(equations: Floats) -> None:
 
 
 class _Polynomials(NamedTuple):
-    """Coefficients of polynomials of fifth degree, each (d, m), in the share of a segment."""
+    """Coefficients of polynomials of degree five, each with shape (d, m).
+
+    The argument of the polynomials is the fraction of the segment, from 0 to 1.
+    """
 
     constant: Floats
     linear: Floats
@@ -105,32 +131,37 @@ class _Polynomials(NamedTuple):
     quintic: Floats
 
 
-def on_curve(
+def evaluate_curve(
     knots: Floats, steps: Floats, segment: Indices, since: Floats, order: int = 0
 ) -> list[Floats]:
-    """Return the values of a curve and its derivatives up to an order, (d, k) each.
+    """Evaluate a curve and its derivatives at several points.
 
     Parameters
     ----------
     knots
-        (3, d, n): of `knots_of`.
+        Knots from `fit_knots`. Shape (3, d, n).
     steps
-        (n - 1,): times from each knot to the next, in the unit of all times.
+        Time from each knot to the next. Shape (n - 1,).
     segment
-        (k,): numbers of the knots before the points.
+        Index of the last knot before each point. Shape (k,).
     since
-        (k,): times since these knots.
+        Time since this knot, in the unit of `steps`. Shape (k,).
     order
-        Highest derivative, 0 to 2.
+        Highest derivative, from 0 to 2.
+
+    Returns
+    -------
+    list
+        Values, followed by the derivatives up to `order`, each with shape (d, k).
     """
-    # Times mostly come in order: coefficients are computed once for all points of a run in one
-    # segment.
+    # Most times are sorted, so the coefficients are computed once for each run of points in the
+    # same segment.
     run_starts = np.flatnonzero(np.diff(segment, prepend=-1))
     counts = np.diff(run_starts, append=len(segment))
     run_segments = segment.take(run_starts)
     step = steps.take(run_segments)
     share = since / step.repeat(counts)
-    # Horner's method; a row is a derivative, divided by the factorial of its order
+    # In Horner's method, each row is a derivative divided by the factorial of its order.
     rows = [*np.zeros((order + 1, knots.shape[1], len(segment)))]
     for term in reversed(_polynomials(knots, run_segments, step)):
         for row in range(order, 0, -1):
@@ -145,9 +176,9 @@ def on_curve(
 
 
 def _polynomials(knots: Floats, segments: Indices, step: Floats) -> _Polynomials:
-    """Return the polynomials of segments (m,), which take `step` (m,)."""
+    """Return the polynomials of segments with durations `step`, both of shape (m,)."""
     powers = np.stack([step / step, step, step * step / 2])[:, None]
-    # p, v, a: values and scaled derivatives at the start; q, w, b: at the end.
+    # p, v and a are the value and the scaled derivatives at the start, and q, w and b at the end.
     (p, v, a), (q, w, b) = (knots.take(segments + k, axis=2) * powers for k in (0, 1))
     change = q - p
     return _Polynomials(

@@ -11,18 +11,19 @@ from ..numerics.arrays import Bools, Floats
 from ..numerics.elementary import arctan2, interp
 from ..numerics.vectors import norm
 
-_STEP_S = 0.1  # positions are resampled to this interval, so that jitter does not count as turning
+_STEP_S = 0.1  # positions are resampled to this interval, so that jitter is not taken for a turn
 _MAX_STEPS = 1_000_000
-_STEADY_S = 1.0  # shortest line
-# On a line, the direction of travel stays within this angle for twice `_STEADY_S`, and within this
-# angle of the line's median direction. Aircraft turn by 1.5 to 3 degrees a second and more.
+_STEADY_S = 1.0  # minimum duration of a line
+# On a line, the direction of travel varies by less than this angle within twice `_STEADY_S`, and
+# differs from the line's median direction by less than this angle. Aircraft turn at a rate of at
+# least 1.5 to 3 degrees per second.
 _STEADY_DEG = 2.0
-_TURN_DEG = 20.0  # between two lines the direction changes by more, otherwise they are one
-_MOVES_M_S = 0.05
+_TURN_DEG = 20.0  # minimum change of direction between two separate lines
+_MOVES_M_S = 0.05  # minimum speed on a line
 
 
 class StraightLines(NamedTuple):
-    """Straight lines of a trajectory, one after the other, without the turns between them."""
+    """Consecutive straight lines of a trajectory, without the turns between them."""
 
     starts_s: Floats  # (n,)
     stops_s: Floats  # (n,)
@@ -35,11 +36,11 @@ class StraightLines(NamedTuple):
 
     @property
     def length_m(self) -> float:
-        """Total length of the lines, meters."""
+        """Total length of the lines in meters."""
         return float(self.lengths_m.sum())
 
     def mean_speed(self, start_s: float, stop_s: float) -> float | None:
-        """Return the mean speed in m/s on lines within an interval, or None without any lines.
+        """Return the mean speed in m/s on the lines within a time interval, or None without lines.
 
         Examples
         --------
@@ -55,9 +56,10 @@ class StraightLines(NamedTuple):
         return float((speeds_m_s * within_s).sum() / within_s.sum())
 
     def seconds_within(self, spans_s: Sequence[tuple[float, float]]) -> Floats:
-        """Return for how long each line (n,) is within any of several spans of time.
+        """Return the time in seconds for which each line overlaps any of several time spans.
 
-        The ends of lines are known to 0.1 s: shorter overlaps count as none.
+        Overlaps of 0.1 s or less are ignored, because the ends of a line are not known more
+        precisely. The result has shape (n,).
 
         Examples
         --------
@@ -66,7 +68,7 @@ class StraightLines(NamedTuple):
         [6.0, 0.0]
         """
         total = np.zeros(len(self.starts_s))
-        covered_to = -np.inf  # so that overlapping spans count once
+        covered_to = -np.inf  # avoids counting overlapping spans twice
         for start, stop in sorted(spans_s):
             first = np.maximum(self.starts_s, max(start, covered_to))
             total += np.maximum(np.minimum(self.stops_s, stop) - first, 0)
@@ -75,14 +77,16 @@ class StraightLines(NamedTuple):
 
     @classmethod
     def find(cls, times_s: Floats, positions: Floats) -> StraightLines:
-        """Find the lines of at least a second, seen from above.
+        """Find the lines of a trajectory that last at least a second.
+
+        Only the horizontal direction of travel is considered.
 
         Parameters
         ----------
         times_s
-            (k,), ascending.
+            Times in seconds, in ascending order. Shape (k,).
         positions
-            (k, 3), meters.
+            Positions in meters. Shape (k, 3).
 
         Examples
         --------
@@ -102,7 +106,7 @@ class StraightLines(NamedTuple):
         velocities = np.gradient(np.stack([x, y]), step_s, axis=1)
         headings = np.degrees(np.unwrap(arctan2(velocities[1], velocities[0])))
         moves: Bools = norm(velocities.T) > _MOVES_M_S
-        pairs = _merged(headings, _steady_runs(headings, moves, round(_STEADY_S / step_s)))
+        pairs = _merge_runs(headings, _steady_runs(headings, moves, round(_STEADY_S / step_s)))
         passed_m = np.append(0.0, np.cumsum(norm(np.diff([x, y, z]).T)))
         starts, stops = np.reshape(pairs, (-1, 2)).astype(np.intp).T
         long = grid[stops] - grid[starts] >= _STEADY_S - 1e-9
@@ -111,10 +115,11 @@ class StraightLines(NamedTuple):
 
 
 def _steady_runs(headings: Floats, moves: Bools, reach: int) -> list[tuple[int, int]]:
-    """Return first and last indices of runs in which the direction of travel is steady.
+    """Return the first and last indices of runs in which the direction of travel is steady.
 
-    `headings` (n,) are degrees; the direction is steady where it hardly changes for `reach` steps
-    before and after, and as long as it stays near the median of that run.
+    A run starts as a range of steps that move and whose headings vary by less than `_STEADY_DEG`
+    for `reach` steps before and after. It is then extended as long as the headings differ from its
+    median by less than `_STEADY_DEG`. The headings are in degrees.
     """
     last = len(headings) - 1
     reach = max(min(reach, last // 2), 1)
@@ -138,14 +143,14 @@ def _steady_runs(headings: Floats, moves: Bools, reach: int) -> list[tuple[int, 
     return runs
 
 
-def _merged(headings: Floats, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Join runs between which the direction of travel hardly changes."""
+def _merge_runs(headings: Floats, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Merge runs if the direction of travel changes by less than `_TURN_DEG` between them."""
     lines: list[tuple[int, int]] = []
     for start, stop in runs:
         if lines:
             first, final = lines[-1]
-            turned = np.abs(headings[first : stop + 1] - np.median(headings[first : final + 1]))
-            if turned.max() < _TURN_DEG:
+            changes = np.abs(headings[first : stop + 1] - np.median(headings[first : final + 1]))
+            if changes.max() < _TURN_DEG:
                 lines[-1] = (first, stop)
                 continue
         lines.append((start, stop))

@@ -1,4 +1,4 @@
-"""Poses, and trajectories that give a pose for each firing."""
+"""Poses, and trajectories that provide a pose for each firing."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from .rotations import (
     rotations_between,
     rotations_of,
 )
-from .spline import knots_of, on_curve
+from .spline import evaluate_curve, fit_knots
 
-QUATERNION_SLACK = 1e-3  # tolerance of a quaternion's length, which files round
-# Times since 1970 are coarser than a nanosecond in double precision, and the beams of the last
-# firing are fired a little after its pose.
+QUATERNION_SLACK = 1e-3  # tolerance for the norm of a quaternion, which is rounded in files
+# Tolerance for times, because double precision is coarser than a nanosecond for times since 1970.
 CLOCK_S = 1e-6
+# Tolerance for the last beams, which are fired shortly after the pose of the last firing.
 _FIRING_S = 1e-3
 
-_STEP_NS = 5e5  # half of the interval of difference quotients
+_STEP_NS = 5e5  # half the interval of the difference quotients
 
 ALWAYS = (-np.inf, np.inf)
 
@@ -120,19 +120,26 @@ class Pose(FileSection):
         if level > 1e-9:
             yaw = arctan2(rotation[1, 0], rotation[0, 0])
             roll = arctan2(rotation[2, 1], rotation[2, 2])
-        else:  # +x points straight up or down: yaw and roll have the same axis
+        else:  # +x points straight up or down, so that yaw and roll have the same axis
             yaw = arctan2(-rotation[0, 1], rotation[1, 1])
             roll = np.zeros(())
         return cls(coordinates, *np.degrees([yaw, pitch, roll]).tolist())
 
 
-def pose_of(name: str, value: Any) -> Pose:
-    """Return a pose as it is, or the pose at x, y and z.
+def as_pose(name: str, value: Any) -> Pose:
+    """Convert a position to a pose, and return a pose unchanged.
+
+    Parameters
+    ----------
+    name
+        Name of the argument for error messages.
+    value
+        Pose, or x, y and z in meters.
 
     Raises
     ------
     LidarError
-        With `name`, if the value is neither a pose nor three numbers.
+        If the value is neither a pose nor three numbers.
     """
     if isinstance(value, Pose):
         return value
@@ -143,10 +150,10 @@ def pose_of(name: str, value: Any) -> Pose:
             f"{name} must be a Pose, or x, y and z in meters, such as (0, 0, 1), but is "
             f"{shown(value)}."
         ) from error
-    return Pose(position)  # type: ignore[arg-type]  # it counts them
+    return Pose(position)  # type: ignore[arg-type]  # Pose checks the length
 
 
-CENTER = Pose((0.0, 0.0, 0.0))  # mount of a sensor without carrier
+CENTER = Pose((0.0, 0.0, 0.0))  # mount of a sensor without a platform
 
 
 @dataclass(frozen=True, repr=False)
@@ -156,7 +163,7 @@ class InstrumentPose(Pose):
     position: Annotated[Triple, about("x, y and z in meters")] = (0, 0, 0)
 
 
-# A pose in a file, which may leave out the position, or be the position alone.
+# A pose in a file, whose position is optional. A list of numbers is a position without angles.
 AT_CENTER = short(
     lambda v: isinstance(v, (dict, list)),
     lambda v: {"position": v} if isinstance(v, list) else {"position": [0] * 3} | v,
@@ -165,9 +172,10 @@ AT_CENTER = short(
 
 
 class Trajectory(Protocol):
-    """Poses over time, at stations: a survey jumps between stations, and may move within each.
+    """Protocol for trajectories, which consist of one or more stations.
 
-    Scans of one station follow one another, while the head keeps turning.
+    A sensor may move during a station, and it jumps from each station to the next. The head keeps
+    rotating during the scans of a station.
     """
 
     @property
@@ -180,32 +188,42 @@ class Trajectory(Protocol):
 
     @property
     def duration_ns(self) -> float:
-        """Longest duration of a station, nanoseconds, possibly infinite."""
+        """Maximum duration of a station in nanoseconds, which may be infinite."""
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
-        """Return the pose at a time since the start of a station, nanoseconds."""
+        """Return the pose at a time in nanoseconds since the start of a station."""
 
     def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats | None]:
-        """Return positions (k, 3) and rotations (k, 3, 3) at times (k,) of a moving station.
+        """Return the positions and rotations at several times.
 
-        Casting is fastest if each number of the poses is contiguous over the poses.
+        Ray casting is fastest if each component is contiguous over the poses.
+
+        Parameters
+        ----------
+        station
+            Index of the station.
+        times_ns
+            Times in nanoseconds since the start of the station. Shape (k,).
+
+        Returns
+        -------
+        tuple
+            Positions (k, 3) in meters, and rotation matrices (k, 3, 3) or None without rotation.
         """
 
 
 def presence_ns(path: Trajectory) -> tuple[float, float]:
-    """Return the first and the last nanosecond at which an actor on a trajectory is in the scene.
+    """Return the times at which an actor on a trajectory enters and leaves the scene.
 
-    Without a property `presence_ns` of its class, the actor is always in the scene.
+    The times are in nanoseconds since the start of the station. An actor is always in the scene if
+    the class of its trajectory has no property `presence_ns`.
     """
     first, last = getattr(path, "presence_ns", ALWAYS)
     return float(first), float(last)
 
 
 def full_poses(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-    """Return positions (k, 3) and rotations (k, 3, 3) at times (k,), ns, of a station.
-
-    Rotations are identities if the trajectory has none.
-    """
+    """Return positions and rotations as `path.poses`, with identity matrices instead of None."""
     positions, rotations = path.poses(station, times_ns)
     if rotations is None:
         rotations = np.broadcast_to(np.eye(3), (len(times_ns), 3, 3))
@@ -213,7 +231,13 @@ def full_poses(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats
 
 
 def check_trajectory_type(name: str, value: object) -> None:
-    """Check that an argument is a trajectory, and not the path of its file."""
+    """Check that an argument is a trajectory instead of, for example, the path of its file.
+
+    Raises
+    ------
+    ArgumentError
+        If the argument is not a trajectory.
+    """
     if not hasattr(value, "poses"):
         raise ArgumentError(
             f"{name} must be a trajectory, but is {shown(value)}. To read a file, use "
@@ -222,17 +246,17 @@ def check_trajectory_type(name: str, value: object) -> None:
 
 
 def velocities(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-    """Return velocities and angular velocities on a trajectory, derivatives of its poses.
+    """Return the linear and angular velocities on a trajectory.
 
-    A class with a method `velocities(station, times_ns)`, as the classes of this package, computes
-    them itself. For other classes, velocities are difference quotients over 1 ms.
+    If the class of the trajectory has a method `velocities(station, times_ns)`, as in this package,
+    that method is called. Otherwise, the velocities are difference quotients over 1 ms.
 
     Returns
     -------
     velocities
-        (k, 3): velocities of the carrier's origin, m/s, in the scene frame.
+        Velocities of the platform origin in the scene frame, in m/s. Shape (k, 3).
     rates
-        (k, 3): angular velocities, rad/s, in the scene frame.
+        Angular velocities in the scene frame, in rad/s. Shape (k, 3).
     """
     if not path.moves:
         return np.zeros((len(times_ns), 3)), np.zeros((len(times_ns), 3))
@@ -254,7 +278,7 @@ def velocities(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats
 
 @dataclass(frozen=True)
 class Stations:
-    """A trajectory of a sensor that stands at a list of poses, in turn."""
+    """A trajectory of a sensor that is stationary at one pose after another."""
 
     at: tuple[Pose, ...]
     moves: ClassVar[bool] = False
@@ -263,17 +287,18 @@ class Stations:
 
     @property
     def stations(self) -> int:
-        """Number of stations: of the poses."""
+        """Number of stations, which is the number of poses."""
         return len(self.at)
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
-        """Return the pose of a station, at any time."""
+        """Return the pose of a station, regardless of the time."""
         return self.at[station]
 
     def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats | None]:
-        """Return the pose of a station for each of k times: positions (k, 3), rotations (k, 3, 3).
+        """Return the pose of a station, repeated for each time.
 
-        Rotations are None if the pose has no rotation.
+        For `times_ns` of shape (k,), the positions have shape (k, 3) and the rotations have shape
+        (k, 3, 3). The rotations are None if the pose has no rotation.
         """
         pose = self.at[station]
         count = len(times_ns)
@@ -284,14 +309,14 @@ class Stations:
 
 @dataclass(frozen=True, eq=False)
 class StaticPose:
-    """A trajectory that stays at one pose, which is given by a matrix and not by angles.
+    """A trajectory that stays at a single pose, which is defined by a rotation matrix.
 
     Attributes
     ----------
     position
-        (3,), meters.
+        Position in meters. Shape (3,).
     rotation
-        (3, 3): from the frame of the carrier to the scene frame.
+        Rotation matrix from the platform frame to the scene frame. Shape (3, 3).
     """
 
     position: Floats
@@ -301,11 +326,15 @@ class StaticPose:
     duration_ns: ClassVar[float] = np.inf
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
-        """Return the pose, at any time."""
+        """Return the pose, regardless of the time."""
         return Pose.from_rotation(self.position, self.rotation)
 
     def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return the pose for each of k times: positions (k, 3), rotations (k, 3, 3)."""
+        """Return the pose, repeated for each time.
+
+        For `times_ns` of shape (k,), the positions have shape (k, 3) and the rotations have shape
+        (k, 3, 3).
+        """
         count = len(times_ns)
         return (
             np.broadcast_to(self.position, (count, 3)),
@@ -424,10 +453,13 @@ class Track:
             raise LidarError(f"A trajectory requires at least two poses, but has {len(times)}.")
         _check_times(times)
         batch = TrackBatch.from_matrices(times, matrices, beyond)
-        return [_BatchTrack.of_batch(batch, number) for number in range(len(matrices))]
+        return [_BatchTrack.from_batch(batch, number) for number in range(len(matrices))]
 
     def _set_quaternions(self, angles: Mapping[str, ArrayLike]) -> None:
-        """Set the quaternions of poses by their angles, {name: (k,) or one for all, degrees}."""
+        """Set the quaternions from angles in degrees, which are mapped by parameter name.
+
+        Each entry is either one angle for all poses or an array of shape (k,).
+        """
         if self.quaternions is not None:
             raise LidarError(
                 f"quaternions and {joined([*angles])} both define the rotations. Pass only one of "
@@ -451,7 +483,7 @@ class Track:
         object.__setattr__(self, "quaternions", quaternions_of(rotations_of(table)))
 
     def _set_poses(self) -> None:
-        """Check and freeze times, positions and quaternions."""
+        """Validate the times, positions and quaternions, and replace them by read-only copies."""
         times = as_array("times_s", self.times_s).copy()
         positions = as_array("positions", self.positions).copy()
         if times.ndim != 1 or len(times) < 2 or positions.shape != (len(times), 3):
@@ -471,7 +503,7 @@ class Track:
                     f"but has the shape {quaternions.shape}."
                 )
             lengths = norm(quaternions)
-            # Written so that NaN is an error.
+            # The comparison is also false for NaN.
             bad = ~(np.abs(lengths - 1) <= QUATERNION_SLACK)
             _check_poses(bad, "The quaternion of pose {} is not of unit length")
             quaternions /= lengths[:, None]
@@ -481,14 +513,14 @@ class Track:
             object.__setattr__(self, name, array)
 
     def _set_span(self) -> None:
-        """Check that the station is within the times, and fill in its start and duration."""
+        """Check that the station is within the times, and set its start and duration."""
         times = self.times_s
         start = times[0] if self.start_s is None else self.start_s
         last = times[-1] if self.duration_s is None else start + self.duration_s
         max_gap_s = CLOCK_S if self.beyond == "refuse" else np.inf
         for label, time in (("start_s", start), ("start_s + duration_s", last)):
             gap = max(times[0] - time, time - times[-1])
-            if not gap <= max_gap_s:  # or NaN
+            if not gap <= max_gap_s:  # also true for NaN
                 raise LidarError(
                     f"{label} is {time:.9g} s, which is {gap:.6g} s outside the trajectory. It "
                     f"covers {times[0]:.9g} to {times[-1]:.9g} s."
@@ -504,7 +536,7 @@ class Track:
     @property
     def duration_ns(self) -> float:
         """Duration of the station in nanoseconds."""
-        assert self.duration_s is not None  # set above
+        assert self.duration_s is not None  # set in __post_init__
         return self.duration_s * 1e9
 
     @property
@@ -516,7 +548,7 @@ class Track:
         """
         if self.beyond != "absent":
             return ALWAYS
-        assert self.start_s is not None  # set above
+        assert self.start_s is not None  # set in __post_init__
         first, last = (self.times_s[[0, -1]] - self.start_s) * 1e9
         return float(first), float(last)
 
@@ -554,7 +586,7 @@ class Track:
             return self.with_turns.poses(station, times_ns)
         segment, since, _ = self._segments_at(times_ns)
         if self.smooth:
-            (values,) = on_curve(*self._spline, segment, since)
+            (values,) = evaluate_curve(*self._spline, segment, since)
             if self._headings is not None:
                 return values.T, _level_rotations(self._headings.at(segment, since))
             quaternions = values[3:] / np.sqrt((values[3:] ** 2).sum(axis=0))
@@ -595,12 +627,12 @@ class Track:
             return self.with_turns.velocities(station, times_ns)
         segment, since, within = self._segments_at(times_ns)
         if self.smooth and self._headings is not None:
-            _, speeds = on_curve(*self._spline, segment, since, 1)
+            _, speeds = evaluate_curve(*self._spline, segment, since, 1)
             rates = np.zeros_like(speeds)
             rates[2] = self._headings.at(segment, since).rates
         elif self.smooth:
-            q, p = on_curve(*self._spline, segment, since, 1)
-            # 2 p conjugate(q); q may have any length, and the length may change.
+            q, p = evaluate_curve(*self._spline, segment, since, 1)
+            # The angular velocity is 2 p conjugate(q). The norm of q is arbitrary and may vary.
             vector_part = q[6] * p[3:6] - p[6] * q[3:6] - np.cross(p[3:6], q[3:6], axis=0)
             speeds = p[:3]
             rates = 2 * vector_part / (q[3:] ** 2).sum(axis=0)
@@ -610,8 +642,8 @@ class Track:
         return (speeds * within).T, (rates * within).T
 
     def _segments_at(self, times_ns: Floats) -> _SegmentTimes:
-        """Return the segments of times (k,), nanoseconds since the start."""
-        assert self.start_s is not None  # set above
+        """Return the segments that contain times in nanoseconds since the start of the station."""
+        assert self.start_s is not None  # set in __post_init__
         times = self.times_s
         moments_s = times_ns / 1e9 + self.start_s
         first_s = moments_s.min(initial=np.inf)
@@ -643,24 +675,24 @@ class Track:
 
     @cached_property
     def _headings(self) -> CurveHeadings | None:
-        """Headings on a smooth track without quaternions, None on other tracks."""
+        """Headings of a smooth track without quaternions, or None for other tracks."""
         if not self.smooth or self.quaternions is not None:
             return None
         return CurveHeadings.from_knots(self.times_s, self._spline[0])
 
     @cached_property
     def _spline(self) -> tuple[Floats, Floats]:
-        """Knots (3, d, k) of positions and quaternions, and steps (k - 1,), s, for `on_curve`.
+        """Knots of positions and quaternions, and steps in seconds, for `evaluate_curve`.
 
-        d is 7, or 3 without quaternions. Of the two quaternions of a rotation, each knot has the
-        nearer to the knot before.
+        The knots have shape (3, d, k), where d is 7, or 3 without quaternions. The steps have shape
+        (k - 1,). The sign of each quaternion is chosen so that it is close to the previous one.
         """
         quaternions = self.quaternions
         groups = [self.positions.T]
         if quaternions is not None:
             flips = np.cumsum((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0)
             groups.append(quaternions.T * (1.0 - 2 * np.append(0, flips % 2)))
-        knots = [knots_of(self.times_s, group) for group in groups]
+        knots = [fit_knots(self.times_s, group) for group in groups]
         return np.concatenate(knots, axis=1), np.diff(self.times_s)
 
     @cached_property
@@ -668,7 +700,7 @@ class Track:
         """Coefficients of the straight segments between the poses of `with_turns`."""
         track = self.with_turns
         quaternions = track.quaternions
-        assert quaternions is not None  # of a track on straight lines
+        assert quaternions is not None  # linear tracks with turns have quaternions
         return _segments(
             np.diff(track.times_s),
             track.positions[:-1],
@@ -679,24 +711,42 @@ class Track:
 
 
 class Segments(NamedTuple):
-    """Coefficients of poses between the poses of a track: a column for each of s segments."""
+    """Coefficients for the poses on the segments of a track, with one column per segment.
 
-    starts: Floats  # (3, s): positions at the start, meters
-    velocities: Floats  # (3, s): m/s
-    # (3, 9, s): the rotation is terms[0] + sin(a) terms[1] + cos(a) terms[2] (Rodrigues, 1840),
-    # with a the angle since the start
+    Attributes
+    ----------
+    starts
+        Positions at the start of each segment, in meters. Shape (3, s).
+    velocities
+        Velocities in m/s. Shape (3, s).
+    rotation_terms
+        Coefficients of the rotation matrix, from `rotations.rotation_terms`. Shape (3, 9, s).
+    rates
+        Rates of the rotation angle in rad/s. Shape (s,).
+    spins
+        Angular velocities in the scene frame, in rad/s. Shape (3, s).
+    """
+
+    starts: Floats
+    velocities: Floats
     rotation_terms: Floats
-    rates: Floats  # (s,): of that angle, rad/s
-    spins: Floats  # (3, s): angular velocities in the scene frame, rad/s
+    rates: Floats
+    spins: Floats
 
 
 def _segments(
     durations_s: Floats, starts: Floats, stops: Floats, first: Floats, last: Floats
 ) -> Segments:
-    """Return segments (s,) from positions (s, 3) and quaternions (s, 4) to the next.
+    """Create segments from the poses at their ends.
 
-    `starts` and `first` are those at the start of each segment, `stops` and `last` at its end;
-    durations (s,) are seconds.
+    Parameters
+    ----------
+    durations_s
+        Durations in seconds. Shape (s,).
+    starts, stops
+        Positions at the start and the end of each segment. Shape (s, 3).
+    first, last
+        Quaternions at the start and the end of each segment. Shape (s, 4).
     """
     first_positions = np.ascontiguousarray(starts.T)
     first_quaternions = np.ascontiguousarray(first.T)
@@ -713,20 +763,20 @@ def _segments(
 
 @dataclass(frozen=True, eq=False)
 class TrackBatch:
-    """Straight tracks of k bodies with the same times, computed all at once.
+    """Linear tracks of several bodies with common times, whose segments are computed together.
 
     Attributes
     ----------
     times_s
-        (s,): times of the poses, seconds; time 0 of the tracks is 0.
+        Times of the poses in seconds. All tracks start at time 0. Shape (s,).
     positions
-        (k, s, 3): meters.
+        Positions in meters. Shape (k, s, 3).
     quaternions
-        (k, s, 4)
+        Quaternions (x, y, z, w). Shape (k, s, 4).
     beyond
-        As of `Track`.
+        As in `Track`.
     segments
-        Coefficients of k * (s - 1) segments, track by track.
+        Coefficients of the k * (s - 1) segments, in the order of the tracks.
     """
 
     times_s: Floats
@@ -737,7 +787,7 @@ class TrackBatch:
 
     @classmethod
     def from_matrices(cls, times_s: Floats, matrices: Floats, beyond: Beyond) -> TrackBatch:
-        """Return the tracks of rigid transforms (k, s, 4, 4) at times (s,)."""
+        """Create tracks from rigid transforms of shape (k, s, 4, 4) at times of shape (s,)."""
         count, samples = matrices.shape[:2]
         quaternions = quaternions_of(matrices[..., :3, :3].reshape(-1, 3, 3))
         rows = quaternions.reshape(count, samples, 4)
@@ -753,25 +803,25 @@ class TrackBatch:
             array.flags.writeable = False
         return cls(times_s, positions, rows, beyond, segments)
 
-    def segments_of(self, numbers: ArrayLike) -> Segments:
-        """Return the segments of tracks `numbers` (n,), track by track."""
+    def select_segments(self, numbers: ArrayLike) -> Segments:
+        """Return the segments of several tracks, in the order of their indices in `numbers`."""
         steps = len(self.times_s) - 1
         columns = (np.asarray(numbers)[:, None] * steps + np.arange(steps)).reshape(-1)
         return Segments(*(np.ascontiguousarray(part[..., columns]) for part in self.segments))
 
 
 class _BatchTrack(Track):
-    """A track of a batch, whose segments are looked up when they are needed.
+    """A track in a batch, which extracts its segments from the batch on demand.
 
-    Its actor is always in the scene.
+    The actor on such a track is always in the scene.
     """
 
     batch: TrackBatch
-    number: int  # number of the track in the batch
+    number: int  # index of the track in the batch
 
     @classmethod
-    def of_batch(cls, batch: TrackBatch, number: int) -> _BatchTrack:
-        """Return a track of a batch."""
+    def from_batch(cls, batch: TrackBatch, number: int) -> _BatchTrack:
+        """Create a track without the validation of `Track`."""
         track = object.__new__(cls)
         vars(track).update(
             times_s=batch.times_s,
@@ -788,28 +838,28 @@ class _BatchTrack(Track):
 
     @cached_property
     def segments(self) -> Segments:
-        """Coefficients of poses on straight lines."""
-        return self.batch.segments_of([self.number])
+        """Coefficients of the linear segments between the poses."""
+        return self.batch.select_segments([self.number])
 
 
-def batch_of(trajectory: Trajectory) -> TrackBatch | None:
-    """Return the batch of a track, or None for other trajectories.
+def find_batch(trajectory: Trajectory) -> TrackBatch | None:
+    """Return the batch that contains a track, or None for other trajectories.
 
-    Actors on tracks of batches are always in the scene.
+    An actor on a track in a batch is always in the scene.
     """
     return trajectory.batch if isinstance(trajectory, _BatchTrack) else None
 
 
 class _SegmentTimes(NamedTuple):
-    """Times on a track, by its segments."""
+    """Times on a track, relative to the segments that contain them."""
 
-    segment: Indices  # (k,): numbers of segments
-    since: Floats  # (k,): seconds since the segments' starts
-    within: Bools  # (k,): whether the time is within the track, so that the carrier moves
+    segment: Indices  # (k,), indices of the segments
+    since: Floats  # (k,), seconds since the start of each segment
+    within: Bools  # (k,), whether the time is within the track, so that the platform moves
 
 
 def _level_rotations(heading: Heading) -> Floats:
-    """Return the rotations (k, 3, 3) of a level carrier."""
+    """Return the rotation matrices of a level platform."""
     rotations = np.zeros((3, 3, len(heading.cosines)))
     rotations[0, 0] = rotations[1, 1] = heading.cosines
     rotations[1, 0] = heading.sines
@@ -819,10 +869,7 @@ def _level_rotations(heading: Heading) -> Floats:
 
 
 def _check_times(times_s: Floats) -> None:
-    """Check that times (k,) are finite and ascend.
-
-    Raises LidarError if not.
-    """
+    """Raise LidarError unless all times are finite and in ascending order."""
     _check_poses(~np.isfinite(times_s), "The time of pose {} is not finite")
     _check_poses(
         np.append(False, np.diff(times_s) <= 0),
@@ -831,6 +878,9 @@ def _check_times(times_s: Floats) -> None:
 
 
 def _check_poses(bad: Bools, words: str) -> None:
-    """Raise LidarError if any pose is bad (k,): `words` with the number of the first bad pose."""
+    """Raise LidarError if any pose is bad.
+
+    The message is `words`, formatted with the index of the first bad pose.
+    """
     if bad.any():
         raise LidarError(f"{words.format(int(bad.argmax()))} (poses are counted from 0).")

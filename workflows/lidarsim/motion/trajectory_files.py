@@ -1,4 +1,4 @@
-"""Trajectories from files: TUM, KITTI, tables of named columns, oxts folders, and bags of ROS 2."""
+"""Reader for trajectory files, such as TUM and KITTI poses, tables, oxts folders and ROS 2 bags."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..numerics.arrays import Floats
 from ..numerics.vectors import rotate
 from ..schema.checks import check_fits, check_list
 from .bag_trajectories import read_bag
-from .oxts import OXTS_TIMES, WIDTH, dates_of, find_oxts, oxts_files, oxts_poses, read_oxts
+from .oxts import OXTS_TIMES, WIDTH, find_oxts, oxts_files, oxts_poses, parse_dates, read_oxts
 from .pose_columns import (
     ANGLES,
     POSE_TABLES,
@@ -27,8 +27,8 @@ from .pose_columns import (
     QUATERNION,
     REFUSED_COLUMNS,
     TIME,
-    angles_of,
-    with_yaw,
+    convert_heading,
+    stack_angles,
 )
 from .rotations import check_rotations, quaternions_of, rotations_of
 from .trajectory import QUATERNION_SLACK, Beyond, Track
@@ -40,25 +40,25 @@ Latitude = Annotated[float, Field(gt=-90, lt=90)]
 Longitude = Annotated[float, Field(ge=-360, le=360)]
 Height = Annotated[float, Field(ge=-1e5, le=1e6)]
 Origin = tuple[Latitude, Longitude, Height]
-_KITTI_WIDTH = 12  # numbers of a row
-# Cameras look along z with y down; carriers look along x with z up.
+_KITTI_WIDTH = 12  # number of values in a row
+# Rotation from a camera frame (z forward, y down) to a platform frame (x forward, z up).
 _CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-# A .trj of HELIOS++ states neither units nor the order of rotations: its survey does.
+# The units and the order of rotations in a HELIOS++ .trj file are only defined by its survey.
 _HELIOS = " To read a HELIOS++ .trj with its survey, run `lidarpool import`."
 
 
 class PoseTable(NamedTuple):
-    """Poses of a file."""
+    """Poses that were read from a file."""
 
     seconds: Floats  # (k,)
-    positions: Floats  # (k, 3): meters
-    quaternions: Floats | None  # (k, 4): x, y, z, w; None if the file has no orientations
+    positions: Floats  # (k, 3), meters
+    quaternions: Floats | None  # (k, 4), (x, y, z, w), or None if the file has no orientations
 
 
 class TimeOptions(NamedTuple):
-    """What a user states of the times of a file of poses."""
+    """Options for the times of a pose file."""
 
-    file: str | Path | None  # file of the times of KITTI's poses
+    file: str | Path | None  # file that contains the times of KITTI poses
     unit: TimeUnit | None
 
 
@@ -142,11 +142,11 @@ def load_trajectory(
     timing = TimeOptions(times, time_unit)
     try:
         if path.is_dir() or is_bag(path) or format in ("oxts", "bag"):
-            kind, poses = _of_container(path, format, timing, topic, origin)
+            kind, poses = _read_container(path, format, timing, topic, origin)
         else:
             _refuse_topic(topic)
             text = read_text(path)
-            kind, poses = _of_text(text, format, timing, columns or {}, ignore, origin)
+            kind, poses = _parse_text(text, format, timing, columns or {}, ignore, origin)
         if (columns or ignore) and kind != "csv":
             raise ValueError(
                 f"columns and ignore require a table with a header, but the format is {kind}"
@@ -165,7 +165,7 @@ def load_trajectory(
             beyond=beyond,
         )
         if camera_axes or (camera_axes is None and kind == "kitti"):
-            track = _from_camera(track)
+            track = _convert_from_camera(track)
         return track
     except (OSError, ValueError, LidarError) as error:
         note = _HELIOS if path.suffix.lower() == ".trj" else ""
@@ -173,19 +173,25 @@ def load_trajectory(
 
 
 def read_kitti_poses(path: Path) -> Floats | None:
-    """Read the matrices (k, 3, 4) of a file of KITTI's poses, which states no times.
+    """Read the matrices in a file of KITTI poses, which has no times.
 
-    Returns None if the file has another format, or cannot be read.
+    Returns
+    -------
+    array or None
+        Matrices of shape (k, 3, 4), or None if the file has another format or cannot be read.
 
-    LidarError if a rotation is none.
+    Raises
+    ------
+    LidarError
+        If a matrix does not contain a rotation.
     """
     if path.is_dir() or is_bag(path):
         return None
     try:
         text = read_text(path)
         has_header = find_header(text.splitlines(), _is_pose_column) is not None
-        rows = np.empty((0, 0)) if has_header else _numbers(text)
-    except (OSError, ValueError, LidarError):  # `load_trajectory` says why
+        rows = np.empty((0, 0)) if has_header else _parse_numbers(text)
+    except (OSError, ValueError, LidarError):  # `load_trajectory` reports the error
         return None
     if rows.shape[1] != _KITTI_WIDTH:
         return None
@@ -197,8 +203,8 @@ def read_kitti_poses(path: Path) -> Floats | None:
     return matrices
 
 
-def files_of_trajectory(path: Path) -> list[Path]:
-    """Return the files of a trajectory: the path itself, or the files in a folder."""
+def list_trajectory_files(path: Path) -> list[Path]:
+    """Return the files of a trajectory, which are the path itself or the files in its folder."""
     if not path.is_dir():
         return [path]
     if is_bag(path):
@@ -208,19 +214,19 @@ def files_of_trajectory(path: Path) -> list[Path]:
 
 
 def _refuse_topic(topic: str | None) -> None:
-    """Raise ValueError if a topic is given for a file that is not a bag."""
+    """Raise ValueError if a topic is set for a file that is not a bag."""
     if topic is not None:
         raise ValueError("topic requires a bag, but this file is not a bag")
 
 
-def _of_container(
+def _read_container(
     path: Path,
     kind: TrajectoryFormat | None,
     timing: TimeOptions,
     topic: str | None,
     origin: Sequence[float] | None,
 ) -> tuple[str, PoseTable]:
-    """Return the format and the poses of a folder or a bag."""
+    """Read a folder or bag, and return its format and poses."""
     if not path.exists():
         raise FileNotFoundError(2, "No such file or directory")
     if is_bag(path) and kind in (None, "bag"):
@@ -236,14 +242,14 @@ def _of_container(
         poses = PoseTable(*read_oxts(folder, origin))
         return "oxts", poses._replace(seconds=_seconds_of_dates(poses.seconds, timing.unit))
     if path.is_file() and kind == "oxts":
-        return _of_text(read_text(path), kind, timing, {}, (), origin)
+        return _parse_text(read_text(path), kind, timing, {}, (), origin)
     raise ValueError(
         "a folder must be a KITTI folder with timestamps.txt and data, or a ROS 2 bag with "
         f"metadata.yaml{'' if kind is None else f', but format is {kind}'}"
     )
 
 
-def _of_text(
+def _parse_text(
     text: str,
     kind: TrajectoryFormat | None,
     timing: TimeOptions,
@@ -251,26 +257,26 @@ def _of_text(
     ignore: Sequence[str],
     origin: Sequence[float] | None,
 ) -> tuple[str, PoseTable]:
-    """Return the format and the poses of a text file."""
+    """Return the format and the poses of the content of a text file."""
     lines = text.splitlines()
     if timing.file is not None and kind not in (None, "kitti", "oxts"):
         raise ValueError(f"times can only be combined with KITTI poses, but format is {kind}")
     header = find_header(lines, _is_pose_column) if timing.file is None else None
     if kind == "csv" or (kind in (None, "tum") and header is not None):
-        # Rows of TUM are separated by spaces, and may have their header in a remark.
+        # The values in TUM rows are separated by spaces, and the header may be in a comment.
         in_remark = header is not None and header.comment and header.separator is None
         bare = {"time_s": "s"} if in_remark or kind == "tum" else {}
-        return "csv", _table(text, columns, ignore, bare, timing.unit)
-    return _of_rows(_numbers(text), kind, timing, origin)
+        return "csv", _parse_table(text, columns, ignore, bare, timing.unit)
+    return _parse_rows(_parse_numbers(text), kind, timing, origin)
 
 
-def _of_rows(
+def _parse_rows(
     rows: Floats,
     kind: TrajectoryFormat | None,
     timing: TimeOptions,
     origin: Sequence[float] | None,
 ) -> tuple[str, PoseTable]:
-    """Return the format and the poses of rows of numbers (k, n) without header."""
+    """Return the format and the poses of rows of numbers without a header."""
     width = rows.shape[1]
     if kind is None:
         kind = (
@@ -299,15 +305,15 @@ def _of_rows(
 
 
 def _seconds_in_file(path: Path, unit: TimeUnit | None) -> Floats:
-    """Return the seconds (k,) in a file of times: a number or a date in each row."""
+    """Return the times in seconds from a file with a number or a date in each row."""
     try:
         text = read_text(path)
-        dates = dates_of(text)
+        dates = parse_dates(text)
         has_dates = dates is not None and len(dates) > 0
-        times = dates if has_dates else _numbers(text, 1)[:, 0]
+        times = dates if has_dates else _parse_numbers(text, 1)[:, 0]
     except ValueError as error:
         raise ValueError(f"{path} has no times: {message_of(error)}") from error
-    assert times is not None  # they are times of dates, or numbers
+    assert times is not None  # set from either dates or numbers
     try:
         return _seconds_of_dates(times, unit) if has_dates else seconds_of(times, unit)
     except ValueError as error:
@@ -315,17 +321,14 @@ def _seconds_in_file(path: Path, unit: TimeUnit | None) -> Floats:
 
 
 def _seconds_of_dates(seconds: Floats, unit: TimeUnit | None) -> Floats:
-    """Return the seconds (k,) of dates.
-
-    Raises ValueError if the user states their unit.
-    """
+    """Validate the times of dates, and raise ValueError if a time unit is set."""
     if unit is not None:
         raise ValueError("its times are dates, so time_unit cannot be set")
     return seconds_of(seconds, None, advice="Correct them")
 
 
 def _is_pose_column(cell: str) -> bool:
-    """Return whether a cell of a header names a quantity of poses."""
+    """Return True if a header cell names a component of a pose."""
     words = column_name(cell).words
     return any(
         words in {column_name(name).words for name in quantity.spellings}
@@ -333,8 +336,11 @@ def _is_pose_column(cell: str) -> bool:
     )
 
 
-def _numbers(text: str, columns: int | None = None) -> Floats:
-    """Return the rows of numbers in a text, (k, columns), without comments (#)."""
+def _parse_numbers(text: str, columns: int | None = None) -> Floats:
+    """Return the rows of numbers in a text, and skip comments that start with #.
+
+    The rows must have `columns` numbers, if it is set.
+    """
     lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
     if not lines:
         raise ValueError("it has no rows of numbers")
@@ -352,22 +358,25 @@ def _numbers(text: str, columns: int | None = None) -> Floats:
     return rows
 
 
-def _table(
+def _parse_table(
     text: str,
     names: Mapping[str, str],
     ignore: Sequence[str],
     bare: Mapping[str, str],
     time_unit: TimeUnit | None,
 ) -> PoseTable:
-    """Return the poses of a table with a header, with units `bare` of columns without a unit."""
+    """Return the poses of a table with a header.
+
+    Columns whose header has no unit have the unit in `bare`.
+    """
     quaternion = [quantity.name for quantity in QUATERNION]
 
     def required_columns(columns: Mapping[str, Floats]) -> tuple[str, ...]:
-        """Return the columns that a table with these columns must have."""
+        """Return the columns that are required in a table with `columns`."""
         rotation_columns = quaternion if any(name in columns for name in quaternion) else ()
         return ("time_s", "x", "y", "z", *rotation_columns)
 
-    columns = with_yaw(
+    columns = convert_heading(
         read_table(
             text,
             (TIME, *POSITION, *QUATERNION, *ANGLES),
@@ -396,15 +405,15 @@ def _table(
             f"{angles[0]} to face the direction of travel"
         )
     return PoseTable(
-        seconds, positions, quaternions_of(rotations_of(angles_of(columns, len(seconds))))
+        seconds, positions, quaternions_of(rotations_of(stack_angles(columns, len(seconds))))
     )
 
 
-def _from_camera(track: Track) -> Track:
-    """Convert poses of a camera frame (z ahead, y down) to a carrier frame (x ahead, z up)."""
+def _convert_from_camera(track: Track) -> Track:
+    """Convert poses from a camera frame to a platform frame."""
     positions = rotate(track.positions, _CAMERA)
     if track.quaternions is None:
         return replace(track, positions=positions)
     x, y, z, w = track.quaternions.T
-    quaternions = np.stack([z, -x, -y, w], axis=1)  # the axis is rotated, the angle is the same
+    quaternions = np.stack([z, -x, -y, w], axis=1)  # rotates the axis and keeps the angle
     return replace(track, positions=positions, quaternions=quaternions)

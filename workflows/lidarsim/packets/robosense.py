@@ -248,8 +248,8 @@ class RobosenseEncoder(PacketEncoder):
         self._next_difop_ns += len(due_ns) * DIFOP_INTERVAL_NS
         packets = np.repeat(self._device_data(), len(due_ns))
         firing = np.maximum(np.searchsorted(shots.starts_ns, due_ns, "right") - 1, 0)
-        jumps_ns = (shots.stamps_ns - shots.starts_ns)[firing]
-        _write_times(packets["time"], due_ns + jumps_ns + self.source.start_ns)
+        time_errors_ns = (shots.stamps_ns - shots.starts_ns)[firing]
+        _write_times(packets["time"], due_ns + time_errors_ns + self.source.start_ns)
         return Datagrams(_as_bytes(packets), due_ns, self.ports["difop"])
 
     def _device_data(self) -> Records:

@@ -83,7 +83,8 @@ class Shots:
         faults = sweeps.faults_in(sweep)
         return replace(
             shots,
-            stamps_ns=shots.starts_ns + sum(fault.jumps_ns(shots.starts_ns) for fault in faults),
+            stamps_ns=shots.starts_ns
+            + sum(fault.time_errors_ns(shots.starts_ns) for fault in faults),
             dropped=_dropped(sweeps, sweep, shots.firings, shots.starts_ns),
         )
 
@@ -142,7 +143,9 @@ def _dropped(sweeps: Sweeps, sweep: int, firings: Ints, starts_ns: Ints) -> Bool
     dropped = np.zeros(len(firings), np.bool_)
     for number, fault in enumerate(sweeps.faults):
         if fault.kind == "dropped_packets" and fault.sensor in (None, sweeps.sensors[sensor]):
-            dropped |= fault.during(starts_ns) & fault.drops(firings, seed, station, number)
+            dropped |= fault.is_active(starts_ns) & fault.find_dropped(
+                firings, seed, station, number
+            )
     return dropped
 
 

@@ -1,4 +1,4 @@
-"""Sensors: beams, heads, models, noise."""
+"""Lidar sensors, with their beams, heads, optics and noise."""
 
 from .beams import Beams, Head, Mirror, Spin
 from .noise import Noise

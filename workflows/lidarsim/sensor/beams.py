@@ -1,4 +1,4 @@
-"""The beams of a sensor, and the head that moves them."""
+"""Beams of a sensor, and the heads that move them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ..schema.checks import as_array, check_fields, check_number
 from ..schema.declared import about
 from ..schema.value_texts import one_line
 
-MAX_CHANNELS = 65_535  # limit of the type of the column
+MAX_CHANNELS = 65_535  # limit of the uint16 column `channel`
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class Beams:
             ("time_ns", (count,)),
             ("origin", (count, 3)),
         ):
-            object.__setattr__(self, name, _table(name, getattr(self, name), shape))
+            object.__setattr__(self, name, _as_table(name, getattr(self, name), shape))
 
     def __len__(self) -> int:
         return len(self.elevation)
@@ -81,7 +81,7 @@ class Beams:
         half = np.radians(vertical_fov_deg) / 2
         return cls(np.linspace(-half, half, layers) if layers > 1 else np.zeros(1))
 
-    def turning(self, radians_per_ns: float) -> Beams:
+    def with_rotation(self, radians_per_ns: float) -> Beams:
         """Return the beams for a head that rotates counterclockwise during a firing.
 
         Each beam is rotated by the angle that the head covers until the beam is fired. The ray
@@ -93,27 +93,39 @@ class Beams:
         origin = np.column_stack([cos * x - sin * y, sin * x + cos * y, z])
         return Beams(self.elevation, self.azimuth + angle, self.time_ns, origin)
 
-    def lowest_first(self) -> Beams:
+    def sort_by_elevation(self) -> Beams:
         """Return the same beams sorted by elevation, with the lowest beam as channel 0."""
         order = np.argsort(self.elevation, kind="stable")
         return Beams(*(a[order] for a in (self.elevation, self.azimuth, self.time_ns, self.origin)))
 
 
 class Head(Protocol):
-    """Mechanism that moves the beams, with the firings of each time step, numbered from 0."""
+    """Protocol for the mechanism that moves the beams.
+
+    Firings and time steps are numbered from 0.
+    """
 
     @property
     def period(self) -> int | None:
         """Number of firings after which azimuths repeat exactly, or None if they never do."""
 
     def firings(self, step: int) -> tuple[int, int]:
-        """Return the half-open range of the firings of a time step, without gaps between steps."""
+        """Return the half-open range of the firing indices in a time step.
+
+        The ranges of consecutive steps must be contiguous.
+        """
 
     def times_ns(self, firings: Ints) -> Floats:
-        """Return the start times of firings (k,) in nanoseconds since the head started."""
+        """Return the start times of several firings in nanoseconds since the head started.
+
+        `firings` and the result have shape (k,).
+        """
 
     def azimuths(self, firings: Ints) -> Floats:
-        """Return the azimuths of the head at firings (k,), in radians."""
+        """Return the azimuths of the head at several firings, in radians.
+
+        `firings` and the result have shape (k,).
+        """
 
 
 Step = Annotated[
@@ -176,9 +188,10 @@ class Spin:
     def _firings_per_step(self) -> Fraction:
         """Exact number of firings in a time step.
 
-        Neither 0.1 nor 360/7 degrees is exact in binary. The nearest fraction with a denominator
-        of at most a million is the intended number, for decimals and for parts of a revolution;
-        then the steps of a revolution have each firing once.
+        Neither 0.1 degrees nor 360/7 degrees can be represented exactly in binary. The intended
+        value of such a decimal or part of a revolution is the nearest fraction with a denominator
+        of at most a million. With this fraction, the steps of a revolution contain each firing
+        exactly once.
         """
         step = Fraction(self.step_deg).limit_denominator(1_000_000)
         per_turn = Fraction(self.firings_per_turn).limit_denominator(1_000_000)
@@ -192,7 +205,7 @@ class Spin:
 
     def firings(self, step: int) -> tuple[int, int]:
         """Return the half-open range of the firing indices in a time step."""
-        # Rounded up, in whole numbers: fractions would take as long as a small scan.
+        # Integer arithmetic rounds up here. Fractions would take as long as a small scan.
         count, steps = self._firings_per_step.as_integer_ratio()
         return -(-step * count // steps), -(-(step + 1) * count // steps)
 
@@ -211,7 +224,7 @@ class Spin:
         turned = 2 * np.pi * self._within(firings) / self.firings_per_turn
         return np.radians(self.zero_deg) + (-turned if self.clockwise else turned)
 
-    def within(self, start: float, share: float) -> Mirror:
+    def restrict_to(self, start: float, share: float) -> Mirror:
         """Return a head that fires only during a part of each revolution.
 
         Time 0 and firing 0 are at the start of this part. A time step contains the same share of
@@ -239,9 +252,10 @@ class Spin:
         )
 
     def _within(self, firings: Ints) -> Floats:
-        """Return the firings (k,) since the start of their revolution: (k,).
+        """Return the number of firings since the start of each firing's revolution.
 
-        Numbers are fractional if revolutions start between two firings.
+        The numbers are fractional if a revolution starts between two firings. `firings` and the
+        result have shape (k,).
         """
         return np.asarray(firings % self.firings_per_turn, np.float64)
 
@@ -256,15 +270,17 @@ class Spin:
 
 @dataclass(frozen=True)
 class Mirror(Spin):
-    """A mirror that sweeps the beams over a line, to and fro or in a single direction.
+    """A mirror that sweeps the beams over a line, back and forth or in a single direction.
 
-    A revolution is a cycle: two lines of a swinging mirror, one line of a polygon's facet.
-    Azimuth 0 is in the middle of a line.
+    A cycle of the mirror counts as a revolution. It consists of two lines for an oscillating
+    mirror, or of the line of one facet for a polygon mirror. Azimuth 0 is the center of a line.
     """
 
-    motion: MirrorMotion = "triangle"  # "sine" and "triangle" swing, "sawtooth" is a polygon
+    # "sine" and "triangle" are oscillating mirrors, and "sawtooth" is a polygon mirror.
+    motion: MirrorMotion = "triangle"
     width_deg: Width = 60.0  # length of a line
-    # Share of each cycle while the sensor fires: a polygon's facets sweep more than the line.
+    # Fraction of each cycle in which the sensor fires. The facets of a polygon mirror sweep over
+    # more than the line.
     duty: Duty = 1.0
 
     __repr__ = one_line
@@ -273,12 +289,18 @@ class Mirror(Spin):
         check_fields(self)
 
     def times_ns(self, firings: Ints) -> Floats:
-        """Return the starts of firings (k,), nanoseconds since the mirror started: (k,)."""
+        """Return the start times of several firings in nanoseconds since the mirror started.
+
+        `firings` and the result have shape (k,).
+        """
         pause = self._within(firings) * (1 - self.duty)
         return (firings - pause) * (1e9 / (self.rate_hz * self.firings_per_turn))
 
     def azimuths(self, firings: Ints) -> Floats:
-        """Return the azimuths of the line at firings (k,), radians: (k,)."""
+        """Return the azimuths along the line at several firings, in radians.
+
+        `firings` and the result have shape (k,).
+        """
         phase = self._within(firings) / self.firings_per_turn
         if self.motion == "sine":
             line_share = -cos(2 * np.pi * phase) / 2
@@ -290,8 +312,8 @@ class Mirror(Spin):
         return np.radians(self.zero_deg) + (-turned if self.clockwise else turned)
 
 
-def _table(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
-    """Return values as a read-only float64 array of a shape, or zeros for an empty array."""
+def _as_table(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
+    """Convert values to a read-only float64 array of a given shape, with zeros if it is empty."""
     array = as_array(f"Beams.{name}", values).copy()
     if not array.size:
         array = np.zeros(shape)

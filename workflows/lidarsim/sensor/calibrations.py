@@ -1,4 +1,4 @@
-"""Calibration files of units: angles of beams, or lists of rays."""
+"""Readers for the calibration files of individual sensors, which list beam angles or rays."""
 
 from __future__ import annotations
 
@@ -28,59 +28,91 @@ from .beams import Beams
 
 @dataclass(frozen=True)
 class Calibration:
-    """Content of a calibration file."""
+    """Calibration of an individual sensor, which consists of either beams or rays.
 
-    file: str  # its name
-    maker: str | None  # maker of the format; None for a plain table of beams
-    beams: Beams | None = None  # beams in the maker's order, with the times in the file, if any
-    rays: Floats | None = None  # instead of beams, unit directions (n, 3) in the order of firing
-    shot_ns: Floats | None = None  # times (n,) of the rays, if the file has times
-    starts: Floats | None = None  # starts of the rays (n, 3), meters; None for the sensor's center
-    cycle_ns: float | None = None  # duration of the list of rays, if the file states it
-    range_m: tuple[float, float] | None = None  # shortest and longest, if the file states ranges
-    sensor: str = ""  # name of the sensor, if the file states it
-    head: dict[str, Any] = field(default_factory=dict)  # fields of `SensorModel`
-    # Part of a revolution in which the unit fires, if not all of it: start and length, as shares of
-    # a revolution from firing 0 on.
+    Attributes
+    ----------
+    file
+        Name of the calibration file.
+    maker
+        Manufacturer that defined the file format, or None for a generic table.
+    beams
+        Beams in the manufacturer's order, with their times if the file contains any.
+    rays
+        Unit directions in firing order. Shape (n, 3).
+    shot_ns
+        Times of the rays, if the file contains any. Shape (n,).
+    starts
+        Origins of the rays in meters, or None if all rays start at the sensor origin.
+        Shape (n, 3).
+    cycle_ns
+        Duration of the ray list, if the file specifies one.
+    range_m
+        Minimum and maximum range, if the file specifies them.
+    sensor
+        Name of the sensor, if the file specifies one.
+    head
+        Fields of `SensorModel` that the file determines.
+    window
+        Part of each revolution in which the sensor fires, or None for the whole revolution. The
+        start, measured from firing 0, and the length are fractions of a revolution.
+    """
+
+    file: str
+    maker: str | None
+    beams: Beams | None = None
+    rays: Floats | None = None
+    shot_ns: Floats | None = None
+    starts: Floats | None = None
+    cycle_ns: float | None = None
+    range_m: tuple[float, float] | None = None
+    sensor: str = ""
+    head: dict[str, Any] = field(default_factory=dict)
     window: tuple[float, float] | None = None
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Read the calibration file of a unit.
+    """Read the calibration file of an individual sensor.
+
+    These formats are supported:
+
+    - Velodyne YAML files with a list of lasers (`lasers:`).
+    - Ouster metadata files (.json).
+    - Hesai angle corrections (.csv) with the columns Channel, Elevation and Azimuth.
+    - RoboSense angle.csv files, which contain vertical and horizontal angles without a header.
+    - Livox ray lists (.csv) with the columns Time/s, Azimuth/deg and Zenith/deg.
+    - Beam tables (.csv) with the column elevation_deg and any of the columns azimuth_deg
+      (counterclockwise), time_us, x_m, y_m and z_m.
+    - Ray files that were written by `export_sensor` (.npz, .parquet, or .csv with the column
+      time_offset_ns).
 
     Parameters
     ----------
     path
-        Velodyne's YAML (`lasers:`), Ouster's metadata (.json), or comma-separated: Hesai's
-        angle corrections (Channel, Elevation, Azimuth), RoboSense's angle.csv (vertical and
-        horizontal angle, no header), Livox's list of rays (Time/s, Azimuth/deg, Zenith/deg), or
-        a table of beams with columns elevation_deg and any of azimuth_deg (counter-clockwise),
-        time_us, x_m, y_m, z_m. Or rays of a sensor as `export_sensor` writes: .npz, .parquet, and
-        .csv with a column time_offset_ns.
+        Path of the calibration file.
 
     Raises
     ------
     LidarError
-        If the file has none of these formats, or numbers are missing, not finite or in the wrong
-        order.
+        If the file format is unknown, or if values are missing, not finite or in the wrong order.
     """
     with converted(f"{path} is not a valid calibration file"):
         if path.suffix.lower() not in (".yaml", ".yml", ".json", ".csv"):
             rays = read_rays(path)
             if rays is not None:
-                return _calibration_of(path.name, rays)
+                return _calibration_from_rays(path.name, rays)
         text = read_text(path)
         if path.suffix.lower() in (".yaml", ".yml"):
-            return _velodyne(path.name, load_yaml(text))
+            return _parse_velodyne(path.name, load_yaml(text))
         if path.suffix.lower() == ".json":
-            return _ouster(path.name, json.loads(text))
-        return _table(path.name, text)
+            return _parse_ouster(path.name, json.loads(text))
+        return _parse_table(path.name, text)
 
 
-def _velodyne(name: str, data: Any) -> Calibration:
-    """Return the beams of Velodyne's YAML.
+def _parse_velodyne(name: str, data: Any) -> Calibration:
+    """Create a calibration from the content of a Velodyne YAML file.
 
-    The geometry is as in ros-drivers/velodyne, rawdata.cc.
+    The geometry follows rawdata.cc in ros-drivers/velodyne.
     """
     if not isinstance(data, dict) or not isinstance(data.get("lasers"), list):
         raise ValueError("it has no list of lasers, which Velodyne calibration files contain")
@@ -99,26 +131,27 @@ def _velodyne(name: str, data: Any) -> Calibration:
             for laser in lasers
         ]
     ).T
-    # Offsets at right angles to the beam, upwards and to the left.
+    # The offsets are perpendicular to the beam and point up and to the left.
     rise, level = sin_cos(elevation)
     sin, cos = sin_cos(azimuth)
-    ahead = -upwards * rise
-    origin = [ahead * cos - leftwards * sin, ahead * sin + leftwards * cos, upwards * level]
+    forward = -upwards * rise
+    origin = [forward * cos - leftwards * sin, forward * sin + leftwards * cos, upwards * level]
     beams = Beams(elevation, azimuth, origin=np.column_stack(origin))
     return Calibration(name, "velodyne", beams)
 
 
-# Distance from the axis to the start of the beams, by product line; by default of the first
-# generation: default_lidar_origin_to_beam_origin in ouster_core/src/sensor_info.cpp of
-# ouster-sdk 1.0.
+# Distance of the beam origins from the rotation axis for each product line, and for the first
+# generation. The values are those of default_lidar_origin_to_beam_origin in
+# ouster_core/src/sensor_info.cpp of ouster-sdk 1.0.
 _OUSTER_ORIGINS_MM = {"OS-0-": 27.67, "OS-1-": 15.806, "OS-2-": 13.762}
 _OUSTER_FIRST_MM = 12.163
 
 
-def _ouster(name: str, data: Any) -> Calibration:
-    """Return the beams of Ouster's metadata, old and new, by the geometry of its sensor manual.
+def _parse_ouster(name: str, data: Any) -> Calibration:
+    """Create a calibration from Ouster metadata of any firmware version.
 
-    Ranges are measured from the beam's start, as of all sensors; Ouster's ranges from the axis.
+    The geometry follows the Ouster sensor manual. Ouster measures ranges from the rotation axis,
+    whereas ranges in this package are always measured from the beam origin.
     """
     if not isinstance(data, dict):
         raise ValueError("it is not an Ouster metadata file")
@@ -157,7 +190,7 @@ def _ouster(name: str, data: Any) -> Calibration:
 
 
 def _ouster_mode(data: dict[str, Any]) -> tuple[int, int]:
-    """Return the columns of a revolution and the revolutions a second of Ouster's metadata."""
+    """Return the number of columns per revolution and the number of revolutions per second."""
     mode = str(_ouster_section(data, "config_params", data).get("lidar_mode", "1024x10"))
     numbers = re.fullmatch(r"([1-9]\d{2,4})x([1-9]\d{0,2})", mode)
     if numbers is None:
@@ -171,19 +204,19 @@ def _ouster_mode(data: dict[str, Any]) -> tuple[int, int]:
 def _ouster_window(
     data: dict[str, Any], layout: dict[str, Any], columns: int
 ) -> tuple[float, float] | None:
-    """Return the window in which an Ouster fires (`Calibration.window`), or None for all columns.
+    """Return `Calibration.window` for an Ouster sensor, or None if the sensor fires in all columns.
 
-    The window of columns counts; without it, the window of azimuths. Azimuths are counter-clockwise
-    in the lidar frame, in which column 0 is at azimuth 0 and columns follow each other clockwise.
-    Windows whose end is below their start contain column 0, or azimuth 0.
+    The column window takes precedence over the azimuth window. In the lidar frame, azimuths
+    increase counterclockwise, whereas columns are numbered clockwise, starting at azimuth 0. A
+    window whose end is less than its start contains column 0 or azimuth 0.
     """
     configuration = _ouster_section(data, "config_params", data)
     if (limits := layout.get("column_window")) is not None:
-        first, last = _limits("column_window", limits, columns - 1)
+        first, last = _parse_limits("column_window", limits, columns - 1)
         count = (last - first) % columns + 1
         start = first
     elif (limits := configuration.get("azimuth_window")) is not None:
-        right, left = _limits("azimuth_window", limits, 360_000)
+        right, left = _parse_limits("azimuth_window", limits, 360_000)
         if left - right in (0, 360_000):
             return None
         start = -(-columns * (360_000 - left) // 360_000) % columns
@@ -193,10 +226,10 @@ def _ouster_window(
     return None if count == columns else (start / columns, count / columns)
 
 
-def _limits(name: str, limits: Any, maximum: int) -> tuple[int, int]:
+def _parse_limits(name: str, limits: Any, maximum: int) -> tuple[int, int]:
     """Return the two limits of a window.
 
-    Raises ValueError for other values.
+    Raise ValueError if `limits` is not a pair of integers between 0 and `maximum`.
     """
     is_pair = isinstance(limits, list) and len(limits) == 2
     if not is_pair or not all(type(limit) is int and 0 <= limit <= maximum for limit in limits):
@@ -208,16 +241,20 @@ def _limits(name: str, limits: Any, maximum: int) -> tuple[int, int]:
 
 
 def _ouster_section(data: dict[str, Any], name: str, default: Any = None) -> dict[str, Any]:
-    """Return a section of Ouster's metadata, or `default` for a layout without sections.
+    """Return a section of Ouster metadata, or `default` if the file has no such section.
 
-    Firmware before 1.14 writes an error in place of a section: then it is empty.
+    Firmware before 1.14 may write an error message instead of a section. The section is then
+    treated as empty.
     """
     content = data.get(name, default)
     return content if isinstance(content, dict) else {}
 
 
 def _ouster_origin_mm(data: dict[str, Any], beam: dict[str, Any]) -> Floats:
-    """Return the start (3,) of Ouster's beams at azimuth 0, in the sensor frame, millimeters."""
+    """Return the origin of the beams at azimuth 0 in the sensor frame, in millimeters.
+
+    The result has shape (3,).
+    """
     beam_pose = np.reshape(beam.get("beam_to_lidar_transform", np.eye(4)), (4, 4))
     if not np.allclose(beam_pose[:3, :3], np.eye(3)):
         raise ValueError(
@@ -241,10 +278,10 @@ def _ouster_origin_mm(data: dict[str, Any], beam: dict[str, Any]) -> Floats:
     return np.asarray(origin_mm, np.float64)
 
 
-def _calibration_of(name: str, rays: RayList) -> Calibration:
-    """Return the rays of a file of a sensor as a calibration, with their times."""
+def _calibration_from_rays(name: str, rays: RayList) -> Calibration:
+    """Create a calibration from rays, with a time for each ray."""
     rays = rays.with_times()
-    assert rays.times_ns is not None  # timed rays have times
+    assert rays.times_ns is not None  # set by with_times
     shot_ns = rays.times_ns.astype(np.float64)
     interval_ns = float(shot_ns[-1]) / max(len(rays) - 1, 1) or 1e9 / rays.rate_hz / len(rays)
     cycle_ns = rays.cycle_ns or float(shot_ns[-1]) + interval_ns
@@ -262,26 +299,27 @@ def _calibration_of(name: str, rays: RayList) -> Calibration:
     )
 
 
-# Hesai's own files may begin with a mark and end with a checksum, a SHA-256 of the lines before.
+# Files from Hesai sensors may begin with a marker line and end with a SHA-256 checksum of the
+# preceding lines.
 _HESAI_MARK = "eeff"
-_HESAI_COLUMNS = ["elevation", "azimuth"]  # after the first, Channel or LaserID
+_HESAI_COLUMNS = ["elevation", "azimuth"]  # columns after the first, which is Channel or LaserID
 _HESAI_CHECKSUM = re.compile(r"^[0-9a-f]{64}[,\s]*\Z", re.IGNORECASE | re.MULTILINE)
 
 
-def _cells(line: str) -> list[str]:
-    """Return the cells between the commas of a line, in lower case."""
+def _split_cells(line: str) -> list[str]:
+    """Return the comma-separated cells of a line in lower case."""
     return [word.strip().lower() for word in line.split(",")]
 
 
-def _table(name: str, text: str) -> Calibration:
-    """Read a comma-separated calibration in the format of its header."""
+def _parse_table(name: str, text: str) -> Calibration:
+    """Create a calibration from comma-separated text, whose header determines the format."""
     if is_ray_table(text):
-        return _calibration_of(name, rays_of_text(text))
+        return _calibration_from_rays(name, rays_of_text(text))
     if is_livox(text):
-        return _livox(name, text)
-    header = _cells(text.partition("\n")[0])
+        return _parse_livox(name, text)
+    header = _split_cells(text.partition("\n")[0])
     if header[0] == _HESAI_MARK or header[1:] == _HESAI_COLUMNS:
-        return _hesai(name, text)
+        return _parse_hesai(name, text)
     if "elevation_deg" in header:
         names = ("elevation_deg", "azimuth_deg", "time_us", "x_m", "y_m", "z_m")
         unknown = [word for word in header if word not in names]
@@ -312,12 +350,12 @@ def _table(name: str, text: str) -> Calibration:
     return Calibration(name, "robosense", Beams(elevation, -azimuth))
 
 
-def _hesai(name: str, text: str) -> Calibration:
-    """Return the beams of Hesai's angle corrections, in files of its sensors or of its manuals."""
+def _parse_hesai(name: str, text: str) -> Calibration:
+    """Create a calibration from Hesai angle corrections, from either a sensor or a manual."""
     lines = text.splitlines()
-    skip = 2 if _cells(lines[0])[0] == _HESAI_MARK else 1
+    skip = 2 if _split_cells(lines[0])[0] == _HESAI_MARK else 1
     header = lines[skip - 1] if len(lines) >= skip else ""
-    if _cells(header)[1:] != _HESAI_COLUMNS:
+    if _split_cells(header)[1:] != _HESAI_COLUMNS:
         raise ValueError(
             f"the line after {_HESAI_MARK} must be Channel,Elevation,Azimuth, but is "
             f"{printable(header, 60)!r}"
@@ -329,8 +367,8 @@ def _hesai(name: str, text: str) -> Calibration:
     return Calibration(name, "hesai", Beams(elevation, -azimuth))
 
 
-def _livox(name: str, text: str) -> Calibration:
-    """Return the rays of Livox's list."""
+def _parse_livox(name: str, text: str) -> Calibration:
+    """Create a calibration from a Livox ray list."""
     rays = rays_of_livox(text)
     if rays.times_ns is None:
         return Calibration(name, "livox", rays=rays.directions)

@@ -1,4 +1,4 @@
-"""Sub-rays of a beam: positions in its cross-section, directions and starts."""
+"""Sub-rays that sample the cross section of a beam."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ import numpy as np
 from ..numerics.arrays import Floats, Indices
 from ..numerics.elementary import log1p, sin_cos
 
-# {number of sub-rays: distances from the middle, as a share of the radius, and angles in degrees,
-# of a sixth of the sub-rays}; the next sixths are rotated by multiples of 60 degrees, and one
-# sub-ray is in the middle. The positions are results of a local search, for the least error of the
-# share of sub-rays on one side of a straight edge, at any angle and offset: 0.214 of the beam with
-# 7, 0.089 with 19, 0.055 with 37, 0.037 with 61, 0.028, 0.022, 0.018, and 0.0148 with 217.
-# Hexagonal rings have 0.054 with 217, spirals 0.020.
+# Positions in one sixth of the beam, for each number of sub-rays. A position consists of the
+# distance from the center, as a fraction of the radius, and the angle in degrees. The other sixths
+# are rotated by multiples of 60 degrees, and one more sub-ray is at the center.
+#
+# The positions were found by a local search that minimizes an error: the maximum deviation, over
+# all straight edges, between the fraction of sub-rays on one side of the edge and the fraction of
+# the beam. For the numbers of sub-rays in this table, the error is 0.214, 0.089, 0.055, 0.037,
+# 0.028, 0.022, 0.018 and 0.0148. With 217 sub-rays, the error of hexagonal rings is 0.054, and the
+# error of a spiral is 0.020.
 _SIXTH = {
     7: "0.7638 11.00",
     19: "0.4522 2.26, 0.7266 41.89, 0.9224 16.09",
@@ -59,12 +62,16 @@ Profile = Literal["even", "gaussian"]
 
 @cache
 def _disc_points(count: int) -> Floats:
-    """Return the positions of sub-rays in the unit disc: (count, 2), the middle first."""
+    """Return the positions of sub-rays in the unit disc, starting with the center.
+
+    The result has shape (count, 2).
+    """
     if count == 1:
         return np.zeros((1, 2))
     radius, angle = np.array([pair.split() for pair in _SIXTH[count].split(",")], float).T
-    # Positions with the second moment of the disc. With that and the symmetry, polynomials to the
-    # third degree have the disc's mean; the energy and range of a return from a plane are such.
+    # Scale the positions so that their second moment is that of the disc. Because of the symmetry,
+    # the mean of any polynomial up to the third degree is then the same as over the disc. The
+    # energy and range of a return from a plane are such polynomials.
     radius *= np.sqrt(count / 2 / (6 * (radius**2).sum()))
     angles = np.radians(angle + 60 * np.arange(6)[:, None])
     sines, cosines = sin_cos(angles)
@@ -74,14 +81,18 @@ def _disc_points(count: int) -> Floats:
 
 @cache
 def _gaussian_points(count: int) -> Floats:
-    """Return positions with equal shares of a Gaussian beam's light: (count, 2), the middle first.
+    """Return positions that represent equal fractions of a Gaussian beam's light.
 
-    Positions are in units of the beam's radius at 1/e². The positions of the disc are moved
-    outwards: where the disc within a position has a share q of the area, the beam within it has the
-    share q of the light, 1 - exp(-2 r²). Their second moment is the beam's. At a straight edge, the
-    share of the light is wrong by at most 0.212 of the beam with 7, 0.107 with 19, 0.072, 0.053,
-    0.043, 0.039, 0.037, and 0.023 with 217. With weights on evenly spread positions, out to the
-    best radius, it is wrong by 0.280, 0.143, 0.103, …, and 0.034 with 217.
+    Positions are in units of the beam radius at 1/e², start with the center, and have shape
+    (count, 2). They are obtained by moving the positions in the disc radially. If a position in the
+    disc encloses a fraction q of the area, the moved position encloses the same fraction q of the
+    light, which is 1 - exp(-2 r²) at radius r. Finally, the positions are scaled so that their
+    second moment is that of the beam.
+
+    For the numbers of sub-rays in `SUBRAYS` from 7 to 217, the maximum error of the light on one
+    side of a straight edge is 0.212, 0.107, 0.072, 0.053, 0.043, 0.039, 0.037 and 0.023. Evenly
+    distributed positions with weights are less accurate, even with the best outer radius. Their
+    error is 0.280 with 7 sub-rays, 0.143 with 19, 0.103 with 37, and 0.034 with 217.
     """
     points = _disc_points(count)
     share = (points**2).sum(axis=1)
@@ -92,18 +103,20 @@ def _gaussian_points(count: int) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Beam:
-    """Sub-rays of a beam, each with the same share of its light, the middle first.
+    """Sub-rays of a beam, which carry equal fractions of its light.
+
+    The first sub-ray is the axis of the beam.
 
     Attributes
     ----------
     angles
-        float64 (k, 2): angles off the axis, across and up, radians.
+        Horizontal and vertical angles from the beam axis, in radians. Shape (k, 2), float64.
     starts
-        float64 (k, 2): starts at the sensor, across and up, meters off the axis; None if all
-        sub-rays start on the axis.
+        Horizontal and vertical offsets of the sub-ray origins from the beam axis, in meters, or
+        None if all sub-rays start on the axis. Shape (k, 2), float64.
     oval
-        Whether the beam is wider in one direction, so that across and up are directions of the
-        sensor.
+        Whether the beam is elliptical, so that its horizontal and vertical axes must be aligned
+        with those of the sensor.
     """
 
     angles: Floats
@@ -121,23 +134,23 @@ class Beam:
         profile: Profile = "even",
         exit_m: float = 0.0,
     ) -> Beam:
-        """Return the sub-rays of a beam by its full angles across and up, radians.
+        """Create the sub-rays of a beam from its divergence.
 
-        Sub-rays of a beam that is wide at its start are skew lines. Off the axis, each starts at a
-        right angle to its direction, so that the beam's radius in the distance R is
-        sqrt(w0² + (θ R / 2)²), as of a Gaussian beam: the hyperboloid consists of straight lines
-        (Herloski, Marshall and Antos 1983).
+        If the beam has a width at the sensor, its sub-rays are skew lines. The offset of each
+        sub-ray's origin from the axis is perpendicular to the offset of its direction. The beam
+        radius at the distance R is then sqrt(w0² + (θ R / 2)²), as for a Gaussian beam, because the
+        sub-rays form a ruled hyperboloid (Herloski, Marshall and Antos 1983).
 
         Parameters
         ----------
         count
-            Number of sub-rays, of `SUBRAYS`.
+            Number of sub-rays, from `SUBRAYS`.
         divergence
-            Full angles across and up, radians.
+            Full horizontal and vertical angles in radians.
         profile
             Distribution of the light over the beam.
         exit_m
-            Width of the beam at the sensor, meters.
+            Width of the beam at the sensor in meters.
         """
         even = profile == "even" or count == 1
         points = _disc_points(count) if even else _gaussian_points(count)
@@ -146,23 +159,25 @@ class Beam:
         if exit_m and count > 1:
             starts = exit_m / 2 * np.stack([points[:, 1], -points[:, 0]], axis=1)
             if across != up:
-                # All skewed to one side, sub-rays would rotate the oval along the beam; a sixth of
-                # them alone would skew it.
+                # Sub-rays that are all skewed to the same side would rotate the ellipse along the
+                # beam. The side alternates within each sixth of the sub-rays, because alternating
+                # by whole sixths would skew the ellipse.
                 starts[1:] *= 1 - np.add.outer(range(6), range(count // 6)).reshape(-1, 1) % 2 * 2
         return cls(np.array([across, up]) / 2 * points, starts, across != up and count > 1)
 
 
 @cache
-def neighbors(count: int) -> Indices:
-    """Return the pairs of neighboring sub-rays: (m, 2).
+def neighboring_subrays(count: int) -> Indices:
+    """Return the pairs of neighboring sub-rays.
 
-    The circle whose diameter connects a pair is empty (Gabriel and Sokal 1969).
+    Two sub-rays are neighbors if no other sub-ray lies in the circle whose diameter connects them
+    (Gabriel and Sokal 1969). The result has shape (m, 2).
     """
     points = _disc_points(count)
     first, second = np.triu_indices(count, 1)
     middle = (points[first] + points[second]) / 2
     reach2 = ((points[first] - middle) ** 2).sum(axis=1)
     apart2 = ((middle[:, None] - points) ** 2).sum(axis=2)
-    # The pair itself is on the circle.
+    # The tolerance excludes the pair itself, which lies on the circle.
     empty = (apart2 < reach2[:, None] * (1 - 1e-9)).sum(axis=1) == 0
     return np.stack([first[empty], second[empty]], axis=1)

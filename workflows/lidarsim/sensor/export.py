@@ -1,4 +1,4 @@
-"""Sensors as files for other programs: rays in the order of firing, with their times."""
+"""Export of a sensor's rays, in firing order and with their times, to files for other programs."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from .optics import Optics
 from .ray_sensors import PrismSensor
 from .sensor import Sensor
 
-MAX_RAYS = 20_000_000  # limit for a file; the arrays of as many rays take 4 GB
-_SLACK_NS = 1e-3  # roundings of times of firings
+MAX_RAYS = 20_000_000  # limit per file; the arrays of this many rays take 4 GB
+_SLACK_NS = 1e-3  # tolerance for rounding errors of firing times
 
 Seconds = Annotated[float, Field(gt=0, le=1e6)]
 Revolutions = Annotated[int, Field(gt=0, le=10_000_000)]
@@ -31,13 +31,13 @@ class SensorFile(NamedTuple):
     Attributes
     ----------
     path
-        The file.
+        Path of the file.
     format
-        Name of its format.
+        Name of the file format.
     rays
-        Rays that it holds; none if it describes the sensor's optics.
+        Rays in the file. The list is empty if the file describes the sensor's optics instead.
     left_out
-        What it does not hold of the sensor, a clause each.
+        Phrases for the properties of the sensor that the file does not store.
     """
 
     path: Path
@@ -99,12 +99,12 @@ def export_sensor(
     if row.describes:
         rays = RayList(np.zeros((0, 3)))
         duration_s = _duration_ns(sensor, seconds, revolutions) / 1e9
-        left_out = write(path, sensor, duration_s, _left_out(sensor, row))
+        left_out = write(path, sensor, duration_s, _missing_properties(sensor, row))
     else:
         rays = fired_rays(sensor, seconds=seconds, revolutions=revolutions)
-        lost = _left_out(sensor, row)
+        lost = _missing_properties(sensor, row)
         if not rays.repeats:
-            assert rays.cycle_ns is not None  # of a sensor
+            assert rays.cycle_ns is not None  # rays of a sensor have a cycle
             lost.append(
                 f"rays after {rounded(rays.cycle_ns / 1e9, 4)} s, where the pattern does not repeat"
             )
@@ -115,18 +115,18 @@ def export_sensor(
 def fired_rays(
     sensor: Sensor, *, seconds: float | None = None, revolutions: int | None = None
 ) -> RayList:
-    """Return the rays of a sensor's first firings, in the order of their times.
+    """Return the rays of a sensor's first firings, sorted by time.
 
-    Firings are whole: the last firing starts before the end of the duration. The duration is
-    `seconds`, or some revolutions or frames, by default one.
+    The duration is set by either `seconds` or `revolutions`. By default, it is one revolution or
+    frame. A firing that starts before the end of the duration is included with all its rays.
 
     Raises
     ------
     LidarError
-        If both are given, or the rays are more than `MAX_RAYS`.
+        If both `seconds` and `revolutions` are set, or if there are more than `MAX_RAYS` rays.
     """
     duration_ns = _duration_ns(sensor, seconds, revolutions)
-    count = _firings_before(sensor, duration_ns)
+    count = _count_firings(sensor, duration_ns)
     firings = np.arange(count)
     times_ns = sensor.times_ns(firings).reshape(-1) - round(sensor.start_ns)
     order = np.argsort(times_ns, kind="stable")
@@ -148,9 +148,9 @@ def fired_rays(
 
 
 def _duration_ns(sensor: Sensor, seconds: float | None, revolutions: int | None) -> float:
-    """Return the duration of a pattern, nanoseconds.
+    """Return the duration of a pattern in nanoseconds.
 
-    Raises LidarError if both figures are given.
+    Raise LidarError if both `seconds` and `revolutions` are set.
     """
     if seconds is not None and revolutions is not None:
         raise LidarError("seconds and revolutions cannot be combined.")
@@ -160,7 +160,6 @@ def _duration_ns(sensor: Sensor, seconds: float | None, revolutions: int | None)
 
 
 def _light(optics: Optics) -> Light:
-    """Return the light of a sensor for files."""
     divergence_mrad = optics.divergence_mrad
     if divergence_mrad is not None:
         across, up = np.broadcast_to(divergence_mrad, 2).tolist()
@@ -168,18 +167,14 @@ def _light(optics: Optics) -> Light:
     return Light(optics.wavelength_nm, optics.pulse_ns, None)
 
 
-def _firings_before(sensor: Sensor, duration_ns: float) -> int:
-    """Return the number of firings that start before a time since the start of the head.
+def _count_firings(sensor: Sensor, duration_ns: float) -> int:
+    """Return the number of firings that start in the first `duration_ns` nanoseconds.
 
-    Raises
-    ------
-    LidarError
-        If the rays are more than `MAX_RAYS`.
+    Raise LidarError if these firings have more than `MAX_RAYS` rays.
     """
     limit = MAX_RAYS // sensor.channels + 1
 
     def starts_before(firing: int) -> bool:
-        """Return True if a firing starts before the end of the duration."""
         start_ns = float(sensor.begins_ns(np.array([firing]))[0]) - sensor.start_ns
         return start_ns < duration_ns - _SLACK_NS
 
@@ -199,9 +194,9 @@ def _firings_before(sensor: Sensor, duration_ns: float) -> int:
 
 
 def _cycle_ns(sensor: Sensor, duration_ns: float, count: int, times_ns: Ints) -> float:
-    """Return the duration after which the list of rays may be repeated.
+    """Return the time in nanoseconds after which the list of rays may be repeated.
 
-    The duration is longer than asked for if beams of the last firing leave after its end.
+    The result is greater than `duration_ns` if some beams of the last firing are emitted later.
     """
     if times_ns[-1] < duration_ns:
         return duration_ns
@@ -210,7 +205,10 @@ def _cycle_ns(sensor: Sensor, duration_ns: float, count: int, times_ns: Ints) ->
 
 
 def _repeats(sensor: Sensor, count: int) -> bool:
-    """Return True if a sensor repeats its first `count` firings, except for parts of a firing."""
+    """Return True if a sensor repeats its first `count` firings.
+
+    Without an exact period, a deviation of less than one firing is ignored.
+    """
     if sensor.period is not None:
         return count % sensor.period == 0
     per_turn = getattr(sensor.head, "firings_per_turn", 0)
@@ -219,8 +217,8 @@ def _repeats(sensor: Sensor, count: int) -> bool:
     return bool(abs(count - max(round(count / per_turn), 1) * per_turn) < 1)
 
 
-def _left_out(sensor: Sensor, row: SensorFormat) -> list[str]:
-    """Return what a format does not hold of a sensor, a clause each."""
+def _missing_properties(sensor: Sensor, row: SensorFormat) -> list[str]:
+    """Return phrases for the properties of a sensor that a format cannot store."""
     has = {
         "times": True,
         "channels": sensor.channels > 1,

@@ -1,9 +1,9 @@
-"""Sensors as scanners of HELIOS++ (.xml): their optics and rotations, not a list of rays.
+"""Export of sensors to HELIOS++ scanner files (.xml), which describe optics instead of rays.
 
-The file has a <scanner>, and <scannerSettings> with its rates that legs name as their template.
-HELIOS++ looks along y with z up and x to the right. All channels fire at each pulse, mirrors and
-heads move by a step from pulse to pulse, and pulses a second are a whole number. Steps keep their
-angles, so that times are stretched where the sensor's pulses a second are no whole number.
+A file contains a <scanner> and <scannerSettings>, which the legs of a survey use as a template. A
+HELIOS++ scanner faces along y, with z up and x to the right. All its channels fire at each pulse,
+mirrors and heads rotate by a constant step between pulses, and the pulse rate is an integer. If the
+pulse rate of a sensor is not an integer, the steps keep their angles and the times are stretched.
 """
 
 from __future__ import annotations
@@ -30,14 +30,15 @@ from .sensor import LineSensor, Sensor
 AXES = "x right, y forward, z up"
 MAX_CHANNELS = 1000
 MAX_PRISMS = 3
-# From the sensor frame (x forward) to the frame of HELIOS++, and from a frame whose x axis is the
-# beam at angle 0, and whose z axis a mirror or prisms turn about, to the frame of its optics.
+# Rotation from the sensor frame (x forward) to the HELIOS++ frame.
 _FRAME = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+# Rotation to the frame of HELIOS++ optics, from a frame in which x is the beam at angle 0 and z is
+# the rotation axis of the mirror or prisms.
 _OPTICS = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
-_REVERSED = np.diag([-1.0, 1, -1])  # of a mirror that turns the other way
-_EVEN_DEG = 1e-6  # of elevations of a line
-_EVEN_NS = 10.0  # of times of a line
-_MIN_LINE = 3  # beams of a line
+_REVERSED = np.diag([-1.0, 1, -1])  # rotation for a mirror that turns in the opposite direction
+_EVEN_DEG = 1e-6  # tolerance for the angles of an evenly spaced line
+_EVEN_NS = 10.0  # tolerance for the times of an evenly spaced line
+_MIN_LINE = 3  # minimum number of beams in a line
 _ADVICE = "The formats npz and csv support any rays."
 
 
@@ -48,11 +49,11 @@ class _Channel:
     Attributes
     ----------
     rotation
-        Rotation (3, 3) of its emitter.
+        Rotation matrix of the emitter.
     height_m
-        Height of its start.
+        Height of the beam origin in meters.
     incident
-        Direction (3,) of light that enters prisms; None for other optics.
+        Direction of the light that enters the prisms, or None for other optics. Shape (3,).
     """
 
     rotation: Floats
@@ -62,24 +63,24 @@ class _Channel:
 
 @dataclass
 class _Scanner:
-    """Optics of a scanner.
+    """Description of a HELIOS++ scanner.
 
     Attributes
     ----------
     optics
-        Kind of its optics.
+        Type of the optics.
     pulse_hz
-        Whole number of pulses a second.
+        Pulse rate in the file, which is an integer.
     exact_hz
-        Pulses a second of the sensor.
+        Pulse rate of the sensor.
     channels
-        Its channels.
+        Channels of the scanner.
     limits
-        Attributes of the scanner. {name: value}
+        Attributes of the <scanner> element, by name.
     settings
-        Attributes of its settings. {name: value}
+        Attributes of the <scannerSettings> element, by name.
     left_out
-        What HELIOS++ does not hold, a clause each.
+        Phrases for the properties of the sensor that the file does not store.
     """
 
     optics: str
@@ -92,14 +93,16 @@ class _Scanner:
 
 
 def write(path: Path, sensor: Sensor, duration_s: float, left_out: Sequence[str]) -> Sequence[str]:
-    """Write a scanner with its settings, which scan for a duration in seconds.
+    """Write a sensor as a HELIOS++ scanner, with settings for a scan of `duration_s` seconds.
+
+    Return `left_out`, followed by phrases for further properties that the file does not store.
 
     Raises
     ------
     LidarError
-        If HELIOS++ has no optics for the sensor; the message says why not.
+        If HELIOS++ has no optics that correspond to the sensor. The message states the reason.
     """
-    scanner = _scanner_of(sensor, duration_s)
+    scanner = _create_scanner(sensor, duration_s)
     lost = [*left_out, *scanner.left_out, *_lost_light(sensor), *_lost_rate(scanner)]
     name = re.sub(r"[^\w.-]+", "_", sensor.model).strip("_.").lower() or "lidar"
     lines = [
@@ -111,7 +114,7 @@ def write(path: Path, sensor: Sensor, duration_s: float, left_out: Sequence[str]
         "<document>",
         *_scanner_lines(name, sensor, scanner),
         f'  <scannerSettings id="{name}" active="true" pulseFreq_hz="{scanner.pulse_hz}"'
-        f"{_attributes(scanner.settings)}/>",
+        f"{_format_attributes(scanner.settings)}/>",
         "</document>",
     ]
     write_complete_text(path, "\n".join(lines) + "\n")
@@ -119,7 +122,7 @@ def write(path: Path, sensor: Sensor, duration_s: float, left_out: Sequence[str]
 
 
 def _scanner_lines(name: str, sensor: Sensor, scanner: _Scanner) -> list[str]:
-    """Return the lines of <scanner>."""
+    """Return the lines of the <scanner> element."""
     optics = sensor.optics
     numbers: dict[str, float] = {
         "pulseFreqs_Hz": scanner.pulse_hz,
@@ -132,7 +135,7 @@ def _scanner_lines(name: str, sensor: Sensor, scanner: _Scanner) -> list[str]:
         **scanner.limits,
     }
     head = f'  <scanner id="{name}" name={quoteattr(sensor.model)} optics="{scanner.optics}"'
-    lines = [f"{head}{_attributes(numbers)}>"]
+    lines = [f"{head}{_format_attributes(numbers)}>"]
     if "headRotatePerSecMax_deg" in scanner.limits:
         lines.append('    <headRotateAxis x="0" y="0" z="1"/>')
     if len(scanner.channels) == 1:
@@ -148,20 +151,23 @@ def _scanner_lines(name: str, sensor: Sensor, scanner: _Scanner) -> list[str]:
 
 
 def _emitter_lines(indent: str, channel: _Channel) -> Iterable[str]:
-    """Yield the lines of the emitter of a channel."""
-    yield f'{indent}<beamOrigin x="0" y="0" z="{_number(channel.height_m)}">'
-    for axis, angle_deg in _turns(channel.rotation):
-        yield f'{indent}  <rot axis="{axis}" angle_deg="{_number(angle_deg)}"/>'
+    """Yield the lines that describe the emitter of a channel."""
+    yield f'{indent}<beamOrigin x="0" y="0" z="{_format_number(channel.height_m)}">'
+    for axis, angle_deg in _fixed_axis_angles(channel.rotation):
+        yield f'{indent}  <rot axis="{axis}" angle_deg="{_format_number(angle_deg)}"/>'
     yield f"{indent}</beamOrigin>"
     if channel.incident is not None:
         x, y, z = channel.incident.tolist()
         yield f'{indent}<incidentBeam x="{x!r}" y="{y!r}" z="{z!r}"/>'
 
 
-def _turns(rotation: Floats) -> list[tuple[str, float]]:
-    """Return rotations about the fixed axes x, y, z, one after the other, degrees."""
+def _fixed_axis_angles(rotation: Floats) -> list[tuple[str, float]]:
+    """Decompose a rotation into successive rotations about the fixed axes x, y and z.
+
+    The result contains an axis and an angle in degrees for each rotation that is not zero.
+    """
     y_deg = np.degrees(np.arctan2(-rotation[2, 0], np.hypot(rotation[2, 1], rotation[2, 2])))
-    if np.hypot(rotation[2, 1], rotation[2, 2]) < 1e-9:  # z and x turn about the same axis
+    if np.hypot(rotation[2, 1], rotation[2, 2]) < 1e-9:  # gimbal lock
         x_deg = np.degrees(np.arctan2(-rotation[1, 2], rotation[1, 1]))
         z_deg = 0.0
     else:
@@ -171,21 +177,21 @@ def _turns(rotation: Floats) -> list[tuple[str, float]]:
     return [(axis, angle_deg) for axis, angle_deg in angles if abs(angle_deg) > 1e-12]
 
 
-def _attributes(numbers: dict[str, float]) -> str:
-    """Return numbers as attributes."""
-    return "".join(f' {name}="{_number(value)}"' for name, value in numbers.items())
+def _format_attributes(numbers: dict[str, float]) -> str:
+    """Format numbers as XML attributes, each with a leading space."""
+    return "".join(f' {name}="{_format_number(value)}"' for name, value in numbers.items())
 
 
-def _number(value: float) -> str:
-    """Return the shortest text of a number.
-
-    HELIOS++ refuses whole numbers that end in .0.
-    """
+def _format_number(value: float) -> str:
+    """Format a number, without a decimal point for integers, because HELIOS++ rejects 1.0."""
     return str(int(value)) if value == int(value) else repr(float(value))
 
 
 def _divergence_mrad(sensor: Sensor) -> float:
-    """Return the divergence for HELIOS++, which has round beams: 0 if unknown."""
+    """Return the divergence of a round beam with the same area, or 0 if it is unknown.
+
+    HELIOS++ only supports round beams.
+    """
     if sensor.optics.divergence_mrad is None:
         return 0.0
     across, up = np.broadcast_to(sensor.optics.divergence_mrad, 2).tolist()
@@ -193,7 +199,7 @@ def _divergence_mrad(sensor: Sensor) -> float:
 
 
 def _lost_light(sensor: Sensor) -> Iterable[str]:
-    """Yield what HELIOS++ does not hold of a sensor's light and noise, a clause each."""
+    """Yield phrases for the properties of light and noise that HELIOS++ cannot represent."""
     divergence_mrad = sensor.optics.divergence_mrad
     if divergence_mrad is not None and np.ptp(divergence_mrad):
         yield (
@@ -207,7 +213,7 @@ def _lost_light(sensor: Sensor) -> Iterable[str]:
 
 
 def _lost_rate(scanner: _Scanner) -> Iterable[str]:
-    """Yield a clause if the pulses a second are no whole number."""
+    """Yield a phrase if the pulse rate was rounded to an integer."""
     if abs(scanner.exact_hz - scanner.pulse_hz) > 1e-6 * scanner.exact_hz / 1e3:
         yield (
             f"the exact pulse rate of {scanner.exact_hz:,.2f} Hz (rounded to {scanner.pulse_hz:,} "
@@ -215,44 +221,43 @@ def _lost_rate(scanner: _Scanner) -> Iterable[str]:
         )
 
 
-def _scanner_of(sensor: Sensor, duration_s: float) -> _Scanner:
-    """Return the optics for a sensor.
+def _create_scanner(sensor: Sensor, duration_s: float) -> _Scanner:
+    """Create the HELIOS++ scanner that corresponds to a sensor.
 
-    Raises LidarError if HELIOS++ has none.
+    Raise LidarError if HELIOS++ has no such optics.
     """
     if isinstance(sensor, PrismSensor):
-        return _prisms(sensor, duration_s)
+        return _prism_scanner(sensor, duration_s)
     kind = type(sensor)
     if isinstance(sensor, ListedSensor):
-        raise _refusal(
+        raise _unsupported(
             sensor, "the sensor is a list of rays, but HELIOS++ scanners have deflecting optics"
         )
     if kind not in (Sensor, LineSensor) or type(sensor.head) not in (Spin, Mirror):
         part = sensor if kind not in (Sensor, LineSensor) else sensor.head
-        raise _refusal(sensor, f"HELIOS++ has no optics that correspond to {type(part).__name__}")
+        raise _unsupported(
+            sensor, f"HELIOS++ has no optics that correspond to {type(part).__name__}"
+        )
     if isinstance(sensor.head, Mirror):
-        return _mirror(sensor, sensor.head, duration_s)
+        return _mirror_scanner(sensor, sensor.head, duration_s)
     assert isinstance(sensor.head, Spin)
     if kind is LineSensor:
-        raise _refusal(sensor, "its head rotates about x, but HELIOS++ heads rotate about z")
-    line = _line_of_beams(sensor, sensor.head, duration_s)
-    return line or _spinning_head(sensor, sensor.head, duration_s)
+        raise _unsupported(sensor, "its head rotates about x, but HELIOS++ heads rotate about z")
+    line = _line_scanner(sensor, sensor.head, duration_s)
+    return line or _multichannel_scanner(sensor, sensor.head, duration_s)
 
 
-def _refusal(sensor: Sensor, reason: str) -> LidarError:
-    """Return an error that says why HELIOS++ has no such scanner."""
+def _unsupported(sensor: Sensor, reason: str) -> LidarError:
+    """Create an error that states why a sensor cannot be written as a HELIOS++ scanner."""
     return LidarError(
         f"{sensor.model} cannot be written as a HELIOS++ scanner: {reason}. {_ADVICE}"
     )
 
 
 def _whole_hz(sensor: Sensor, exact_hz: float) -> int:
-    """Return a whole number of pulses a second.
-
-    Raises LidarError for less than one.
-    """
+    """Round a pulse rate to an integer, and raise LidarError if the result is 0."""
     if exact_hz < 0.5:
-        raise _refusal(
+        raise _unsupported(
             sensor,
             f"it fires {rounded(exact_hz)} times per second, but pulseFreq_hz must be a whole "
             "number",
@@ -260,10 +265,12 @@ def _whole_hz(sensor: Sensor, exact_hz: float) -> int:
     return round(exact_hz)
 
 
-def _head(head: Spin, pulse_hz: float, pulses_per_firing: int, duration_s: float) -> _Scanner:
-    """Return a scanner without channels whose head turns as a sensor's head."""
+def _rotating_scanner(
+    head: Spin, pulse_hz: float, pulses_per_firing: int, duration_s: float
+) -> _Scanner:
+    """Create a scanner that rotates like a sensor's head and does not have channels yet."""
     speed = 360 / head.firings_per_turn * pulse_hz / pulses_per_firing
-    turned = 360 * head.rate_hz * duration_s
+    total_deg = 360 * head.rate_hz * duration_s
     sign = -1 if head.clockwise else 1
     return _Scanner(
         "rotating",
@@ -274,29 +281,29 @@ def _head(head: Spin, pulse_hz: float, pulses_per_firing: int, duration_s: float
         {
             "headRotatePerSec_deg": sign * speed,
             "headRotateStart_deg": float(head.zero_deg),
-            "headRotateStop_deg": float(head.zero_deg + sign * turned),
+            "headRotateStop_deg": float(head.zero_deg + sign * total_deg),
         },
     )
 
 
-def _spinning_head(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner:
-    """Return a head with a channel for each beam, whose mirror stands.
+def _multichannel_scanner(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner:
+    """Create a scanner with a rotating head, a stationary mirror and a channel for each beam.
 
-    HELIOS++'s own Velodyne VLP-16 is such a scanner. A standing mirror is at angle 0, and needs a
-    scan angle above 0 for its pulses to leave the device.
+    HELIOS++ defines its Velodyne VLP-16 in the same way. A stationary mirror is at angle 0, but its
+    scan angle must be greater than 0, because otherwise no pulses leave the device.
     """
     if sensor.channels > MAX_CHANNELS:
-        raise _refusal(
+        raise _unsupported(
             sensor,
             f"its {sensor.channels:,} beams are not evenly spaced, and more than {MAX_CHANNELS:,} "
             "channels cannot be written",
         )
     exact_hz = head.firings_per_turn * head.rate_hz
     pulse_hz = _whole_hz(sensor, exact_hz)
-    scanner = _head(head, pulse_hz, 1, duration_s)
+    scanner = _rotating_scanner(head, pulse_hz, 1, duration_s)
     scanner.exact_hz = exact_hz
-    standing = {"scanAngleMax_deg": 1, "scanAngleEffectiveMax_deg": 1}
-    scanner.limits |= standing | {"scanFreqMin_Hz": 0, "scanFreqMax_Hz": 0}
+    scan_angles = {"scanAngleMax_deg": 1, "scanAngleEffectiveMax_deg": 1}
+    scanner.limits |= scan_angles | {"scanFreqMin_Hz": 0, "scanFreqMax_Hz": 0}
     scanner.settings |= {"scanFreq_hz": 0, "scanAngle_deg": 1}
     beams = sensor.beams
     if np.ptp(beams.time_ns):
@@ -316,7 +323,7 @@ def _spinning_head(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner:
 
 
 class _EvenLine(NamedTuple):
-    """Beams that follow each other upwards, with even steps of angle and time."""
+    """Beams that are fired upward one after another, evenly spaced in angle and time."""
 
     lowest_deg: float
     azimuth_deg: float
@@ -325,9 +332,9 @@ class _EvenLine(NamedTuple):
 
 
 def _even_line(beams: Beams, radians_per_ns: float) -> _EvenLine | None:
-    """Return the line of beams, or None for beams that make no even line from the center.
+    """Return the line that the beams form, or None if they do not form an evenly spaced line.
 
-    `radians_per_ns` is the speed of the head, which turns while the beams fire.
+    `radians_per_ns` is the angular velocity of the head, which rotates while the beams are fired.
     """
     if len(beams) < _MIN_LINE or beams.origin.any():
         return None
@@ -351,10 +358,10 @@ def _even_line(beams: Beams, radians_per_ns: float) -> _EvenLine | None:
     return _EvenLine(float(elevations_deg[0]), float(azimuths_deg[0]), step_deg, step_ns)
 
 
-def _line_of_beams(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner | None:
-    """Return a mirror that draws a line in each firing.
+def _line_scanner(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner | None:
+    """Create a scanner whose mirror sweeps one line per firing.
 
-    Returns None for beams that make no even line.
+    The result is None if the beams do not form an evenly spaced line.
     """
     line = _even_line(sensor.beams, head.radians_per_ns)
     if line is None:
@@ -363,10 +370,10 @@ def _line_of_beams(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner | 
     firing_hz = head.firings_per_turn * head.rate_hz
     pulses_per_line = max(round(1e9 / (firing_hz * line.step_ns)), count)
     if line.step_deg * pulses_per_line > 360:
-        return None  # the mirror would turn more than once in a line
+        return None  # the mirror would rotate more than once per line
     exact_hz = pulses_per_line * firing_hz
     pulse_hz = _whole_hz(sensor, exact_hz)
-    scanner = _head(head, pulse_hz, pulses_per_line, duration_s)
+    scanner = _rotating_scanner(head, pulse_hz, pulses_per_line, duration_s)
     scanner.exact_hz = exact_hz
     middle_deg = _set_line(scanner, line.step_deg, count, pulses_per_line, pulse_hz)
     tilt_deg = line.lowest_deg + line.step_deg * (count - 1) / 2 - middle_deg
@@ -378,16 +385,17 @@ def _line_of_beams(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner | 
 def _set_line(
     scanner: _Scanner, step_deg: float, count: int, pulses_per_line: int, pulse_hz: int
 ) -> float:
-    """Give a scanner a mirror that draws lines, and return the angle of their middle, degrees.
+    """Set the mirror of a scanner so that it sweeps lines of `count` pulses.
 
-    The mirror turns from -scanAngleMax_deg on, by a step from pulse to pulse; pulses between
-    verticalAngleMin_deg and verticalAngleMax_deg leave the device.
+    The mirror starts at -scanAngleMax_deg and rotates by `step_deg` per pulse. Only pulses between
+    verticalAngleMin_deg and verticalAngleMax_deg leave the device. Return the mirror angle at the
+    center of the lines, in degrees.
     """
     half_turn_deg = step_deg * pulses_per_line / 2
     first_deg = (pulses_per_line - count) // 2 * step_deg - half_turn_deg
     last_deg = first_deg + (count - 1) * step_deg
     scan_hz = pulse_hz / pulses_per_line
-    half_line_deg = (count / 2 + 0.25) * step_deg  # of a line, with room for roundings
+    half_line_deg = (count / 2 + 0.25) * step_deg  # with a margin for rounding errors
     scanner.limits |= {
         "scanAngleMax_deg": half_turn_deg,
         "scanAngleEffectiveMax_deg": half_line_deg,
@@ -403,26 +411,26 @@ def _set_line(
     return (first_deg + last_deg) / 2
 
 
-def _mirror(sensor: Sensor, head: Mirror, duration_s: float) -> _Scanner:
-    """Return a mirror that draws lines with a single beam.
+def _mirror_scanner(sensor: Sensor, head: Mirror, duration_s: float) -> _Scanner:
+    """Create a scanner whose mirror sweeps lines with a single beam.
 
-    Raises LidarError for other mirrors.
+    Raise LidarError if HELIOS++ has no corresponding mirror.
     """
     beams = sensor.beams
     if len(beams) > 1 or abs(beams.elevation[0]) > 1e-9 or beams.origin.any():
-        raise _refusal(
+        raise _unsupported(
             sensor,
             "its mirror must deflect a single beam, centered and perpendicular to the mirror axis",
         )
     if head.motion == "sine":
-        raise _refusal(
+        raise _unsupported(
             sensor,
             "its mirror oscillates sinusoidally, but a HELIOS++ mirror oscillates at constant "
             "speed",
         )
     count = head.period
     if count is None or count < _MIN_LINE:
-        raise _refusal(
+        raise _unsupported(
             sensor,
             f"it fires {head.firings_per_turn:g} times per line, which is not a whole number",
         )
@@ -435,7 +443,7 @@ def _mirror(sensor: Sensor, head: Mirror, duration_s: float) -> _Scanner:
     sign = -1 if head.clockwise else 1
     if head.motion == "triangle":
         if head.duty != 1:
-            raise _refusal(
+            raise _unsupported(
                 sensor,
                 f"its mirror has a duty cycle of {head.duty:g}, but HELIOS++ mirrors do not pause",
             )
@@ -453,7 +461,7 @@ def _mirror(sensor: Sensor, head: Mirror, duration_s: float) -> _Scanner:
     else:
         step_deg = head.width_deg / count
         line_deg = _set_line(scanner, step_deg, count, pulses_per_line, pulse_hz)
-        # A line of ours starts at half its width, and ends a step before the other half.
+        # A line in this package starts at half its width and ends one step before the other half.
         middle -= sign * np.radians(line_deg + step_deg / 2)
     scanner.settings["maxDuration_s"] = duration_s
     axes = np.eye(3) if sensor.axes is None else sensor.axes
@@ -462,19 +470,21 @@ def _mirror(sensor: Sensor, head: Mirror, duration_s: float) -> _Scanner:
     return scanner
 
 
-def _prisms(sensor: PrismSensor, duration_s: float) -> _Scanner:
-    """Return Risley prisms.
+def _prism_scanner(sensor: PrismSensor, duration_s: float) -> _Scanner:
+    """Create a scanner with Risley prisms.
 
-    Raises LidarError for prisms that HELIOS++ does not have.
+    Raise LidarError if HELIOS++ does not support the prisms.
     """
     if sensor.mirror is not None:
-        raise _refusal(sensor, "it has a mirror behind its prisms, which HELIOS++ does not support")
+        raise _unsupported(
+            sensor, "it has a mirror behind its prisms, which HELIOS++ does not support"
+        )
     if len(sensor.prisms) > MAX_PRISMS:
-        raise _refusal(
+        raise _unsupported(
             sensor, f"it has {len(sensor.prisms)} prisms, but HELIOS++ supports {MAX_PRISMS}"
         )
     if not isinstance(sensor.head, Spin):
-        raise _refusal(
+        raise _unsupported(
             sensor, f"HELIOS++ has no timing that corresponds to {type(sensor.head).__name__}"
         )
     exact_hz = sensor.head.firings_per_turn * sensor.head.rate_hz
@@ -496,21 +506,21 @@ def _prisms(sensor: PrismSensor, duration_s: float) -> _Scanner:
         )
     if np.ptp(sensor.beams.time_ns):
         scanner.left_out.append("time offsets of the rays in a firing (all channels fire at once)")
-    # All prisms start at the angle of the first: the whole device is turned by it.
-    turned = _about_x(np.radians(phases_deg[0]))
-    rotation = _FRAME @ turned @ _OPTICS.T
-    incident = sensor.ahead @ (_OPTICS @ turned.T).T
+    # HELIOS++ prisms start at angle 0, so the whole device is rotated to the first prism's phase.
+    device = _about_x(np.radians(phases_deg[0]))
+    rotation = _FRAME @ device @ _OPTICS.T
+    incident = sensor.beam_directions @ (_OPTICS @ device.T).T
     scanner.channels = [_Channel(rotation, incident=vector) for vector in incident]
     return scanner
 
 
 def _about_x(radians: float) -> Floats:
-    """Return the rotation (3, 3) about x."""
+    """Return the matrix of a rotation about x."""
     sine, cosine = np.sin(radians), np.cos(radians)
     return np.array([[1.0, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
 
 
 def _about_z(radians: float) -> Floats:
-    """Return the rotation (3, 3) about z."""
+    """Return the matrix of a rotation about z."""
     sine, cosine = np.sin(radians), np.cos(radians)
     return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0.0, 0, 1]])

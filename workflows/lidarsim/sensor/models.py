@@ -1,4 +1,4 @@
-"""Sensor models by name: reading their data files, and making sensors."""
+"""Sensor models, which are read from data files, and the sensors that are created from them."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class _ModelSection(BaseModel):
 _MAX_BEAMS = 1_000_000
 
 
-def _numbers(value: Any) -> Any:
-    """Expand {first, last, count} to evenly spaced numbers, both ends included."""
+def _expand_numbers(value: Any) -> Any:
+    """Expand a mapping of first, last and count to evenly spaced numbers, including both ends."""
     if isinstance(value, dict):
         count = value.get("count")
         if isinstance(count, int) and count > _MAX_BEAMS:
@@ -59,24 +59,29 @@ def _numbers(value: Any) -> Any:
     return value
 
 
-Numbers = Annotated[tuple[float, ...], BeforeValidator(_numbers)]
+Numbers = Annotated[tuple[float, ...], BeforeValidator(_expand_numbers)]
 OffsetXYZ = tuple[float, float, float]
-# 55.296 is not exact in binary, nor 500/9 in decimal.
+# Fractions are exact, whereas a float cannot represent 55.296 exactly, and a decimal number cannot
+# represent 500/9.
 Exact = Annotated[Fraction, BeforeValidator(lambda value: Fraction(str(value)))]
 Positive = Annotated[float, Field(gt=0)]
 
 
 class BeamTable(_ModelSection):
-    """Beams in the maker's order, as in `Beams`."""
+    """Beams of a sensor model in the manufacturer's order.
+
+    Except for their units, the fields are those of `Beams`. All beams cross in a point at a
+    distance of `crossing_m` from the axis, if it is set.
+    """
 
     elevation_deg: Numbers = ()
     azimuth_deg: Numbers = ()
     time_us: Numbers = ()
     origin_m: OffsetXYZ | tuple[OffsetXYZ, ...] = ()
-    crossing_m: Annotated[float, Field(ge=0, le=1)] = 0.0  # see `origins`
+    crossing_m: Annotated[float, Field(ge=0, le=1)] = 0.0
 
     def beams(self) -> Beams:
-        """Return the beams, or a single beam straight ahead if the table has no elevations."""
+        """Create the beams, or a single forward beam if the table has no elevations."""
         count = len(self.elevation_deg)
         if not count:
             return Beams(np.zeros(1))
@@ -88,10 +93,11 @@ class BeamTable(_ModelSection):
         )
 
     def origins(self, count: int) -> Floats:
-        """Return the starts of `count` beams: (count, 3), meters, or (0, 3) without origins.
+        """Return the origins of `count` beams in meters.
 
-        Beams that cross in a point `crossing_m` ahead of the axis, at the height of the sensor's
-        center, start on the axis, above or below the center.
+        The result has shape (count, 3), or shape (0, 3) if the table has no origins. If
+        `crossing_m` is set, the beams start on the axis and cross in a point `crossing_m` in front
+        of the sensor origin.
         """
         if self.crossing_m:
             up, level = sin_cos(np.radians(self.elevation_deg))
@@ -101,8 +107,8 @@ class BeamTable(_ModelSection):
         return np.repeat(origin, count, axis=0) if len(origin) == 1 else origin
 
 
-class MirrorPart(_ModelSection):
-    """Motion of a mirror that sweeps lines, as in `Mirror`."""
+class MirrorSpec(_ModelSection):
+    """Motion of a mirror that sweeps lines, with the fields of `Mirror`."""
 
     motion: MirrorMotion
     width_deg: Width
@@ -110,7 +116,7 @@ class MirrorPart(_ModelSection):
 
 
 class RangePrecision(_ModelSection):
-    """Standard deviation of the ranges of a surface, at right angles."""
+    """Standard deviation of ranges on a perpendicular surface."""
 
     sigma_m: Positive
     range_m: Positive
@@ -118,7 +124,7 @@ class RangePrecision(_ModelSection):
 
 
 class Detection(_ModelSection):
-    """Range at which a share of the pulses on a surface, at right angles, return."""
+    """Range at which a fraction of the pulses on a perpendicular surface is detected."""
 
     range_m: Positive
     reflectance: Annotated[float, Field(gt=0, le=1)] = TARGET_REFLECTANCE
@@ -126,13 +132,13 @@ class Detection(_ModelSection):
 
     @property
     def threshold_m(self) -> float:
-        """Range at which a surface of 10 % reflectance returns half of the pulses."""
+        """Range at which half of the pulses on a surface with 10 % reflectance are detected."""
         range_m = self.range_m * math.sqrt(TARGET_REFLECTANCE / self.reflectance)
         energy = 1 + NormalDist().inv_cdf(self.probability) / THRESHOLD_SIGMAS
         return float(range_m * math.sqrt(max(energy, 0.0)))
 
 
-# Figures that a data sheet may state: {field of `Noise`: words}.
+# Values that a data sheet may specify. {field of `Noise`: phrase}
 STATED = {
     "range_m": "range precision",
     "detection_range_m": "detection range at a given reflectance",
@@ -142,12 +148,12 @@ STATED = {
 
 
 class Performance(_ModelSection):
-    """Figures of a data sheet on a sensor's noise and returns.
+    """Values from a data sheet that describe a sensor's noise and returns.
 
-    `SensorModel.datasheet` makes settings of them.
+    `SensorModel.datasheet` converts them to settings.
 
-    The precision of ranges is given either by the fields of `Noise`, with the same names, or for
-    two surfaces, which give its dependence on energy.
+    The range precision is specified either by fields with the same names as those of `Noise`, or by
+    `precision` for two surfaces, from which its dependence on energy is derived.
     """
 
     range_m: Annotated[float, Field(ge=0)] | None = None
@@ -156,39 +162,40 @@ class Performance(_ModelSection):
     precision: tuple[RangePrecision, RangePrecision] | None = None
     angle_deg: Annotated[float, Field(ge=0)] | None = None
     detection: Detection | None = None
-    false_alarms: Annotated[float, Field(ge=0, lt=0.5)] | None = None  # share of pulses
-    dropout: UnitShare = 0.0  # share of returns, whatever their energy
+    # Fraction of pulses with a false alarm.
+    false_alarms: Annotated[float, Field(ge=0, lt=0.5)] | None = None
+    dropout: UnitShare = 0.0  # fraction of returns that are lost, regardless of their energy
     mode: Mode = "strongest"
 
     @model_validator(mode="after")
     def _check_consistency(self) -> Performance:
-        """Check that the figures fit together."""
         if self.precision and (self.range_m or self.range_per_m or self.range_at_threshold_m):
             raise ValueError("precision cannot be combined with other range accuracy values.")
         for name in ("precision", "false_alarms", "range_at_threshold_m"):
             if getattr(self, name) and self.detection is None:
                 raise ValueError(f"{name} requires detection.")
-        self.noise(1.0)  # LidarError if figures are impossible
+        self.noise(1.0)  # raises LidarError for impossible values
         return self
 
     def noise(self, gate_s: float) -> Noise:
         """Return the noise of a sensor whose receiver waits `gate_s` seconds for returns."""
-        figures = self.model_dump(
-            include={field.name for field in fields(Noise)}, exclude_none=True
-        )
+        values = self.model_dump(include={field.name for field in fields(Noise)}, exclude_none=True)
         if self.detection is not None:
-            figures["detection_range_m"] = self.detection.threshold_m
+            values["detection_range_m"] = self.detection.threshold_m
             if self.precision is not None:
-                strong_m, weak_m = self._by_energy(self.detection.threshold_m)
-                figures |= {"range_m": strong_m, "range_at_threshold_m": weak_m}
+                strong_m, weak_m = self._range_sigmas_m(self.detection.threshold_m)
+                values |= {"range_m": strong_m, "range_at_threshold_m": weak_m}
         if self.false_alarms is not None:
-            figures["false_alarm_hz"] = -float(log1p(-self.false_alarms)) / gate_s
-        return Noise(**figures)
+            values["false_alarm_hz"] = -float(log1p(-self.false_alarms)) / gate_s
+        return Noise(**values)
 
-    def _by_energy(self, threshold_m: float) -> tuple[float, float]:
-        """Return the standard deviations of strong returns, and of returns at the threshold."""
+    def _range_sigmas_m(self, threshold_m: float) -> tuple[float, float]:
+        """Return the range standard deviations for strong returns and at the threshold.
+
+        `threshold_m` is `Detection.threshold_m`.
+        """
         assert self.precision is not None
-        # The threshold over the energy: it grows with the square of the range.
+        # Ratio of the threshold to the energy, which increases with the square of the range.
         weakness = [
             TARGET_REFLECTANCE / surface.reflectance * np.square(surface.range_m / threshold_m)
             for surface in self.precision
@@ -204,11 +211,8 @@ class Performance(_ModelSection):
         return float(np.sqrt(s - slope * x)), float(np.sqrt(slope))
 
 
-class PacketPart(_ModelSection):
-    """Packets of the maker, as in `PacketSettings`.
-
-    The format defines the identifiers.
-    """
+class PacketSpec(_ModelSection):
+    """Packet format of the manufacturer, with the fields of `PacketSettings`."""
 
     format: str
     ports: dict[str, Annotated[int, Field(ge=1, le=65_535)]] = {}
@@ -216,7 +220,7 @@ class PacketPart(_ModelSection):
 
 
 class SensorModel(_ModelSection):
-    """Data file of a sensor, with the fields that `docs/how-to/sensor.md` describes."""
+    """Content of a sensor data file, whose fields are described in docs/how-to/sensor.md."""
 
     name: str
     sources: dict[str, str] = {}
@@ -229,18 +233,17 @@ class SensorModel(_ModelSection):
     rates_hz: tuple[Positive, Positive] | None = None
     range_m: tuple[float, float] | None = None
     beams: BeamTable = BeamTable()
-    mirror: MirrorPart | None = None
+    mirror: MirrorSpec | None = None
     prisms: tuple[Prism, ...] = ()
     turning_mirror: TurningMirror | None = None  # behind the prisms
-    typical: bool = False  # whether units differ, so that the rays are only similar to a unit's
+    typical: bool = False  # whether the ray pattern differs between units
     optics: Optics = Optics()
     performance: Performance | None = None
     listed: bool = False
-    packets: PacketPart | None = None
+    packets: PacketSpec | None = None
 
     @model_validator(mode="after")
     def _check_consistency(self) -> SensorModel:
-        """Check that the fields fit together."""
         if (self.firing_us is None) == (self.firings_per_turn is None):
             raise ValueError("Set exactly one of firing_us and firings_per_turn.")
         if self.range_m is not None and not 0 <= self.range_m[0] < self.range_m[1]:
@@ -259,18 +262,21 @@ class SensorModel(_ModelSection):
             raise ValueError(
                 "turning_mirror requires prisms. For a mirror that scans lines, use mirror."
             )
-        self.beams.beams()  # LidarError if beams are impossible
+        self.beams.beams()  # raises LidarError for impossible beams
         return self
 
     @property
     def needs_calibration(self) -> bool:
-        """Whether the rays of the model need a calibration file."""
+        """Whether the model requires a calibration file, because it does not define its rays."""
         return not (self.beams.elevation_deg or self.mirror or self.prisms)
 
     def datasheet(self) -> Datasheet:
-        """Return noise and returns by the data sheet.
+        """Return the noise and returns that the data sheet specifies.
 
-        Raises LidarError if the file has no performance.
+        Raises
+        ------
+        LidarError
+            If the data file does not specify the performance.
         """
         performance = self.performance
         if performance is None:
@@ -286,7 +292,10 @@ class SensorModel(_ModelSection):
         return Datasheet(noise, Returns(performance.mode, subrays=subrays), missing)
 
     def packet_settings(self, lasers: Ints) -> PacketSettings | None:
-        """Return the packets of a sensor, `lasers` being the maker's number of each channel."""
+        """Return the packet settings of a sensor, or None if the model has no packet format.
+
+        For each channel, `lasers` contains the index of its laser in the manufacturer's order.
+        """
         if self.packets is None:
             return None
         return PacketSettings(
@@ -294,10 +303,19 @@ class SensorModel(_ModelSection):
         )
 
     def firing_rates(self, rate_hz: float | None, columns: int | None) -> tuple[float, float]:
-        """Return the firings in a revolution, and the revolutions a second.
+        """Return the number of firings per revolution and the number of revolutions per second.
 
-        `rate_hz` and `columns` (firings in a revolution) take the place of the model's figures, if
-        they are not None.
+        Parameters
+        ----------
+        rate_hz
+            Revolutions per second. None selects the rate of the model.
+        columns
+            Number of firings per revolution. None selects the number of the model.
+
+        Raises
+        ------
+        LidarError
+            If `columns` is set, but the model has a constant firing interval.
         """
         rate = self.rate_hz if rate_hz is None else rate_hz
         if self.firing_us is not None:
@@ -311,13 +329,13 @@ class SensorModel(_ModelSection):
         return self.firings_per_turn if columns is None else columns, rate
 
 
-def plugin_of_model(name: str | None) -> Plugin | None:
-    """Return the plug-in with a model of a name, or None.
+def find_model_plugin(name: str | None) -> Plugin | None:
+    """Return the plug-in that provides a sensor model, or None.
 
     Raises
     ------
     LidarError
-        If two plug-ins have models of the maker.
+        If two plug-ins provide models from the same manufacturer.
     """
     if not name or name.endswith(MODEL_FILES) or full_name(name) in model_names():
         return None
@@ -325,14 +343,14 @@ def plugin_of_model(name: str | None) -> Plugin | None:
 
 
 def plugin_model_file(name: str | None) -> Path | None:
-    """Return the data file of a plug-in's model, or None for a model of the package or of a file.
+    """Return the data file of a model from a plug-in, or None if the model has another source.
 
     Raises
     ------
     LidarError
         If the plug-in cannot be used.
     """
-    plugin = plugin_of_model(name)
+    plugin = find_model_plugin(name)
     if plugin is None or name is None:
         return None
     file = maker_folder(plugin) / f"{name.partition('/')[2]}.yaml"
@@ -340,28 +358,33 @@ def plugin_model_file(name: str | None) -> Path | None:
 
 
 def read_model(name: str | Path) -> SensorModel:
-    """Read a model by its name, from the package or a plug-in, or by the path of its file (.yaml).
+    """Read a sensor model from its data file.
 
-    The maker may be left out of the name of a model that comes with the package.
+    Parameters
+    ----------
+    name
+        Name of a model from the package or from a plug-in, or path of a data file (.yaml). The name
+        of a model from the package may omit the manufacturer.
 
     Raises
     ------
     LidarError
-        If no model has that name, its plug-in cannot be used, or the file is not of a sensor.
+        If the model does not exist, its plug-in cannot be used, or the file is not a valid sensor
+        model.
     """
     if str(name).endswith(MODEL_FILES):
         return _read(Path(name))
     models = model_names()
     name = full_name(str(name))
     if name in models:
-        return _built_in(name)
-    plugin = plugin_of_model(name)
+        return _read_built_in(name)
+    plugin = find_model_plugin(name)
     if plugin is not None:
         folder = maker_folder(plugin)
         models = (*models, *names_in(folder))
         if name in models:
             return _read(folder / f"{name.partition('/')[2]}.yaml")
-    similar = [model for model in models if _plain(name) in _plain(model)][:3]
+    similar = [model for model in models if _normalize(name) in _normalize(model)][:3]
     hint = f" Did you mean {' or '.join(map(repr, similar))}?" if similar else ""
     names = [*models, *(model.partition("/")[2] for model in models)]
     raise LidarError(
@@ -370,22 +393,19 @@ def read_model(name: str | Path) -> SensorModel:
     )
 
 
-def _plain(name: str) -> str:
-    """Return the lower-case letters and digits of a name, such as vlp16 of «VLP-16»."""
+def _normalize(name: str) -> str:
+    """Return the letters and digits of a name in lower case, for example vlp16 for VLP-16."""
     return "".join(filter(str.isalnum, name.lower()))
 
 
 @cache
-def _built_in(name: str) -> SensorModel:
-    """Read a model that comes with the package."""
+def _read_built_in(name: str) -> SensorModel:
+    """Read a model that is included in the package."""
     return _read(BUILT_IN / f"{name}.yaml")
 
 
 def _read(path: Path | Traversable) -> SensorModel:
-    """Read the data file of a model.
-
-    Raises LidarError if the file cannot be used.
-    """
+    """Read the data file of a model, and raise LidarError if it is invalid."""
     with converted(f"{path} is not a valid sensor model"):
         text = read_input_text(path) if isinstance(path, Path) else path.read_text("utf-8")
         content = load_yaml(text)
@@ -394,15 +414,15 @@ def _read(path: Path | Traversable) -> SensorModel:
 
 
 class Datasheet(NamedTuple):
-    """Noise and returns of a sensor by its data sheet."""
+    """Noise and returns that a sensor's data sheet specifies."""
 
     noise: Noise
     returns: Returns
-    missing: tuple[str, ...]  # figures that the sheet does not state, with the fields for them
+    missing: tuple[str, ...]  # values that the data sheet lacks, with their fields
 
 
-def shown_noise(noise: Noise) -> str:
-    """Return the fields of noise that differ from their defaults, as in a scenario."""
+def format_noise(noise: Noise) -> str:
+    """Return the noise fields that differ from their defaults, as written in a scenario."""
     shown = (
         f"{field.name}: {value:.4g}"
         for field in fields(noise)
@@ -465,7 +485,7 @@ def load_sensor(
     if model is not None:
         sensor_model = read_model(model)
     elif unit is not None:
-        sensor_model = _model_of(unit, columns)
+        sensor_model = _match_model(unit, columns)
     else:
         raise LidarError("A sensor requires a model, a calibration or both.")
     if unit is not None:
@@ -490,11 +510,11 @@ def load_sensor(
         common_fields |= {"noise": sheet.noise, "returns": sheet.returns}
     head = Spin(firings, step_deg, rate, sensor_model.clockwise, sensor_model.zero_deg)
     if unit is not None and unit.window is not None:
-        head = head.within(*unit.window)
+        head = head.restrict_to(*unit.window)
     if unit is not None and (unit.rays is not None or sensor_model.listed or sensor_model.prisms):
         common_fields["packets"] = sensor_model.packet_settings(np.arange(1))
-        return _listed(sensor_model, unit, head, common_fields)
-    beams = sensor_model.beams.beams() if unit is None else _calibrated(sensor_model, unit)
+        return _create_listed_sensor(sensor_model, unit, head, common_fields)
+    beams = sensor_model.beams.beams() if unit is None else _calibrate_beams(sensor_model, unit)
     if sensor_model.prisms:
         common_fields["packets"] = sensor_model.packet_settings(np.arange(len(beams)))
         mirror = sensor_model.turning_mirror
@@ -503,22 +523,26 @@ def load_sensor(
         mirror_fields = sensor_model.mirror.model_dump()
         head = Mirror(firings, step_deg, rate, head.clockwise, head.zero_deg, **mirror_fields)
     else:
-        beams = beams.turning(head.radians_per_ns)
+        beams = beams.with_rotation(head.radians_per_ns)
     kind = LineSensor if sensor_model.axis == "x" else Sensor
     common_fields["packets"] = sensor_model.packet_settings(laser_order(beams.elevation))
-    return kind(beams.lowest_first(), head, **common_fields)
+    return kind(beams.sort_by_elevation(), head, **common_fields)
 
 
 def _sensor_name(sensor_model: SensorModel, unit: Calibration | None) -> str:
-    """Return the name of a sensor for reports, with the source of its rays."""
+    """Return the name of a sensor for reports, including the origin of its ray pattern."""
     if unit is not None:
         return f"{sensor_model.name}, {unit.file}"
     return f"{sensor_model.name}, typical pattern" if sensor_model.typical else sensor_model.name
 
 
-def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
-    """Return the model whose beams are nearest to a unit's, else a model of the file alone."""
-    deviations_deg = {}  # {model: greatest difference between its elevations and the unit's}
+def _match_model(unit: Calibration, columns: int | None) -> SensorModel:
+    """Return the model whose beams best match a calibration.
+
+    If no model matches, create a model from the calibration alone. Raise LidarError if the
+    calibration has no firing times.
+    """
+    deviations_deg = {}  # {model: maximum difference from the calibrated elevations}
     for name in model_names():
         if unit.beams is None or not name.startswith(f"{unit.maker}/"):
             continue
@@ -526,7 +550,7 @@ def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
         if len(model_deg) == len(unit.beams):
             unit_deg = np.degrees(unit.beams.elevation)
             deviations_deg[name] = float(np.abs(np.sort(unit_deg) - np.sort(model_deg)).max())
-    if deviations_deg and min(deviations_deg.values()) < 5:  # units of one model differ by far less
+    if deviations_deg and min(deviations_deg.values()) < 5:  # units of a model differ far less
         return read_model(min(deviations_deg, key=deviations_deg.__getitem__))
     head = {"firings_per_turn": columns} if columns and unit.maker is None else unit.head
     if not head:
@@ -537,16 +561,19 @@ def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
     return SensorModel(name=unit.sensor or (unit.maker or "beams").title(), sources={}, **head)
 
 
-def _listed(
+def _create_listed_sensor(
     sensor_model: SensorModel, unit: Calibration, head: Spin, common_fields: dict[str, Any]
 ) -> ListedSensor:
-    """Return a sensor with a unit's list of rays, at the model's rate if the list has no times."""
+    """Create a sensor from a calibrated ray list.
+
+    If the list has no times, the rays are fired at the rate of the model.
+    """
     if unit.rays is None or (sensor_model.beams.elevation_deg and not sensor_model.prisms):
         raise LidarError(
             f"{unit.file} does not match {sensor_model.name}. One describes rays and the other "
             "describes beams."
         )
-    if not unit.head:  # a firing of the model has all beams, a firing of the list has one ray
+    if not unit.head:  # a firing of the model comprises all beams, and one of the list a single ray
         firings = head.firings_per_turn * len(sensor_model.beams.beams())
         head = replace(head, firings_per_turn=firings)
     interval_ns = 1e9 / (head.firings_per_turn * head.rate_hz)
@@ -564,11 +591,11 @@ def _listed(
     )
 
 
-def _calibrated(sensor_model: SensorModel, unit: Calibration) -> Beams:
-    """Return the beams of a unit, fired at the times of its model."""
+def _calibrate_beams(sensor_model: SensorModel, unit: Calibration) -> Beams:
+    """Return calibrated beams, with times and origins from the model if the file has none."""
     beams = unit.beams
     table = sensor_model.beams
-    assert beams is not None  # a file has beams or rays
+    assert beams is not None  # a calibration has beams or rays
     expected = len(table.elevation_deg) or len(table.time_us)
     if expected not in (0, len(beams)):
         raise LidarError(

@@ -1,4 +1,4 @@
-"""Noise of a sensor: errors of ranges and angles, lost returns and false alarms."""
+"""Noise model of a sensor, with range and angle errors, lost returns and false alarms."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from ..errors import LidarError
-from ..media.materials import at_right_angles
+from ..media.materials import normal_incidence_energy
 from ..numerics.random_numbers import named_seed
 from ..schema.checks import check_fields
 from ..schema.declared import AngleDeg, Seed, Several, UnitShare, about, allowed
@@ -18,8 +18,9 @@ from ..schema.value_texts import one_line
 
 # Detection threshold for signal plus noise, in standard deviations.
 THRESHOLD_SIGMAS = 5.0
-TARGET_REFLECTANCE = 0.1  # reflectance of stated ranges
-MAX_ALARMS = 20  # false alarms of a pulse on average: a ray has numbers for 255
+TARGET_REFLECTANCE = 0.1  # reflectance to which specified detection ranges refer
+# Maximum mean number of false alarms per pulse. Each ray has random numbers for 255 alarms.
+MAX_ALARMS = 20
 
 Meters = Annotated[float, Field(ge=0, le=1000)]
 Bias = Annotated[float, Field(ge=-1000, le=1000)]
@@ -177,24 +178,24 @@ class Noise:
         """Energy at which half of the returns are detected, or 0 if there is no detection range."""
         if self.detection_range_m is None:
             return 0.0
-        return float(TARGET_REFLECTANCE * at_right_angles(self.detection_range_m))
+        return float(TARGET_REFLECTANCE * normal_incidence_energy(self.detection_range_m))
 
     @property
-    def full(self) -> float:
+    def saturation_energy(self) -> float:
         """Energy at which the receiver saturates, or infinity if it never saturates."""
         return inf if self.saturation is None else self.saturation * self.threshold
 
     @property
-    def loses(self) -> bool:
+    def loses_returns(self) -> bool:
         """Whether returns can be lost."""
         return self.dropout > 0 or self.detection_range_m is not None
 
     @property
-    def moves_ranges(self) -> bool:
+    def has_range_errors(self) -> bool:
         """Whether measured ranges differ from the true ranges."""
         random = self.range_m, self.range_per_m, self.range_at_threshold_m
         return any((*random, self.walk_m, self.channel_bias_m, self.warm_up_m))
 
-    def named(self, name: str) -> Noise:
-        """Return a copy of the noise with a seed that also depends on the name of a sensor."""
+    def for_sensor(self, name: str) -> Noise:
+        """Return a copy whose seed also depends on the name of a sensor."""
         return replace(self, seed=named_seed(self.seed, name))

@@ -1,4 +1,4 @@
-"""Light of a sensor, and the returns that it reports."""
+"""Optical parameters of a sensor, and the returns that it reports for each pulse."""
 
 from __future__ import annotations
 
@@ -20,20 +20,23 @@ from ..words import rounded
 from .disc import SUBRAYS, Beam, Profile
 from .reflectivity import SCALES
 
-LIGHT_M_NS = 0.299792458  # speed in vacuum; in air it is slower by 0.03 %
+LIGHT_M_NS = 0.299792458  # speed of light in vacuum; the speed in air is 0.03 % lower
 FWHM = sqrt(8 * log_of(2.0))  # full width at half maximum of a Gaussian, in standard deviations
-WINDOW_SIGMAS = 10  # width of a return in a waveform, standard deviations of the system waveform
-CUT = WINDOW_SIGMAS / 2  # standard deviations of the system waveform: beyond, a return is 0 (4e-6)
-# Standard deviation of the response of a Gaussian receiver times its bandwidth at -3 dB.
+# Width of a return in a waveform, in standard deviations of the system waveform.
+WINDOW_SIGMAS = 10
+# Number of standard deviations beyond which a return is set to 0, because it is less than 4e-6 of
+# its maximum.
+CUT = WINDOW_SIGMAS / 2
+# Product of a Gaussian receiver's -3 dB bandwidth and the standard deviation of its response.
 _RESPONSE = sqrt(log_of(2.0)) / (2 * pi)
 
 Processing = Literal["none", "peaks", "gaussian"]
 Mode = Literal["strongest", "first", "last", "dual", "two_strongest", "all"]
-TWO_RETURNS: tuple[Mode, ...] = ("dual", "two_strongest")  # modes that report two at most
+TWO_RETURNS: tuple[Mode, ...] = ("dual", "two_strongest")  # modes with at most two returns
 
 
 AngleMrad = Annotated[float, Field(ge=0, le=1000)]
-# Full angle of a beam's cone, at 1/e² of the maximum; or two angles, across and up.
+# Full cone angle of a beam at 1/e² of the maximum, or a horizontal and a vertical angle.
 Divergence = Annotated[
     AngleMrad | Annotated[Sequence[AngleMrad], Field(min_length=2, max_length=2)],
     allowed("from 0 to 1000, or two such numbers as [horizontal, vertical]"),
@@ -83,7 +86,7 @@ class Optics(FileSection):
 
 @dataclass(frozen=True)
 class Returns:
-    """Sub-rays of each beam, and the returns that the sensor reports for each pulse.
+    """Settings for the sub-rays of a beam and for the returns that are reported per pulse.
 
     The mode "dual" reports the strongest and the last return, or the two strongest returns if the
     last return is the strongest. The mode "two_strongest" always reports the two strongest returns.
@@ -171,7 +174,7 @@ class Returns:
     def divergence(self, optics: Optics) -> float:
         """Return the full divergence angle of the beam, in radians.
 
-        If the angles across and up differ, the result is their geometric mean.
+        If the horizontal and the vertical angle differ, the result is their geometric mean.
 
         Raises
         ------
@@ -189,7 +192,7 @@ class Returns:
         return LIGHT_M_NS * self.length_ns(optics) / 2
 
     def beam(self, optics: Optics) -> Beam:
-        """Return the sub-rays of the beam of a sensor.
+        """Return the sub-rays of a sensor's beam.
 
         Raises
         ------
@@ -205,7 +208,7 @@ class Returns:
         return optics.exit_diameter_m if self.exit_diameter_m is None else self.exit_diameter_m
 
     def _divergences(self, optics: Optics) -> tuple[float, float]:
-        """Return the full angles of the beam across and up, radians."""
+        """Return the full horizontal and vertical angles of the beam, in radians."""
         divergence_mrad = (
             optics.divergence_mrad if self.divergence_mrad is None else self.divergence_mrad
         )

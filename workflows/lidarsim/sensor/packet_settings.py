@@ -1,4 +1,4 @@
-"""Packets of a sensor's maker: format, identifiers, ports, and the maker's order of lasers."""
+"""Settings for packets in a manufacturer's format."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ Identifier = int | float | str
 
 @dataclass(frozen=True, eq=False)
 class PacketSettings:
-    """Packets that a sensor of a maker sends its returns in.
+    """Settings for the packets in which a sensor sends its returns.
 
     Parameters
     ----------
     format
-        Name of the format, of `lidarsim.packets.encoders` or of a plug-in.
+        Name of a format from `lidarsim.packets.encoders` or from a plug-in.
     ports
-        {kind of packet: UDP port}.
+        UDP port for each kind of packet.
     identifiers
-        What the format needs to know of the model, as its encoder defines: {name: value}.
+        Model-specific values that the encoder of the format requires, by name.
     lasers
-        int64 (c,): number of the laser of each channel in the maker's order, from 0.
+        Index of each channel's laser in the manufacturer's order, starting at 0. Shape (c,),
+        int64.
     """
 
     format: str
@@ -36,13 +37,14 @@ class PacketSettings:
 
     @property
     def channels(self) -> Ints:
-        """Channel of each laser in the maker's order: int64 (c,)."""
+        """Channel of each laser in the manufacturer's order, as an int64 array of shape (c,)."""
         return np.argsort(self.lasers)
 
 
 def laser_order(elevations: ArrayLike) -> Ints:
-    """Return the maker's number of the laser of each channel: (c,).
+    """Return the index of each channel's laser in the manufacturer's order.
 
-    `elevations` (c,) are in the maker's order; channels are sorted by elevation, the lowest first.
+    The elevations are in the manufacturer's order. Channels are numbered by increasing elevation.
+    Both `elevations` and the result have shape (c,).
     """
     return np.argsort(np.asarray(elevations, np.float64), kind="stable").astype(np.int64)

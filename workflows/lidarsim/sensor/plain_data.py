@@ -1,4 +1,4 @@
-"""Sensors as plain data, so that a file contains the directions and times of its rays."""
+"""Conversion of sensors to JSON data and arrays, so that files can store their ray patterns."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .packet_settings import PacketSettings
 from .ray_sensors import ListedSensor, Prism, PrismSensor, TurningMirror
 from .sensor import LineSensor, Sensor
 
-# The classes that directions and times of rays depend on; no other class is made from a file.
+# Classes that determine ray directions and times. Files cannot create objects of other classes.
 _KINDS = {
     kind.__name__: kind
     for kind in (
@@ -34,9 +34,9 @@ _LEFT_OUT = ("optics", "noise", "returns")
 
 
 def to_plain_data(value: Any, arrays: MutableMapping[str, AnyArray]) -> Any:
-    """Return sensors as data for JSON, and put their arrays into `arrays` {name: array}.
+    """Convert sensors to JSON data, and add their arrays to `arrays` by name.
 
-    None if a sensor has a class that is not of this package.
+    The result is None if a sensor or one of its parts has a user-defined class.
     """
     try:
         return _to_plain_data(value, arrays)
@@ -45,9 +45,9 @@ def to_plain_data(value: Any, arrays: MutableMapping[str, AnyArray]) -> Any:
 
 
 def _to_plain_data(value: Any, arrays: MutableMapping[str, AnyArray]) -> Any:
-    """Return a value as data for JSON.
+    """Convert a value to JSON data.
 
-    Raises TypeError for a class that is not of this package.
+    Raise TypeError for a user-defined class.
     """
     if isinstance(value, np.ndarray):
         name = f"rays{len(arrays)}"
@@ -69,12 +69,12 @@ def _to_plain_data(value: Any, arrays: MutableMapping[str, AnyArray]) -> Any:
 
 
 def from_plain_data(data: Any, arrays: Mapping[str, AnyArray]) -> Any:
-    """Return the sensors of the data and arrays of `to_plain_data`.
+    """Create sensors from the JSON data and arrays that `to_plain_data` produced.
 
     Raises
     ------
     Exception
-        Of any class, if the data are not of `to_plain_data`.
+        If the data were not produced by `to_plain_data`. The type of the exception is unspecified.
     """
     if isinstance(data, list):
         return tuple(from_plain_data(item, arrays) for item in data)

@@ -1,4 +1,4 @@
-"""Sensors whose beams do not sweep cones: behind prisms, or with listed rays."""
+"""Sensors whose beams do not sweep cones, such as prism scanners and lists of rays."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from .sensor import Sensor
 
 @dataclass(frozen=True)
 class Prism:
-    """A wedge prism that turns about x."""
+    """A wedge prism that rotates about the x axis."""
 
-    wedge_deg: float  # angle between its two faces
-    index: Annotated[float, Field(gt=0)]  # refractive
-    rpm: float  # revolutions a minute about x, from y to z
-    phase_deg: float = 0.0  # angle of its thin edge at time 0, from y to z
-    inclined_first: bool = False  # light enters through the inclined face, else the flat face
+    wedge_deg: float  # angle between the two faces
+    index: Annotated[float, Field(gt=0)]  # refractive index
+    rpm: float  # revolutions per minute about x, from y to z
+    phase_deg: float = 0.0  # angle of the thin edge at time 0, from y to z
+    inclined_first: bool = False  # whether light enters through the inclined face
 
     __repr__ = one_line
 
@@ -38,11 +38,11 @@ class Prism:
 
 @dataclass(frozen=True)
 class TurningMirror:
-    """A plane mirror behind prisms, which turns about the axis of the prisms and looks up."""
+    """A plane mirror that rotates about the axis of the prisms in front of it."""
 
-    tilt_deg: Annotated[float, Field(gt=0, lt=90)]  # angle between its normal and the axis
-    rpm: float  # revolutions a minute about the axis, from x to y of the sensor
-    phase_deg: float = 0.0  # azimuth of its normal at time 0, from x to y
+    tilt_deg: Annotated[float, Field(gt=0, lt=90)]  # angle between the normal and the axis
+    rpm: float  # revolutions per minute about the axis, from x to y of the sensor
+    phase_deg: float = 0.0  # azimuth of the normal at time 0, from x to y
 
     __repr__ = one_line
 
@@ -52,58 +52,64 @@ class TurningMirror:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PrismSensor(Sensor):
-    """Beams along x through wedge prisms that turn about x at different rates.
+    """A sensor with wedge prisms that rotate about a common axis at different rates.
 
-    With a mirror, the axis of prisms and mirror is z instead, and y and z of the prisms are x and y
-    of the sensor. The head is only the clock. Directions are exact by Snell's law at each face.
-    Prisms are thin: all rays start at the sensor's center. The pattern has no useful period.
+    By default, the light enters the first prism along the axis, which is the x axis of the sensor.
+    If there is a mirror, the common axis of the prisms and the mirror is the z axis instead, and
+    the y and z axes of the prisms are the x and y axes of the sensor. The head only provides the
+    firing times.
+
+    Ray directions are computed by applying Snell's law at each face. Prisms are treated as thin, so
+    that all rays start at the sensor origin. The pattern has no useful period.
     """
 
-    # A beam along x by default; several beams enter the first prism at angles.
+    # The default is a single beam along x. Several beams enter the first prism at different angles.
     beams: Beams = field(default_factory=lambda: Beams(np.zeros(1)))
-    # In the order of the light's path.
+    # Prisms in the order in which the light passes through them.
     prisms: tuple[Prism, ...] = (Prism(18, 1.5, 7294), Prism(18, 1.5, -4664, 0, True))
     mirror: TurningMirror | None = None
     cycle: ClassVar[str] = "frame"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.directions(np.arange(0, 100_000, 97))  # LidarError if light does not get through
+        self.directions(np.arange(0, 100_000, 97))  # raises LidarError on total reflection
 
     @property
     def period(self) -> int | None:
-        """None: the pattern does not repeat."""
+        """None, because the pattern does not repeat."""
         return None
 
     def directions(self, firings: Ints) -> Floats:
-        """Return the unit directions of firings (k,), in the sensor frame: (k, channels, 3).
+        """Return the ray directions of several firings in the sensor frame.
 
-        Directions of consecutive firings are read-only. Those of the latest sweeps are kept, as
-        packets of a sweep need them again after it was cast.
+        For `firings` of shape (k,), the result has shape (k, channels, 3). Directions are unit
+        vectors. Directions of consecutive firings are cached for the latest sweeps, because they
+        are needed again to encode the packets of a sweep. Cached arrays are read-only.
         """
         count = len(firings)
         key = (int(firings[0]), count) if count else (0, 0)
         if not count or count * self.channels > _MAX_KEPT_RAYS or (np.diff(firings) != 1).any():
-            return self._computed_directions(firings)
+            return self._compute_directions(firings)
         kept = _KEPT_DIRECTIONS.setdefault(self, {})
         directions = kept.get(key)
         if directions is None:
-            directions = self._computed_directions(firings)
+            directions = self._compute_directions(firings)
             directions.flags.writeable = False
             for oldest in [*kept][: max(0, len(kept) + 1 - _KEPT_SWEEPS)]:
-                kept.pop(oldest, None)  # another thread may have dropped the sweep
+                kept.pop(oldest, None)  # another thread may have removed the sweep
             kept[key] = directions
         return directions
 
-    def _computed_directions(self, firings: Ints) -> Floats:
-        """Return the directions of `directions`, by Snell's law."""
+    def _compute_directions(self, firings: Ints) -> Floats:
+        """Compute the result of `directions` with Snell's law."""
         minutes = self.head.times_ns(firings) / 60e9
         flat = np.array([1.0, 0, 0])[:, None, None]
-        ray = np.repeat(self.ahead.T[:, None, :], len(firings), axis=1)
+        ray = np.repeat(self.beam_directions.T[:, None, :], len(firings), axis=1)
         for prism in self.prisms:
-            # Reduced to one revolution first: the cosine of a large angle loses digits.
+            # Reduce the angle to one revolution, because the cosine of a large angle is imprecise.
             angle = 2 * np.pi * ((prism.rpm * minutes + prism.phase_deg / 360) % 1)
-            # Normals along the light's direction; the faces diverge towards the thick edge.
+            # The normals point in the direction of the light. The faces diverge toward the thick
+            # edge.
             sine, cosine = sin_cos_of(math.radians(prism.wedge_deg))
             inclined = np.empty((3, len(firings), 1))
             inclined[0] = cosine
@@ -112,13 +118,17 @@ class PrismSensor(Sensor):
                 inclined[1:] *= -1
             faces = (inclined, flat) if prism.inclined_first else (flat, inclined)
             for face, ratio in zip(faces, (1 / prism.index, prism.index), strict=True):
-                ray = _refracted(ray, face, ratio)
+                ray = _refract(ray, face, ratio)
         if self.mirror is not None:
-            ray = self._reflected(ray, minutes)
+            ray = self._reflect(ray, minutes)
         return np.ascontiguousarray(ray.transpose(1, 2, 0))
 
-    def _reflected(self, rays: Floats, minutes: Floats) -> Floats:
-        """Reflect rays (3, k, c) at the mirror at times (k,), minutes: (3, k, c), z on the axis."""
+    def _reflect(self, rays: Floats, minutes: Floats) -> Floats:
+        """Reflect rays at the mirror, and make its axis the z axis.
+
+        The rays and the result have shape (3, k, c). The times of the firings in minutes have
+        shape (k,).
+        """
         assert self.mirror is not None
         angle = 2 * np.pi * ((self.mirror.rpm * minutes + self.mirror.phase_deg / 360) % 1)
         sine, cosine = sin_cos_of(math.radians(self.mirror.tilt_deg))
@@ -129,21 +139,23 @@ class PrismSensor(Sensor):
         return reflected[[1, 2, 0]]
 
 
-# {sensor: {(first firing, number of firings): directions}}; not in the sensors, which are pickled.
+# Cached directions for each sensor, by first firing and number of firings. The cache is not an
+# attribute of the sensor because sensors are pickled.
 _KEPT_DIRECTIONS: WeakKeyDictionary[PrismSensor, dict[tuple[int, int], Floats]] = (
     WeakKeyDictionary()
 )
 _KEPT_SWEEPS = 16
-_MAX_KEPT_RAYS = 1 << 16  # rays of a sweep that is kept: 1.5 MB
+_MAX_KEPT_RAYS = 1 << 16  # maximum number of rays in a cached sweep, which takes 1.5 MB
 
 
-def _refracted(rays: Floats, normals: Floats, ratio: float) -> Floats:
-    """Return the rays (3, k, c) behind a face, by Snell's law.
+def _refract(rays: Floats, normals: Floats, ratio: float) -> Floats:
+    """Refract rays at a face with Snell's law.
 
-    `ratio` is the refractive index before the face over the index behind it. The normals
-    (3, k, 1), or (3, 1, 1), point along the light's direction.
+    The rays and the result have shape (3, k, c). `ratio` is the refractive index before the face
+    divided by the index behind it. The normals point in the direction of the light and have shape
+    (3, k, 1) or (3, 1, 1).
     """
-    # Component by component: arrays of all components would take twice the time.
+    # Components are computed one by one, which takes half as long as whole arrays.
     cosine = rays[0] * normals[0] + rays[1] * normals[1] + rays[2] * normals[2]
     behind = 1 - ratio * ratio * (1 - cosine * cosine)
     if not (behind >= 0).all():
@@ -160,23 +172,25 @@ def _refracted(rays: Floats, normals: Floats, ratio: float) -> Floats:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ListedSensor(Sensor):
-    """A sensor with a list of rays, as in a maker's file: each firing is the next ray of the list.
+    """A sensor that fires the rays of a list one by one, such as the ray list of a manufacturer.
 
-    The list repeats. The head's time steps are parts of the list; its times and azimuths are
-    not used.
+    The list is repeated indefinitely. The head divides the list into time steps, but the times and
+    azimuths of the head are not used.
     """
 
     beams: Beams = field(default_factory=lambda: Beams(np.zeros(1)))
-    # (n, 3): unit directions in the order of firing, and (n,): firing times from 0 on.
+    # Unit directions in firing order, with shape (n, 3).
     rays: Floats = field(default_factory=lambda: np.array([[1.0, 0, 0]]))
+    # Firing times since the start of the list, with shape (n,).
     shot_ns: Floats = field(default_factory=lambda: np.zeros(1))
     cycle_ns: float = 1e8  # duration of the list
-    starts: Floats | None = None  # (n, 3): starts of the rays, meters; None for the center
+    # Origins of the rays in meters, with shape (n, 3), or None for the sensor origin.
+    starts: Floats | None = None
     cycle: ClassVar[str] = "frame"
 
     @property
     def ring_step(self) -> int | None:
-        """None: a list may have the rays of several channels in turn."""
+        """None, because a list may contain the rays of several channels in turn."""
         return None
 
     @property
@@ -185,20 +199,27 @@ class ListedSensor(Sensor):
         return len(self.rays)
 
     def directions(self, firings: Ints) -> Floats:
-        """Return the unit directions of firings (k,), in the sensor frame: (k, 1, 3)."""
+        """Return the ray directions of several firings in the sensor frame.
+
+        For `firings` of shape (k,), the result has shape (k, 1, 3). Directions are unit vectors.
+        """
         return self.rays[firings % len(self.rays)][:, None, :]
 
     def origins(self, firings: Ints) -> Floats | None:
-        """Return the starts of the rays of firings (k,), sensor frame: (k, 1, 3), meters.
+        """Return the ray origins of several firings in the sensor frame, in meters.
 
-        None if all rays start at the sensor's center.
+        For `firings` of shape (k,), the result has shape (k, 1, 3). It is None if all rays start at
+        the sensor origin.
         """
         if self.starts is None:
             return None
         return self.starts[firings % len(self.rays)][:, None, :]
 
     def begins_ns(self, firings: Ints) -> Floats:
-        """Return the starts of firings (k,), nanoseconds since the start of the station: (k,)."""
+        """Return the start times of several firings in nanoseconds since the start of the station.
+
+        `firings` and the result have shape (k,).
+        """
         cycles, shots = np.divmod(firings, len(self.rays))
         times: Floats = self.start_ns + cycles * self.cycle_ns + self.shot_ns[shots]
         return times

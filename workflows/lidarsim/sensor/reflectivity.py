@@ -1,4 +1,4 @@
-"""Reflectivity as makers of sensors define it: bytes for reflectances, calibrated by range."""
+"""Scales on which sensor manufacturers report range-corrected reflectances as single bytes."""
 
 from __future__ import annotations
 
@@ -11,36 +11,44 @@ from ..numerics.arrays import Bytes, Floats
 from ..numerics.elementary import exp, log
 from ..numerics.elementary_scalars import log_of
 
-_BEST = 8 * RETRO_GAIN  # reflectance of the best retro-reflective sheets
+_BEST = 8 * RETRO_GAIN  # reflectance of the best retroreflective sheeting
 
 
 class ByteScale(NamedTuple):
-    """Codes of reflectances: linear up to `code`, then logarithmic."""
+    """Scale that encodes reflectances as bytes, linearly up to `code` and logarithmically above."""
 
     code: int
-    reflectance: float  # reflectance of `code`
-    max_reflectance: float  # reflectance of the code 255
+    reflectance: float  # reflectance at `code`
+    max_reflectance: float  # reflectance at code 255
 
-    def codes(self, reflectance: Floats) -> Bytes:
-        """Return the codes (n,) of reflectances (n,), 255 for reflectances beyond the scale."""
+    def encode(self, reflectance: Floats) -> Bytes:
+        """Encode reflectances as bytes.
+
+        Reflectances above the end of the scale have the code 255. Both arrays have shape (n,).
+        """
         share = reflectance / self.reflectance
         code = self.code * np.minimum(share, 1) + log(np.maximum(share, 1)) / self._step
         return np.rint(np.minimum(code, 255)).astype(np.uint8)
 
-    def reflectances(self, codes: Bytes) -> Floats:
-        """Return the reflectances (n,) of codes (n,): the inverse of `codes`, but for rounding."""
+    def decode(self, codes: Bytes) -> Floats:
+        """Decode bytes to reflectances, which inverts `encode` except for rounding.
+
+        Both arrays have shape (n,).
+        """
         linear = np.minimum(codes, self.code)
         return self.reflectance * (linear / self.code) * exp(self._step * (codes - linear))
 
     @property
     def _step(self) -> float:
-        """Logarithm of the ratio of the reflectances of neighboring codes."""
+        """Logarithm of the ratio between the reflectances of adjacent codes."""
         return log_of(self.max_reflectance / self.reflectance) / max(255 - self.code, 1) or 1.0
 
 
-COUNTS = 10_000  # value of an intensity of 1 in the column signal: makers publish no such figure
-# From the makers' manuals. Only Hesai publishes its scale completely: other makers say that the
-# scale is logarithmic above white, or ends with an ideal retro-reflector.
+# Value of the column `signal` for an intensity of 1. Manufacturers do not publish this factor.
+COUNTS = 10_000
+# The scales follow the manufacturers' manuals. Only Hesai publishes its complete scale. The other
+# manuals state that the scale is logarithmic above white, or that it ends at an ideal
+# retroreflector.
 SCALES = {
     "velodyne": ByteScale(100, 1.0, _BEST),
     "vls128": ByteScale(110, 1.0, _BEST),

@@ -1,4 +1,4 @@
-"""A lidar: beams, and a head that moves them."""
+"""Lidar sensors, which consist of beams and a head that moves them."""
 
 from __future__ import annotations
 
@@ -48,8 +48,9 @@ Sector = Annotated[
         le=360,
     ),
 ]
-SAMPLED_FIRINGS = 2000  # firings that give the field of view
-MAX_GAP_DEG = 5.0  # between neighboring azimuths of a sensor that looks all around
+SAMPLED_FIRINGS = 2000  # number of firings from which the field of view is determined
+# Maximum gap between adjacent azimuths of a sensor with a 360-degree field of view.
+MAX_GAP_DEG = 5.0
 MinRange = Annotated[float, Field(ge=0, le=1e8)]
 MaxRange = Annotated[float, Field(gt=0, allow_inf_nan=True)]
 
@@ -108,7 +109,7 @@ class Sensor:
     noise: Noise | None = field(default=None, kw_only=True, compare=False)
     returns: Returns | None = field(default=None, kw_only=True, compare=False)
     packets: PacketSettings | None = field(default=None, kw_only=True, compare=False)
-    cycle: ClassVar[str] = "turn"  # name of a cycle
+    cycle: ClassVar[str] = "turn"  # term for one cycle of the sensor
 
     __repr__ = one_line
 
@@ -120,7 +121,7 @@ class Sensor:
             )
 
     def _repr_html_(self) -> str:
-        """Return the table of the main figures, and a picture if a package draws sensors."""
+        """Return a table of the main properties, and a picture if a package can draw sensors."""
         rows = {
             "sensor": self.model,
             "channels": f"{self.channels:,}",
@@ -133,24 +134,24 @@ class Sensor:
         return table_of(rows.items()) + picture_of(self)
 
     def _revolution_firings(self) -> tuple[int, int]:
-        """Return the half-open range of the firings of the first revolution, or frame."""
+        """Return the half-open range of the firing indices in the first revolution or frame."""
         steps = self.steps_of_revolution(0)
         return self.firings(steps[0])[0], self.firings(steps[-1])[1]
 
     def _field_of_view(self) -> str:
-        """Return the horizontal and vertical field of view, degrees, from a sample of rays."""
+        """Return the horizontal and vertical field of view as text, from a sample of the rays."""
         first, stop = self._revolution_firings()
         firings = np.linspace(first, stop - 1, min(stop - first, SAMPLED_FIRINGS)).astype(np.int64)
         x, y, z = self.directions(firings).reshape(-1, 3).T
         azimuths = np.sort(np.degrees(arctan2(y, x)))
-        # All around, less the widest gap between neighbors.
+        # The field of view is the full circle except for the widest gap between adjacent azimuths.
         gaps = np.diff(azimuths, append=azimuths[0] + 360)
         width = 360.0 if gaps.max() < MAX_GAP_DEG else 360.0 - float(gaps.max())
         elevations = np.degrees(arcsin(np.clip(z, -1, 1)))
         return f"{width:.4g}°, {elevations.min():.3g}° to {elevations.max():.3g}°"
 
     def _rate(self) -> str:
-        """Return the revolutions, or frames, and the rays of a second."""
+        """Return the revolution or frame rate and the number of rays per second as text."""
         first, stop = self._revolution_firings()
         seconds = (self.revolution_start_ns(1) - self.revolution_start_ns(0)) / 1e9
         rays = (stop - first) * self.channels / seconds
@@ -240,7 +241,7 @@ class Sensor:
                 rays_per_revolution,
                 step_deg,
                 rate_hz,
-                zero_deg=0,  # not 0.0: fingerprints tell them apart
+                zero_deg=0,  # not 0.0, which would change the fingerprint
                 motion="sawtooth",
                 width_deg=horizontal_fov_deg,
             )
@@ -312,10 +313,12 @@ class Sensor:
         return self._first_step(1, 1)
 
     def _first_step(self, number: int, steps_per_revolution: int) -> int:
-        """Return the first time step of a revolution, with `steps_per_revolution` as a guess."""
+        """Return the first time step of a revolution.
+
+        `steps_per_revolution` is only a first guess, which speeds up the search.
+        """
 
         def revolution_of(step: int) -> int:
-            """Return the number of the revolution that a time step starts in."""
             return int(self.revolutions([step])[0])
 
         lower = upper = number * steps_per_revolution
@@ -334,7 +337,7 @@ class Sensor:
         For `firings` of shape (k,), the result has shape (k, channels, 3). Directions are unit
         vectors.
         """
-        return self._rotated(firings, self.ahead)
+        return self._rotate(firings, self.beam_directions)
 
     def origins(self, firings: Ints) -> Floats | None:
         """Return the ray origins of several firings in the sensor frame, in meters.
@@ -344,10 +347,10 @@ class Sensor:
         """
         if not self.beams.origin.any():
             return None
-        return self._rotated(firings, self.beams.origin)
+        return self._rotate(firings, self.beams.origin)
 
     @cached_property
-    def ahead(self) -> Floats:
+    def beam_directions(self) -> Floats:
         """Unit vectors along the beams in the head frame at azimuth 0.
 
         The shape is (channels, 3).
@@ -380,11 +383,12 @@ class Sensor:
         """Rotation matrix from the head frame to the sensor frame, or None for the identity."""
         return None
 
-    def _rotated(self, firings: Ints, vectors: Floats) -> Floats:
-        """Rotate vectors (c, 3) of beams with the head at firings (k,): (k, c, 3).
+    def _rotate(self, firings: Ints, vectors: Floats) -> Floats:
+        """Rotate one vector per beam with the head, for several firings.
 
-        Vectors are products of firing and beam terms, without trigonometry for each ray.
+        For `vectors` of shape (c, 3) and `firings` of shape (k,), the result has shape (k, c, 3).
         """
+        # Sines and cosines are computed per firing instead of per ray.
         sin, cos = sin_cos(self.head.azimuths(firings)[:, None])
         x, y, z = vectors.T
         rotated = np.empty((len(firings), len(vectors), 3))
@@ -418,14 +422,15 @@ class Sensor:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LineSensor(Sensor):
-    """A sensor whose head rotates about its x axis: azimuth 0 is down, 90 degrees to the left.
+    """A sensor whose head rotates about its x axis, such as an airborne scanner.
 
-    For airborne scanners, which fly along x and sweep across.
+    The sensor flies along x and sweeps across its track. Azimuth 0 points down, and 90 degrees
+    points to the left.
     """
 
     cycle: ClassVar[str] = "cycle"
 
     @property
     def axes(self) -> Floats:
-        """Rotation (3, 3) from the head frame to the sensor frame."""
+        """Rotation matrix from the head frame to the sensor frame."""
         return np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])

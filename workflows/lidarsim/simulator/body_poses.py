@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..errors import LidarError, prefixed
 from ..motion.rotations import check_rotations
-from ..motion.trajectory import CENTER, Pose, StaticPose, Track, Trajectory, pose_of
+from ..motion.trajectory import CENTER, Pose, StaticPose, Track, Trajectory, as_pose
 from ..numerics.arrays import Bools, Floats
 from ..schema.value_texts import shown
 
@@ -123,7 +123,7 @@ def _listed_poses(poses: Sequence[Any]) -> BodyPoses:
         if trajectory is not None and trajectory.moves:
             pose = CENTER  # a placeholder, because the trajectory provides the poses
         else:
-            pose = pose_of("pose", value) if trajectory is None else trajectory.pose(0)
+            pose = as_pose("pose", value) if trajectory is None else trajectory.pose(0)
         trajectories.append(trajectory)
         positions.append(pose.position)
         rotations.append(pose.rotation_matrix)

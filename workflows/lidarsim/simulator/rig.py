@@ -113,7 +113,7 @@ class Rig:
             rays = _Rays(None)
             if by_head:
                 origin = sensor.beams.origin if sensor.center is None else None
-                pattern = Pattern(sensor.ahead, origin, step=sensor.ring_step)
+                pattern = Pattern(sensor.beam_directions, origin, step=sensor.ring_step)
                 rays = _Rays(pattern, by_head=True)
             elif repeats:
                 rays = _Rays(self._pattern_of_firings(number, 0, sensor.period or 0))
@@ -261,7 +261,9 @@ class Rig:
         groups = np.array([spec.firings[0] - first for spec in specs]) * channels
         if self._device is not None:
             return self._device.returns(specs, pattern, poses, window, groups)
-        first_key = specs[0].scan + specs[0].ahead  # scan number in the keys of random numbers
+        first_key = (
+            specs[0].scan + specs[0].random_offset
+        )  # scan number in the keys of random numbers
         scanned = self.pulse_casters[number].scan(
             first_key, pattern, poses, window, groups, firings, tally=tally
         )
@@ -366,7 +368,7 @@ class Rig:
         returns = (
             self.pulse_casters[specs[0].sensor]
             .scan(
-                specs[0].scan + specs[0].ahead + first_scan,
+                specs[0].scan + specs[0].random_offset + first_scan,
                 pattern,
                 poses,
                 (0, len(image)),

@@ -20,7 +20,7 @@ from ..columns.table import AXES, SCAN, Column
 from ..errors import LidarError
 from ..media.materials import Material
 from ..media.weather import FOG_LIDAR_RATIO_SR
-from ..motion.trajectory import CENTER, Pose, Stations, Trajectory, pose_of
+from ..motion.trajectory import CENTER, Pose, Stations, Trajectory, as_pose
 from ..numerics.arrays import Floats, Floats32, Indices
 from ..scene.actors import Actor
 from ..scene.scene import Scene
@@ -509,7 +509,7 @@ class Scanner:
         """Return the scans of revolution `number`, and the delay of its start in nanoseconds.
 
         The random numbers are those of the revolution that follows `revolutions_ahead` later
-        (`ScanSpec.ahead`).
+        (`ScanSpec.random_offset`).
         """
         check_fits("number", number, SweepNumber)
         check_fits("start_s", start_s, StartSeconds)
@@ -561,7 +561,7 @@ def _span_ns(rig: Rig, specs: list[ScanSpec]) -> tuple[float, float]:
 
 def _trajectory_of(pose: Any) -> Trajectory:
     """Return a trajectory unchanged, or convert a pose to a stationary trajectory."""
-    path: Trajectory = pose if hasattr(pose, "poses") else Stations((pose_of("pose", pose),))
+    path: Trajectory = pose if hasattr(pose, "poses") else Stations((as_pose("pose", pose),))
     return path
 
 
@@ -570,7 +570,7 @@ def _poses_of(poses: Any) -> tuple[Floats, Floats | None]:
     if isinstance(poses, Pose):
         poses = [poses]
     if isinstance(poses, Sequence) and any(isinstance(pose, Pose) for pose in poses):
-        valid_poses = [pose_of("a pose", pose) for pose in poses]
+        valid_poses = [as_pose("a pose", pose) for pose in poses]
         positions = np.array([pose.position for pose in valid_poses])
         return positions, np.array([pose.rotation_matrix for pose in valid_poses])
     try:

@@ -1,4 +1,4 @@
-"""Surveys: sensors on a carrier or at stations, and their faults."""
+"""Surveys, which combine sensors with a trajectory and environmental conditions."""
 
 from .faults import Fault
 from .survey import Mounted, ScanSpec, Survey

@@ -1,4 +1,4 @@
-"""Faults of sensors, to test programs that read sensor data."""
+"""Sensor faults, for testing programs that process sensor data."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Channels = Annotated[Several[Annotated[int, Field(ge=0)]], Field(min_length=1)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Shift = Annotated[float, Field(ge=-1e6, le=1e6)]
 
-# {kind: fields that only this kind has}; sectors may be left out
+# Fields that only apply to one kind of fault. The angles of the sector are optional.
 _KIND_FIELDS: dict[str, tuple[str, ...]] = {
     "dirt": ("transmission", "azimuth_deg", "elevation_deg"),
     "dead_channels": ("channels",),
@@ -79,7 +79,7 @@ class Fault(FileSection):
 
     def __post_init__(self) -> None:
         check_fields(self)
-        for name, value in self.words().items():  # labels have them as JSON
+        for name, value in self.to_dict().items():  # values must be JSON types for the labels
             if np.iterable(value) and not isinstance(value, str):
                 value = tuple(np.asarray([*value]).tolist())
             elif isinstance(value, np.number):
@@ -88,7 +88,7 @@ class Fault(FileSection):
         if self.elevation_deg is not None:
             check_order("elevation_deg", self.elevation_deg)
         kind_fields = _KIND_FIELDS[self.kind]
-        present = self.words().keys() - {"kind", "from_s", "to_s", "sensor"}
+        present = self.to_dict().keys() - {"kind", "from_s", "to_s", "sensor"}
         optional = {name for name in kind_fields if name.endswith("_deg")}
         for name in sorted((present ^ {*kind_fields}) - optional):
             advice = f"Remove {name}" if name in present else f"Set {name}"
@@ -103,7 +103,7 @@ class Fault(FileSection):
                 f"to_s must be greater than from_s ({self.from_s:g}), but is {self.to_s:g}."
             )
 
-    def words(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return all fields that are not None as a dict."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
@@ -115,7 +115,7 @@ class Fault(FileSection):
         """
         return self.from_s * 1e9, inf if self.to_s is None else self.to_s * 1e9
 
-    def during(self, starts_ns: Floats | Ints, stops_ns: Floats | Ints | None = None) -> Bools:
+    def is_active(self, starts_ns: Floats | Ints, stops_ns: Floats | Ints | None = None) -> Bools:
         """Return a mask of the times or time intervals at which the fault is active.
 
         Times are in nanoseconds since the start of the survey.
@@ -124,7 +124,7 @@ class Fault(FileSection):
         begin, end = self.span_ns
         return np.asarray((stops_ns >= begin) & (starts_ns < end))
 
-    def drops(self, firings: Ints, seed: int, station: int, number: int) -> Bools:
+    def find_dropped(self, firings: Ints, seed: int, station: int, number: int) -> Bools:
         """Return a mask of the firings that belong to dropped packets.
 
         Parameters
@@ -141,25 +141,32 @@ class Fault(FileSection):
         packets = firings // (self.packet or 1)
         return np.asarray(uniform(seed, PACKET, station, packets, number) < (self.share or 0.0))
 
-    def jumps_ns(self, times_ns: Floats | Ints) -> Ints:
+    def time_errors_ns(self, times_ns: Floats | Ints) -> Ints:
         """Return the error of the timestamps at several times, in nanoseconds.
 
         Times and results have shape (n,). The error is zero while the fault is inactive.
         """
-        return self.during(times_ns) * np.int64(round((self.by_s or 0) * 1e9))
+        return self.is_active(times_ns) * np.int64(round((self.by_s or 0) * 1e9))
 
 
 def check_faults(
     faults: Sequence[Fault], sensors: Mapping[str, Sensor], duration_ns: float
 ) -> None:
-    """Check that faults fit the sensors and the duration of a survey.
+    """Check that faults are compatible with the sensors and the duration of a survey.
 
-    `sensors` are {name: sensor}.
+    Parameters
+    ----------
+    faults
+        Faults of the survey.
+    sensors
+        Sensors by name.
+    duration_ns
+        Duration of the survey in nanoseconds.
 
     Raises
     ------
     LidarError
-        If a fault does not fit.
+        If a fault refers to a sensor or channel that does not exist, or starts at an invalid time.
     """
     for number, fault in enumerate(faults):
         with prefixed(f"faults[{number}]"):
@@ -167,7 +174,6 @@ def check_faults(
 
 
 def _check_fault(fault: Fault, sensors: Mapping[str, Sensor], duration_s: float) -> None:
-    """Check that a fault fits the sensors {name: sensor} and the duration of a survey."""
     faulty = [sensor for name, sensor in sensors.items() if fault.sensor in (None, name)]
     if not faulty:
         advice = " The survey has a single unnamed sensor. Remove sensor."

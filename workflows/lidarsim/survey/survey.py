@@ -1,4 +1,4 @@
-"""A survey: sensors on a carrier, its trajectory, and the resulting scans."""
+"""Surveys, which define the sensors, the trajectory of their platform, and the scans."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from ..columns.table import (
 )
 from ..environment.notebook import picture_of, table_of
 from ..errors import ArgumentError, LidarError
-from ..media.materials import ClassNames, Material, class_names_problem
-from ..media.weather import EXIT_M, FAINTEST, Air, Weather, reach
+from ..media.materials import ClassNames, Material, find_class_names_error
+from ..media.weather import EXIT_M, FAINTEST, Air, Weather, particle_range
 from ..motion.navigation import Navigation, check_navigation
-from ..motion.trajectory import CENTER, Pose, Stations, Trajectory, check_trajectory_type, pose_of
+from ..motion.trajectory import CENTER, Pose, Stations, Trajectory, as_pose, check_trajectory_type
 from ..numerics.arrays import Floats, Ints
 from ..schema.checks import check_fields, check_type
 from ..schema.declared import FILLED_IN, FileSection, Names, Several, about, written_as
@@ -40,25 +40,25 @@ from ..sensor.sensor import Sensor
 from ..words import joined, listed, plural, rounded, scans_in_words
 from .faults import Fault, FaultKind, check_faults
 
-STEPS = 36  # default at each pose: one revolution of most sensors
-MAX_STEPS = 10_000_000  # along a trajectory
+STEPS = 36  # default number of steps per pose, which is one revolution of most sensors
+MAX_STEPS = 10_000_000  # maximum number of steps along a trajectory
 StepCount = Annotated[int, Field(ge=1, le=MAX_STEPS)]
 OPTIONAL_NAMES = tuple(column.in_files for column in OPTIONAL)
-MAX_SENSORS = 255  # limit of the type of the column
-MAX_PARTICLES = 100  # particles that a pulse may return from
-MAX_RAYS = 1 << 32  # rays of a scan, which is cast in one call
-PRECISION_M = 0.01  # precision of points, if a sensor states no resolution
-START_FROM = datetime(2017, 1, 1, tzinfo=UTC)  # since when GPS and UTC have been 18 s apart
+MAX_SENSORS = 255  # limit of the column `sensor`
+MAX_PARTICLES = 100  # maximum mean number of particles that return light per pulse
+MAX_RAYS = 1 << 32  # maximum number of rays in a scan, which is cast in a single call
+PRECISION_M = 0.01  # precision of points if the resolution of the sensor is unknown
+START_FROM = datetime(2017, 1, 1, tzinfo=UTC)  # start of the current GPS-UTC offset of 18 s
 # EPSG code of the world's coordinate system.
 EpsgCode = Annotated[int, Field(ge=1024, le=32767)]
-MAX_DURATION_NS = 2.0**63  # limit of the type of the column time: 292 years
+MAX_DURATION_NS = 2.0**63  # limit of the column `time`, which is 292 years
 
 
 _ON_SENSORS = " To load a sensor model, use load_sensor('velodyne/vlp16')."
 
 
 def nanoseconds(moment: datetime) -> int:
-    """Return the nanoseconds from 1970-01-01 UTC to a time with a time zone."""
+    """Return the nanoseconds from 1970-01-01 UTC to a timezone-aware datetime."""
     return (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
 
 
@@ -122,7 +122,7 @@ class ScanSpec:
         Index of the sensor.
     channels
         Number of channels of the sensor.
-    ahead
+    random_offset
         Offset that is added to `scan` to obtain the index that selects the random numbers.
     repeats
         For a scan of a frozen sensor, the first scan of the sweep that is repeated, and the first
@@ -135,7 +135,7 @@ class ScanSpec:
     start_ns: int = 0
     sensor: int = 0
     channels: int = 1
-    ahead: int = 0
+    random_offset: int = 0
     repeats: tuple[int, int] | None = None
 
     @property
@@ -143,18 +143,18 @@ class ScanSpec:
         """Number of rays in this scan."""
         return (self.firings[1] - self.firings[0]) * self.channels
 
-    def shifted(self, start_ns: int, ahead: int) -> ScanSpec:
+    def shifted(self, start_ns: int, random_offset: int) -> ScanSpec:
         """Return a copy of the scan with another station start and another random number offset."""
-        spec = object.__new__(type(self))  # `replace` takes five times as long
-        vars(spec).update(vars(self), start_ns=start_ns, ahead=ahead)
+        spec = object.__new__(type(self))  # five times as fast as `replace`
+        vars(spec).update(vars(self), start_ns=start_ns, random_offset=random_offset)
         return spec
 
 
 @dataclass(frozen=True, kw_only=True)
 class CloudOptions(FileSection):
-    """Selection of the hits that become points, and the columns of points.
+    """Options that select the points of a cloud and their columns.
 
-    In Python a column may also be a user's `Column`.
+    In Python, `columns` may also contain user-defined `Column` objects.
     """
 
     keep_every: Annotated[
@@ -184,7 +184,7 @@ class CloudOptions(FileSection):
     ] = "world"
     columns: Annotated[
         Sequence[str | Column],
-        written_as(Several[Literal[(*OPTIONAL_NAMES, *TABLE)]]),  # those always there, too
+        written_as(Several[Literal[(*OPTIONAL_NAMES, *TABLE)]]),  # includes the default columns
         about(
             "columns in addition to x, y, z, scan, channel and object: "
             + ", ".join(OPTIONAL_NAMES),
@@ -218,9 +218,9 @@ class CloudOptions(FileSection):
 class SensorSweeps(NamedTuple):
     """Sweeps of a sensor in a survey."""
 
-    firsts: Ints  # (s,): first scan
-    starts_ns: Floats  # (s,): start of the first firing, since the survey's start
-    stops_ns: Floats  # (s,): start of the last firing
+    firsts: Ints  # (s,), index of the first scan
+    starts_ns: Floats  # (s,), start of the first firing since the start of the survey
+    stops_ns: Floats  # (s,), start of the last firing since the start of the survey
 
 
 @dataclass(frozen=True)
@@ -299,7 +299,7 @@ class Survey(CloudOptions, Weather):
         check_type("sensor", self.sensor, Sensor, advice=_ON_SENSORS)
         check_fields(self)
         check_type("classes", self.classes, Mapping)
-        if problem := class_names_problem(self.classes):
+        if problem := find_class_names_error(self.classes):
             raise ArgumentError(f"classes: {problem}")
         if self.trajectory is not None:
             check_trajectory_type("trajectory", self.trajectory)
@@ -326,7 +326,7 @@ class Survey(CloudOptions, Weather):
         check_faults(self.faults, sensors, self.duration_ns)
 
     def _repr_html_(self) -> str:
-        """Return the table of the main figures, and a picture if a package draws surveys."""
+        """Return a table of the main properties, and a picture if a package can draw surveys."""
         models = [
             f"{carried.name}: {carried.sensor.model}" if carried.name else carried.sensor.model
             for carried in self.carried
@@ -345,7 +345,7 @@ class Survey(CloudOptions, Weather):
         return table_of(rows.items()) + picture_of(self)
 
     def _fill_in(self, name: str, default: Returns | Noise) -> None:
-        """Set the returns or the noise of all sensors, if the survey has none."""
+        """Set the returns or noise to those of the sensors or the default, if they are not set."""
         if getattr(self, name) is not None:
             return
         if self.sensors:
@@ -359,14 +359,14 @@ class Survey(CloudOptions, Weather):
         self._set(**{name: default})
 
     def _set(self, **fields: Any) -> None:
-        """Set fields of the frozen survey."""
+        """Set fields although the survey is frozen."""
         for name, value in fields.items():
             object.__setattr__(self, name, value)
 
     def _trajectory(self) -> Trajectory:
-        """Return the trajectory, or the poses as stations.
+        """Return the trajectory, or create stations from the poses.
 
-        Raises LidarError for both or neither.
+        Raise LidarError if both or neither are set.
         """
         if self.trajectory is None:
             if not self.poses:
@@ -377,7 +377,7 @@ class Survey(CloudOptions, Weather):
         return self.trajectory
 
     def _check_names(self) -> None:
-        """Check that sensors have different names, and are not too many."""
+        """Check that sensor names are unique and that there are not too many sensors."""
         names = [carried.name for carried in self.sensors]
         if len(names) > MAX_SENSORS or len({*names}) < len(names):
             raise LidarError(
@@ -386,7 +386,7 @@ class Survey(CloudOptions, Weather):
             )
 
     def _check_values(self) -> None:
-        """Check that options fit together and to the sensors."""
+        """Check that the options are compatible with each other and with the sensors."""
         if self.epsg in WORLD_EPSG:
             raise LidarError(f"epsg is {self.epsg}, {OF_THE_WORLD}.")
         if self.navigation is not None:
@@ -397,7 +397,7 @@ class Survey(CloudOptions, Weather):
                 f"2026-11-21T10:00:00Z, but is {self.start}."
             )
         for carried, returns in zip(self.carried, self.returns_each, strict=True):
-            returns.divergence(carried.sensor.optics)  # LidarError for sub-rays without divergence
+            returns.divergence(carried.sensor.optics)  # raises LidarError if it is unknown
             self._check_waveform(carried.sensor, returns)
         for number, noise in enumerate(self.noise_each):
             _check_noise(noise, self.carried[number].sensor)
@@ -410,7 +410,7 @@ class Survey(CloudOptions, Weather):
                 self._check_air(number)
 
     def _check_waveform(self, sensor: Sensor, returns: Returns) -> None:
-        """Check that the samples of waveforms suit the pulse of a sensor, and LAS."""
+        """Check that the waveform samples are suitable for the pulse of a sensor and for LAS."""
         if returns.waveform != "none" or self.waveform_samples:
             sigma_ns = returns.system_ns(sensor.optics)
             min_samples = ceil(WINDOW_SIGMAS * sigma_ns / returns.sample_ns) + 2
@@ -427,7 +427,11 @@ class Survey(CloudOptions, Weather):
             )
 
     def _check_crosstalk(self, number: int) -> None:
-        """Check that the survey has several sensors, with a greatest range and a divergence."""
+        """Check that crosstalk to a sensor can be simulated.
+
+        Crosstalk requires several sensors, a maximum range for each of them, and the divergence of
+        the affected sensor.
+        """
         if len(self.carried) == 1:
             raise LidarError(
                 "noise.crosstalk requires at least two sensors, but this survey has one."
@@ -445,14 +449,14 @@ class Survey(CloudOptions, Weather):
             )
 
     def _check_air(self, number: int) -> None:
-        """Check that a sensor's returns from the air can be computed, and are not too many."""
+        """Check that a sensor's returns from the air can be simulated and are not too numerous."""
         carried = self.carried[number]
         sensor = carried.sensor
         name = f" of {carried.name}" if carried.name else ""
         if self.noise_each[number].detection_range_m is None:
             missing = "is not set" if carried.noise is None else "is not in its data sheet"
             guess_m = sensor.max_range_m / 2 if sensor.max_range_m < np.inf else 100
-            guess = f"{float(f'{guess_m:.3g}'):g}"  # never 1e+03, which YAML reads as text
+            guess = f"{float(f'{guess_m:.3g}'):g}"  # avoids 1e+03, which YAML reads as a string
             raise LidarError(
                 f"Returns from rain, snow, spray or dust require noise.detection_range_m{name}, "
                 f"the range at 10 % reflectance, which {missing}. Set it, or use half of the "
@@ -471,7 +475,7 @@ class Survey(CloudOptions, Weather):
             )
 
     def _check_duration(self, sensor: Sensor, steps: int) -> None:
-        """Check that a sensor's steps fit into the trajectory, its rays and times into numbers."""
+        """Check that the steps of a sensor fit into the trajectory and do not exceed any limit."""
         needed_s = _last_firing_ns(sensor, steps) / 1e9
         available_s = self.path.duration_ns / 1e9
         if needed_s > available_s:
@@ -496,7 +500,7 @@ class Survey(CloudOptions, Weather):
     @cached_property
     def path(self) -> Trajectory:
         """Trajectory of the platform, which has one station per pose if `poses` is set."""
-        assert self.trajectory is not None  # the poses have a trajectory by default
+        assert self.trajectory is not None  # set in __post_init__
         return self.trajectory
 
     @cached_property
@@ -505,7 +509,7 @@ class Survey(CloudOptions, Weather):
         return tuple(self.sensors) or (Mounted(self.sensor),)
 
     @property
-    def carrier(self) -> str:
+    def platform_name(self) -> str:
         """Name of the first sensor, which determines the seeds of the platform's instruments."""
         return self.carried[0].name
 
@@ -517,7 +521,9 @@ class Survey(CloudOptions, Weather):
     @cached_property
     def noise_each(self) -> tuple[Noise, ...]:
         """Noise of each sensor, with a seed that depends on the name of the sensor."""
-        return tuple((carried.noise or self.noise).named(carried.name) for carried in self.carried)
+        return tuple(
+            (carried.noise or self.noise).for_sensor(carried.name) for carried in self.carried
+        )
 
     @cached_property
     def stored_columns(self) -> tuple[Column, ...]:
@@ -546,7 +552,7 @@ class Survey(CloudOptions, Weather):
         sensor = self.carried[number].sensor
         min_energy = FAINTEST * self.noise_each[number].threshold
         air = self.air(number)
-        span = reach(sensor.min_range_m, sensor.max_range_m)
+        span = particle_range(sensor.min_range_m, sensor.max_range_m)
         return sum(air.mean_particles(kind, min_energy, *span) for kind in self.particles)
 
     @cached_property
@@ -576,7 +582,7 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def _firsts(self) -> list[int]:
-        """First scan of each sensor, and the number of scans."""
+        """Index of the first scan of each sensor, followed by the number of scans."""
         return [0, *accumulate(steps * self.path.stations for steps in self.steps_each)]
 
     @property
@@ -666,7 +672,7 @@ class Survey(CloudOptions, Weather):
         start = station * self.station_ns
         return ScanSpec(index, station, lidar.firings(step), start, sensor, lidar.channels)
 
-    def faults_of(self, sensor: int, *kinds: FaultKind) -> dict[int, Fault]:
+    def sensor_faults(self, sensor: int, *kinds: FaultKind) -> dict[int, Fault]:
         """Return the faults of the given kinds that affect a sensor.
 
         The keys are indices into `faults`.
@@ -686,20 +692,21 @@ class Survey(CloudOptions, Weather):
         every worker selects the same scan.
         """
         spec = self.scan(index)
-        frozen = self.faults_of(spec.sensor, "frozen").values()
+        frozen = self.sensor_faults(spec.sensor, "frozen").values()
         if not frozen:
             return spec
         firsts, starts_ns, _ = self.sweeps_each[spec.sensor]
         sweep = int(np.searchsorted(firsts, index, "right")) - 1
         source = sweep
-        while active := [fault for fault in frozen if fault.during(starts_ns[source])]:
+        while active := [fault for fault in frozen if fault.is_active(starts_ns[source])]:
             source = int(np.searchsorted(starts_ns, active[0].from_s * 1e9)) - 1
         if source == sweep:
             return spec
-        # The last sweep at a pose may have fewer scans: then scans are lost (`LossStep`).
+        # The repeated sweep may have fewer scans if it is the last at a pose. `LossStep` then drops
+        # the returns of the surplus scans.
         older = min(int(firsts[source] + index - firsts[sweep]), int(firsts[source + 1]) - 1)
         repeats = int(firsts[source]), int(firsts[sweep])
-        return replace(self.scan(older), scan=index, ahead=older - index, repeats=repeats)
+        return replace(self.scan(older), scan=index, random_offset=older - index, repeats=repeats)
 
     def scans(self) -> Iterator[ScanSpec]:
         """Return an iterator over all scans in order."""
@@ -719,7 +726,7 @@ class Survey(CloudOptions, Weather):
 
 
 def _check_noise(noise: Noise, sensor: Sensor) -> None:
-    """Check that noise suits a sensor, and that false alarms are not too many."""
+    """Check that the noise is compatible with a sensor and does not cause too many false alarms."""
     biases = noise.channel_bias_m
     channels = sensor.channels
     if isinstance(biases, Sequence) and len(biases) != channels:
@@ -745,22 +752,22 @@ def _check_noise(noise: Noise, sensor: Sensor) -> None:
 
 
 def firing_start_ns(sensor: Sensor, firing: int) -> float:
-    """Return the start of a firing, nanoseconds since the start of the station."""
+    """Return the start time of a firing in nanoseconds since the start of the station."""
     return float(sensor.begins_ns(np.array([firing], np.int64))[0])
 
 
 def _last_firing_ns(sensor: Sensor, steps: int) -> float:
-    """Return the start of the last firing of `steps` time steps, ns since the station's start."""
+    """Return the start time of the last firing in the first `steps` time steps.
+
+    The time is in nanoseconds since the start of the station.
+    """
     return firing_start_ns(sensor, sensor.firings(steps - 1)[1] - 1) + sensor.lead_ns
 
 
 def _poses(poses: Sequence[Any]) -> tuple[Pose, ...]:
-    """Return poses, where each may be x, y and z.
-
-    Raises LidarError if they are not a list of poses.
-    """
+    """Convert positions to poses, and raise LidarError if `poses` is not a list."""
     if isinstance(poses, str) or not isinstance(poses, Iterable):
         raise LidarError(
             f"poses must be a list of poses, such as [(0, 0, 1)], but is {shown(poses)}."
         )
-    return tuple(pose_of("poses", pose) for pose in poses)
+    return tuple(as_pose("poses", pose) for pose in poses)

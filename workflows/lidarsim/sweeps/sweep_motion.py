@@ -179,7 +179,7 @@ def _cast_at(survey: Survey, number: int) -> tuple[Ints, Floats]:
     per_station = len(firsts) // survey.path.stations
     stations = np.arange(len(firsts)) // per_station
     begins_ns = starts - stations * survey.station_ns
-    if survey.faults_of(number, "frozen"):
+    if survey.sensor_faults(number, "frozen"):
         for sweep, scan in enumerate(firsts.tolist()):
             spec = survey.sent_scan(scan)
             if spec.repeats is not None:

@@ -323,7 +323,7 @@ class Sweeps:
         for count in range(1 + len(jumps)):
             for faults in combinations(jumps, count):
                 candidate = stamps - sum(round((fault.by_s or 0) * 1e9) for fault in faults)
-                stated_stamps = sum((fault.jumps_ns(candidate) for fault in jumps), candidate)
+                stated_stamps = sum((fault.time_errors_ns(candidate) for fault in jumps), candidate)
                 # If several times give a stamp, the time closest to the point's scan counts.
                 distance = np.abs(candidate - begin_ns - by_scan)
                 better = (stated_stamps == stamps) & (distance < smallest_distance)
@@ -465,13 +465,15 @@ class Sweeps:
         return tuple(
             fault
             for fault in sensor_faults
-            if fault.during(begin, None if fault.kind == "frozen" else end)
+            if fault.is_active(begin, None if fault.kind == "frozen" else end)
         )
 
     def stamp_ns(self, sweep: int) -> int:
         """Return the start of a sweep by the sensor's clock, ns since the survey's start."""
         begin = self.begins_ns[sweep]
-        return round(begin) + sum(int(fault.jumps_ns(begin)) for fault in self.faults_in(sweep))
+        return round(begin) + sum(
+            int(fault.time_errors_ns(begin)) for fault in self.faults_in(sweep)
+        )
 
     def points(self, cloud: CloudLike, first: int = 0, stop: int | None = None) -> Iterator[Cloud]:
         """Yield the points of each sweep from `first` to `stop` in order, empty sweeps included.
@@ -529,7 +531,7 @@ class Sweeps:
             values["instruments"] = self.instruments.to_json()
         values |= {"classes": dict(self.classes)} if self.classes else {}
         values |= {"materials": self.materials} if self.materials else {}
-        values |= {"faults": [fault.words() for fault in self.faults]} if self.faults else {}
+        values |= {"faults": [fault.to_dict() for fault in self.faults]} if self.faults else {}
         arrays: dict[str, Any] = {"words": np.frombuffer(json.dumps(values).encode(), np.uint8)}
         arrays |= {name: getattr(self, name) for name in _ARRAY_FIELDS}
         poses_by_prefix = {"": self.pose, "mount_": self.mounts, "actor_": self.actor_poses}
@@ -640,7 +642,7 @@ def _sensor_sweeps(survey: Survey, number: int) -> _SensorSweeps:
         positions.append(carrier_positions + carrier_rotations @ np.array(mount.position))
         rotations.append(carrier_rotations @ mount.rotation_matrix)
     specs = [survey.sent_scan(scan) for scan in firsts.tolist()]
-    cast_scans = np.array([spec.scan + spec.ahead for spec in specs])  # repeated if frozen
+    cast_scans = np.array([spec.scan + spec.random_offset for spec in specs])  # repeated if frozen
     first_steps = (cast_scans - firsts[0]) % survey.steps_each[number]
     return _SensorSweeps(np.concatenate(positions), np.concatenate(rotations), first_steps)
 

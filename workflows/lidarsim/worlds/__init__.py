@@ -1,4 +1,7 @@
-"""Lidars in worlds that other programs move, such as MuJoCo, without importing these programs."""
+"""Lidars in worlds that are controlled by other programs, such as MuJoCo.
+
+The programs themselves are not imported.
+"""
 
 from .mujoco_scanner import MujocoScanner
 

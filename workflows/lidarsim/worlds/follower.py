@@ -1,4 +1,7 @@
-"""A lidar in a world that another program moves: meshes once, and matrices at each step."""
+"""A lidar in a world that is controlled by another program.
+
+The program passes the meshes of the bodies once, and their transformation matrices at each step.
+"""
 
 from __future__ import annotations
 
@@ -24,15 +27,15 @@ from ..sensor import Sensor
 from ..simulator.scanner import Scanner
 from ..survey.survey import Mounted
 
-_SLACK_S = 1e-9  # the time of a step may be before a sweep's last beam by so much
+_SLACK_S = 1e-9  # tolerance for the time of the last beam of a sweep
 
 
 class _Step(NamedTuple):
-    """A step of the world."""
+    """State of the world at a time step."""
 
     time_s: float  # seconds since the first step
-    pose: Floats  # (4, 4), from the frame of the sensor's carrier to the world
-    matrices: Floats  # (k, 4, 4), from the frames of the bodies to the world
+    pose: Floats  # (4, 4), from the platform frame to the world
+    matrices: Floats  # (k, 4, 4), from the body frames to the world
 
 
 class Follower:
@@ -98,13 +101,13 @@ class Follower:
         self._sensor = sensor
         self._options = options
         instances = [SceneInstance(mesh, np.eye(4), mesh.name) for mesh in bodies]
-        # Of a world that stands still during a sweep.
+        # Scanner of a world that is stationary during each sweep.
         self._frozen = Scanner(Scene.from_meshes([*static, *instances]), sensor, **options)
         self._matrices = np.tile(np.eye(4), (len(bodies), 1, 1))
         self._steps: deque[_Step] = deque()
         self._start_s: float | None = None  # time of the first step
-        self._number = 0  # number of the sweep under way
-        # Times of the first and last beam of the sweep under way, seconds since the first step.
+        self._number = 0  # index of the current sweep
+        # Times of the first and last beam of the current sweep, in seconds since the first step.
         self._span_s: tuple[float, float] | None = None
 
     def __repr__(self) -> str:
@@ -153,7 +156,7 @@ class Follower:
             rigid transform.
         """
         sensor_pose = _matrices(pose, 1)
-        self._place(_matrices(matrices, len(self._bodies)))
+        self._move_bodies(_matrices(matrices, len(self._bodies)))
         origin = self._frozen.origin
         path = StaticPose(sensor_pose[0, :3, 3] - origin, sensor_pose[0, :3, :3])
         return self._frozen.sweep(path, number=number)
@@ -183,8 +186,8 @@ class Follower:
             rigid transform.
         """
         sensor_poses = _matrices(poses, None)
-        self._place(_matrices(matrices, len(self._bodies)))
-        return self._frozen.ranges(_local(sensor_poses, self._frozen.origin), number=number)
+        self._move_bodies(_matrices(matrices, len(self._bodies)))
+        return self._frozen.ranges(_to_local(sensor_poses, self._frozen.origin), number=number)
 
     def step(self, time_s: float, pose: ArrayLike, matrices: ArrayLike = ()) -> list[Cloud]:
         """Record a time step of the world, and return the sweeps completed since the last step.
@@ -227,7 +230,7 @@ class Follower:
         if self._steps and step.time_s == self._steps[-1].time_s:
             self._steps.pop()
         self._steps.append(step)
-        return list(self._ended_sweeps())
+        return list(self._completed_sweeps())
 
     def reset(self) -> None:
         """Discard all recorded steps, so that the next step starts a new first sweep."""
@@ -236,8 +239,8 @@ class Follower:
         self._number = 0
         self._span_s = None
 
-    def _ended_sweeps(self) -> Iterator[Cloud]:
-        """Yield the sweeps whose beams are fired until the last step."""
+    def _completed_sweeps(self) -> Iterator[Cloud]:
+        """Yield the sweeps whose last beam was fired before or at the last step."""
         while True:
             if self._span_s is None:
                 self._span_s = self._moving.span_s(self._number)
@@ -248,30 +251,30 @@ class Follower:
             times_s, poses, matrices = map(np.array, zip(*self._steps, strict=True))
             origin = self._moving.origin
             if self._bodies:
-                by_body = _local(matrices.transpose(1, 0, 2, 3), origin)
+                by_body = _to_local(matrices.transpose(1, 0, 2, 3), origin)
                 self._moving.move(self._body_names, by_body, times_s=times_s)
-            # Held before the first step, since the scanner also asks for the pose at time 0.
-            (path,) = Track.from_matrices(times_s, _local(poses, origin)[None], "hold")
+            # The first pose is held, because the scanner also requires the pose at time 0.
+            (path,) = Track.from_matrices(times_s, _to_local(poses, origin)[None], "hold")
             yield self._moving.sweep(path, number=self._number)
             self._number += 1
             self._span_s = None
 
     def _drop_steps(self, start_s: float) -> None:
-        """Drop the steps before the last step at or before a time, seconds."""
+        """Discard the steps that are no longer needed for times after `start_s`."""
         while len(self._steps) > 2 and self._steps[1].time_s <= start_s:
             self._steps.popleft()
 
-    def _place(self, matrices: Floats) -> None:
-        """Move the instances whose matrices (k, 4, 4) have changed."""
+    def _move_bodies(self, matrices: Floats) -> None:
+        """Move the instances whose matrices have changed."""
         changed = np.flatnonzero((matrices != self._matrices).any(axis=(1, 2)))
         if len(changed):
             names = [self._body_names[row] for row in changed]
-            self._frozen.move(names, _local(matrices[changed], self._frozen.origin))
+            self._frozen.move(names, _to_local(matrices[changed], self._frozen.origin))
             self._matrices = matrices.copy()
 
 
-def _local(matrices: Floats, origin: Floats) -> Floats:
-    """Return matrices (..., 4, 4) to local coordinates, from matrices to the world."""
+def _to_local(matrices: Floats, origin: Floats) -> Floats:
+    """Convert matrices from world coordinates to local coordinates with the given origin."""
     if not origin.any():
         return matrices
     local = matrices.copy()
@@ -280,11 +283,10 @@ def _local(matrices: Floats, origin: Floats) -> Floats:
 
 
 def _matrices(values: ArrayLike, count: int | None) -> Floats:
-    """Return matrices as an array (k, 4, 4).
+    """Convert matrices to an array of shape (k, 4, 4).
 
-    Raises LidarError if they are not `count` such matrices.
-
-    The scanner checks that matrices are rigid.
+    Raise LidarError if the shape is different, or if `count` is set and differs from k. The scanner
+    checks that the matrices are rigid.
     """
     try:
         matrices = np.asarray(values, np.float64).reshape(-1, 4, 4)

@@ -1,4 +1,4 @@
-"""Meshes of the bodies of MuJoCo's models."""
+"""Triangle meshes of the bodies in MuJoCo models."""
 
 from __future__ import annotations
 
@@ -16,40 +16,46 @@ from ..scene.colors import LINEAR, Colors, as_bytes, as_srgb
 from ..scene.face_materials import FaceMaterials
 from ..scene.scene_mesh import SceneMesh, stack_meshes
 from ..words import name_hint, plural
-from .mujoco_geoms import PLANE_M, SAG_M, GeomMesh, mesh_of_geom
+from .mujoco_geoms import PLANE_M, SAG_M, GeomMesh, create_geom_mesh
 
-_TEXTURE_OF_COLORS = 1  # mjTEXROLE_RGB, column of mat_texid
+_COLOR_TEXTURE_ROLE = 1  # mjTEXROLE_RGB, a column index of mat_texid
 
 Objects = Literal["body", "geom"]
 
 
 class ModelBody(NamedTuple):
-    """A body, or a geom of a body, that a lidar may see."""
+    """A body, or a geom of a body, that is visible to a lidar."""
 
-    body: int  # number of the body
-    mesh: SceneMesh  # mesh in the frame of the body; equal bodies share its arrays
+    body: int  # ID of the body
+    mesh: SceneMesh  # mesh in the body frame, whose arrays are shared by equal bodies
 
 
 class ModelBodies(NamedTuple):
-    """Bodies of a model."""
+    """Visible bodies of a model."""
 
     static: list[SceneMesh]  # meshes in world coordinates
     moving: list[ModelBody]
 
 
 class BodySelection(NamedTuple):
-    """What a lidar sees of a model, and how."""
+    """Selection of the bodies and geoms that are visible to a lidar, and options for their meshes.
 
-    groups: Sequence[int]  # groups of geoms that are seen
+    The options `sag_m` and `plane_m` are those of `create_geom_mesh`.
+    """
+
+    groups: Sequence[int]  # visible geom groups
     excluded_bodies: Sequence[int]
     excluded_geoms: Sequence[int]
-    objects: Objects  # what an object of the scene is: a body or a geom
+    objects: Objects  # whether each body or each geom is an object in the scene
     sag_m: float = SAG_M
     plane_m: float = PLANE_M
 
 
-def number_of(model: Any, kind: str, name: str | int) -> int:
-    """Return the number of a body, geom or site by its name or number, or -1 if none exists."""
+def find_id(model: Any, kind: str, name: str | int) -> int:
+    """Return the ID of a body, geom or site, or -1 if it does not exist.
+
+    `name` is either a name or an ID.
+    """
     names = names_of(model, kind)
     if isinstance(name, str):
         return names.index(name) if name in names else -1
@@ -57,9 +63,9 @@ def number_of(model: Any, kind: str, name: str | int) -> int:
 
 
 def names_of(model: Any, kind: str) -> list[str]:
-    """Return the names of all bodies, geoms or sites.
+    """Return the names of all elements of a kind, such as bodies, geoms or sites.
 
-    Nameless ones are numbered.
+    An element without a name is named after its kind and ID, such as "geom 3".
     """
     addresses = np.asarray(getattr(model, f"name_{kind}adr"))
     table = bytes(model.names)
@@ -67,27 +73,40 @@ def names_of(model: Any, kind: str) -> list[str]:
     return [name or f"{kind} {number}" for number, name in enumerate(names)]
 
 
-def required_number(model: Any, kind: str, name: str | int) -> int:
-    """Return the number of a body or site, by its name or number.
+def require_id(model: Any, kind: str, name: str | int) -> int:
+    """Return the ID of a body or site.
 
-    Raises LidarError if none exists.
+    Raises
+    ------
+    LidarError
+        If the body or site does not exist.
     """
-    number = number_of(model, kind, name)
+    number = find_id(model, kind, name)
     if number < 0:
         raise LidarError(_unknown(name, kind, names_of(model, kind)))
     return number
 
 
-def excluded(model: Any, names: Iterable[str | int]) -> tuple[list[int], list[int]]:
-    """Return the numbers of excluded bodies and geoms, where numbers in `names` are of bodies.
+def find_excluded(model: Any, names: Iterable[str | int]) -> tuple[list[int], list[int]]:
+    """Return the IDs of excluded bodies and of excluded geoms.
 
-    LidarError if there is neither a body nor a geom with a name.
+    Parameters
+    ----------
+    model
+        An `mjModel`.
+    names
+        Names of bodies and geoms, or IDs of bodies.
+
+    Raises
+    ------
+    LidarError
+        If neither a body nor a geom has one of the names.
     """
     bodies = []
     geoms = []
     for name in names:
-        body = number_of(model, "body", name)
-        geom = number_of(model, "geom", name) if isinstance(name, str) else -1
+        body = find_id(model, "body", name)
+        geom = find_id(model, "geom", name) if isinstance(name, str) else -1
         if body < 0 and geom < 0:
             known = [*names_of(model, "body"), *names_of(model, "geom")]
             raise LidarError(_unknown(name, "body or geom", known))
@@ -97,17 +116,17 @@ def excluded(model: Any, names: Iterable[str | int]) -> tuple[list[int], list[in
 
 
 def _unknown(name: str | int, kind: str, known: list[str]) -> str:
-    """Return the message on a name that a model lacks."""
     return f"The model has no {kind} {name!r}.{name_hint(str(name), known)}"
 
 
-def bodies_of(model: Any, choice: BodySelection) -> ModelBodies:
-    """Return the bodies of a model with visible geoms.
+def create_bodies(model: Any, choice: BodySelection) -> ModelBodies:
+    """Create the meshes of the bodies that have visible geoms.
 
-    Bodies that are welded to the world stand; mocap bodies and all others move. Geoms that are
-    completely transparent are left out, as by MuJoCo's rays, and so are flexes and skins.
+    Bodies that are welded to the world are static, except for mocap bodies. All other bodies move.
+    Completely transparent geoms are omitted, because MuJoCo's ray casting ignores them, too. Flexes
+    and skins are also omitted.
     """
-    geoms = seen_geoms(model, choice)
+    geoms = visible_geoms(model, choice)
     groups = [[geom] for geom in geoms]
     if choice.objects == "body":
         by_body: dict[int, list[int]] = {}
@@ -117,7 +136,7 @@ def bodies_of(model: Any, choice: BodySelection) -> ModelBodies:
     is_static = _static_bodies(model)
     names = names_of(model, choice.objects)
     colors = _colors(model)
-    meshes: dict[Hashable, SceneMesh] = {}  # equal bodies have the mesh of the first
+    meshes: dict[Hashable, SceneMesh] = {}  # meshes, which are shared by equal bodies
     static = []
     moving = []
     for group in groups:
@@ -135,12 +154,12 @@ def bodies_of(model: Any, choice: BodySelection) -> ModelBodies:
 
 
 def _static_bodies(model: Any) -> Any:
-    """Return whether each body stands: (bodies,)."""
+    """Return a mask of the static bodies."""
     return (np.asarray(model.body_weldid) == 0) & (np.asarray(model.body_mocapid) < 0)
 
 
-def seen_geoms(model: Any, choice: BodySelection) -> list[int]:
-    """Return the numbers of the geoms that a lidar may see."""
+def visible_geoms(model: Any, choice: BodySelection) -> list[int]:
+    """Return the IDs of the geoms that are visible to a lidar."""
     colors = _colors(model)
     seen = np.isin(model.geom_group, choice.groups) & (colors[:, 3] > 0)
     seen &= ~np.isin(model.geom_bodyid, choice.excluded_bodies)
@@ -149,23 +168,23 @@ def seen_geoms(model: Any, choice: BodySelection) -> list[int]:
 
 
 def _colors(model: Any) -> Floats:
-    """Return the colors and opacities of geoms: (geoms, 4), 0 to 1."""
+    """Return the RGBA values of all geoms, from 0 to 1, with shape (geoms, 4)."""
     colors = np.array(model.geom_rgba, np.float64).reshape(-1, 4)
     material = np.asarray(model.geom_matid)
-    # As MuJoCo does: the material counts, unless the geom's own color differs from the default.
+    # As in MuJoCo, the color of the material is used unless the geom has a non-default color.
     by_material = (material >= 0) & (colors == [0.5, 0.5, 0.5, 1]).all(axis=1)
     colors[by_material] = np.asarray(model.mat_rgba)[material[by_material]]
     return colors
 
 
 def _srgb_of(model: Any, geom: int, color: Floats) -> Bytes:
-    """Return the color of a geom, multiplied by the mean of its texture: sRGB (3,)."""
+    """Return the sRGB color of a geom, multiplied by the mean color of its texture."""
     srgb = as_bytes(color[:3])
     material = int(model.geom_matid[geom])
     if material < 0:
         return srgb
     texture_numbers = np.atleast_1d(model.mat_texid[material])
-    role = _TEXTURE_OF_COLORS if len(texture_numbers) > 1 else 0
+    role = _COLOR_TEXTURE_ROLE if len(texture_numbers) > 1 else 0
     texture = int(texture_numbers[role])
     if texture < 0:
         return srgb
@@ -180,9 +199,9 @@ def _srgb_of(model: Any, geom: int, color: Floats) -> Bytes:
 def _mesh_of_geoms(
     model: Any, geoms: list[int], colors: Floats, choice: BodySelection
 ) -> SceneMesh:
-    """Return the mesh of geoms of a body, in the frame of the body, without a name.
+    """Create an unnamed mesh from geoms of a body, in the body frame.
 
-    `colors` (geoms, 4) are the colors of all geoms of the model.
+    `colors` contains the colors of all geoms in the model, with shape (geoms, 4).
     """
     shapes = [_placed_geom(model, geom, choice) for geom in geoms]
     counts = [len(shape.faces) for shape in shapes]
@@ -198,14 +217,17 @@ def _mesh_of_geoms(
 
 
 def _placed_geom(model: Any, geom: int, choice: BodySelection) -> GeomMesh:
-    """Return the triangles of a geom in the frame of its body."""
-    shape = mesh_of_geom(model, geom, choice.sag_m, choice.plane_m)
+    """Create the mesh of a geom in the frame of its body."""
+    shape = create_geom_mesh(model, geom, choice.sag_m, choice.plane_m)
     points = rotate(shape.vertices, _rotation(model.geom_quat[geom]))
     return GeomMesh(points + np.asarray(model.geom_pos[geom], np.float64), shape.faces)
 
 
 def _materials_of(model: Any, geoms: list[int], counts: list[int]) -> FaceMaterials | None:
-    """Return the materials of the faces of geoms, `counts` of each, or None without materials."""
+    """Return the materials of the faces of several geoms, or None if no geom has a material.
+
+    `counts` contains the number of faces of each geom.
+    """
     materials = np.asarray(model.geom_matid)[geoms]
     if (materials < 0).all():
         return None
@@ -216,20 +238,20 @@ def _materials_of(model: Any, geoms: list[int], counts: list[int]) -> FaceMateri
 
 
 def _key(model: Any, geom: int) -> Hashable:
-    """Return a key that is equal for geoms of the same triangles in the frames of their bodies."""
+    """Return a key that is equal for geoms with equal meshes in the frames of their bodies."""
     fields = ("type", "dataid", "matid", "size", "pos", "quat", "rgba")
     return tuple(np.asarray(getattr(model, f"geom_{field}")[geom]).tobytes() for field in fields)
 
 
 def _rotation(quaternion: Any) -> Floats:
-    """Return the rotation (3, 3) of a quaternion w, x, y, z."""
+    """Return the rotation matrix of a quaternion in MuJoCo's order (w, x, y, z)."""
     w, x, y, z = np.asarray(quaternion, np.float64).tolist()
     xyzw = np.array([[x, y, z, w]])
     return np.asarray(rotations_of_quaternions(xyzw / norm(xyzw)[:, None])[0])
 
 
 def _rest_pose(model: Any, body: int) -> tuple[Floats, Floats]:
-    """Return rotation (3, 3) and position (3,) of a body that is welded to the world."""
+    """Return the rotation matrix and position of a body that is welded to the world."""
     rotation = np.eye(3)
     position = np.zeros(3)
     while body:
@@ -240,8 +262,11 @@ def _rest_pose(model: Any, body: int) -> tuple[Floats, Floats]:
     return rotation, position
 
 
-def soft_bodies(model: Any) -> str:
-    """Return the numbers of flexes and skins, which a lidar does not see, or "" without any."""
+def describe_soft_bodies(model: Any) -> str:
+    """Describe how many flexes and skins a model has, because they are invisible to a lidar.
+
+    The result is an empty string if the model has none.
+    """
     counts = {
         "flex": (int(getattr(model, "nflex", 0)), "flexes"),
         "skin": (int(getattr(model, "nskin", 0)), "skins"),

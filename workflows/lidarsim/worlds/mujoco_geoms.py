@@ -1,4 +1,4 @@
-"""Meshes of MuJoCo's geoms, in the frames of the geoms."""
+"""Triangle meshes of MuJoCo geoms, in the geom frames."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from ..scene.actors import box
 from ..scene.scene_mesh import SceneMesh
 from ..scene.shapes import capsule, cylinder
 
-# Half of the side of planes without a size, meters: far beyond the range of lidars on robots, and
-# so small that single precision resolves a millimeter.
+# Half the side length of infinite planes, in meters. It is far beyond the range of a lidar on a
+# robot, and small enough for single precision to resolve a millimeter.
 PLANE_M = 4000.0
-# Largest distance of triangles from the surface of cylinders, meters; of balls twice that.
+# Maximum distance in meters between triangles and the surface of a cylinder. For spheres, it is
+# twice as large.
 SAG_M = 2.5e-4
 _MAX_SEGMENTS = 1024
 
 
 class GeomType(IntEnum):
-    """Types of geoms, as numbered by MuJoCo (mjtGeom)."""
+    """Geom types of MuJoCo (mjtGeom)."""
 
     PLANE = 0
     HFIELD = 1
@@ -38,22 +39,31 @@ class GeomType(IntEnum):
 
 
 class GeomMesh(NamedTuple):
-    """Triangles of a geom, in its frame."""
+    """Triangle mesh of a geom in the geom frame."""
 
     vertices: Floats  # (v, 3), meters
     faces: Ints  # (f, 3)
 
 
-def mesh_of_geom(model: Any, geom: int, sag_m: float, plane_m: float = PLANE_M) -> GeomMesh:
-    """Return the triangles of a geom, by its number.
+def create_geom_mesh(model: Any, geom: int, sag_m: float, plane_m: float = PLANE_M) -> GeomMesh:
+    """Create the triangle mesh of a geom.
 
-    Triangles of round surfaces are up to `sag_m` within the surface, twice that on balls. Planes
-    without a size end `plane_m` from their center.
+    Parameters
+    ----------
+    model
+        An `mjModel`.
+    geom
+        ID of the geom.
+    sag_m
+        Maximum distance in meters between the triangles and a curved surface. For spheres and
+        ellipsoids, it is twice as large.
+    plane_m
+        Half the side length of infinite planes, in meters.
 
     Raises
     ------
     LidarError
-        If MuJoCo has no such type of geom.
+        If the type of the geom is unknown.
     """
     kind = int(model.geom_type[geom])
     size = np.asarray(model.geom_size[geom], np.float64)
@@ -64,14 +74,14 @@ def mesh_of_geom(model: Any, geom: int, sag_m: float, plane_m: float = PLANE_M) 
         case GeomType.HFIELD:
             return height_field(model, int(model.geom_dataid[geom]))
         case GeomType.SPHERE:
-            return _of(capsule(radius, 0, segments(radius, sag_m), "ball"))
+            return _geom_mesh(capsule(radius, 0, count_segments(radius, sag_m), "ball"))
         case GeomType.CAPSULE:
-            return _of(capsule(radius, 2 * half, segments(radius, sag_m), "capsule"))
+            return _geom_mesh(capsule(radius, 2 * half, count_segments(radius, sag_m), "capsule"))
         case GeomType.ELLIPSOID:
-            ball = capsule(1, 0, segments(float(size.max()), sag_m), "ball")
+            ball = capsule(1, 0, count_segments(float(size.max()), sag_m), "ball")
             return GeomMesh(ball.vertices * size, ball.faces)
         case GeomType.CYLINDER:
-            return _of(cylinder(radius, 2 * half, segments(radius, sag_m), "cylinder"))
+            return _geom_mesh(cylinder(radius, 2 * half, count_segments(radius, sag_m), "cylinder"))
         case GeomType.BOX:
             cube = box("box", (2.0, 2.0, 2.0))
             return GeomMesh((cube.vertices - [0, 0, 1]) * size, cube.faces)
@@ -80,10 +90,11 @@ def mesh_of_geom(model: Any, geom: int, sag_m: float, plane_m: float = PLANE_M) 
     raise LidarError(f"Geom {geom} has the unknown type {kind}. The known types are {[*GeomType]}.")
 
 
-def segments(radius: float, sag_m: float) -> int:
-    """Return the number of sides of a circle whose middles are `sag_m` within the circle.
+def count_segments(radius: float, sag_m: float) -> int:
+    """Return the number of sides of a polygon that approximates a circle.
 
-    A multiple of 4.
+    The centers of the sides are at most `sag_m` from the circle, unless the number of sides is
+    limited. The result is a multiple of 4.
     """
     share = min(max(sag_m / radius, 1e-9), 0.2)
     half_angle = float(arctan2(math.sqrt((2 - share) * share), 1 - share))
@@ -91,9 +102,10 @@ def segments(radius: float, sag_m: float) -> int:
 
 
 def height_field(model: Any, field: int) -> GeomMesh:
-    """Return the triangles of a height field: its surface, sides and base.
+    """Create the triangle mesh of a height field, which includes its sides and base.
 
-    Cells are divided as by MuJoCo: the edge goes along the rising row and column.
+    As in MuJoCo, the diagonal of each cell runs from the vertex with the lowest row and column to
+    the vertex with the highest.
     """
     columns = int(model.hfield_ncol[field])
     top = _field_vertices(model, field)
@@ -109,7 +121,7 @@ def height_field(model: Any, field: int) -> GeomMesh:
 
 
 def _field_vertices(model: Any, field: int) -> Floats:
-    """Return the vertices of the surface of a height field, row by row: (rows * columns, 3)."""
+    """Return the vertices of a height field in row order, with shape (rows * columns, 3)."""
     rows = int(model.hfield_nrow[field])
     columns = int(model.hfield_ncol[field])
     first = int(model.hfield_adr[field])
@@ -122,7 +134,7 @@ def _field_vertices(model: Any, field: int) -> Floats:
 
 
 def _cells(grid: Ints) -> Ints:
-    """Return the triangles of the cells of a grid (r, c) of vertices, two of each cell."""
+    """Return two triangles for each cell of a two-dimensional grid of vertex indices."""
     first = grid[:-1, :-1]
     right = grid[:-1, 1:]
     above = grid[1:, :-1]
@@ -136,7 +148,10 @@ def _cells(grid: Ints) -> Ints:
 
 
 def _walls(rim: Ints, first_lower: int) -> Ints:
-    """Return the triangles below a closed line of vertices, with the lower vertices numbered on."""
+    """Return the triangles between a closed rim and the vertices below it.
+
+    The index of the first lower vertex is `first_lower`.
+    """
     lower = first_lower + np.arange(len(rim))
     next_rim = np.roll(rim, -1)
     next_lower = np.roll(lower, -1)
@@ -149,14 +164,13 @@ def _walls(rim: Ints, first_lower: int) -> Ints:
 
 
 def _plane(size: Floats, plane_m: float) -> GeomMesh:
-    """Return the triangles of a plane, of `plane_m` along an axis without a size."""
+    """Create the mesh of a plane, which extends to `plane_m` along axes without a size."""
     x, y = np.where(size[:2] > 0, size[:2], plane_m).tolist()
     corners = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]])
     return GeomMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def _mesh(model: Any, mesh: int) -> GeomMesh:
-    """Return the triangles of a mesh."""
     vertex = int(model.mesh_vertadr[mesh])
     face = int(model.mesh_faceadr[mesh])
     vertices = model.mesh_vert[vertex : vertex + int(model.mesh_vertnum[mesh])]
@@ -164,6 +178,5 @@ def _mesh(model: Any, mesh: int) -> GeomMesh:
     return GeomMesh(np.array(vertices, np.float64), np.array(faces, np.int64))
 
 
-def _of(mesh: SceneMesh) -> GeomMesh:
-    """Return the triangles of a generated shape."""
+def _geom_mesh(mesh: SceneMesh) -> GeomMesh:
     return GeomMesh(mesh.vertices, mesh.faces)

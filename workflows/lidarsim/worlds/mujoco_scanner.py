@@ -1,4 +1,4 @@
-"""A lidar on a body or site of a model of MuJoCo."""
+"""A lidar on a body or site of a MuJoCo model."""
 
 from __future__ import annotations
 
@@ -14,7 +14,14 @@ from ..numerics.arrays import Floats, Floats32, Indices
 from ..sensor import Sensor
 from ..survey.survey import Mounted
 from .follower import Follower
-from .mujoco_bodies import BodySelection, Objects, bodies_of, excluded, required_number, soft_bodies
+from .mujoco_bodies import (
+    BodySelection,
+    Objects,
+    create_bodies,
+    describe_soft_bodies,
+    find_excluded,
+    require_id,
+)
 from .mujoco_geoms import SAG_M
 
 _log = logging.getLogger(__name__)
@@ -85,22 +92,22 @@ class MujocoScanner:
         self._is_single = isinstance(names, str | int)
         listed: Any = [names] if self._is_single else names
         self._frames: Indices = np.array(
-            [required_number(model, self._kind, name) for name in listed], np.intp
+            [require_id(model, self._kind, name) for name in listed], np.intp
         )
-        carriers = self._frames
+        mount_bodies = self._frames
         if self._kind == "site":
-            carriers = np.asarray(model.site_bodyid)[self._frames]
+            mount_bodies = np.asarray(model.site_bodyid)[self._frames]
         if objects not in ("body", "geom"):
             raise LidarError(f"objects must be 'body' or 'geom', but is {objects!r}.")
         if not sag_m > 0:
             raise LidarError(f"sag_m must be greater than 0, but is {sag_m}.")
-        excluded_bodies, excluded_geoms = excluded(model, exclude)
-        # The world, body 0, cannot carry a lidar that would not see it.
-        unseen = [*excluded_bodies, *(carrier for carrier in carriers.tolist() if carrier)]
-        choice = BodySelection(tuple(groups), unseen, excluded_geoms, objects, sag_m)
-        if soft := soft_bodies(model):
+        excluded_bodies, excluded_geoms = find_excluded(model, exclude)
+        # A lidar that is mounted on the world, body 0, still sees the world.
+        unseen = [*excluded_bodies, *(body for body in mount_bodies.tolist() if body)]
+        selection = BodySelection(tuple(groups), unseen, excluded_geoms, objects, sag_m)
+        if soft := describe_soft_bodies(model):
             _log.warning("the model has %s, which the lidar ignores", soft)
-        bodies = bodies_of(model, choice)
+        bodies = create_bodies(model, selection)
         self._bodies: Indices = np.array([item.body for item in bodies.moving], np.intp)
         if not bodies.static and not bodies.moving:
             raise LidarError(
@@ -168,9 +175,9 @@ class MujocoScanner:
         return self.follower.step(float(data.time), self._pose(data), self._matrices(data))
 
     def _pose(self, data: Any) -> Floats:
-        """Return the matrix (4, 4) of the only lidar.
+        """Return the transformation matrix of the only lidar.
 
-        Raises LidarError if there are several.
+        Raise LidarError if there are several lidars.
         """
         if len(self._frames) != 1:
             raise LidarError(
@@ -180,18 +187,21 @@ class MujocoScanner:
         return np.asarray(self._poses(data)[0])
 
     def _poses(self, data: Any) -> Floats:
-        """Return the matrices of the lidars (s, 4, 4)."""
+        """Return the transformation matrices of the lidars, with shape (s, 4, 4)."""
         if self._kind == "site":
             return _matrices(data.site_xpos, data.site_xmat, self._frames)
         return _matrices(data.xpos, data.xmat, self._frames)
 
     def _matrices(self, data: Any) -> Floats:
-        """Return the matrices of the bodies (k, 4, 4)."""
+        """Return the transformation matrices of the moving bodies, with shape (k, 4, 4)."""
         return _matrices(data.xpos, data.xmat, self._bodies)
 
 
 def _matrices(positions: Any, rotations: Any, row_indices: Indices) -> Floats:
-    """Return matrices (k, 4, 4) of positions (n, 3) and rotations (n, 9), selected by rows (k,)."""
+    """Create transformation matrices from selected rows of positions and rotations.
+
+    The positions have 3 columns, the rotations have 9 columns, and the result has shape (k, 4, 4).
+    """
     matrices = np.zeros((len(row_indices), 4, 4))
     matrices[:, :3, 3] = np.asarray(positions).reshape(-1, 3)[row_indices]
     matrices[:, :3, :3] = np.asarray(rotations).reshape(-1, 3, 3)[row_indices]

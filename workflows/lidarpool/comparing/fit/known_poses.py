@@ -12,7 +12,7 @@ import numpy as np
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.motion.rotations import check_rotations
-from lidarsim.motion.trajectory import Pose, pose_of
+from lidarsim.motion.trajectory import Pose, as_pose
 from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.scene.scene import Scene
@@ -135,7 +135,7 @@ def _given_matrices(pose: Any, recording: Recording) -> Floats:
             raise LidarError("`pose` contains positions that are not finite.")
     else:
         is_single = isinstance(pose, Pose) or isinstance(next(iter(pose), 0), Real)
-        poses = [pose_of("pose", single) for single in ([pose] if is_single else pose)]
+        poses = [as_pose("pose", single) for single in ([pose] if is_single else pose)]
         matrices = np.array(
             [affine(pose.rotation_matrix, np.array(pose.position)) for pose in poses]
         )

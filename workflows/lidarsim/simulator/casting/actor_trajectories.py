@@ -18,7 +18,7 @@ from ...motion.trajectory import (
     Stations,
     Track,
     Trajectory,
-    batch_of,
+    find_batch,
     presence_ns,
 )
 from ...numerics.arrays import Floats, Indices, Integers, Ints, owned
@@ -50,7 +50,7 @@ def _straight_tracks(trajectories: Sequence[Trajectory]) -> Iterator[_StraightTr
     static: list[int] = []
     batches: dict[int, list[int]] = {}  # {id of a batch: actor numbers}
     for actor, trajectory in enumerate(trajectories):
-        batch = batch_of(trajectory)
+        batch = find_batch(trajectory)
         if batch is not None:
             batches.setdefault(id(batch), []).append(actor)
         elif isinstance(trajectory, Stations | StaticPose):
@@ -86,7 +86,7 @@ def _batch_tracks(actors: list[int], tracks: Sequence[Any]) -> _StraightTracks:
         np.full(len(actors), steps, np.int64),
         np.tile(_limits_of(tracks[0]), (len(actors), 1)),
         np.tile(batch.times_s[:-1], len(actors)),
-        batch.segments_of([track.number for track in tracks]),
+        batch.select_segments([track.number for track in tracks]),
     )
 
 
@@ -159,7 +159,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
     def presence_ns(self) -> Floats:
         """First and last time at which each actor is in the scene, in nanoseconds. Shape (w, 2)."""
         presence = [
-            presence_ns(trajectory) if batch_of(trajectory) is None else ALWAYS
+            presence_ns(trajectory) if find_batch(trajectory) is None else ALWAYS
             for trajectory in self
         ]
         return np.array(presence, np.float64).reshape(-1, 2)

@@ -13,12 +13,12 @@ from raybeam.rays import UNIT_SLACK
 
 from ...media.materials import GLASS_INDEX, NEAREST_M, REFERENCE_M, RETRO_GAIN, WATER_INDEX
 from ...media.materials import fresnel as fresnel_of_arrays
-from ...media.materials import within_water as within_water_of_arrays
+from ...media.materials import water_film_factor as water_film_factor_of_arrays
 from ...numerics.arrays import Bools, Floats, Floats32, Ints, Ints32
 from ...numerics.elementary_loops import exp, sin_cos
 
 fresnel = inlined(fresnel_of_arrays)
-within_water = inlined(within_water_of_arrays)
+water_film_factor = inlined(water_film_factor_of_arrays)
 
 
 class TriangleNumbers(NamedTuple):
@@ -262,9 +262,10 @@ def compute_incidence(hits, directions, tables, reflectance, retro, output):  # 
 
 
 @inlined
-def at_right_angles(distance, extinction):
-    """Return the energy from a white surface at normal incidence, as `materials.at_right_angles`.
+def normal_incidence_energy(distance, extinction):
+    """Return the energy from a white surface at normal incidence.
 
+    This is the scalar version of `materials.normal_incidence_energy`.
     `distance` is in meters, and `extinction` in 1/m.
     """
     range_m = max(distance, NEAREST_M)
@@ -275,9 +276,9 @@ def at_right_angles(distance, extinction):
 
 @compiled()
 def attenuate_energies(distance, extinction, energy):
-    """Multiply energies by `at_right_angles` at the given distances."""
+    """Multiply energies by `normal_incidence_energy` at the given distances."""
     for k in range(len(energy)):
-        energy[k] *= at_right_angles(distance[k], extinction)
+        energy[k] *= normal_incidence_energy(distance[k], extinction)
 
 
 @compiled()
@@ -297,7 +298,7 @@ def apply_water_film(normals_z, cosines, kinds, shares, water, film, back):
         film[k] = visible_z >= level and not dry[kinds[k]]
         if film[k]:
             mirrored = fresnel(abs(cosines[k]), WATER_INDEX)
-            back[k] *= 1 - wet * (1 - within_water(mirrored, shares[k]))
+            back[k] *= 1 - wet * (1 - water_film_factor(mirrored, shares[k]))
 
 
 @compiled()
@@ -333,7 +334,7 @@ def divide_light(row_indices, reflected, hits, shares, optics, limits, onward_sh
         if len(hits.film) and hits.film[k]:
             onward = (1 - limits.wet) * onward + limits.wet * fresnel(cosine, WATER_INDEX)
         onward = hits.share[k] * (onward * onward)
-        brightest = limits.brightest * at_right_angles(hits.distance[k], limits.extinction)
+        brightest = limits.brightest * normal_incidence_energy(hits.distance[k], limits.extinction)
         if onward * brightest > limits.faintest:
             row_indices[count] = k
             reflected[count] = reflected[j]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ...media.materials import NEAR_NM, Material, MaterialTable, at_right_angles
+from ...media.materials import NEAR_NM, Material, MaterialTable, normal_incidence_energy
 from ...numerics.arrays import Bools, Floats, Integers, Ints, Ints32, UInts32, owned
 from ...numerics.vectors import rotate_into_frames
 from ...scene.colors import GRAY, Lookup, join_colors, luminance, pack_colors
@@ -209,12 +209,12 @@ class SceneSurfaces:
         normals, cosines, back = incidence
         bright = luminance(colors) if table.textured and colors is not None else None
         if table.textured or table.roughness.any():
-            back = table.scattered(kinds, np.abs(cosines), bright)
+            back = table.relative_energy(kinds, np.abs(cosines), bright)
         film = None
         if sensor_light.wet:
             film = np.empty(len(cosines), np.bool_)
             water = surface_loops.WaterFilm(LEVEL, sensor_light.wet, table.passes | table.leafy)
-            shares = table.shares(kinds, bright)
+            shares = table.diffuse_reflectances(kinds, bright)
             surface_loops.apply_water_film(
                 normals[2], cosines, kinds=kinds, shares=shares, water=water, film=film, back=back
             )
@@ -299,5 +299,5 @@ class SceneSurfaces:
         """
         table = self.at_wavelength(sensor_light.wavelength_nm)
         bright = luminance(colors) if table.textured and colors is not None else None
-        scattered = table.scattered(self.kinds(triangle), cosine, bright)
-        return np.asarray(scattered * at_right_angles(distance, sensor_light.extinction))
+        scattered = table.relative_energy(self.kinds(triangle), cosine, bright)
+        return np.asarray(scattered * normal_incidence_energy(distance, sensor_light.extinction))

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...media.materials import matching_rows
+from ...media.materials import match_object_names
 from ...numerics.arrays import Bools
 from ...scene.scene import Scene
 from ...survey.survey import Survey
@@ -35,7 +35,7 @@ def unseen_objects(scene: Scene, survey: Survey) -> tuple[Bools | None, ...]:
         mask = np.zeros(len(names), np.bool_)
         subject = f"unseen of sensor {carried.name!r}" if carried.name else "unseen"
         for pattern in carried.unseen:
-            mask[matching_rows(pattern, names, object_rows, subject)] = True
+            mask[match_object_names(pattern, names, object_rows, subject)] = True
         masks.append(mask if mask.any() else None)
     return tuple(masks)
 

@@ -12,7 +12,7 @@ from raybeam import Pattern
 from ...columns.table import Column
 from ...columns.waveforms import column_type
 from ...errors import LidarError
-from ...media.materials import at_right_angles
+from ...media.materials import normal_incidence_energy
 from ...numerics.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, UInts32
 from ...numerics.elementary import arccos, arcsin, arctan2
 from ...numerics.random_numbers import normal
@@ -139,8 +139,8 @@ class BatchPoints:
         if spec.repeats is not None:
             repeated_start_ns, current_start_ns = map(self.survey.begins_ns, spec.repeats)
             stamp = stamp + round(current_start_ns - repeated_start_ns)
-        jumps = self.survey.faults_of(spec.sensor, "time_jump").values()
-        return sum((jump.jumps_ns(stamp) for jump in jumps), stamp)
+        jumps = self.survey.sensor_faults(spec.sensor, "time_jump").values()
+        return sum((jump.time_errors_ns(stamp) for jump in jumps), stamp)
 
     @property
     def _actor_times_ns(self) -> Ints:
@@ -476,7 +476,9 @@ class BatchPoints:
     @property
     def _clipped_energy(self) -> Floats:
         """Received energy, clipped at saturation."""
-        return np.minimum(self.intensity, self.survey.noise_each[self.specs[0].sensor].full)
+        return np.minimum(
+            self.intensity, self.survey.noise_each[self.specs[0].sensor].saturation_energy
+        )
 
     @property
     def signal(self) -> NDArray[np.uint16]:
@@ -486,13 +488,13 @@ class BatchPoints:
     @property
     def reflectivity(self) -> Bytes:
         """Clipped energy, corrected for the loss with distance, on the manufacturer's scale."""
-        remaining = at_right_angles(self.pulse_returns.distance)
-        return SCALES[self.sensor.optics.reflectivity].codes(self._clipped_energy / remaining)
+        remaining = normal_incidence_energy(self.pulse_returns.distance)
+        return SCALES[self.sensor.optics.reflectivity].encode(self._clipped_energy / remaining)
 
     @property
     def reflectance(self) -> Floats:
         """Intensity, corrected for the losses due to distance and air."""
-        remaining = at_right_angles(
+        remaining = normal_incidence_energy(
             self.pulse_returns.distance, self.survey.extinction(self.sensor)
         )
         # In dense fog or dust, no light returns from the distance of a false alarm.
@@ -521,7 +523,7 @@ class BatchPoints:
         noise = self.survey.noise_each[self.specs[0].sensor]
         if noise.velocity_m_s:
             # A frozen sensor sends an older scan again, including its random numbers.
-            scan = self.scan.astype(np.int64) + self.specs[0].ahead
+            scan = self.scan.astype(np.int64) + self.specs[0].random_offset
             errors = normal(noise.seed, VELOCITY, scan, self.ray, self.return_number)
             velocity = velocity + noise.velocity_m_s * errors
         return velocity

@@ -65,7 +65,7 @@ class RippleStep(PulseStep):
         sin, _ = sin_cos(noise.ripple_cycles * azimuth + np.radians(noise.ripple_phase_deg))
         # An azimuth error moves a beam sideways in proportion to the horizontal part of its
         # direction.
-        level = hypot(*sensor.ahead.T[:2])
+        level = hypot(*sensor.beam_directions.T[:2])
         across = ((np.radians(noise.ripple_deg) * sin)[:, None] * level).reshape(-1)
         batch.deflect(np.column_stack([across, np.zeros(len(across))]))
         return returns

@@ -199,7 +199,7 @@ class CastStep(PulseStep):
         self._faintest = FAINTEST * setup.noise.threshold
         white = np.ones(len(table.reflectance))
         # Largest energy that any kind of surface returns from a distance of 10 m.
-        self._brightest = float(table.scattered(np.arange(len(white)), white, white).max())
+        self._brightest = float(table.relative_energy(np.arange(len(white)), white, white).max())
         shown = any(column.name in COLORS for column in survey.stored_columns)
         self._colored = shown or surfaces.materials.textured
         # Whether the origins of rays are needed in addition to their directions.
@@ -577,7 +577,7 @@ class CastStep(PulseStep):
                 light.share,
                 surface_hits.distance,
             ),
-            shares=materials.shares(surface_hits.kinds[row_indices], bright),
+            shares=materials.diffuse_reflectances(surface_hits.kinds[row_indices], bright),
             optics=surface_loops.OnwardOptics(
                 materials.specular, materials.passes, ~materials.refracts, materials.leafy
             ),

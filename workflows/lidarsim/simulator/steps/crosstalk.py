@@ -11,7 +11,7 @@ import numpy as np
 from raybeam import Pattern
 
 from ...columns.table import CAUSES
-from ...media.materials import at_right_angles
+from ...media.materials import normal_incidence_energy
 from ...numerics.arrays import Floats, Indices, Ints, Ints32, owned
 from ...numerics.elementary import arccos, exp
 from ...numerics.elementary_scalars import sin_cos_of
@@ -322,7 +322,7 @@ class CrosstalkStep(PulseStep):
         table = surfaces.at_wavelength(self._sensor.optics.wavelength_nm)
         # A retroreflector returns light only to the sensor that emitted it.
         share = table.reflectance[kinds] * ~table.retro[kinds]
-        return np.asarray(share * cosine * at_right_angles(path_m) * exp(-air_depth))
+        return np.asarray(share * cosine * normal_incidence_energy(path_m) * exp(-air_depth))
 
 
 def _expanded(first: Indices, stop: Indices) -> tuple[Indices, Indices]:

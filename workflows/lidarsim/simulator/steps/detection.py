@@ -28,7 +28,7 @@ class DetectionStep(PulseStep):
     @staticmethod
     def applies(setup: Setup) -> bool:
         """Return True if returns are found in waveforms and can be lost because of noise."""
-        return setup.noise.loses and setup.in_waveforms
+        return setup.noise.loses_returns and setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the detected returns."""

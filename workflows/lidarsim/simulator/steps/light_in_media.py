@@ -19,7 +19,7 @@ from raybeam import Pattern
 from raybeam.sub_rays import perpendicular_axes
 
 from ...errors import LidarError
-from ...media.leaves import brightness, projection
+from ...media.leaves import mean_brightness, mean_projection
 from ...media.materials import MaterialTable, fresnel
 from ...numerics.arrays import AnyArray, Bools, Floats, Indices, Integers, Ints, Ints32
 from ...numerics.elementary import exp, log
@@ -220,7 +220,7 @@ class Media:
         self._bounds = bounds
         if self.leafy:
             for angle in self._angles:
-                projection(angle, np.ones(1))  # computes and caches the table for this angle
+                mean_projection(angle, np.ones(1))  # computes and caches the table for this angle
 
     def enters(self, kinds: Ints32, cosines: Floats) -> Bools:
         """Return whether light enters bodies, given the cosines between normals and light."""
@@ -350,7 +350,7 @@ class Media:
         density = self._area[stack.kinds]
         if density.any():
             for number, angle in enumerate(self._angles):
-                projected_area = projection(angle, upright)[:, None]
+                projected_area = mean_projection(angle, upright)[:, None]
                 density *= np.where(self._angle[stack.kinds] == number, projected_area, 1)
         return density
 
@@ -362,7 +362,9 @@ class Media:
         """
         cosines = np.ones(len(kinds))
         for number, angle in enumerate(self._angles):
-            cosines = np.where(self._angle[kinds] == number, brightness(angle, upright), cosines)
+            cosines = np.where(
+                self._angle[kinds] == number, mean_brightness(angle, upright), cosines
+            )
         return cosines
 
 

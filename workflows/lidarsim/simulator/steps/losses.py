@@ -34,7 +34,7 @@ class DirtStep(PulseStep):
         for fault in self.setup.faults("dirt").values():
             in_spot = _in_spot(fault, x, y, z)
             if fault.from_s or fault.to_s is not None:
-                in_spot &= fault.during(batch.firings.times(beams))
+                in_spot &= fault.is_active(batch.firings.times(beams))
             transmission[in_spot] *= required(fault.transmission)
         transmission = transmission.repeat(batch.subrays_per_beam)
         hits = returns._replace(energy=required(returns.energy) * transmission.take(returns.ray))
@@ -79,8 +79,10 @@ class LossStep(PulseStep):
         seed = self.setup.noise.seed
         # First scans of the sweep that a frozen sensor sends again, and of the sweep that it
         # replaces.
-        first_sent_again, first_replaced = spec.repeats or (spec.ahead, 0)
-        if spec.ahead != first_sent_again - first_replaced:  # the repeated sweep has no such scan
+        first_sent_again, first_replaced = spec.repeats or (spec.random_offset, 0)
+        if (
+            spec.random_offset != first_sent_again - first_replaced
+        ):  # the repeated sweep has no such scan
             return returns.take(np.zeros(0, np.intp))
         faults = self.setup.faults("dead_channels", "dropped_packets")
         spans = np.array([fault.span_ns for fault in faults.values()]).reshape(-1, 2)
@@ -90,7 +92,9 @@ class LossStep(PulseStep):
             if fault.packet is None:
                 lost_channels[row, required(fault.channels)] = True
             else:
-                lost_firings[row] = fault.drops(firings.numbers, seed, spec.station, fault_number)
+                lost_firings[row] = fault.find_dropped(
+                    firings.numbers, seed, spec.station, fault_number
+                )
         row_indices = np.empty(len(returns.ray), np.int64)
         ray = owned(returns.ray, np.int64)
         count = fault_loops.remaining(

@@ -16,8 +16,7 @@ import numpy as np
 
 from ...columns.table import CAUSES
 from ...media.materials import MaterialTable
-from ...media.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
-from ...media.weather import reach as reach_of
+from ...media.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles, particle_range
 from ...numerics.arrays import Bools, Floats, Indices, Ints, owned
 from ...numerics.elementary import exp, expm1, geomspace, interp, log1p
 from ...numerics.elementary_scalars import exp_of
@@ -110,7 +109,7 @@ class WeatherStep(PulseStep):
         self._wavelength_nm = sensor.optics.wavelength_nm
         air = survey.air(setup.number)
         faintest = FAINTEST * noise.threshold
-        min_range_m, max_range_m = reach_of(sensor.min_range_m, sensor.max_range_m)
+        min_range_m, max_range_m = particle_range(sensor.min_range_m, sensor.max_range_m)
         # One entry per kind of particles; None if no particle of a kind can be detected.
         self.detectable_kinds = [
             _detectable(air, kind, faintest, min_range_m, max_range_m) for kind in survey.particles
@@ -363,20 +362,20 @@ def seen_by_range(
     `DetectableParticles.by_range`. Returns None if no particle is detectable.
     """
     distance = geomspace(min_range_m, max(max_range_m, min_range_m * 1.001), NODES)
-    detectable = np.flatnonzero(air.rate(kind, min_energy, distance) > 0)
+    detectable = np.flatnonzero(air.particle_rate(kind, min_energy, distance) > 0)
     if not len(detectable):
         return None
     last = min(detectable[-1] + 1, NODES - 1)
     distance = geomspace(distance[max(detectable[0] - 1, 0)], distance[last], NODES)
-    rate = air.rate(kind, min_energy, distance)
+    rate = air.particle_rate(kind, min_energy, distance)
     integrals = (rate[1:] + rate[:-1]) / 2 * np.diff(distance)
     sums = np.concatenate([[0.0], np.cumsum(integrals)])
     shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
     distance = round_to_single(interp(shares, sums / sums[-1], distance))
-    smallest = np.minimum(air.smallest(kind, min_energy, distance), kind.largest)
+    smallest = np.minimum(air.min_diameter_mm(kind, min_energy, distance), kind.largest)
     larger = -expm1(-kind.slope * (kind.largest - smallest))
     full_beam_energy = kind.reflectance * air.white_energy(distance)
-    energy_of_1_mm = full_beam_energy / (1000 * air.width(distance)) ** 2
+    energy_of_1_mm = full_beam_energy / (1000 * air.beam_diameter(distance)) ** 2
     quantities = [smallest, larger, energy_of_1_mm, full_beam_energy]
     return float(sums[-1]), np.stack([distance, *(round_to_single(row) for row in quantities)])
 
@@ -410,7 +409,7 @@ def _fog_cells(
     """
     count = int(min((max_range_m - min_range_m) / cell_m, MAX_FOG_CELLS)) if cell_m else 0
     edges = min_range_m + cell_m * np.arange(count + 1, dtype=np.float64)
-    energy = air.cloud(backscatter, edges[:-1], edges[1:])
+    energy = air.backscatter_energy(backscatter, edges[:-1], edges[1:])
     energy = energy[: int(np.sum(np.cumprod(energy >= FAINTEST * threshold)))]
     if not len(energy):
         return None

@@ -30,7 +30,7 @@ class RangeNoiseStep(PulseStep):
     @staticmethod
     def applies(setup: Setup) -> bool:
         """Return True if the noise changes ranges."""
-        return setup.noise.moves_ranges
+        return setup.noise.has_range_errors
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns with their reported ranges."""

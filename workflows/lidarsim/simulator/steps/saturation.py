@@ -39,7 +39,7 @@ class SaturationStep(PulseStep):
         pulse_ns = setup.reporting.length_ns(optics)
         if setup.in_waveforms:
             pulse_ns = FWHM * setup.reporting.system_ns(optics)
-        return apply_saturation(returns, setup.noise.full, pulse_ns)
+        return apply_saturation(returns, setup.noise.saturation_energy, pulse_ns)
 
 
 def apply_saturation(returns: PulseReturns, full: float, pulse_ns: float) -> PulseReturns:

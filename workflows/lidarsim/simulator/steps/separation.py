@@ -9,7 +9,7 @@ import numpy as np
 from ...numerics.arrays import Bools, owned
 from ...numerics.random_numbers import quantiles, starts
 from ...scene.colors import GRAY, pack_colors
-from ...sensor.disc import neighbors
+from ...sensor.disc import neighboring_subrays
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise
 from ...sensor.optics import Mode
 from ..returns import (
@@ -115,7 +115,7 @@ def _receiver(subrays: int, gap_m: float, reporting: Reporting, *, with_velocity
     from .separation_loops import Receiver
 
     noise = reporting.noise
-    detects = noise is not None and noise.loses
+    detects = noise is not None and noise.loses_returns
     return Receiver(
         subrays=subrays,
         gap_m=gap_m,
@@ -134,7 +134,7 @@ def _detection_keys(reporting: Reporting) -> RandomKeys:
 
     noise = reporting.noise
     keys = reporting.keys
-    detects = noise is not None and noise.loses
+    detects = noise is not None and noise.loses_returns
     return RandomKeys(
         starts=starts(noise.seed, LOSS, DETECTION)
         if noise is not None and detects
@@ -195,7 +195,7 @@ def neighbors_of(subrays: int, planes: Planes | None) -> SubrayNeighbors:
         no_planes = np.zeros((3, 0))
         return SubrayNeighbors(subrays, np.zeros((0, 2), np.int64), no_planes, no_planes)
     normals, directions = planes
-    pairs = owned(neighbors(subrays), np.int64)
+    pairs = owned(neighboring_subrays(subrays), np.int64)
     return SubrayNeighbors(subrays, pairs, owned(normals.T), owned(directions.T))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from raybeam.moving import pair_cells_with_boxes
 
 from ...columns.table import CAUSES
-from ...media.weather import FAINTEST, LARGE, reach, spray
+from ...media.weather import FAINTEST, LARGE, particle_range, spray_clumps
 from ...numerics.arrays import Floats, Ints, owned
 from ...numerics.random_numbers import Purpose
 from ...numerics.vectors import norm, rotate_into_frames
@@ -80,8 +80,8 @@ class SprayStep(PulseStep):
         noise = setup.noise
         check_spray(setup.scene.actors)
         air = survey.air(setup.number)
-        range_limits_m = reach(sensor.min_range_m, sensor.max_range_m)
-        clump_kind = spray(survey.spray_g_m3)
+        range_limits_m = particle_range(sensor.min_range_m, sensor.max_range_m)
+        clump_kind = spray_clumps(survey.spray_g_m3)
         # Cross-sections of clumps in 1/m, half of whose extinction is diffraction.
         self._extinction = clump_kind.extinction / LARGE
         self._step_mm = 1 / clump_kind.slope

@@ -121,7 +121,9 @@ class Setup:
         if self.has_role(Role.CHANGES | Role.RECEIVES):
             return True
         dark = any(material.reflectance == 0 for material in self.survey.materials)
-        return self.reporting.subrays > 1 or self.has_onward_light or dark or self.noise.loses
+        return (
+            self.reporting.subrays > 1 or self.has_onward_light or dark or self.noise.loses_returns
+        )
 
     @property
     def has_received_returns(self) -> bool:
@@ -142,7 +144,7 @@ class Setup:
 
     def faults(self, *kinds: FaultKind) -> dict[int, Fault]:
         """Return the sensor's faults of the given kinds, by their number in the survey."""
-        return self.survey.faults_of(self.number, *kinds)
+        return self.survey.sensor_faults(self.number, *kinds)
 
 
 class Sizes(NamedTuple):

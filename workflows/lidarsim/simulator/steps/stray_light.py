@@ -134,7 +134,7 @@ class StrayLightStep(PulseStep):
         from .stray_loops import RetroTriangles
 
         white = np.ones(len(cluster.triangles))
-        back = table.scattered(self.surfaces.kinds(cluster.triangles), white, white)
+        back = table.relative_energy(self.surfaces.kinds(cluster.triangles), white, white)
         return RetroTriangles(cluster.corners, *cluster.bounds, back)
 
     def _has_return(self, returns: PulseReturns, ray: Ints, distance: Floats) -> Bools:

@@ -15,7 +15,7 @@ from raybeam.ray_loops import perpendicular_axes
 from ...numerics.arrays import Bools, Floats, Ints
 from ...numerics.elementary_loops import arctan2, sin_cos
 from ...sensor.optics import LIGHT_M_NS
-from ..casting.surface_loops import at_right_angles
+from ..casting.surface_loops import normal_incidence_energy
 
 CELL_RAYS = 1 << 8  # number of consecutive rays that are compared with retroreflectors at a time
 MAX_STRAY = math.radians(30.0)  # largest angle between a ray and stray light
@@ -215,7 +215,7 @@ def _reach_of_cell(rays, c, triangles, limits):
         half_angle = arctan2(sine, math.sqrt((1 - sine) * (1 + sine)))
         axis_angle = _angle(((cones[c, 0] * x + cones[c, 1] * y) + cones[c, 2] * z) / distance)
     nearest_m = max(distance - size, max(limits.min_range_m, 1e-3))
-    in_beam_energy = triangles.back[0] * at_right_angles(nearest_m, limits.extinction)
+    in_beam_energy = triangles.back[0] * normal_incidence_energy(nearest_m, limits.extinction)
     reach_angle = math.radians(
         math.sqrt(limits.share_at_degree / (limits.faintest / max(in_beam_energy, 1e-300)))
     )
@@ -263,7 +263,7 @@ def _add_light(k, t, ray, triangles, limits, strongest):
         y = nearest[1] + INWARDS * ((middles[t, 1] - ray[1]) - nearest[1])
         z = nearest[2] + INWARDS * ((middles[t, 2] - ray[2]) - nearest[2])
         distance = math.sqrt((x * x + y * y) + z * z)
-        in_beam_energy = triangles.back[t] * at_right_angles(distance, limits.extinction)
+        in_beam_energy = triangles.back[t] * normal_incidence_energy(distance, limits.extinction)
         energy = min(limits.share_at_degree / (angle * angle), 1.0) * in_beam_energy
         if energy > strongest.energy[k]:
             strongest.energy[k] = energy

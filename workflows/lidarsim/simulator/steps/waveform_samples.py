@@ -91,7 +91,7 @@ class RecordingStep(PulseStep):
             number = windows.begin[:, None] + np.arange(samples.shape[1])
             errors = normal(noise.seed, SAMPLE, stream, number >> 8, number & 255)
             samples += (noise.threshold / THRESHOLD_SIGMAS) * errors
-        return np.minimum(samples, noise.full)
+        return np.minimum(samples, noise.saturation_energy)
 
 
 def _window_starts(distance: Floats, return_number: Ints, digitizer: Digitizer, count: int) -> Ints:
