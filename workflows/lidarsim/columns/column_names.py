@@ -103,5 +103,8 @@ def columns_for(columns: Mapping[str, AnyArray], name: str) -> dict[str, AnyArra
 
 
 def _known(name: str) -> tuple[str, int]:
-    """Return the standard name of a column, or an empty string, and the rank of its alias."""
+    """Return the standard name of a column and the rank of its alias.
+
+    The standard name is empty if the column has none.
+    """
     return _STANDARD.get(name.lower().removeprefix("scalar_"), ("", 0))
