@@ -1,4 +1,4 @@
-"""Libraries that are extras: checks for their installation, and errors as sentences."""
+"""Checks for optional libraries, and conversion of their exceptions to readable errors."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ CHECKOUT = "a checkout of lidarpool (docs/install.md#extras)"
 
 
 def install_command(*requirements: str) -> str:
-    """Return the command that installs requirements, such as ``lidarpool[las]``, here.
+    """Return the command that installs requirements, such as ``lidarpool[las]``.
 
-    lidarpool is on no package index: its extras are added from a checkout.
+    Since lidarpool is not available from a package index, its extras are installed from a checkout.
     """
     from raybeam.installation import install_command  # raybeam imports NumPy
 
     words: list[str] = []
     for name in requirements:
         if name.partition("[")[0] == "lidarpool":
-            # Editable: a copy beside a checkout would hide changes of the checkout.
+            # The installation is editable so that changes to the checkout take effect.
             words += ["-e", f".{name.removeprefix('lidarpool')}"]
         else:
             words.append(name)
@@ -30,11 +30,14 @@ def install_command(*requirements: str) -> str:
 
 
 def need(package: str, extra: str, purpose: str) -> None:
-    """Check that the package of an extra is installed.
+    """Check that a package from an extra is installed.
 
-    Raises LidarError if not.
+    `purpose` is the subject of the error message, for example "Reading clouds".
 
-    `purpose` is the subject of the error message, such as "Reading clouds".
+    Raises
+    ------
+    LidarError
+        If the package is not installed.
     """
     if find_spec(package) is None:
         raise LidarError(
@@ -45,7 +48,10 @@ def need(package: str, extra: str, purpose: str) -> None:
 
 @contextmanager
 def reading(name: str) -> Iterator[None]:
-    """Turn the errors of a library that reads a file into a LidarError of a line."""
+    """Convert exceptions from a library that reads a file into a LidarError.
+
+    The message is a single line that starts with the name of the file.
+    """
     try:
         with prefixed(name):
             yield
@@ -55,5 +61,5 @@ def reading(name: str) -> Iterator[None]:
         file = "" if error.filename in (None, name) else f", {error.filename}"
         reason = message_of(error).rstrip(".")
         raise LidarError(f"{name} cannot be read: {reason}{file}.") from error
-    except Exception as error:  # libraries raise errors of any class
+    except Exception as error:  # libraries may raise exceptions of any class
         raise LidarError(unreadable(name, error)) from error

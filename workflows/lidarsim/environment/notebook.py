@@ -1,4 +1,4 @@
-"""Notebooks: displays in their cells, and how objects are shown there as tables and pictures."""
+"""Display of objects in notebooks as HTML tables and pictures."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import sys
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-PICTURE_SIZE = (800, 500)  # pixels; letters of smaller pictures could not be read
+PICTURE_SIZE = (800, 500)  # pixels; text would be illegible in smaller pictures
 
-# {name of a class: "module:function" that draws an instance as a PNG}, of packages that draw.
+# {class name: "module:function" that draws an instance as a PNG}
 _drawers: dict[str, str] = {}
 
 
 def cell_display() -> Any:
-    """Return `IPython.display` in a notebook, whose cells show printed text, else None."""
+    """Return the `IPython.display` module in a notebook, or None elsewhere."""
     if "ipykernel" not in sys.modules:
         return None
     from IPython import display, get_ipython
@@ -33,7 +33,7 @@ def draw_with(drawers: Mapping[str, str]) -> None:
 
 
 def table_of(rows: Iterable[tuple[str, str]]) -> str:
-    """Return an HTML table of names and values, in the colors of the notebook."""
+    """Return an HTML table of names and values in the color theme of the notebook."""
     from html import escape
 
     left = " style='text-align:left'"
@@ -45,7 +45,7 @@ def table_of(rows: Iterable[tuple[str, str]]) -> str:
 
 
 def picture_of(instance: object) -> str:
-    """Return the picture of an instance as HTML, or "" if no package draws its class."""
+    """Return a picture of an instance as HTML, or "" if no function draws its class."""
     from importlib import import_module
 
     from ..errors import LidarError
@@ -57,13 +57,13 @@ def picture_of(instance: object) -> str:
     module, _, function = drawer.partition(":")
     try:
         png: bytes | None = getattr(import_module(module), function)(instance)
-    except LidarError:  # a scene that cannot be cast is shown as a table
+    except LidarError:  # if the scene cannot be rendered, only the table is shown
         return ""
     return "" if png is None else image_of(png, type(instance).__name__)
 
 
 def image_of(png: bytes, name: str) -> str:
-    """Return a PNG as HTML, as wide as drawn at most."""
+    """Return a PNG as an HTML image that is at most as wide as the PNG."""
     from base64 import b64encode
     from html import escape
 

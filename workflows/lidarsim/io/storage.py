@@ -189,7 +189,7 @@ class Storage:
         return os.getpid(), system, folder
 
     def file_system(self) -> tuple[Any, str]:
-        """Return the fsspec file system and the folder, for libraries that open files themselves."""
+        """Return the fsspec file system and the folder, for libraries that open files."""
         with self._remote() as opened:
             return opened
 
@@ -206,7 +206,7 @@ class Storage:
             self.local(name).mkdir(parents=True, exist_ok=True)
             return
         with suppress(FileExistsError), self._remote() as (system, folder):
-            # Object stores have no folders, and s3fs would create a bucket if the name is misspelled.
+            # Object stores have no folders, and s3fs would create a bucket with a misspelled name.
             if folder.startswith("/"):
                 system.makedirs(f"{folder}/{name}".rstrip("/"), exist_ok=True)
 

@@ -113,7 +113,7 @@ def read_yaml(
         line = f", line {mark.line + 1}" if mark else ""
         raise LidarError(f"{path}{line}: {error.problem or 'not valid YAML'}.") from error
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
-        # A ValueError is raised if the file is not UTF-8, or if a date such as 2026-99-99 is invalid.
+        # A ValueError means that the file is not UTF-8, or that a date or number is invalid.
         reason = " ".join(str(error).partition(";")[0].split())[:200]
         raise LidarError(f"{path} is not valid YAML: {reason}.") from error
     if content is None:
