@@ -266,7 +266,7 @@ def test_labels_list_the_faults_of_each_sweep(tmp_path):
         about = json.load(tar.extractfile(name))
     assert about["faults"] == [{"kind": "time_jump", "from_s": 0.22, "by_s": -0.5}]
     assert about["time_ns"] == round(survey.begins_ns(2 * SWEEP))
-    assert b'"faults"' not in Sweeps.from_survey(STANDING, ROOM).packed()
+    assert b'"faults"' not in Sweeps.from_survey(STANDING, ROOM).to_bytes()
 
 
 @pytest.mark.extended

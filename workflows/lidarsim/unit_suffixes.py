@@ -84,12 +84,12 @@ def unit_of(name: str) -> str | None:
     return None if parsed is None else parsed.unit
 
 
-def other_unit(name: str, candidates: Iterable[str]) -> str | None:
+def find_other_unit(name: str, candidates: Iterable[str]) -> str | None:
     """Return the candidate that differs from a name only in its unit, or None.
 
     Examples
     --------
-    >>> other_unit("visibility_m", ["rain_mm_h", "visibility_km"])
+    >>> find_other_unit("visibility_m", ["rain_mm_h", "visibility_km"])
     'visibility_km'
     """
     given = UnitName.parse(name)
@@ -125,23 +125,23 @@ def factor_between(name: str, candidate: str) -> float | None:
     return None if given.size == wanted.size else given.size / wanted.size
 
 
-def converted(value: Any, factor: float) -> Any:
+def convert_value(value: Any, factor: float) -> Any:
     """Multiply a number, or all numbers in a list or mapping, by a factor.
 
     Returns None for values of other types.
 
     Examples
     --------
-    >>> converted([60, 1500], 0.001)
+    >>> convert_value([60, 1500], 0.001)
     [0.06, 1.5]
     """
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         number = float(f"{value * factor:.12g}")
         return int(number) if number.is_integer() and abs(number) < 1e15 else number
     if isinstance(value, (list, tuple)):
-        entries = [converted(entry, factor) for entry in value]
+        entries = [convert_value(entry, factor) for entry in value]
         return None if None in entries else entries
     if isinstance(value, dict):
-        changed = {key: converted(entry, factor) for key, entry in value.items()}
+        changed = {key: convert_value(entry, factor) for key, entry in value.items()}
         return None if None in changed.values() else changed
     return None

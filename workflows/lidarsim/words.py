@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 
-from .unit_suffixes import factor_between, other_unit, unit_of
+from .unit_suffixes import factor_between, find_other_unit, unit_of
 
 
 def did_you_mean(word: str, candidates: Iterable[str]) -> str:
@@ -61,7 +61,7 @@ def did_you_mean_each(words: Sequence[str], candidates: Iterable[str]) -> str:
 def most_similar(word: str, candidates: Iterable[str]) -> str | None:
     """Return the candidate that is most similar to a word, or None if none is similar."""
     names = [*candidates]
-    if (same_quantity := other_unit(word, names)) is not None:
+    if (same_quantity := find_other_unit(word, names)) is not None:
         return same_quantity
     lower = {name.lower(): name for name in names}
     matches = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=0.6)
@@ -115,12 +115,12 @@ _CALLS = {
 }
 
 
-def as_python(note: str) -> str:
+def format_as_python(note: str) -> str:
     """Format the settings in a note as Python, for example `Scene.load(path, up_axis="z")`."""
     return _SETTING.sub(lambda m: f"{_CALLS[m[1]]}, {m[2]}={m[3]}{m[4]}{m[3]})", note)
 
 
-def as_scenario(note: str) -> str:
+def format_as_scenario(note: str) -> str:
     """Format the settings in a note as in a scenario, for example `{file: …, up_axis: z}`."""
     form = {"file": "{{file: …, {}: {}}}"}
     return _SETTING.sub(lambda m: form.get(m[1], f"{{}}: {{}} in {m[1]}").format(m[2], m[4]), note)
@@ -146,18 +146,18 @@ def rounded(number: float, digits: int = 3) -> str:
     return f"{float(text):,.0f}" if "e+" in text and abs(number) < _EXPONENT_FROM else text
 
 
-def scans_in_words(scans: int, sweeps: int) -> str:
+def format_scan_counts(scans: int, sweeps: int) -> str:
     """Format scan and sweep counts, for example "36,000 scans (1,000 sweeps)"."""
     return f"{plural(scans, 'scan')} ({plural(sweeps, 'sweep')})"
 
 
-def natural(name: str) -> list[tuple[int, str]]:
+def natural_sort_key(name: str) -> list[tuple[int, str]]:
     """Return a natural sort key, which sorts GPU-2 before GPU-10."""
     pieces = re.split(r"(\d+)", name)
     return [(int(p), "") if p.isdecimal() else (-1, p) for p in pieces]
 
 
-def as_text(name: bytes) -> str:
+def decode_name(name: bytes) -> str:
     """Decode a name as UTF-8, or as Latin-1 if it is not valid UTF-8.
 
     Older programs write Latin-1.
@@ -177,14 +177,14 @@ def printable(text: str, max_letters: int = 200) -> str:
     return " ".join(cleaned.split())[:max_letters]
 
 
-def fits(name: str, pattern: str) -> bool:
+def matches_pattern(name: str, pattern: str) -> bool:
     """Return whether a name matches a pattern with `*` and `?`.
 
     Brackets in the pattern have no special meaning.
 
     Examples
     --------
-    >>> fits("vel_x [m/s]", "vel_x [m/s]"), fits("vel_x [m/s]", "vel_*")
+    >>> matches_pattern("vel_x [m/s]", "vel_x [m/s]"), matches_pattern("vel_x [m/s]", "vel_*")
     (True, True)
     """
     return name == pattern or fnmatchcase(name, pattern.replace("[", "[[]"))
@@ -194,12 +194,12 @@ _PLAIN_IN_YAML = re.compile(r"[A-Za-z_][\w./-]*(?: [\w./-]+)*")
 _WORDS_OF_YAML = {"null", "true", "false", "yes", "no", "on", "off", "y", "n"}
 
 
-def in_yaml(names: Iterable[str]) -> str:
+def format_yaml_list(names: Iterable[str]) -> str:
     """Format names from a file as a YAML list, with quotes where YAML requires them.
 
     Examples
     --------
-    >>> print(in_yaml(["fix", "vel_x [m/s]", "on"]))
+    >>> print(format_yaml_list(["fix", "vel_x [m/s]", "on"]))
     [fix, "vel_x [m/s]", "on"]
     """
     return f"[{', '.join(map(_scalar_in_yaml, names))}]"
@@ -212,12 +212,12 @@ def _scalar_in_yaml(name: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
 
-def distinct(names: Iterable[str]) -> list[str]:
+def make_distinct(names: Iterable[str]) -> list[str]:
     """Make names distinct by appending a number to each name that occurs again.
 
     Examples
     --------
-    >>> distinct(["x", "ring", "ring", "ring"])
+    >>> make_distinct(["x", "ring", "ring", "ring"])
     ['x', 'ring', 'ring_2', 'ring_3']
     """
     unique: dict[str, None] = {}
@@ -231,7 +231,7 @@ def distinct(names: Iterable[str]) -> list[str]:
     return list(unique)
 
 
-def shortened(name: str, max_letters: int = 18) -> str:
+def shorten_name(name: str, max_letters: int = 18) -> str:
     """Shorten a name to `max_letters` characters by removing its middle.
 
     Control characters are replaced by the Unicode replacement character.
@@ -241,12 +241,12 @@ def shortened(name: str, max_letters: int = 18) -> str:
     return name if len(name) <= max_letters else f"{name[: max_letters - 1 - tail]}…{name[-tail:]}"
 
 
-def without_common_prefix(names: Sequence[str]) -> list[str]:
+def remove_common_prefix(names: Sequence[str]) -> list[str]:
     """Remove the words that all names start with, if there are at least three names.
 
     Examples
     --------
-    >>> without_common_prefix(["site_a_Wall", "site_a_Floor", "site_a_Lamp_1"])
+    >>> remove_common_prefix(["site_a_Wall", "site_a_Floor", "site_a_Lamp_1"])
     ['Wall', 'Floor', 'Lamp_1']
     """
     if len(names) < 3:

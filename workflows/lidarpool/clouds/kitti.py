@@ -26,7 +26,7 @@ from lidarsim.motion.rotations import matrices
 from lidarsim.numerics.arrays import Floats, Floats32
 from lidarsim.scene.files.float_rows import columns_by_name, read_float_columns
 from lidarsim.scene.files.text_rows import RowReader
-from lidarsim.sweeps.sweeps import Sweeps, plain_names
+from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
 
 from .boxes import Boxes
 from .cloud_format import Entry, PointColumns
@@ -205,7 +205,7 @@ def _names(sweeps: Sweeps, entry: Entry | None) -> list[str]:
     if entry is None:
         return [f"{sensor:02}" for sensor in range(len(sweeps.sensors))]
     first = f"{entry.number:02}"
-    names = plain_names(name or "lidar" for name in sweeps.sensors)[1:]
+    names = make_identifiers(name or "lidar" for name in sweeps.sensors)[1:]
     return [first, *(f"{first}_{name}" for name in names)]
 
 

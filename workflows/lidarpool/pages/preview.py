@@ -66,7 +66,7 @@ def preview_of(job: Job, note: str, title: str) -> View:
     """Return the view of a job before its run."""
     planning = planning_picture(job.planning)
     content, _ = PictureContent.before_casting(job.scene, job.survey, planning)
-    cloud = Cloud.joined([*first_sweeps(job)])
+    cloud = Cloud.concatenate([*first_sweeps(job)])
     if not job.scene.material_names:
         columns = {name: values for name, values in cloud.columns.items() if name != MATERIAL.name}
         cloud = replace(cloud, columns=columns)

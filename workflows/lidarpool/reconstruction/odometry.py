@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.environment.extras import need, reading
+from lidarsim.environment.extras import reading, require_package
 from lidarsim.errors import LidarError
 from lidarsim.motion.trajectory_files import load_trajectory, read_kitti_poses
 from lidarsim.numerics.arrays import Floats
@@ -190,7 +190,7 @@ def _registered(sweeps: RecordedSweeps) -> Floats:
     sweeps are the same circles. Points are not compensated for the motion within sweeps: all sweeps
     are distorted alike, and to compensate by a motion that is estimated so makes estimates swing.
     """
-    need("small_gicp", "twin", "Registering sweeps without poses")
+    require_package("small_gicp", "twin", "Registering sweeps without poses")
     import small_gicp
 
     # The first sweeps may be empty, or parts of one.

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.columns.part_columns import positions_of
+from lidarsim.columns.part_columns import cell_positions
 from lidarsim.columns.table import Column
 from lidarsim.numerics.arrays import AnyArray, Floats, Ints, Ints32
 
@@ -113,7 +113,7 @@ class CloudCounts:
         """Lowest and highest coordinates in the world, (2, 3), meters, or zeros without points."""
         if self._squares.box is None:
             return np.zeros((2, 3))
-        return positions_of(self._squares.box, self._precision_m, self._origin)
+        return cell_positions(self._squares.box, self._precision_m, self._origin)
 
     @property
     def above(self) -> Ints:
@@ -128,7 +128,7 @@ class CloudCounts:
     @property
     def corner(self) -> Floats:
         """World position of the corner of `above` in the south-west, (2,), meters."""
-        return positions_of(self._pixels.lowest, self._precision_m, self._origin[:2])
+        return cell_positions(self._pixels.lowest, self._precision_m, self._origin[:2])
 
     @property
     def _pixels(self) -> GridCounts:

@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from lidarsim.columns.table import optional_columns
-from lidarsim.environment.interrupts import deferred_interrupts
+from lidarsim.environment.interrupts import defer_interrupts
 from lidarsim.errors import LidarError, explained
 from lidarsim.io.storage import Storage, flush
 from lidarsim.io.writing_progress import WritingProgress
@@ -264,7 +264,7 @@ class SurveyOutput:
                 if not sent:
                     _clear(target, further, earlier)
                 _put(staged, target, further)
-                with deferred_interrupts():
+                with defer_interrupts():
                     on_written()
             else:
                 _move(staged, folder, report["files"], earlier, on_written)
@@ -418,7 +418,7 @@ def _move(
     """Move all files of a result into place, the report last; a killed run can be resumed."""
     for name in files:  # before its name: parts, the other copy of the points, are removed then
         flush(staged / name)
-    with deferred_interrupts():
+    with defer_interrupts():
         _clear(Storage.at(folder), files, earlier)
         for name in (*_known_further(files), *FILES):
             if name in files:

@@ -23,7 +23,15 @@ from lidarsim.motion.trajectory_files import (
     load_trajectory,
 )
 from lidarsim.numerics.arrays import Floats
-from lidarsim.schema.declared import Several, Text, TextOrTexts, about, by_text, declared, one_of
+from lidarsim.schema.declared import (
+    Several,
+    Text,
+    TextOrTexts,
+    about,
+    accept_text,
+    declared_values,
+    require_one_of,
+)
 from lidarsim.survey.survey import Mounted, StepCount
 
 from .ground import StandingSurfaces, follow_surfaces
@@ -64,7 +72,7 @@ class MountSection(Section, InstrumentPose):
 
     def pose(self) -> Pose:
         """Return position and angles as a pose."""
-        return Pose(**declared(self, Pose))
+        return Pose(**declared_values(self, Pose))
 
 
 MountEntry = Annotated[MountSection, by_position(MountSection)]
@@ -109,7 +117,7 @@ class CarriedSection(SensorSection):
         return replace(mounted, sensor=sensor, steps=self.steps)
 
 
-CarriedEntry = Annotated[CarriedSection, by_text("model", CarriedSection)]
+CarriedEntry = Annotated[CarriedSection, accept_text("model", CarriedSection)]
 
 
 class TimedPose(Section, Pose):
@@ -224,7 +232,7 @@ class TrajectorySection(Section):
         ),
     ] = "refuse"
 
-    _one_source = one_of("file", "points", "vehicle")
+    _one_source = require_one_of("file", "points", "vehicle")
 
     def track(
         self,
@@ -322,7 +330,7 @@ class TrajectorySection(Section):
         )
 
 
-TrajectoryEntry = Annotated[TrajectorySection, by_text("file", TrajectorySection)]
+TrajectoryEntry = Annotated[TrajectorySection, accept_text("file", TrajectorySection)]
 
 
 class JointTable(Section):
@@ -371,7 +379,7 @@ class ActorSection(DeformingSection):
         about("whether the actor raises spray if weather.spray_g_m3 is set; robots never do"),
     ] = True
     joints: Annotated[
-        Annotated[JointTable, by_text("file", JointTable)] | None,
+        Annotated[JointTable, accept_text("file", JointTable)] | None,
         about("table with time_s and the joint values of a robot, in radians or meters", "arm.csv"),
     ] = None
 

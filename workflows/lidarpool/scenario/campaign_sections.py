@@ -44,16 +44,16 @@ from lidarsim.schema.declared import (
     TextOrTexts,
     UnitShare,
     about,
+    accept_short_form,
     allowed,
     is_text,
-    must_be,
-    one_of,
-    short,
+    not_allowed_error,
+    require_one_of,
 )
-from lidarsim.schema.error_sentences import sentences
+from lidarsim.schema.error_sentences import convert_validation_errors
 from lidarsim.schema.section_fields import sections_in
 from lidarsim.schema.value_texts import one_line
-from lidarsim.words import did_you_mean_each, in_yaml, joined, printable
+from lidarsim.words import did_you_mean_each, format_yaml_list, joined, printable
 
 from ..clouds.format_table import DATA_SETS, LAYOUTS
 from ..clouds.writing import ExportSpec
@@ -250,7 +250,7 @@ class Sample(Section):
     ]
     count: Annotated[
         MinMax[Annotated[int, Field(ge=0)]],
-        short(lambda v: type(v) is int, lambda v: [v, v], int | list[int]),
+        accept_short_form(lambda v: type(v) is int, lambda v: [v, v], int | list[int]),
         about("number of rows in a job, or [minimum, maximum]"),
     ]
     ignore: IgnoredColumns = ()
@@ -304,7 +304,7 @@ class Choice(Section):
         ),
     ] = None
 
-    _one_kind = one_of(*_KINDS)
+    _one_kind = require_one_of(*_KINDS)
 
     @model_validator(mode="after")
     def _check_weights(self) -> Choice:
@@ -384,7 +384,7 @@ class Choice(Section):
 def _choice(value: Any) -> Any:
     """Return an entry of `vary`, or raise an error for an entry that is not a choice."""
     if not isinstance(value, (dict, Choice)):
-        raise must_be(
+        raise not_allowed_error(
             "a mapping that defines the choice, such as {uniform: [0, 1]} or {choice: [1, 4]}"
         )
     return value
@@ -465,7 +465,7 @@ class Keep(FileSection):
 
 KeepEntry = Annotated[
     Keep,
-    short(
+    accept_short_form(
         lambda v: v is None or is_text(v),
         lambda v: {"format": v} if v else {},
         Text | Keep | None,
@@ -616,7 +616,7 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
     rows = []
     for line, cells in table.rows:
         source = f"{path}, line {line}"
-        with mistakes.noted(), sentences(model, source):
+        with mistakes.noted(), convert_validation_errors(model, source):
             if len(cells) > len(table.header):
                 raise LidarError(
                     f"{source}: The line has {len(cells)} cells, but the header has "
@@ -668,7 +668,7 @@ def _check_columns(names: Sequence[str], model: Any) -> None:
         shown = joined([printable(name) for name in unknown])
         raise ValueError(
             f"it contains the unknown {noun} {shown}.{did_you_mean_each(unknown, fields)} Rename "
-            f"{pronoun}, or set `ignore: {in_yaml(unknown)}`. The available columns are "
+            f"{pronoun}, or set `ignore: {format_yaml_list(unknown)}`. The available columns are "
             f"{', '.join(fields)}"
         )
 

@@ -18,7 +18,7 @@ from lidarsim.scene.scene import Scene
 from lidarsim.sensor.sensor import LineSensor
 from lidarsim.simulator.casting.visibility import static_key, unseen_objects, without_objects
 from lidarsim.survey.survey import Survey
-from lidarsim.words import as_scenario, printable, rounded
+from lidarsim.words import format_as_scenario, printable, rounded
 
 from .default_poses import free_above, on_one_line, seen_from, surroundings_of
 from .prepare import Prepared
@@ -96,7 +96,7 @@ def implausibilities(prepared: Prepared) -> list[str]:
         warnings += _speed_warnings(motion, flies=_flies(scene, survey, surroundings, positions))
         warnings += _up_axis_warnings(motion, scene.bounds[0, 2])
         warnings += _orientation_warnings(motion)
-    return [as_scenario(warning) for warning in dict.fromkeys(warnings)]
+    return [format_as_scenario(warning) for warning in dict.fromkeys(warnings)]
 
 
 # -- positions -------------------------------------------------------------------------------

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from ..environment.extras import need, reading
+from ..environment.extras import reading, require_package
 from ..errors import CutShortError, LidarError
 from ..io.input_files import input_size
 from ..numerics.arrays import AnyArray
-from ..words import distinct, printable
+from ..words import make_distinct, printable
 from .mcap_chunks import check_chunks, check_packed
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def open_bag(path: Path, name: str) -> Reader:
     LidarError
         If the bag cannot be opened. The message starts with `name`.
     """
-    need("rosbags", "ros", f"Reading {name}")
+    require_package("rosbags", "ros", f"Reading {name}")
     from rosbags.rosbag2 import ReaderError
 
     from .closing_bag import ClosingBag
@@ -105,7 +105,7 @@ def opened_bag(path: Path, name: str) -> Iterator[Reader]:
         yield bag
 
 
-def messages_of(bag: Reader, topics: Sequence[str]) -> Iterator[BagMessage]:
+def read_messages(bag: Reader, topics: Sequence[str]) -> Iterator[BagMessage]:
     """Yield the messages on the given topics in the order of the bag."""
     connections = [entry for entry in bag.connections if entry.topic in topics]
     if connections:  # given no connections, rosbags would yield the messages on all topics
@@ -163,7 +163,7 @@ def point_columns(data: bytes) -> dict[str, AnyArray]:
     formats = [order + kinds[field.datatype] for _, field, _ in numbers]
     row = np.dtype(
         {
-            "names": distinct(name for name, _, _ in numbers),
+            "names": make_distinct(name for name, _, _ in numbers),
             "formats": formats,
             "offsets": [
                 field.offset + index * np.dtype(kind).itemsize

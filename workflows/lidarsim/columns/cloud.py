@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from ..environment.extras import install_command
-from ..environment.notebook import picture_of
+from ..environment.notebook import html_picture
 from ..errors import LidarError
 from ..numerics.arrays import AnyArray, AnyFloats
 from ..schema.checks import as_array, check_choice, check_fields
@@ -71,7 +71,7 @@ class CloudDisplay:
         body = "".join(f"<tr>{row}</tr>" for row in cells)
         sides = " × ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0).tolist())
         caption = f"<caption>{len(self):,} points, {sides} m</caption>"
-        return f"<table>{caption}{body}</table>{picture_of(self)}"
+        return f"<table>{caption}{body}</table>{html_picture(self)}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -234,7 +234,7 @@ class Cloud(CloudDisplay):
             If the library is not installed.
         """
         check_choice("library", library, ("pandas", "polars"))
-        need_packages(library)
+        require_packages(library)
         return import_module(library).DataFrame(self.by_name)
 
     def head(self, points: int = SHOWN_POINTS) -> Cloud:
@@ -257,7 +257,7 @@ class Cloud(CloudDisplay):
         return int(np.searchsorted(self["scan"], scan))
 
     @classmethod
-    def joined(cls, clouds: list[Cloud]) -> Cloud:
+    def concatenate(cls, clouds: list[Cloud]) -> Cloud:
         """Concatenate one or more clouds with the same columns."""
         first = clouds[0]
         if len(clouds) == 1:
@@ -269,7 +269,7 @@ class Cloud(CloudDisplay):
         return cls(positions, columns, first.custom_columns, first.sweeps)
 
 
-def need_packages(*packages: str) -> None:
+def require_packages(*packages: str) -> None:
     """Raise LidarError if packages are not installed."""
     # `find_spec` fails for modules without a spec, such as modules that a program creates itself.
     missing = [

@@ -12,7 +12,7 @@ import numpy as np
 from ..numerics.arrays import AnyArray, AnyFloats, Ints, Records
 from ..numerics.even_samples import even_indices
 from .cloud import CHUNK_POINTS, Cloud
-from .ply_format import AXES, mapped_rows
+from .ply_format import AXES, map_rows
 from .table import TABLE, Column
 
 
@@ -34,7 +34,7 @@ class CloudFile:
     """
 
     def __init__(self, path: Path, custom_columns: Sequence[Column] = ()) -> None:
-        self._rows = mapped_rows(path)
+        self._rows = map_rows(path)
         dtype = self._rows.dtype
         self.table = _table(dtype, custom_columns)
         scans = self._rows["scan"] if "scan" in (dtype.names or ()) else np.empty(0, np.int32)

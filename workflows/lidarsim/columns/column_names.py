@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Mapping
 from functools import lru_cache
 
 from ..numerics.arrays import AnyArray
-from ..words import distinct
+from ..words import make_distinct
 
 AXES = ("x", "y", "z")
 COLORS = ("red", "green", "blue")
@@ -81,7 +81,7 @@ def _standard_names(names: tuple[str, ...], among: frozenset[str] | None) -> tup
             continue
         best[standard] = min(best.get(standard, (rank, index)), (rank, index))
     renamed = {index: standard for standard, (_, index) in best.items()}
-    return tuple(distinct(renamed.get(index, name) for index, name in enumerate(names)))
+    return tuple(make_distinct(renamed.get(index, name) for index, name in enumerate(names)))
 
 
 def with_standard_names(

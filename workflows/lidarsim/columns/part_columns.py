@@ -90,10 +90,10 @@ class PartColumns:
         }
         if WAVEFORM in self.columns:
             columns[WAVEFORM] = self.columns[WAVEFORM][row_selection]
-        return Cloud(positions_of(cells, precision_m, origin), columns, tuple(table), sweeps)
+        return Cloud(cell_positions(cells, precision_m, origin), columns, tuple(table), sweeps)
 
 
-def decimals_of(precision_m: float) -> int:
+def position_decimals(precision_m: float) -> int:
     """Return the number of decimals to which positions are rounded, given the cell size.
 
     Multiplying a cell by its size may return 0.07000000000000001 instead of 0.07, which rounding
@@ -102,13 +102,13 @@ def decimals_of(precision_m: float) -> int:
     return max(0, 3 - decade(precision_m))
 
 
-def positions_of(cells: AnyArray, precision_m: float, origin: Floats | float) -> Floats:
+def cell_positions(cells: AnyArray, precision_m: float, origin: Floats | float) -> Floats:
     """Convert cells of size `precision_m` to world coordinates in meters.
 
     The cells have shape (n, 3) if `origin` is a position of shape (3,), or shape (n,) if they are
     the cells along one axis and `origin` is a coordinate.
     """
-    digits = decimals_of(precision_m)
+    digits = position_decimals(precision_m)
     positions = np.empty(cells.shape)
     for start in range(0, len(cells), _BLOCK_CELLS):  # keeps intermediate values in the CPU cache
         block = slice(start, start + _BLOCK_CELLS)

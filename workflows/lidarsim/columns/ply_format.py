@@ -120,7 +120,7 @@ def layout(path: Path) -> PlyLayout:
     return PlyLayout(start, count, dtype)
 
 
-def mapped_rows(path: Path) -> Records:
+def map_rows(path: Path) -> Records:
     """Memory-map the points of a PLY file as rows.
 
     Raises

@@ -255,7 +255,7 @@ class Sweep:
         return np.asarray(self.points @ self.pose[:3, :3].T + self.pose[:3, 3])
 
     @classmethod
-    def joined(cls, sweeps: Sequence[Self], *, only_shared: bool = False) -> Self:
+    def concatenate(cls, sweeps: Sequence[Self], *, only_shared: bool = False) -> Self:
         """Concatenate the points of several sweeps.
 
         By default, the result has the columns of all sweeps, filled with NaN where a sweep lacks a

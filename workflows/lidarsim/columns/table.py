@@ -357,7 +357,7 @@ def check_names(columns: Iterable[Column]) -> None:
         used_names.add(name)
 
 
-def value_names(names: Mapping[int, str]) -> list[str]:
+def names_by_value(names: Mapping[int, str]) -> list[str]:
     """Convert a mapping from column values to names into a list indexed by value.
 
     The list contains an empty string for each value without a name.
@@ -373,6 +373,6 @@ def waveform_column(samples: int) -> Column:
     return Column(WAVEFORM, column_type(samples), "", "waveform of the pulse", "waveform")
 
 
-def stored(optional: Sequence[Column]) -> tuple[Column, ...]:
+def columns_in_parts(optional: Sequence[Column]) -> tuple[Column, ...]:
     """Return all columns stored in a part, in file order."""
     return (*ALWAYS, *optional)

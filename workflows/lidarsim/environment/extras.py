@@ -29,7 +29,7 @@ def install_command(*requirements: str) -> str:
     return command if words == [*requirements] else f"{command} in {CHECKOUT}"
 
 
-def need(package: str, extra: str, purpose: str) -> None:
+def require_package(package: str, extra: str, purpose: str) -> None:
     """Check that a package from an extra is installed.
 
     `purpose` is the subject of the error message, for example "Reading clouds".

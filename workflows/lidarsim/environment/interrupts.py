@@ -60,7 +60,7 @@ def _drops_errors(frame: FrameType | None) -> bool:
     return False
 
 
-def end_on_signals() -> None:
+def exit_on_signals() -> None:
     """End the process immediately on a signal. Use this function before any work has started."""
     _on_signals(lambda number, frame: _exit_at_once(f"lidarpool: {UNTOUCHED}\n".encode()))
 
@@ -86,7 +86,7 @@ def _exit_at_once(message: bytes) -> NoReturn:
 
 
 @contextmanager
-def deferred_interrupts() -> Iterator[None]:
+def defer_interrupts() -> Iterator[None]:
     """Defer signals until the context exits, and then handle the first one.
 
     Use this context for operations that must not be interrupted, such as starting and stopping
@@ -118,7 +118,7 @@ def deferred_interrupts() -> Iterator[None]:
 
 
 @contextmanager
-def children_spared() -> Iterator[None]:
+def block_child_signals() -> Iterator[None]:
     """Block Ctrl-C in processes and threads that are started in the context.
 
     A terminal sends SIGINT and SIGQUIT to the entire process group, as well as SIGHUP when it is

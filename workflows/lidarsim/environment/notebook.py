@@ -22,7 +22,7 @@ def cell_display() -> Any:
     return display if type(shell).__name__ == "ZMQInteractiveShell" else None
 
 
-def draw_with(drawers: Mapping[str, str]) -> None:
+def register_drawers(drawers: Mapping[str, str]) -> None:
     """Register functions that draw objects in notebooks.
 
     `drawers` maps class names to functions, which are specified as "module:function". A function
@@ -32,7 +32,7 @@ def draw_with(drawers: Mapping[str, str]) -> None:
     _drawers.update(drawers)
 
 
-def table_of(rows: Iterable[tuple[str, str]]) -> str:
+def html_table(rows: Iterable[tuple[str, str]]) -> str:
     """Return an HTML table of names and values in the color theme of the notebook."""
     from html import escape
 
@@ -44,7 +44,7 @@ def table_of(rows: Iterable[tuple[str, str]]) -> str:
     return f"<table>{''.join(lines)}</table>"
 
 
-def picture_of(instance: object) -> str:
+def html_picture(instance: object) -> str:
     """Return a picture of an instance as HTML, or "" if no function draws its class."""
     from importlib import import_module
 
@@ -59,10 +59,10 @@ def picture_of(instance: object) -> str:
         png: bytes | None = getattr(import_module(module), function)(instance)
     except LidarError:  # if the scene cannot be rendered, only the table is shown
         return ""
-    return "" if png is None else image_of(png, type(instance).__name__)
+    return "" if png is None else html_image(png, type(instance).__name__)
 
 
-def image_of(png: bytes, name: str) -> str:
+def html_image(png: bytes, name: str) -> str:
     """Return a PNG as an HTML image that is at most as wide as the PNG."""
     from base64 import b64encode
     from html import escape

@@ -50,7 +50,7 @@ _ADVICE = "download or copy it again, or read it on a machine with more memory"
 Piece = bytes | memoryview  # a piece of a file that is written in pieces
 
 
-def packed(arrays: Mapping[str, Any]) -> bytes:
+def pack_arrays(arrays: Mapping[str, Any]) -> bytes:
     """Create a compressed archive of arrays. Equal arrays result in equal bytes."""
     memory = io.BytesIO()  # NumPy leaves a file open if writing fails
     np.savez_compressed(memory, **arrays)
@@ -105,7 +105,7 @@ class _StoredFile(NamedTuple):
         )
 
 
-def stored_pieces(arrays: Mapping[str, AnyArray]) -> list[Piece]:
+def archive_pieces(arrays: Mapping[str, AnyArray]) -> list[Piece]:
     """Create an uncompressed archive of arrays, and return it in pieces to be written in order.
 
     Contiguous arrays are not copied. Their pieces are views, which must be written before the
@@ -195,7 +195,7 @@ def read_arrays(data: bytes, allowance: Allowance | None = None) -> dict[str, An
     return {name.removesuffix(".npy"): read_npy(content, name) for name, content in files}
 
 
-def stored_arrays(file: IO[bytes]) -> dict[str, StoredArray]:
+def locate_arrays(file: IO[bytes]) -> dict[str, StoredArray]:
     """Locate the arrays in an uncompressed archive without reading their elements.
 
     If the archive is damaged, the exception may be of any class.

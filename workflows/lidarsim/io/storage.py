@@ -32,7 +32,7 @@ WRITING = ".lidarpool-writing-"  # name prefix of folders that contain unfinishe
 _LEFTOVER = re.compile(rf"(?:{re.escape(TEMPORARY)}(.+)-|{re.escape(WRITING)})[0-9a-f]{{8}}")
 
 
-def target_of(name: str) -> str:
+def final_name(name: str) -> str:
     """Return the final name of a temporary file, or the name itself if it is not temporary."""
     match = _LEFTOVER.fullmatch(name)
     return match[1] or name if match else name

@@ -19,7 +19,15 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from ..numerics.arrays import Floats
-from ..words import alternatives, did_you_mean_each, fits, in_yaml, joined, printable, rounded
+from ..words import (
+    alternatives,
+    did_you_mean_each,
+    format_yaml_list,
+    joined,
+    matches_pattern,
+    printable,
+    rounded,
+)
 from .time_units import SECONDS, TimeUnit, seconds_of
 
 # {unit: number of units per first unit}
@@ -153,7 +161,11 @@ def ignored_columns(names: Sequence[str], ignore: Sequence[str]) -> set[int]:
     indices = set[int]()
     unmatched: list[str] = []
     for pattern in ignore:
-        matches = {index for index, name in enumerate(names) if fits(name.lower(), pattern.lower())}
+        matches = {
+            index
+            for index, name in enumerate(names)
+            if matches_pattern(name.lower(), pattern.lower())
+        }
         unmatched += [] if matches else [repr(pattern)]
         indices |= matches
     if unmatched:
@@ -437,7 +449,7 @@ class _ColumnReader:
                     faults.append(str(error))
             elif reason := next((refused[w] for w in refused if _letters(w) == words[index]), ""):
                 faults.append(f"its column {printable(cell)!r} {reason}")
-            elif not any(fits(words[index], pattern) for pattern in patterns):
+            elif not any(matches_pattern(words[index], pattern) for pattern in patterns):
                 unknown.append(cell)
         if without_unit:
             faults.insert(0, self._lacking_units(without_unit))
@@ -576,7 +588,7 @@ def _listed(cells: Sequence[str]) -> str:
 
 def _ignoring(cells: Sequence[str]) -> str:
     """Return the scenario setting that ignores columns."""
-    return f"{{file: …, ignore: {in_yaml(cells)}}}"
+    return f"{{file: …, ignore: {format_yaml_list(cells)}}}"
 
 
 def _numbers(

@@ -127,8 +127,8 @@ def adjugates(matrices: Floats) -> tuple[Floats, Floats]:
     """Compute the adjugates and determinants of 3x3 matrices from their cofactors."""
     rows = np.moveaxis(matrices, (-2, -1), (0, 1))  # (3, 3, ...)
     (a, b, c), (d, e, f), (g, h, i) = rows
-    # The columns are cross products of the rows. If there are few matrices, `numpy.cross` takes four
-    # times as long.
+    # The columns are cross products of the rows. For few matrices, `numpy.cross` takes four times
+    # as long.
     columns = [
         [e * i - f * h, f * g - d * i, d * h - e * g],
         [h * c - i * b, i * a - g * c, g * b - h * a],

@@ -12,7 +12,7 @@ from ..errors import LidarError
 from ..numerics.arrays import AnyArray, Bools, Floats, Floats32, Ints
 from ..sensor import Sensor
 from ..sensor.packet_settings import PacketSettings
-from ..sweeps.ray_image import Image, fired_of
+from ..sweeps.ray_image import Image, require_fired_rays
 from ..sweeps.sweeps import Sweeps
 
 
@@ -77,7 +77,7 @@ class Shots:
             rays of the survey are unknown.
         """
         names = tuple(columns)
-        settings_of(fired_of(sweeps).sensors[sweeps.sensor[sweep]])
+        settings_of(require_fired_rays(sweeps).sensors[sweeps.sensor[sweep]])
         check_columns(points.columns, names)
         shots = cls.from_image(Image.from_points(sweeps, sweep, points), points, names)
         faults = sweeps.faults_in(sweep)
@@ -138,7 +138,7 @@ def _dropped(sweeps: Sweeps, sweep: int, firings: Ints, starts_ns: Ints) -> Bool
     sensor = int(sweeps.sensor[sweep])
     sweeps_per_station = int(np.count_nonzero(sweeps.sensor == sensor)) // sweeps.stations
     station = int(sweeps.numbers[sweep]) // sweeps_per_station
-    seed = fired_of(sweeps).seeds[sensor]
+    seed = require_fired_rays(sweeps).seeds[sensor]
     dropped = np.zeros(len(firings), np.bool_)
     for number, fault in enumerate(sweeps.faults):
         if fault.kind == "dropped_packets" and fault.sensor in (None, sweeps.sensors[sensor]):

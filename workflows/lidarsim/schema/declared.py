@@ -52,7 +52,7 @@ def _in_order(value: Any, handler: Callable[[Any], Any]) -> Any:
     """Validate a pair of finite numbers in ascending order."""
     limits = handler(value)
     if not 0 <= limits[1] - limits[0] < inf:
-        raise must_be("[least, largest]")
+        raise not_allowed_error("[least, largest]")
     return limits
 
 
@@ -63,7 +63,7 @@ def _upright(value: Any, handler: Callable[[Any], Any]) -> Any:
     """Validate a rectangle whose minimum x and y come first."""
     sides = handler(value)
     if sides[0] >= sides[2] or sides[1] >= sides[3]:
-        raise must_be("[x0, y0, x1, y1] with the lower corner first")
+        raise not_allowed_error("[x0, y0, x1, y1] with the lower corner first")
     return sides
 
 
@@ -102,7 +102,7 @@ def about(description: str, *examples: Any, **limits: Any) -> Any:
     return Field(description=description, examples=[*examples] or None, **limits)
 
 
-def declared(instance: Any, base: type) -> dict[str, Any]:
+def declared_values(instance: Any, base: type) -> dict[str, Any]:
     """Return the values of those fields of an instance that are declared in a base class.
 
     The result maps field names to values.
@@ -110,12 +110,14 @@ def declared(instance: Any, base: type) -> dict[str, Any]:
     return {field.name: getattr(instance, field.name) for field in fields(base)}
 
 
-def written_as(kind: Any) -> GetPydanticSchema:
+def scenario_type(kind: Any) -> GetPydanticSchema:
     """Declare that a field has a different type in scenarios than in Python."""
     return GetPydanticSchema(lambda _, handler: handler.generate_schema(kind))
 
 
-def short(is_short: Callable[[Any], bool], long: Callable[[Any], Any], allowed: Any) -> Any:
+def accept_short_form(
+    is_short: Callable[[Any], bool], long: Callable[[Any], Any], allowed: Any
+) -> Any:
     """Accept a short form of a value in scenarios, and expand it.
 
     `allowed` is the type of the input in the JSON schema, including the short form.
@@ -125,12 +127,12 @@ def short(is_short: Callable[[Any], bool], long: Callable[[Any], Any], allowed: 
     )
 
 
-def by_text(field: str, kind: Any) -> Any:
+def accept_text(field: str, kind: Any) -> Any:
     """Accept a string such as "hall.glb" in place of a section, as the value of one field."""
-    return short(is_text, lambda value: {field: value}, Text | kind)
+    return accept_short_form(is_text, lambda value: {field: value}, Text | kind)
 
 
-def one_of(*fields: str) -> Any:
+def require_one_of(*fields: str) -> Any:
     """Check that exactly one of the given fields is set in a section."""
 
     def check(section: Any) -> Any:
@@ -151,12 +153,12 @@ def allowed(words: str) -> WrapValidator:
         try:
             return handler(value)
         except ValidationError:
-            raise must_be(words) from None
+            raise not_allowed_error(words) from None
 
     return WrapValidator(validated)
 
 
-def must_be(words: str) -> PydanticCustomError:
+def not_allowed_error(words: str) -> PydanticCustomError:
     """Return the error for a validator to raise if a value is not allowed.
 
     `words` describes the allowed values. In the message for the user, it follows the location of
@@ -172,6 +174,6 @@ def is_text(value: Any) -> bool:
 
 # A list of strings, or a single string.
 Texts = Several[Text]
-TextOrTexts = Annotated[Texts, short(is_text, lambda v: [v], Text | Texts)]
+TextOrTexts = Annotated[Texts, accept_short_form(is_text, lambda v: [v], Text | Texts)]
 # The corresponding type of arguments in Python.
-Names = Annotated[str | Sequence[Text], written_as(TextOrTexts)]
+Names = Annotated[str | Sequence[Text], scenario_type(TextOrTexts)]

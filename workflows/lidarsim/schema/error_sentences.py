@@ -43,7 +43,7 @@ _UNKNOWN_FIELD = ("extra_forbidden", "invalid_key", "unexpected_keyword_argument
 
 
 @contextmanager
-def sentences(
+def convert_validation_errors(
     section: Any,
     source: object = "",
     content: Any = None,

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, get_args, get_origin
 from pydantic import GetPydanticSchema, ValidationError
 from pydantic.fields import FieldInfo
 
-from ..unit_suffixes import converted, factor_between, other_unit
+from ..unit_suffixes import convert_value, factor_between, find_other_unit
 from ..words import did_you_mean, joined, most_similar
 from .section_fields import FieldPath, classes_in, fields_by_name, is_section
 from .value_texts import shown
@@ -150,7 +150,7 @@ def _similar_name(name: str, value: Any, field_names: Collection[str]) -> str:
     """Suggest a similar field, with a converted value if only the unit differs."""
     similar = most_similar(name, field_names)
     factor = None if similar is None else factor_between(name, similar)
-    right = None if factor is None else converted(value, factor)
+    right = None if factor is None else convert_value(value, factor)
     return (
         did_you_mean(name, field_names) if right is None else f" Write {similar}: {shown(right)}."
     )
@@ -159,9 +159,9 @@ def _similar_name(name: str, value: Any, field_names: Collection[str]) -> str:
 def _other_unit_elsewhere(name: str, value: Any, file: Any) -> str:
     """Return an example of a field in another section that differs only in its unit, or ""."""
     for owner in _inner_sections(owner_of_file(file)):
-        similar = other_unit(name, fields_by_name(owner.kind))
+        similar = find_other_unit(name, fields_by_name(owner.kind))
         factor = None if similar is None else factor_between(name, similar)
-        right = None if factor is None else converted(value, factor)
+        right = None if factor is None else convert_value(value, factor)
         if similar is not None and right is not None:
             return f" Write {_example(owner, similar, right)}."
     return ""

@@ -12,7 +12,7 @@ from ..numerics.arrays import Bools, Floats, Floats32, Ints32
 from ..numerics.vectors import cross, matvec
 from ..scene.actors import Actor
 from ..scene.scene import Scene
-from .sweep_motion import STILL, knots_in, relative_knots
+from .sweep_motion import STILL, knot_count, relative_knots
 
 # Interval between stored poses. If an actor accelerates at 10 m/s², the interpolation error is at
 # most 0.13 mm.
@@ -83,7 +83,7 @@ class _OneActor(NamedTuple):
         comes = (starts_ns < appears_ns) & (appears_ns <= stops_ns)
         moving = (present | comes) & actor.trajectory.moves
         spans_ns = stops_ns - starts_ns
-        count = knots_in(float(spans_ns.max(initial=0.0)), KNOT_NS)
+        count = knot_count(float(spans_ns.max(initial=0.0)), KNOT_NS)
         return cls(
             poses.positions,
             poses.rotations,

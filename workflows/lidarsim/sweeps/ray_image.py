@@ -39,7 +39,7 @@ class Image:
         LidarError
             If the points are not in order, or if the rays of the survey are unknown.
         """
-        fired = fired_of(sweeps)
+        fired = require_fired_rays(sweeps)
         number = int(sweeps.sensor[sweep])
         sensor = fired.sensors[number]
         first_scan, stop_scan = sweeps.scans[sweep : sweep + 2].tolist()
@@ -139,7 +139,7 @@ class Image:
         }
 
 
-def fired_of(sweeps: Sweeps) -> FiredRays:
+def require_fired_rays(sweeps: Sweeps) -> FiredRays:
     """Return the description of all rays in a survey. Raise LidarError if there is none."""
     if sweeps.fired is None:
         raise LidarError(

@@ -115,7 +115,7 @@ def _turned(vectors: Floats, quaternions: Floats, sign: float) -> Floats:
     return np.stack(rows, axis=1)
 
 
-def knots_in(longest_ns: float, knot_ns: float) -> int:
+def knot_count(longest_ns: float, knot_ns: float) -> int:
     """Return the number of knots per sweep, given the duration of the longest sweep.
 
     The interval between knots is at most `knot_ns`, unless the sweep is so long that the number of
@@ -148,7 +148,7 @@ def relative_knots(displacements: Floats, rotations: Floats) -> Floats32:
     return np.concatenate([displacements, quaternions], axis=2).astype(np.float32)
 
 
-def knots_of(survey: Survey, lidars: Sequence[LidarTraits], rotations: Floats) -> Floats32:
+def compute_knots(survey: Survey, lidars: Sequence[LidarTraits], rotations: Floats) -> Floats32:
     """Compute the sensor poses at evenly spaced times during each sweep.
 
     The last knot is at the time of the last beam in the sweep. If a frozen sensor repeats a sweep,
@@ -176,7 +176,7 @@ def knots_of(survey: Survey, lidars: Sequence[LidarTraits], rotations: Floats) -
         stop - start + lidar.firing_ns
         for (_, start, stop), lidar in zip(survey.sweeps_each, lidars, strict=True)
     ]
-    count = knots_in(max(float(span.max(initial=0.0)) for span in spans), KNOT_NS)
+    count = knot_count(max(float(span.max(initial=0.0)) for span in spans), KNOT_NS)
     knots = np.empty((len(rotations), count, 7), np.float32)
     first = 0
     for number, span in enumerate(spans):
@@ -221,7 +221,7 @@ def _cast_at(survey: Survey, number: int) -> tuple[Ints, Floats]:
 def _relative_poses(
     path: Trajectory, station: int, times_ns: Floats, mount: Pose, sent_rotations: Floats
 ) -> Floats32:
-    """Compute the knots of k sweeps for `knots_of`.
+    """Compute the knots of k sweeps for `compute_knots`.
 
     `times_ns` has shape (k, m). `sent_rotations` are the rotations from the sensor frame to the
     world frame at the start of each sweep that is sent, with shape (k, 3, 3). If the sensor is
@@ -239,13 +239,15 @@ def _relative_poses(
     return relative_knots(displacement @ sent_rotations.transpose(0, 2, 1), rotations)
 
 
-def poses_at(knots: Floats32, position: Floats, rotation: Floats, shares: Floats) -> FiringPoses:
+def interpolate_poses(
+    knots: Floats32, position: Floats, rotation: Floats, shares: Floats
+) -> FiringPoses:
     """Interpolate poses within a sweep.
 
     Parameters
     ----------
     knots
-        Knots of the sweep, with shape (m, 7); see `knots_of`.
+        Knots of the sweep, with shape (m, 7); see `compute_knots`.
     position, rotation
         Sensor pose at the start of the sweep, with shapes (3,) and (3, 3).
     shares

@@ -16,7 +16,7 @@ import numpy as np
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import NORMAL, ORIGIN, TABLE
 from ..errors import LidarError
-from ..io.archives import open_archive, packed
+from ..io.archives import open_archive, pack_arrays
 from ..motion.rotations import matrices, quaternions_of
 from ..motion.trajectory import full_poses
 from ..numerics.arrays import AnyArray, AnyFloats, Bools, Bytes, Floats, Floats32, Ints, Ints32
@@ -30,7 +30,7 @@ from ..survey.survey import Survey, nanoseconds
 from .actor_sweeps import NO_ROWS, ActorSweeps
 from .instruments import Instruments
 from .lidar_traits import LidarTraits
-from .sweep_motion import STILL, FiringPoses, knots_of, poses_at
+from .sweep_motion import STILL, FiringPoses, compute_knots, interpolate_poses
 
 SWEEPS_FILE = "sweeps.npz"
 MIXED_UP = (
@@ -70,7 +70,7 @@ def states_compensation(frame_text: str) -> bool | None:
     return None if match is None else match[1] is None
 
 
-def numbered_places(positions: Floats) -> Ints:
+def number_positions(positions: Floats) -> Ints:
     """Return the number of each position in order of first occurrence, starting at 1.
 
     Equal positions have the same number. The positions have shape (n, 3), and the result has dtype
@@ -78,7 +78,7 @@ def numbered_places(positions: Floats) -> Ints:
 
     Examples
     --------
-    >>> numbered_places(np.array([[5.0, 0, 0], [1, 0, 0], [5, 0, 0]]))
+    >>> number_positions(np.array([[5.0, 0, 0], [1, 0, 0], [5, 0, 0]]))
     array([1, 2, 1])
     """
     _, first, group = np.unique(positions, axis=0, return_index=True, return_inverse=True)
@@ -167,7 +167,7 @@ class Sweeps:
     faults: tuple[Fault, ...] = ()  # faults of all sensors
     materials: tuple[str, ...] = ()  # names; the `material` column contains indices
     lidars: tuple[LidarTraits, ...] = ()  # traits of each sensor, or empty if unknown
-    knots: Floats32 = field(default_factory=lambda: STILL)  # (n, m, 7); see `knots_of`
+    knots: Floats32 = field(default_factory=lambda: STILL)  # (n, m, 7); see `compute_knots`
     stations: int = 1  # number of stations, which all have the same number of sweeps per sensor
     station_ns: int = 0  # time between the starts of consecutive stations
     # (a, n), row in `actor_knots` for each actor and sweep, or -1 if the actor is static or absent.
@@ -253,14 +253,16 @@ class Sweeps:
     def _sensor_within(self, sweep: int, shares: Floats) -> FiringPoses:
         """Return the sensor poses at fractions of a sweep."""
         knots = self.knots[sweep] if len(self.knots) else _NO_KNOTS
-        return poses_at(knots, self.pose.positions[sweep], self.pose.rotations[sweep], shares)
+        return interpolate_poses(
+            knots, self.pose.positions[sweep], self.pose.rotations[sweep], shares
+        )
 
     def _actor_within(self, actor: int, sweep: int, shares: Floats) -> FiringPoses:
         """Return the poses of an actor at fractions of a sweep."""
         row = self.actor_rows[actor, sweep] if len(self.actor_rows) else -1
         knots = self.actor_knots[row] if row >= 0 else _NO_KNOTS
         (rotation,) = matrices(self.actor_poses.quaternions[actor, [sweep]])
-        return poses_at(knots, self.actor_poses.positions[actor, sweep], rotation, shares)
+        return interpolate_poses(knots, self.actor_poses.positions[actor, sweep], rotation, shares)
 
     def carrier_within(self, sweep: int, shares: Floats) -> SweepPoses:
         """Return the platform poses at fractions of a sweep.
@@ -380,7 +382,7 @@ class Sweeps:
     @cached_property
     def actor_types(self) -> list[str]:
         """Types of the actors."""
-        return [type_of(actor) for actor in self.actors]
+        return [actor_type(actor) for actor in self.actors]
 
     @cached_property
     def station_numbers(self) -> Ints:
@@ -392,7 +394,7 @@ class Sweeps:
         if self.stations > 1:
             for sensor in np.unique(self.sensor):
                 of_sensor = self.sensor == sensor
-                numbers[of_sensor] = numbered_places(self.pose.positions[of_sensor])
+                numbers[of_sensor] = number_positions(self.pose.positions[of_sensor])
         return numbers
 
     @cached_property
@@ -479,7 +481,7 @@ class Sweeps:
             faults=tuple(survey.faults),
             materials=scene.material_names,
             lidars=traits,
-            knots=knots_of(survey, traits, rotations),
+            knots=compute_knots(survey, traits, rotations),
             stations=survey.path.stations,
             station_ns=survey.station_ns,
         )
@@ -538,14 +540,14 @@ class Sweeps:
             starts = np.flatnonzero(np.diff(sweep[:end], prepend=-1))
             for start, stop_row in pairwise([*starts, end]):
                 while current < sweep[start]:
-                    yield Cloud.joined(sweep_parts) if sweep_parts else empty
+                    yield Cloud.concatenate(sweep_parts) if sweep_parts else empty
                     sweep_parts = []
                     current = current + 1
                 sweep_parts.append(chunk[start:stop_row])
             if end < len(sweep):
                 break
         while current < stop:
-            yield Cloud.joined(sweep_parts) if sweep_parts else empty
+            yield Cloud.concatenate(sweep_parts) if sweep_parts else empty
             sweep_parts = []
             current = current + 1
 
@@ -557,9 +559,9 @@ class Sweeps:
         OSError
             If the file cannot be written.
         """
-        path.write_bytes(self.packed())
+        path.write_bytes(self.to_bytes())
 
-    def packed(self) -> bytes:
+    def to_bytes(self) -> bytes:
         """Serialize the sweeps as an NPZ archive. Equal sweeps result in equal bytes."""
         values = {"format": _FORMAT, **{name: getattr(self, name) for name in _JSON_FIELDS}}
         values["lidars"] = [lidar.to_json() for lidar in self.lidars]
@@ -582,7 +584,7 @@ class Sweeps:
             }
             arrays["rays"] = np.frombuffer(json.dumps(rays).encode(), np.uint8)
             arrays["steps"] = self.fired.steps
-        return packed(arrays)
+        return pack_arrays(arrays)
 
     @classmethod
     def load(cls, path: Path | str, read: Callable[[], bytes] | None = None) -> Sweeps:
@@ -626,26 +628,26 @@ class Sweeps:
             )
 
 
-def type_of(name: str) -> str:
+def actor_type(name: str) -> str:
     """Return the type of an actor for labels, given its name.
 
     The type is the name without a trailing number and with underscores in place of spaces.
 
     Examples
     --------
-    >>> [type_of(name) for name in ("Car 1", "Car (b.2)", "Delivery van", "7")]
+    >>> [actor_type(name) for name in ("Car 1", "Car (b.2)", "Delivery van", "7")]
     ['Car', 'Car', 'Delivery_van', '7']
     """
     plain = re.sub(r"(\s*\([^()]*\)|[\s._-]*\d+)$", "", name.strip())
     return re.sub(r"\s+", "_", plain or name.strip())
 
 
-def plain_names(names: Iterable[str]) -> list[str]:
+def make_identifiers(names: Iterable[str]) -> list[str]:
     """Convert names to unique identifiers that are valid as ROS names and folder names.
 
     Examples
     --------
-    >>> plain_names(["roof", "left/rear", "left rear", "2nd"])
+    >>> make_identifiers(["roof", "left/rear", "left rear", "2nd"])
     ['roof', 'left_rear', 'left_rear_2', '_2nd']
     """
     unique: list[str] = []
