@@ -74,12 +74,12 @@ def test_poses_between_knots_are_on_straight_lines():
         np.testing.assert_allclose(poses.quaternions[:, number], turn.as_quat())
         np.testing.assert_allclose(poses.steps[:, number], path[first + 1] - path[first])
         in_world = (mount * turn).apply(points[number]) + position
-        np.testing.assert_allclose(poses.outward(points)[number], in_world)
+        np.testing.assert_allclose(poses.to_world(points)[number], in_world)
         in_sensor = (mount * turn).inv().apply(points[number] - position)
-        np.testing.assert_allclose(poses.inward(points)[number], in_sensor)
+        np.testing.assert_allclose(poses.to_body_frame(points)[number], in_sensor)
     still = interpolate_poses(knots[:1], start, mount.as_matrix(), shares)
-    np.testing.assert_allclose(still.outward(points), mount.apply(points) + start)
-    np.testing.assert_allclose(still.inward(points), mount.inv().apply(points - start))
+    np.testing.assert_allclose(still.to_world(points), mount.apply(points) + start)
+    np.testing.assert_allclose(still.to_body_frame(points), mount.inv().apply(points - start))
 
 
 @pytest.mark.extended(every=3)

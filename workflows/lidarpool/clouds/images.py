@@ -18,7 +18,7 @@ from lidarsim.io.archives import open_archive, pack_arrays
 from lidarsim.io.input_files import read_input
 from lidarsim.io.numbered_files import sort_by_number
 from lidarsim.numerics.arrays import AnyArray
-from lidarsim.sweeps.ray_image import Image, require_fired_rays
+from lidarsim.sweeps.ray_image import RayImage, require_fired_rays
 from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
 
 from .boxes import Boxes
@@ -64,7 +64,7 @@ class ImageFolder(MultiFileFormat):
     def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], Boxes | None]:
         """Return the file of a sweep, and its boxes if there are actors."""
         sweeps = self.sweeps
-        image = Image.from_points(sweeps, number, points)
+        image = RayImage.from_points(sweeps, number, points)
         positions = sweeps.in_sensor(number, points.positions).astype(np.float32)
         columns = sweeps.columns_in_sensor(number, points)
         columns = {name: values for name, values in columns.items() if name not in _RAY_COLUMNS}
@@ -73,7 +73,7 @@ class ImageFolder(MultiFileFormat):
         arrays["pose"] = sweeps.pose.matrix(number)
         arrays["frame"] = np.array(sweeps.frame_text(compensated=sweeps.coordinates == "world"))
         for name, values in columns.items():
-            for plane, image_of_return in enumerate(image.filled(values)):
+            for plane, image_of_return in enumerate(image.to_images(values)):
                 if (key := _key(name, plane)) in arrays:
                     raise LidarError(
                         f"An image would contain two arrays named {key!r}. Rename one of the "

@@ -241,7 +241,7 @@ def _labels(
     """
     rotation = camera @ matrices(sweeps.pose.quaternions[sweep, None])[0].T
     forward = (rotation @ matrices(boxes.quaternions))[:, :, 0]  # headings of the actors
-    positions = sweeps.pose.inward(sweep, boxes.centers) @ camera.T
+    positions = sweeps.pose.to_body_frame(sweep, boxes.centers) @ camera.T
     positions[:, 1] += boxes.sizes[:, 2] / 2
     rotation_y = np.arctan2(-forward[:, 2], forward[:, 0])
     alpha = rotation_y - np.arctan2(positions[:, 0], positions[:, 2])

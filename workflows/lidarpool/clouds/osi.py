@@ -190,7 +190,7 @@ class _OSIMessages:
         """Return the host vehicle and the actors in world coordinates at the start of a sweep."""
         osi = self._osi
         sweeps = self._sweeps
-        carrier = sweeps.carrier
+        carrier = sweeps.platform
         zero = np.zeros(3)
         attributes = osi.MovingObject.VehicleAttributes(bbcenter_to_rear=_vector(osi, zero))
         host = osi.MovingObject(

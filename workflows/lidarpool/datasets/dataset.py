@@ -376,7 +376,7 @@ class DataSet:
                     return row, source.path(manifest_name)
                 with suppress(FileNotFoundError):
                     self.storage.prepare(Path(file).parent)
-                    self.storage.take(source, file, file)
+                    self.storage.copy_from(source, file, file)
                     if file == manifest_name or self.storage.checksum(file) == checksum:
                         continue
                     self.storage.remove([file])

@@ -65,7 +65,7 @@ def write_jobs(
     the rows if the worker does not see both files. The record of the task counts scans.
     """
     recorder = Recorder(EXPORT, LIDAR)
-    if not all(storage.sees(name, content) for storage, name, content in probes):
+    if not all(storage.has_content(name, content) for storage, name, content in probes):
         return None, recorder.finish()
     outcomes = [_write_job(dataset, job) for job in jobs]
     scan_count = sum(int(job.sweeps.scans[-1]) for job in jobs)  # one past the last scan of each

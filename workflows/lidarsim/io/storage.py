@@ -324,7 +324,7 @@ class Storage:
         with self._remote() as (system, folder):
             system.get_file(f"{folder}/{name}", str(path))
 
-    def take(self, source: Storage, name: str, new_name: str) -> None:
+    def copy_from(self, source: Storage, name: str, new_name: str) -> None:
         """Copy a file atomically from another storage.
 
         If possible, the copy is a hard link or is made by the object store itself.
@@ -341,7 +341,7 @@ class Storage:
         with source._reading(name) as source_file, self.writing(new_name) as file:
             shutil.copyfileobj(source_file, file, _BLOCK_BYTES)
 
-    def sees(self, name: str, data: bytes) -> bool:
+    def has_content(self, name: str, data: bytes) -> bool:
         """Return True if a file has the given content.
 
         Use this method to check whether this process has access to the same storage as another

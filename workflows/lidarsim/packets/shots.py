@@ -12,7 +12,7 @@ from ..errors import LidarError
 from ..numerics.arrays import AnyArray, Bools, Floats, Floats32, Ints
 from ..sensor import Sensor
 from ..sensor.packet_settings import PacketSettings
-from ..sweeps.ray_image import Image, require_fired_rays
+from ..sweeps.ray_image import RayImage, require_fired_rays
 from ..sweeps.sweeps import Sweeps
 
 
@@ -79,7 +79,7 @@ class Shots:
         names = tuple(columns)
         settings_of(require_fired_rays(sweeps).sensors[sweeps.sensor[sweep]])
         check_columns(points.columns, names)
-        shots = cls.from_image(Image.from_points(sweeps, sweep, points), points, names)
+        shots = cls.from_image(RayImage.from_points(sweeps, sweep, points), points, names)
         faults = sweeps.faults_in(sweep)
         return replace(
             shots,
@@ -88,7 +88,7 @@ class Shots:
         )
 
     @classmethod
-    def from_image(cls, image: Image, points: Cloud, columns: Iterable[str] = ()) -> Shots:
+    def from_image(cls, image: RayImage, points: Cloud, columns: Iterable[str] = ()) -> Shots:
         """Return the shots of the points in an image, without faults.
 
         Raises LidarError if the sensor has no packet format, or if the points lack a column.

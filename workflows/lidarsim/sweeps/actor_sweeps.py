@@ -44,7 +44,9 @@ class ActorSweeps(NamedTuple):
         smoothly from sweep to sweep.
         """
         shape = len(scene.actors), len(starts_ns)
-        actors = [_OneActor.in_sweeps(actor, starts_ns, stops_ns) for actor in scene.actors]
+        actors = [
+            _SingleActorSweeps.in_sweeps(actor, starts_ns, stops_ns) for actor in scene.actors
+        ]
         moving = np.reshape([actor.moving for actor in actors], shape).astype(np.bool_)
         rows = np.where(moving, np.cumsum(moving).reshape(shape) - 1, -1)
         knots = [part for actor in actors for part in actor.knots]
@@ -61,7 +63,7 @@ class ActorSweeps(NamedTuple):
         )
 
 
-class _OneActor(NamedTuple):
+class _SingleActorSweeps(NamedTuple):
     """Poses and presence of a single actor in n sweeps."""
 
     positions: Floats  # (n, 3), scene frame, meters
@@ -74,7 +76,7 @@ class _OneActor(NamedTuple):
     knots: list[Floats32]  # parts of shape (…, k, 7), for sweeps in which the actor moves
 
     @classmethod
-    def in_sweeps(cls, actor: Actor, starts_ns: Floats, stops_ns: Floats) -> _OneActor:
+    def in_sweeps(cls, actor: Actor, starts_ns: Floats, stops_ns: Floats) -> _SingleActorSweeps:
         """Compute the poses of an actor, given the times of each sweep's start and last beam."""
         appears_ns, leaves_ns = presence_ns(actor.trajectory)
         poses = _poses(actor, starts_ns)

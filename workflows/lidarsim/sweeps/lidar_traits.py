@@ -36,7 +36,7 @@ class MirrorLines:
         # Times are rounded to 1 ns, so a line must start up to 1 ns before its first firing.
         return np.floor((times_ns - self.start_ns + 1) * (per_second / 1e9)).astype(np.int64)
 
-    def leftwards(self, lines: Ints) -> Ints:
+    def runs_leftward(self, lines: Ints) -> Ints:
         """Return 1 for each line that runs from right to left, and 0 for the others."""
         returning = lines % 2 if self.swings else np.zeros(len(lines), np.int64)
         return returning ^ int(self.leftward)

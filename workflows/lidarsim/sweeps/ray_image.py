@@ -14,7 +14,7 @@ from .sweeps import MIXED_UP, FiredRays, Sweeps
 
 
 @dataclass(frozen=True, eq=False)
-class Image:
+class RayImage:
     """Pixel indices of the points in a sweep.
 
     An image has one row per channel and one column per firing. Additional returns of a pulse are in
@@ -31,7 +31,7 @@ class Image:
     planes: int
 
     @classmethod
-    def from_points(cls, sweeps: Sweeps, sweep: int, points: Cloud) -> Image:
+    def from_points(cls, sweeps: Sweeps, sweep: int, points: Cloud) -> RayImage:
         """Locate the points of a sweep in its image.
 
         Raises
@@ -61,7 +61,7 @@ class Image:
         begin_ns: float,
         returns_per_pulse: int,
         points: Cloud,
-    ) -> Image:
+    ) -> RayImage:
         """Locate the points from consecutive time steps of a sensor in an image.
 
         `first_scan` is the scan of the first step, `begin_ns` is the start of the station, and
@@ -101,7 +101,7 @@ class Image:
             planes=max(returns_per_pulse, max_returns),
         )
 
-    def filled(self, values: AnyArray) -> AnyArray:
+    def to_images(self, values: AnyArray) -> AnyArray:
         """Arrange point values as images.
 
         Rays without a return have the value NaN, -1 in signed integer images, or 0 in images of

@@ -48,13 +48,13 @@ class FiringPoses:
             self.position, self.rotation, *(None if p is None else p[:, rows] for p in parts)
         )
 
-    def inward(self, points: Floats) -> Floats:
+    def to_body_frame(self, points: Floats) -> Floats:
         """Transform points from the world frame to the sensor frame at the time of each point."""
-        return self.turned_inward(points - self.positions)
+        return self.rotate_to_body_frame(points - self.positions)
 
-    def outward(self, points: Floats) -> Floats:
+    def to_world(self, points: Floats) -> Floats:
         """Transform points from the sensor frame at the time of each point to the world frame."""
-        in_world: Floats = self.turned_outward(points) + self.positions
+        in_world: Floats = self.rotate_to_world(points) + self.positions
         return in_world
 
     def frames(self, count: int) -> tuple[Floats, Floats]:
@@ -68,28 +68,28 @@ class FiringPoses:
             rotations = rotations @ matrices(self.quaternions.T)
         return positions, rotations
 
-    def to_start(self, points: Floats) -> Floats:
+    def move_to_start(self, points: Floats) -> Floats:
         """Move points with the body to the start of the sweep.
 
         The points are in world coordinates before and after.
         """
-        at_start: Floats = self.inward(points) @ self.rotation.T + self.position
+        at_start: Floats = self.to_body_frame(points) @ self.rotation.T + self.position
         return at_start
 
-    def turned_to_start(self, vectors: Floats) -> Floats:
+    def rotate_to_start(self, vectors: Floats) -> Floats:
         """Rotate vectors with the body to the start of the sweep.
 
         The vectors are in the world frame before and after.
         """
-        at_start: Floats = self.turned_inward(vectors) @ self.rotation.T
+        at_start: Floats = self.rotate_to_body_frame(vectors) @ self.rotation.T
         return at_start
 
-    def turned_inward(self, vectors: Floats) -> Floats:
+    def rotate_to_body_frame(self, vectors: Floats) -> Floats:
         """Rotate vectors from the world frame to the sensor frame at the time of each vector."""
         inside: Floats = vectors @ self.rotation
         return inside if self.quaternions is None else _turned(inside, self.quaternions, -1.0)
 
-    def turned_outward(self, vectors: Floats) -> Floats:
+    def rotate_to_world(self, vectors: Floats) -> Floats:
         """Rotate vectors from the sensor frame at the time of each vector to the world frame."""
         inside = vectors if self.quaternions is None else _turned(vectors, self.quaternions, 1.0)
         return inside @ self.rotation.T

@@ -116,7 +116,7 @@ class SweepPoses:
         """
         return affine(self.rotations[sweep], self.positions[sweep])
 
-    def inward(self, sweep: int, points: Floats) -> Floats:
+    def to_body_frame(self, sweep: int, points: Floats) -> Floats:
         """Transform points from the world frame to the body frame at the start of a sweep."""
         in_frame: Floats = (points - self.positions[sweep]) @ self.rotations[sweep]
         return in_frame
@@ -186,7 +186,7 @@ class Sweeps:
         If the points are already stored in the sensor frame, they are returned unchanged.
         """
         exact = points.astype(np.float64)
-        return exact if self.coordinates == "sensor" else self.pose.inward(sweep, exact)
+        return exact if self.coordinates == "sensor" else self.pose.to_body_frame(sweep, exact)
 
     def columns_in_sensor(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
         """Return the columns of a sweep with vectors in the same frame as `in_sensor`."""
@@ -195,7 +195,7 @@ class Sweeps:
         return _with_vectors(
             points,
             lambda normals: normals @ self.pose.rotations[sweep],
-            lambda origins: self.pose.inward(sweep, origins),
+            lambda origins: self.pose.to_body_frame(sweep, origins),
         )
 
     def columns_as_fired(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
@@ -203,7 +203,7 @@ class Sweeps:
         if self.coordinates == "sensor":
             return dict(points.columns)
         poses = self.firing_poses(sweep, points)
-        return _with_vectors(points, poses.turned_inward, poses.inward)
+        return _with_vectors(points, poses.rotate_to_body_frame, poses.to_body_frame)
 
     def columns_compensated(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
         """Return the columns of a sweep with vectors in the same frame as `compensated`."""
@@ -212,8 +212,8 @@ class Sweeps:
         poses = self.firing_poses(sweep, points)
         return _with_vectors(
             points,
-            lambda normals: poses.turned_outward(normals) @ self.pose.rotations[sweep],
-            lambda origins: self.pose.inward(sweep, poses.outward(origins)),
+            lambda normals: poses.rotate_to_world(normals) @ self.pose.rotations[sweep],
+            lambda origins: self.pose.to_body_frame(sweep, poses.to_world(origins)),
         )
 
     def as_fired(self, sweep: int, points: Cloud) -> Floats:
@@ -221,7 +221,7 @@ class Sweeps:
         exact = points.positions.astype(np.float64)
         if self.coordinates == "sensor":
             return exact
-        return self.firing_poses(sweep, points).inward(exact)
+        return self.firing_poses(sweep, points).to_body_frame(exact)
 
     def compensated(self, sweep: int, points: Cloud) -> Floats:
         """Return the points of a sweep in the sensor frame at the start of the sweep.
@@ -230,8 +230,8 @@ class Sweeps:
         """
         exact = points.positions.astype(np.float64)
         if self.coordinates == "sensor":
-            exact = self.firing_poses(sweep, points).outward(exact)
-        return self.pose.inward(sweep, exact)
+            exact = self.firing_poses(sweep, points).to_world(exact)
+        return self.pose.to_body_frame(sweep, exact)
 
     def firing_poses(self, sweep: int, points: Cloud) -> FiringPoses:
         """Return the sensor poses at the firing times of the points in a sweep.
@@ -239,7 +239,7 @@ class Sweeps:
         If there is no `time` column, the points are assumed to be fired in the middle of their
         scans.
         """
-        return self._sensor_within(sweep, self._shares(sweep, points))
+        return self._sensor_firing_poses(sweep, self._shares(sweep, points))
 
     def span_ns(self, sweep: int) -> float:
         """Return the time in nanoseconds from the start of a sweep to its last beam."""
@@ -250,37 +250,37 @@ class Sweeps:
         """Return the fraction of the sweep that has elapsed when each point is fired."""
         return np.clip(self.since_ns(sweep, points) / max(self.span_ns(sweep), 1.0), 0, 1)
 
-    def _sensor_within(self, sweep: int, shares: Floats) -> FiringPoses:
+    def _sensor_firing_poses(self, sweep: int, shares: Floats) -> FiringPoses:
         """Return the sensor poses at fractions of a sweep."""
         knots = self.knots[sweep] if len(self.knots) else _NO_KNOTS
         return interpolate_poses(
             knots, self.pose.positions[sweep], self.pose.rotations[sweep], shares
         )
 
-    def _actor_within(self, actor: int, sweep: int, shares: Floats) -> FiringPoses:
+    def _actor_firing_poses(self, actor: int, sweep: int, shares: Floats) -> FiringPoses:
         """Return the poses of an actor at fractions of a sweep."""
         row = self.actor_rows[actor, sweep] if len(self.actor_rows) else -1
         knots = self.actor_knots[row] if row >= 0 else _NO_KNOTS
         (rotation,) = matrices(self.actor_poses.quaternions[actor, [sweep]])
         return interpolate_poses(knots, self.actor_poses.positions[actor, sweep], rotation, shares)
 
-    def carrier_within(self, sweep: int, shares: Floats) -> SweepPoses:
+    def platform_poses_at(self, sweep: int, shares: Floats) -> SweepPoses:
         """Return the platform poses at fractions of a sweep.
 
         `shares` has shape (k,). Values slightly greater than 1 are extrapolated.
         """
-        positions, rotations = self._sensor_within(sweep, shares).frames(len(shares))
+        positions, rotations = self._sensor_firing_poses(sweep, shares).frames(len(shares))
         number = self.sensor[sweep]
         (mount,) = matrices(self.mounts.quaternions[[number]])
         rotations = rotations @ mount.T
         return _poses_of(positions - rotations @ self.mounts.positions[number], rotations)
 
-    def actor_within(self, actor: int, sweep: int, shares: Floats) -> SweepPoses:
+    def actor_poses_at(self, actor: int, sweep: int, shares: Floats) -> SweepPoses:
         """Return the poses of an actor at fractions of a sweep.
 
         `shares` has shape (k,). Values slightly greater than 1 are extrapolated.
         """
-        return _poses_of(*self._actor_within(actor, sweep, shares).frames(len(shares)))
+        return _poses_of(*self._actor_firing_poses(actor, sweep, shares).frames(len(shares)))
 
     def with_actors_at_start(self, sweep: int, points: Cloud) -> Cloud:
         """Move the points on actors to their positions at the start of the sweep.
@@ -299,23 +299,24 @@ class Sweeps:
         moved = points[rows]
         owners = actor[rows]
         shares = self._shares(sweep, moved)
-        sensor = self._sensor_within(sweep, shares) if self.coordinates == "sensor" else None
+        sensor = self._sensor_firing_poses(sweep, shares) if self.coordinates == "sensor" else None
         masks = {owner: owners == owner for owner in np.unique(owners).tolist()}
         bodies = {
-            owner: self._actor_within(owner, sweep, shares[mask]) for owner, mask in masks.items()
+            owner: self._actor_firing_poses(owner, sweep, shares[mask])
+            for owner, mask in masks.items()
         }
 
         def at_start(positions: Floats) -> Floats:
-            in_world = positions if sensor is None else sensor.outward(positions)
+            in_world = positions if sensor is None else sensor.to_world(positions)
             for owner, mask in masks.items():
-                in_world[mask] = bodies[owner].to_start(in_world[mask])
-            return in_world if sensor is None else sensor.inward(in_world)
+                in_world[mask] = bodies[owner].move_to_start(in_world[mask])
+            return in_world if sensor is None else sensor.to_body_frame(in_world)
 
         def turned(normals: Floats) -> Floats:
-            in_world = normals if sensor is None else sensor.turned_outward(normals)
+            in_world = normals if sensor is None else sensor.rotate_to_world(normals)
             for owner, mask in masks.items():
-                in_world[mask] = bodies[owner].turned_to_start(in_world[mask])
-            return in_world if sensor is None else sensor.turned_inward(in_world)
+                in_world[mask] = bodies[owner].rotate_to_start(in_world[mask])
+            return in_world if sensor is None else sensor.rotate_to_body_frame(in_world)
 
         positions = points.positions.astype(np.float64)
         positions[rows] = at_start(positions[rows])
@@ -364,7 +365,7 @@ class Sweeps:
         return text + _ACTORS_AT_START if self.actors_at_start else text
 
     @cached_property
-    def carrier(self) -> SweepPoses:
+    def platform(self) -> SweepPoses:
         """Platform poses at the start of each sweep."""
         mounts = matrices(self.mounts.quaternions)[self.sensor]
         rotations = matrices(self.pose.quaternions) @ mounts.transpose(0, 2, 1)
@@ -678,9 +679,9 @@ def _sensor_sweeps(survey: Survey, number: int) -> _SensorSweeps:
     positions = []
     rotations = []
     for station in range(path.stations):
-        carrier_positions, carrier_rotations = full_poses(path, station, times)
-        positions.append(carrier_positions + carrier_rotations @ np.array(mount.position))
-        rotations.append(carrier_rotations @ mount.rotation_matrix)
+        platform_positions, platform_rotations = full_poses(path, station, times)
+        positions.append(platform_positions + platform_rotations @ np.array(mount.position))
+        rotations.append(platform_rotations @ mount.rotation_matrix)
     specs = [survey.sent_scan(scan) for scan in firsts.tolist()]
     # While a sensor is frozen, it repeats scans that were simulated earlier.
     cast_scans = np.array([spec.scan + spec.ahead for spec in specs])

@@ -148,7 +148,7 @@ def collect(
     and gets `Receipt`, `ColumnsLost` and `Failed`.
     """
     secede()
-    visible_storage = storage if storage.sees(*probe) else None
+    visible_storage = storage if storage.has_content(*probe) else None
     recorder = Recorder(start.stage, LIDAR)
     sender = _Sender(start, outlet)  # the driver limits its orders
     start.trace("start")
