@@ -27,7 +27,7 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.clouds.boxes import Boxes
-from lidarpool.clouds.images import Image
+from lidarpool.clouds.images import RayImage
 from lidarpool.clouds.ros.bags import Rosbag2
 from lidarpool.clouds.webdataset import WebDataset
 from lidarpool.clouds.writing import ExportSpec
@@ -231,7 +231,7 @@ def test_images_find_the_rays_of_frozen_sweeps():
     found = cast(survey)
     some = rows(found, (found["scan"] >= 2 * SWEEP) & (found["scan"] < 3 * SWEEP))
     points = Cloud(np.zeros((len(some["scan"]), 3)), {name: some[name] for name in ("scan", "ray")})
-    image = Image.from_points(sweeps, 2, points)
+    image = RayImage.from_points(sweeps, 2, points)
     azimuth = image.ray_arrays()["azimuth"][image.row, image.column]
     np.testing.assert_allclose(azimuth, some["azimuth"], atol=1e-4)
 

@@ -1,4 +1,4 @@
-"""Exceptions for errors that the user can correct, and helpers that phrase their messages."""
+"""Exceptions for errors that the user can correct, and helpers that format their messages."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class LidarError(Exception):
     command line prints the message without a traceback and exits with code 2. Very long lines are
     shortened in the middle, and long lists of names are wrapped.
 
-    If a file does not exist, the error is also a FileNotFoundError. If an argument has a wrong type
-    or value, the error is also a ValueError.
+    If a file does not exist, the error is also a FileNotFoundError. If an argument has an invalid
+    type or value, the error is also a ValueError.
     """
 
     def __init__(self, message: object = "") -> None:
@@ -44,7 +44,7 @@ class MissingFileError(LidarError, FileNotFoundError):
 
 
 class ArgumentError(LidarError, ValueError):
-    """A LidarError for an argument with a wrong type or value."""
+    """A LidarError for an argument with an invalid type or value."""
 
 
 def _cut(line: str) -> str:

@@ -48,7 +48,7 @@ for _name, _aliases in ALIASES.items():
 
 
 def standard_names(names: Iterable[str], among: Collection[str] | None = None) -> list[str]:
-    """Replace column names by standard names, and make them distinct.
+    """Replace column names with standard names, and make them distinct.
 
     Only one column gets a standard name: the column that already has it, or else the column whose
     name comes first in `ALIASES`. All other columns keep their names. A number is appended to names

@@ -240,8 +240,9 @@ class Sweep:
         return selected
 
     def with_columns(self, **columns: AnyArray | None) -> Self:
-        """Return a copy of the sweep with exactly the given columns. Columns may be None to omit.
+        """Return a copy of the sweep that has only the given columns.
 
+        Columns that are None are omitted.
         The copy no longer has rings and times that its recording determines.
         """
         return self.replace(

@@ -51,7 +51,10 @@ class _Interrupt:
 
 
 def _drops_errors(frame: FrameType | None) -> bool:
-    """Return True if an object may be being finalized, where Python ignores exceptions."""
+    """Return True if a finalizer or weak reference callback is running.
+
+    Python ignores exceptions that are raised there.
+    """
     while frame is not None:
         code = frame.f_code
         if code.co_name == "__del__" or code.co_filename in _WEAK:

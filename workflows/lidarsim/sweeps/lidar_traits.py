@@ -44,7 +44,7 @@ class MirrorLines:
 
 @dataclass(frozen=True)
 class LidarTraits:
-    """Sensor properties on which fields in files depend."""
+    """Sensor properties that determine the values of fields in output files."""
 
     channels: int
     mode: str  # return mode; see `Returns`

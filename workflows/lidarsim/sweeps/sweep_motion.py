@@ -49,11 +49,11 @@ class FiringPoses:
         )
 
     def to_body_frame(self, points: Floats) -> Floats:
-        """Transform points from the world frame to the sensor frame at the time of each point."""
+        """Transform points from the world frame to the body frame at the time of each point."""
         return self.rotate_to_body_frame(points - self.positions)
 
     def to_world(self, points: Floats) -> Floats:
-        """Transform points from the sensor frame at the time of each point to the world frame."""
+        """Transform points from the body frame at the time of each point to the world frame."""
         in_world: Floats = self.rotate_to_world(points) + self.positions
         return in_world
 
@@ -85,12 +85,12 @@ class FiringPoses:
         return at_start
 
     def rotate_to_body_frame(self, vectors: Floats) -> Floats:
-        """Rotate vectors from the world frame to the sensor frame at the time of each vector."""
+        """Rotate vectors from the world frame to the body frame at the time of each vector."""
         inside: Floats = vectors @ self.rotation
         return inside if self.quaternions is None else _turned(inside, self.quaternions, -1.0)
 
     def rotate_to_world(self, vectors: Floats) -> Floats:
-        """Rotate vectors from the sensor frame at the time of each vector to the world frame."""
+        """Rotate vectors from the body frame at the time of each vector to the world frame."""
         inside = vectors if self.quaternions is None else _turned(vectors, self.quaternions, 1.0)
         return inside @ self.rotation.T
 
