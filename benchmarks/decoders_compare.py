@@ -128,7 +128,7 @@ def _nuscenes_points(drive: Drive, arrays: Arrays) -> Row:
         file = f"{_CHANNELS[sweeps.sensor[number]]}/{sweeps.numbers[number]:06}.pcd.bin"
         (name,) = (n for n in arrays if n.startswith("points/") and n.endswith(file))
         parts["read"].append(arrays[name][:, :3])
-        parts["true"].append(sweeps.pose.inward(number, drive.in_world(number)))
+        parts["true"].append(sweeps.pose.to_body_frame(number, drive.in_world(number)))
         parts["classes"].append(arrays[name.replace("points/", "classes/", 1)])
     joined = {name: np.concatenate(arrays_of_sweeps) for name, arrays_of_sweeps in parts.items()}
     differences = {
@@ -146,9 +146,9 @@ def _joined_sweeps(drive: Drive, arrays: Arrays) -> Row:
         parts = []
         for earlier in range(number, max(number - _JOINED, -1), -1):
             in_world = drive.in_world(earlier)
-            beside = np.abs(poses.inward(earlier, in_world)[:, :2]) < 1
+            beside = np.abs(poses.to_body_frame(earlier, in_world)[:, :2]) < 1
             parts.append(in_world[~beside.all(axis=1)])  # the devkit leaves out the rest
-        truth = poses.inward(number, np.concatenate(parts))
+        truth = poses.to_body_frame(number, np.concatenate(parts))
         off_m.append(np.linalg.norm(arrays[f"joined/{number}"][:, :3] - truth, axis=1))
     total = np.concatenate(off_m)
     differences = {"position (`from_file_multisweep`)": meters(greatest(total))}

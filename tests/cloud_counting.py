@@ -20,7 +20,7 @@ def counts_of(cloud: CloudLike, objects: int, materials: int = 0) -> CloudCounts
     counts = CloudCounts(cloud.table, objects, materials, precision_m, origin)
     if not len(cloud):
         return counts
-    points = Cloud.joined(list(cloud.chunks()))
+    points = Cloud.concatenate(list(cloud.chunks()))
     counts.add(points.columns)
     cells = np.rint((points.positions - origin) / precision_m).astype(np.int32)
     counts.widen(np.stack([cells.min(axis=0), cells.max(axis=0)]).astype(np.int64))

@@ -103,7 +103,7 @@ def test_an_entry_beyond_a_list_is_named_in_a_line(path, words):
 
 def test_without_names_sweeps_have_the_bytes_that_they_had(scene, sweeps):
     plain = replace(sweeps, classes={})
-    assert b"classes" not in plain.packed()
+    assert b"classes" not in plain.to_bytes()
     assert fingerprint(plain) == fingerprint(sweeps), "which tokens and GUIDs depend on"
 
 
@@ -134,7 +134,7 @@ def test_ply_has_them_in_comments_however_many(saved, scene, sweeps):
     found = (line.removeprefix("comment class ").partition(" ") for line in lines)
     assert {int(number): name for number, _, name in found} == many
     assert np.array_equal(read_cloud(path)["class"], points_of(scene, 0)["class"])
-    saved("ply").with_name(SWEEPS_FILE).write_bytes(sweeps.packed())
+    saved("ply").with_name(SWEEPS_FILE).write_bytes(sweeps.to_bytes())
     assert read_cloud(path).sweeps().classes == NAMES
 
 
@@ -264,7 +264,7 @@ def test_data_sets_give_them_back(scene, sweeps, tmp_path, name):
 
 def test_the_page_names_them_in_legend_and_filter(saved, scene, sweeps, tmp_path):
     saved("ply")
-    (tmp_path / SWEEPS_FILE).write_bytes(sweeps.packed())
+    (tmp_path / SWEEPS_FILE).write_bytes(sweeps.to_bytes())
     survey = Survey(
         Sensor.grid(90, 4), [(0, 0, 1)], materials=[Material("*", semantic_class=3)], classes=NAMES
     )

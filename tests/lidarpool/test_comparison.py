@@ -195,7 +195,7 @@ def test_the_step_is_found_where_most_returns_are_lost():
 def test_the_first_of_several_returns_counts():
     first = cloud()
     second = cloud(RANGES + 3)
-    dual = Cloud.joined([second, first])
+    dual = Cloud.concatenate([second, first])
     image = of_image(dual, first)
     assert image["residual"]["rmse_m"] < 1e-6
     assert image["hidden_points"] == {"a": 0.5, "b": 0.0}
@@ -299,7 +299,7 @@ def written(tmp_path_factory):
             "time": (begin + 1000 * scan.ravel()).astype(np.int64),
         }
         clouds.append(Cloud(inside.reshape(-1, 3) + pose, columns))  # fmt: skip
-    made = Cloud.joined(clouds)
+    made = Cloud.concatenate(clouds)
     for name in ("ply", "laz", "las", "pcd", "mcap", "rosbag2"):
         one = ExportSpec(name)
         one.write(folder / one.row.file, made, sweeps)

@@ -194,7 +194,7 @@ def test_what_one_of_two_scans_lacks_is_gray(path, quantity, are_zero):
 def test_intensities_stay_with_their_scan_in_comparisons(path):
     write_scans(path, [{"fields": wall()}, {"fields": wall() | intensities(np.full(COUNT, 7.0))}])
     recording = open_recording(path)
-    joined = Sweep.joined([*recording])
+    joined = Sweep.concatenate([*recording])
     np.testing.assert_array_equal(joined.intensity, np.repeat([np.nan, 7.0], COUNT))
 
 

@@ -378,7 +378,7 @@ def with_points(recording, chosen, points_of):
     def read(number):
         sweep = recording.read(number)
         added, rings, light = points_of(number)
-        return Sweep.joined(
+        return Sweep.concatenate(
             [
                 sweep.select(chosen(number, sweep.points, sweep.columns["channel"])),
                 Sweep(added, {"channel": rings, "intensity": light}),

@@ -22,11 +22,11 @@ from lidarpool.columns.parts import (
     read_part,
     unpack,
 )
-from lidarsim.columns.part_columns import PartColumns, positions_of
-from lidarsim.columns.table import OPTIONAL, stored
+from lidarsim.columns.part_columns import PartColumns, cell_positions
+from lidarsim.columns.table import OPTIONAL, columns_in_parts
 from lidarsim.io.storage import Storage
 
-COLUMNS = stored(OPTIONAL)
+COLUMNS = columns_in_parts(OPTIONAL)
 ORIGIN = np.array([500_000.0, 5_400_000.0, 300.0])
 PRECISION_M = 0.01
 
@@ -225,7 +225,7 @@ def test_a_cloud_is_the_same_however_it_is_divided(tmp_path_factory, counts, poi
     chunks = list(cloud.chunks(points))
     assert all(len(chunk) == points for chunk in chunks[:-1])
     assert len(chunks) == -(-len(cloud) // points)
-    assert not chunks or same(Cloud.joined(chunks), whole)
+    assert not chunks or same(Cloud.concatenate(chunks), whole)
 
 
 def test_a_sample_is_of_the_cloud_and_in_its_order(storage):
@@ -252,7 +252,7 @@ def test_a_sample_is_of_the_cloud_and_in_its_order(storage):
 @pytest.mark.parametrize("precision", [1e-6, 1e-3, 0.01, 0.05, 0.07, 0.25, 1.0, 1000.0])
 def test_positions_are_the_short_decimals_that_are_meant(precision):
     cells = np.arange(-1000, 1000)[:, None] * np.ones(3, int)
-    found = positions_of(cells, precision, np.zeros(3))[:, 0]
+    found = cell_positions(cells, precision, np.zeros(3))[:, 0]
     assert [repr(abs(float(x))) for x in found] == [
         repr(abs(float(f"{c * precision:.9g}"))) for c in range(-1000, 1000)
     ]

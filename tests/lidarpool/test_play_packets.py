@@ -67,7 +67,7 @@ def played(tmp_path_factory):
     (folder / "out").mkdir()
     with open_source(folder / "s.yaml", ExportSpec("pcap")) as source:
         cloud = replace(
-            Cloud.joined([points for _, points in source]), sweeps=lambda: source.sweeps
+            Cloud.concatenate([points for _, points in source]), sweeps=lambda: source.sweeps
         )
         save_cloud(cloud, folder / "out" / "cloud.ply")
         save_cloud(cloud, folder / "out" / "packets", format="pcap")

@@ -8,7 +8,7 @@ import pytest
 from lidarpool import Column, LidarError
 from lidarpool.clouds.ply_rows import PlyRowEncoder
 from lidarpool.columns.part_blocks import BlockMemory
-from lidarsim.columns.part_columns import positions_of
+from lidarsim.columns.part_columns import cell_positions
 from lidarsim.columns.ply_format import as_file_type, row_type
 from lidarsim.columns.table import AXES, OPTIONAL, SCAN, TABLE
 
@@ -43,7 +43,7 @@ def expected_rows(row, table, columns, precision_m, origin) -> np.ndarray:
     """Rows, field by field."""
     rows = np.empty(len(columns["x"]), row)
     for i, axis in enumerate("xyz"):
-        rows[axis] = positions_of(columns[axis], precision_m, origin[i])
+        rows[axis] = cell_positions(columns[axis], precision_m, origin[i])
     for column in table:
         rows[column.in_files] = as_file_type(column, columns[column.name])
     return rows

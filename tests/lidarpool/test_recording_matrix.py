@@ -169,7 +169,7 @@ def test_a_capture_has_the_same_points_between_other_bounds(result):
     sweeps = [sweep.returns() for sweep in open_recording(path)]
     assert 0 <= len(cloud) - sum(map(len, sweeps)) < 384  # of the last packet, which is not full
     for number, sweep in enumerate(sweeps):
-        around = Sweep.joined(truth[max(number - 1, 0) : number + 2])
+        around = Sweep.concatenate(truth[max(number - 1, 0) : number + 2])
         distances, rows = cKDTree(around.points).query(sweep.points)
         assert distances.max() < TOLERANCE_M
         np.testing.assert_array_equal(sweep.rings, around.columns["channel"][rows])

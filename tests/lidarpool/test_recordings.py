@@ -23,7 +23,7 @@ from lidarpool.reconstruction.odometry import RecordedPoses, find_poses
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.bags import POINT_CLOUD
-from lidarsim.io.archives import packed
+from lidarsim.io.archives import pack_arrays
 
 # From axes of a lidar to those of a camera of KITTI: x to the right, y down, z forward.
 TO_CAMERA = np.array([[0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1.0]])
@@ -44,7 +44,7 @@ def write_image(path, x):
     """Write a range image with one ray that ends at x."""
     names = ("x", "y", "z", "range")
     arrays = {name: np.full((1, 1), x, np.float32) for name in names} | {"pose": np.eye(4)}
-    path.write_bytes(packed(arrays))
+    path.write_bytes(pack_arrays(arrays))
 
 
 def first_x(recording):

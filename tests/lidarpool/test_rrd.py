@@ -92,7 +92,7 @@ def check(rows, sweeps, points_of_sweeps, origin):
 def test_clouds_poses_boxes_and_scene_are_read_back(scanned, tmp_path):
     sweeps, points, content = scanned
     path = tmp_path / "cloud.rrd"
-    ExportSpec("rrd").write(path, Cloud.joined(points), sweeps, content=lambda: content)
+    ExportSpec("rrd").write(path, Cloud.concatenate(points), sweeps, content=lambda: content)
     rows = read(path)
     check(rows, sweeps, points, np.zeros(3))
     ((_, vertices),) = rows["/map/scene", "Mesh3D:vertex_positions"]
@@ -117,7 +117,7 @@ def test_coordinates_of_maps_keep_their_precision(scanned, tmp_path):
 
     on_map = replace(sweeps, pose=moved(sweeps.pose), actor_poses=moved(sweeps.actor_poses))
     clouds = [replace(cloud, positions=cloud.positions + UTM) for cloud in points]
-    cloud = replace(Cloud.joined(clouds), sweeps=lambda: on_map)
+    cloud = replace(Cloud.concatenate(clouds), sweeps=lambda: on_map)
     assert save_cloud(cloud, tmp_path / "map.rrd") == []
     rows = read(tmp_path / "map.rrd")
     origin = [rows["/__properties/origin", axis][0][1][0] for axis in "xyz"]
@@ -134,7 +134,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(scanned, tmp_path):
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
     try:
         with pytest.raises(LidarError, match="cannot be written"):
-            ExportSpec("rrd").write(tmp_path / "cloud.rrd", Cloud.joined(points), sweeps)
+            ExportSpec("rrd").write(tmp_path / "cloud.rrd", Cloud.concatenate(points), sweeps)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert [*tmp_path.iterdir()] == []

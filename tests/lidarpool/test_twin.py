@@ -204,7 +204,7 @@ def test_lost_pulses_are_steps_of_a_ring_without_a_return():
         cosines = found @ truth.T
         assert np.mean(cosines.max(axis=1) > np.cos(np.radians(0.25))) > 0.98
     # Second returns of the pulses, whose azimuths are rounded.
-    both = Sweep.joined([sweep, sweep.replace(points=sweep.points * 1.01 + (1e-6, -1e-6, 0))])
+    both = Sweep.concatenate([sweep, sweep.replace(points=sweep.points * 1.01 + (1e-6, -1e-6, 0))])
     assert len(lost_pulses(both, elevation, coverage, 0.0)[0]) == pytest.approx(len(lost), rel=0.01)
     unknown, _ = lost_pulses(sweep, np.empty(0), coverage, 0.0)
     assert not len(unknown)
@@ -315,7 +315,7 @@ def test_a_twin_simulates_all_sweeps_with_energies_as_recorded(bag):
     np.testing.assert_allclose(last.position, found.poses[-1, :3, 3] + step, atol=0.01)
     simulated, _ = scanned(folder / "twin")
     recording = open_recording(folder / "drive.mcap", name="drive")
-    recorded = Sweep.joined([recording[number] for number in range(SWEEPS)])
+    recorded = Sweep.concatenate([recording[number] for number in range(SWEEPS)])
     range_m = np.linalg.norm(recorded.points, axis=1)
     light = recorded.intensity
     poses = job.survey.path.poses(0, simulated["time"].astype(np.float64))[0]

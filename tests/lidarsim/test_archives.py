@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarsim.io import archives
-from lidarsim.io.archives import read_arrays, stored_pieces
+from lidarsim.io.archives import archive_pieces, read_arrays
 
 
 def zipfile_bytes(arrays):
@@ -44,7 +44,7 @@ ARRAYS = {
 
 
 def test_bytes_are_those_of_zipfile_and_numpy_reads_them():
-    data = b"".join(stored_pieces(ARRAYS))
+    data = b"".join(archive_pieces(ARRAYS))
     assert_bytes_of_zipfile(data, ARRAYS)
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         assert archive.testzip() is None
@@ -58,7 +58,7 @@ def test_bytes_are_those_of_zipfile_and_numpy_reads_them():
 def test_numbers_of_64_bits_are_where_zipfile_has_them(limit):
     """As of a part of more than 2 GiB, with a smaller limit."""
     with patch.object(zipfile, "ZIP64_LIMIT", limit), patch.object(archives, "_MAX_SIZE", limit):
-        data = b"".join(stored_pieces(ARRAYS))
+        data = b"".join(archive_pieces(ARRAYS))
         assert_bytes_of_zipfile(data, ARRAYS)
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         assert archive.testzip() is None
@@ -68,12 +68,12 @@ def test_numbers_of_64_bits_are_where_zipfile_has_them(limit):
 @given(st.lists(st.integers(0, 9), max_size=5), st.sampled_from(["u1", "<i4", "<f8", ">u2"]))
 def test_arrays_of_any_length(lengths, kind):
     arrays = {f"column{i}": np.arange(length).astype(kind) for i, length in enumerate(lengths)}
-    data = b"".join(stored_pieces(arrays))
+    data = b"".join(archive_pieces(arrays))
     assert_bytes_of_zipfile(data, arrays)
     assert all(np.array_equal(a, arrays[name]) for name, a in read_arrays(data).items())
 
 
 def test_columns_are_not_copied():
     column = np.arange(1000)
-    views = [piece for piece in stored_pieces({"x": column}) if isinstance(piece, memoryview)]
+    views = [piece for piece in archive_pieces({"x": column}) if isinstance(piece, memoryview)]
     assert len(views) == 1 and np.shares_memory(np.frombuffer(views[0], np.uint8), column)

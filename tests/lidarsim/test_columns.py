@@ -29,7 +29,7 @@ from lidarpool import (
     save_cloud,
     simulate,
 )
-from lidarsim.columns.table import ALWAYS, OPTIONAL, TABLE, optional_columns, stored
+from lidarsim.columns.table import ALWAYS, OPTIONAL, TABLE, columns_in_parts, optional_columns
 from lidarsim.simulator.points.batch_points import BatchPoints
 
 # -- the table ------------------------------------------------------------------------------------
@@ -50,7 +50,7 @@ def test_columns_are_chosen_by_name_once_and_in_order():
         ["range", own, "time", "range", own, TABLE["time"], "ring", "channel", "scan"]
     )
     assert [column.name for column in found] == ["range", "mine", "time"]
-    assert stored(found) == (*ALWAYS, *found)
+    assert columns_in_parts(found) == (*ALWAYS, *found)
     assert optional_columns(OPTIONAL) == OPTIONAL
 
 
@@ -245,7 +245,7 @@ def test_chunks_are_the_cloud(count, points):
     assert all(len(chunk) == points for chunk in chunks[:-1])
     assert len(chunks) == -(-count // points)
     if chunks:
-        joined = Cloud.joined(chunks)
+        joined = Cloud.concatenate(chunks)
         assert np.array_equal(joined.positions, cloud.positions)
         for name, values in cloud.columns.items():
             assert np.array_equal(joined[name], values) and joined[name].dtype == values.dtype

@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from lidarsim.environment.interrupts import deferred_interrupts
+from lidarsim.environment.interrupts import defer_interrupts
 
 
 @pytest.fixture
@@ -17,7 +17,7 @@ def events():
 
 
 def work(events):
-    with deferred_interrupts():
+    with defer_interrupts():
         signal.raise_signal(signal.SIGTERM)
         events.append("work")
 

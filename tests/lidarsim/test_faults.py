@@ -27,7 +27,7 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.clouds.boxes import Boxes
-from lidarpool.clouds.images import Image
+from lidarpool.clouds.images import RayImage
 from lidarpool.clouds.ros.bags import Rosbag2
 from lidarpool.clouds.webdataset import WebDataset
 from lidarpool.clouds.writing import ExportSpec
@@ -231,7 +231,7 @@ def test_images_find_the_rays_of_frozen_sweeps():
     found = cast(survey)
     some = rows(found, (found["scan"] >= 2 * SWEEP) & (found["scan"] < 3 * SWEEP))
     points = Cloud(np.zeros((len(some["scan"]), 3)), {name: some[name] for name in ("scan", "ray")})
-    image = Image.from_points(sweeps, 2, points)
+    image = RayImage.from_points(sweeps, 2, points)
     azimuth = image.ray_arrays()["azimuth"][image.row, image.column]
     np.testing.assert_allclose(azimuth, some["azimuth"], atol=1e-4)
 
@@ -266,7 +266,7 @@ def test_labels_list_the_faults_of_each_sweep(tmp_path):
         about = json.load(tar.extractfile(name))
     assert about["faults"] == [{"kind": "time_jump", "from_s": 0.22, "by_s": -0.5}]
     assert about["time_ns"] == round(survey.begins_ns(2 * SWEEP))
-    assert b'"faults"' not in Sweeps.from_survey(STANDING, ROOM).packed()
+    assert b'"faults"' not in Sweeps.from_survey(STANDING, ROOM).to_bytes()
 
 
 @pytest.mark.extended

@@ -25,7 +25,7 @@ from lidarpool.run.job_source import input_fingerprints
 from lidarsim import Actor, Returns, box
 from lidarsim.numerics.vectors import rotate_into_frames
 from lidarsim.simulator.rig import Rig
-from lidarsim.sweeps.sweep_motion import poses_at
+from lidarsim.sweeps.sweep_motion import interpolate_poses
 from raybeam import moving_loops
 
 WALL_M = 8.0
@@ -62,7 +62,7 @@ def test_poses_between_knots_are_on_straight_lines():
     mount = Rotation.from_euler("zyx", [30, -20, 10], degrees=True)
     start = np.array([10.0, -5.0, 2.0])
     shares = np.array([-0.1, 0, 0.2, 0.5, 0.7, 1, 1.3])
-    poses = poses_at(knots, start, mount.as_matrix(), shares)
+    poses = interpolate_poses(knots, start, mount.as_matrix(), shares)
     points = np.random.default_rng(1).normal(size=(len(shares), 3)) * 9
     for number, share in enumerate(shares):  # before the first and after the last, extrapolated
         first = 0 if share < 0.5 else 1
@@ -74,12 +74,12 @@ def test_poses_between_knots_are_on_straight_lines():
         np.testing.assert_allclose(poses.quaternions[:, number], turn.as_quat())
         np.testing.assert_allclose(poses.steps[:, number], path[first + 1] - path[first])
         in_world = (mount * turn).apply(points[number]) + position
-        np.testing.assert_allclose(poses.outward(points)[number], in_world)
+        np.testing.assert_allclose(poses.to_world(points)[number], in_world)
         in_sensor = (mount * turn).inv().apply(points[number] - position)
-        np.testing.assert_allclose(poses.inward(points)[number], in_sensor)
-    still = poses_at(knots[:1], start, mount.as_matrix(), shares)
-    np.testing.assert_allclose(still.outward(points), mount.apply(points) + start)
-    np.testing.assert_allclose(still.inward(points), mount.inv().apply(points - start))
+        np.testing.assert_allclose(poses.to_body_frame(points)[number], in_sensor)
+    still = interpolate_poses(knots[:1], start, mount.as_matrix(), shares)
+    np.testing.assert_allclose(still.to_world(points), mount.apply(points) + start)
+    np.testing.assert_allclose(still.to_body_frame(points), mount.inv().apply(points - start))
 
 
 @pytest.mark.extended(every=3)

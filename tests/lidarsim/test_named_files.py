@@ -66,7 +66,7 @@ def test_a_storage_uses_files_of_its_folder_only(root, name):
             with pytest.raises(LidarError, match="is not the name of a file in"):
                 use(name)
         with pytest.raises(LidarError, match="is not the name of a file in"):
-            storage.take(storage, name, "taken")
+            storage.copy_from(storage, name, "taken")
         assert storage.read("sweeps/a.bin") == b"a"
 
 

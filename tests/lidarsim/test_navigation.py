@@ -392,7 +392,7 @@ def test_a_cloud_by_itself_has_no_instruments(tmp_path):
     assert not {"/imu/data_raw"} & {topic for topic, *_ in read_bag(tmp_path / "cloud.mcap")}
     plain = replace(survey, navigation=None)
     assert Instruments.from_survey(plain) is None
-    assert b"instruments" not in Sweeps.from_survey(plain, Scene.seed()).packed()
+    assert b"instruments" not in Sweeps.from_survey(plain, Scene.seed()).to_bytes()
 
 
 def test_scenarios(tmp_path):

@@ -118,7 +118,7 @@ def test_a_sweep_has_the_bytes_of_a_survey(scene, name, moves, physics):
     whole = surveyed(scene, Survey(sensors=[carried], steps=steps, **where, **options))
     scanner = Scanner(scene, given, backend="numpy", **options)
     sweeps = [scanner.sweep(DRIVE if moves else HERE, number=number) for number in (2, 0, 1)]
-    same(Cloud.joined([sweeps[1], sweeps[2], sweeps[0]]), whole)
+    same(Cloud.concatenate([sweeps[1], sweeps[2], sweeps[0]]), whole)
     assert all(len(sweep) > 20 for sweep in sweeps)
     assert (whole["object"] == len(scene.names)).any(), "the actor is seen"
 

@@ -54,10 +54,10 @@ def test_another_process_may_see_the_same_place(storage):
     storage.write("here", b"token")
     there = pickle.loads(pickle.dumps(storage))
     assert there == storage and len(pickle.dumps(storage)) < 500
-    assert there.sees("here", b"token")
-    assert not there.sees("here", b"another")
-    assert not there.sees("gone", b"token")
-    assert not Storage("nonsense://a/b").sees("here", b"token")
+    assert there.has_content("here", b"token")
+    assert not there.has_content("here", b"another")
+    assert not there.has_content("gone", b"token")
+    assert not Storage("nonsense://a/b").has_content("here", b"token")
 
 
 def test_a_file_is_whole_or_not_there(storage):
@@ -257,10 +257,10 @@ def test_a_file_of_another_storage_is_taken_or_copied(places, tmp_path, monkeypa
     if places[0] != "memory" or places[1] == "memory":  # by a link, and by the store itself
         monkeypatch.setattr(Storage, "writing", None)
     for _ in range(2):
-        target.take(source, "a", "b")
+        target.copy_from(source, "a", "b")
         assert target.read("b") == b"new" and source.read("a") == b"new"
     with pytest.raises(FileNotFoundError):
-        target.take(source, "c", "c")
+        target.copy_from(source, "c", "c")
 
 
 def test_a_file_is_copied_where_there_are_no_links(tmp_path, monkeypatch):
@@ -273,8 +273,8 @@ def test_a_file_is_copied_where_there_are_no_links(tmp_path, monkeypatch):
         raise OSError(errno.EXDEV, "another disk")
 
     monkeypatch.setattr(os, "link", link)
-    target.take(source, "a", "a")
+    target.copy_from(source, "a", "a")
     assert target.read("a") == b"new" and target.local("a").stat().st_nlink == 1
     (tmp_path / "link").symlink_to(tmp_path / "a")
     with pytest.raises(LidarError, match="link is a symbolic link"):
-        target.take(source, "link", "link")
+        target.copy_from(source, "link", "link")

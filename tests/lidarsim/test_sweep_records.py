@@ -109,7 +109,7 @@ def test_intensity_is_the_reflectivity_of_sweeps_without_intensities():
 def test_joined_sweeps_have_all_columns_or_the_shared_ones():
     first = Sweep(POINTS[:1], {"a": np.array([1]), "b": np.array([2])})
     second = Sweep(POINTS[2:3], {"a": np.array([3])})
-    joined = Sweep.joined([first, second, Sweep(POINTS[:0])])
+    joined = Sweep.concatenate([first, second, Sweep(POINTS[:0])])
     assert joined.columns["a"].tolist() == [1, 3] and np.isnan(joined.columns["b"][1])
-    assert [*Sweep.joined([first, second], only_shared=True).columns] == ["a"]
-    assert len(Sweep.joined([])) == 0
+    assert [*Sweep.concatenate([first, second], only_shared=True).columns] == ["a"]
+    assert len(Sweep.concatenate([])) == 0

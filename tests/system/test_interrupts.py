@@ -178,13 +178,13 @@ import re, subprocess, sys
 from multiprocessing import resource_tracker
 from pathlib import Path
 from signal import SIGHUP, SIGINT, SIGQUIT
-from lidarsim.environment.interrupts import children_spared
+from lidarsim.environment.interrupts import block_child_signals
 
 def blocked(process):
     mask = re.search(r"SigBlk:\\s+(\\w+)", Path(f"/proc/{process}/status").read_text())[1]
     return [number.name for number in (SIGINT, SIGHUP, SIGQUIT) if int(mask, 16) >> number - 1 & 1]
 
-with children_spared():
+with block_child_signals():
     worker = subprocess.Popen(["cat"], stdin=subprocess.PIPE)
     print(*blocked(worker.pid))
     worker.communicate()
@@ -204,10 +204,10 @@ def test_a_terminal_spares_workers_and_what_clears_up_behind_them():
 SIGNALED = {
     "a program under nohup": (
         "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
-        "for obey in (end_on_signals, interrupt_on_signals):\n"
+        "for obey in (exit_on_signals, interrupt_on_signals):\n"
         "    obey()\n"
         "    signal.raise_signal(signal.SIGHUP)\n"
-        "    with deferred_interrupts(): signal.raise_signal(signal.SIGHUP)\n"
+        "    with defer_interrupts(): signal.raise_signal(signal.SIGHUP)\n"
         "print('still here')\n",
         (0, "still here\n", ""),
     ),
@@ -217,7 +217,7 @@ SIGNALED = {
         "except KeyboardInterrupt: pass\n"
         "signal.raise_signal(signal.SIGINT)\n"  # the first one's twin
         "time.sleep(1.1)\n"
-        "with deferred_interrupts():\n"
+        "with defer_interrupts():\n"
         "    signal.raise_signal(signal.SIGINT)\n"
         "    print('still here')\n",
         (130, "", "lidarpool: stopped at once"),

@@ -5,12 +5,12 @@ from __future__ import annotations
 import sys
 from typing import NoReturn, TextIO, cast
 
-from lidarsim.environment.interrupts import end_on_signals
+from lidarsim.environment.interrupts import exit_on_signals
 
 
 def main() -> NoReturn:
     """Run the command (`cli.main`)."""
-    end_on_signals()
+    exit_on_signals()
     # A second of imports, during which an interrupt would print Python's traceback.
     from .cli.commands import main as command
     from .processes import rare_collections  # noqa: F401

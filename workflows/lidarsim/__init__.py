@@ -1,7 +1,8 @@
-"""Points that a lidar measures in a scene, computed in the calling process.
+"""Lidar simulation in the calling process.
 
-`Scanner` casts single sweeps; a `Survey` describes sensors, poses, noise and weather. Neither Dask
-nor Open3D is imported. The package `lidarpool` makes thousands of surveys on a Dask cluster.
+A `Survey` describes sensors, poses, noise and weather, and a `Scanner` simulates individual sweeps.
+This package imports neither Dask nor Open3D. To run thousands of surveys on a Dask cluster, use the
+`lidarpool` package.
 """
 
 from importlib import import_module
@@ -66,8 +67,9 @@ __all__ = [
     "load_trajectory",
 ]
 
-# Modules of the names above, except names of `sensor`. A module is imported when one of its names
-# is asked for, because importing all modules takes half a second.
+# Modules that define the names above; names that are not listed here are defined in `sensor`. A
+# module is imported on first access to one of its names, because importing all of them takes half a
+# second.
 _MODULES = {
     "errors": ("LidarError",),
     "columns.cloud": ("Cloud",),

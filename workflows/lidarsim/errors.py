@@ -1,4 +1,4 @@
-"""The exception for errors of users."""
+"""Exceptions for errors that the user can correct, and helpers that format their messages."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ from .words import printable
 
 MAX_MISTAKES = 20
 _UNFORESEEN = (IndexError, TypeError, AttributeError, ArithmeticError, AssertionError)
-_MAX_REASON = 400  # letters: libraries may quote a whole file
-_MAX_LETTERS = 2000  # letters of a line of a message, whose start names the file
-_END_LETTERS = 500  # a line that is cut in its middle keeps so many: what was expected, and advice
+_MAX_REASON = 400  # characters; libraries may quote an entire file
+_MAX_LETTERS = 2000  # characters per line of a message; longer lines are cut in the middle
+# The start of a line names the file. Its end, which states what was expected and what to do, keeps
+# this many characters.
+_END_LETTERS = 500
 
 
 _LONG_LIST = re.compile(r"(?:[^\s,]+(?: \([^)]*\))?, ){15,}\S+")
-_MIN_LIST_LETTERS = 300  # letters of a list that is put on separate lines
-_WIDTH = 100  # letters of these lines, as of --help
+_MIN_LIST_LETTERS = 300  # characters; longer lists are moved to separate lines
+_WIDTH = 100  # characters per line of a wrapped list, as in the output of --help
 _INDENT = "  "
 
 
@@ -29,8 +31,8 @@ class LidarError(Exception):
     command line prints the message without a traceback and exits with code 2. Very long lines are
     shortened in the middle, and long lists of names are wrapped.
 
-    If a file does not exist, the error is also a FileNotFoundError. If an argument has a wrong type
-    or value, the error is also a ValueError.
+    If a file does not exist, the error is also a FileNotFoundError. If an argument has an invalid
+    type or value, the error is also a ValueError.
     """
 
     def __init__(self, message: object = "") -> None:
@@ -42,18 +44,18 @@ class MissingFileError(LidarError, FileNotFoundError):
 
 
 class ArgumentError(LidarError, ValueError):
-    """A LidarError for an argument with a wrong type or value."""
+    """A LidarError for an argument with an invalid type or value."""
 
 
 def _cut(line: str) -> str:
-    """Return a line without its middle if the line is too long to be read."""
+    """Remove the middle of a line that is too long to read."""
     if len(line) <= _MAX_LETTERS:
         return line
     return f"{line[: _MAX_LETTERS - _END_LETTERS]} … {line[-_END_LETTERS:]}"
 
 
 def _wrap_list(line: str) -> str:
-    """Return a line with a long list, such as all columns, on separate indented lines."""
+    """Move a long list in a line, such as all columns, to separate indented lines."""
     names = _LONG_LIST.search(line)
     if names is None or len(names[0]) < _MIN_LIST_LETTERS or line.startswith(_INDENT):
         return line
@@ -69,11 +71,14 @@ def _wrap_list(line: str) -> str:
 
 
 class CutShortError(ValueError):
-    """An error of a file whose end is missing: what is announced, and what is there."""
+    """An error for a truncated file.
+
+    The message states how much data was expected and how much the file contains.
+    """
 
 
 def message_of(error: Exception) -> str:
-    """Return the message of an error as a sentence in a line.
+    """Return the message of an error as a sentence on a single line.
 
     Examples
     --------
@@ -87,7 +92,9 @@ def message_of(error: Exception) -> str:
 
 
 def reason_of(error: Exception) -> str:
-    """Return why a file cannot be read, from an error of any class: a clause without a period.
+    """Describe why a file cannot be read, as a clause without a period.
+
+    `error` may be an exception of any class.
 
     Examples
     --------
@@ -101,13 +108,13 @@ def reason_of(error: Exception) -> str:
     reason = type(error).__name__
     if str(error):
         reason = printable(message_of(error), _MAX_REASON).rstrip(".")
-    if isinstance(error, _UNFORESEEN):  # whose messages speak of Python, not of the file
+    if isinstance(error, _UNFORESEEN):  # messages that describe Python objects, not the file
         reason = f"its content does not match its format ({reason})"
     return reason
 
 
 def as_sentence(advice: str) -> str:
-    """Return advice as a sentence, with a capital letter and a period.
+    """Capitalize a piece of advice and end it with a period.
 
     Examples
     --------
@@ -118,7 +125,9 @@ def as_sentence(advice: str) -> str:
 
 
 def unreadable(subject: object, error: Exception, advice: str = "") -> str:
-    """Return a sentence on the error, of any class, of reading a file.
+    """Return a message about a file that cannot be read.
+
+    `error` may be an exception of any class. The advice, if any, follows as a second sentence.
 
     Examples
     --------
@@ -134,9 +143,10 @@ def unreadable(subject: object, error: Exception, advice: str = "") -> str:
 
 @contextmanager
 def explained(failure: str, advice: str = "") -> Iterator[None]:
-    """Turn an OSError of the body into a LidarError: the failure, the reason, and advice.
+    """Convert an OSError raised in the context into a LidarError.
 
-    The error is a MissingFileError if a file does not exist.
+    The message consists of the failure, the reason and the advice. If a file does not exist, the
+    error is a MissingFileError.
     """
     try:
         yield
@@ -152,10 +162,11 @@ def explained(failure: str, advice: str = "") -> Iterator[None]:
 
 @contextmanager
 def converted(failure: str) -> Iterator[None]:
-    """Turn an error of any class in the body into a LidarError: the failure, and the reason.
+    """Convert any exception raised in the context into a LidarError.
 
-    For files that users give, whose readers and libraries raise errors of many classes. If the file
-    that the failure names does not exist, the error says only that.
+    Use this context for input files, whose readers and libraries raise exceptions of many classes.
+    The message consists of the failure and the reason. If the file named in `failure` does not
+    exist, the message only states that.
     """
     try:
         yield
@@ -172,7 +183,7 @@ def converted(failure: str) -> Iterator[None]:
 
 @contextmanager
 def prefixed(subject: object) -> Iterator[None]:
-    """Start a LidarError of the body with its subject: «leg 3: …»."""
+    """Prefix a LidarError raised in the context with its subject, for example "leg 3: …"."""
     try:
         yield
     except LidarError as error:
@@ -181,21 +192,21 @@ def prefixed(subject: object) -> Iterator[None]:
 
 
 class Mistakes:
-    """Collector of errors, which reports all errors together."""
+    """Collector that reports several errors as a single one."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
 
     @contextmanager
     def noted(self) -> Iterator[None]:
-        """Note a LidarError of the body, and continue after the body."""
+        """Collect a LidarError raised in the context instead of propagating it."""
         try:
             yield
         except LidarError as error:
             self.lines.append(str(error))
 
     def tell(self) -> None:
-        """Raise LidarError with a line for each error, if there are errors."""
+        """Raise LidarError with one line per distinct error if any errors were collected."""
         lines = list(dict.fromkeys(self.lines))
         if len(lines) > MAX_MISTAKES:
             lines[MAX_MISTAKES:] = [f"And {len(lines) - MAX_MISTAKES:,} more."]

@@ -1,4 +1,7 @@
-"""The imports of plug-ins of mesh files and packets, with examples in docs/how-to/plugins.md."""
+"""Names that plug-ins for mesh formats and packet formats import.
+
+See docs/how-to/plugins.md for examples.
+"""
 
 from .packets.encoders import Datagrams, PacketEncoder, PacketSource
 from .packets.service import Destination, Service

@@ -1,4 +1,4 @@
-"""Units at the end of names, such as in `visibility_km`, and conversions between them."""
+"""Unit suffixes of names, as in `visibility_km`, and conversions between units."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-# {dimension: {unit as in names: its size}}
+# {dimension: {unit suffix: size in base units}}
 _UNITS: dict[str, dict[str, float]] = {
     "length": {
         "nm": 1e-9,
@@ -46,7 +46,7 @@ _UNITS: dict[str, dict[str, float]] = {
     "energy": {"pj": 1e-12, "nj": 1e-9, "uj": 1e-6, "mj": 1e-3, "j": 1.0},
     "data": {"kb": 1e3, "mb": 1e6, "gb": 1e9, "kib": 2.0**10, "mib": 2.0**20, "gib": 2.0**30},
 }
-_WORDS = {  # {unit in words: as in names}
+_WORDS = {  # {spelled-out unit: unit suffix}
     **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
     **dict.fromkeys(("feet", "foot"), "ft"),
     **dict.fromkeys(("sec", "second", "seconds"), "s"),
@@ -69,7 +69,7 @@ class UnitName(NamedTuple):
 
     @classmethod
     def parse(cls, name: str) -> UnitName | None:
-        """Split a name, or return None if it does not end with a unit."""
+        """Split a name into its stem and unit, or return None if it does not end with a unit."""
         parts = name.lower().split("_")
         for count in (2, 1):  # m_s is a speed, not a time
             unit = "_".join(parts[-count:])
@@ -79,17 +79,17 @@ class UnitName(NamedTuple):
 
 
 def unit_of(name: str) -> str | None:
-    """Return the unit at the end of a name, or None."""
+    """Return the unit at the end of a name, or None if the name has no unit."""
     parsed = UnitName.parse(name)
     return None if parsed is None else parsed.unit
 
 
-def other_unit(name: str, candidates: Iterable[str]) -> str | None:
-    """Return the candidate that differs from a name in its unit only, or None.
+def find_other_unit(name: str, candidates: Iterable[str]) -> str | None:
+    """Return the candidate that differs from a name only in its unit, or None.
 
     Examples
     --------
-    >>> other_unit("visibility_m", ["rain_mm_h", "visibility_km"])
+    >>> find_other_unit("visibility_m", ["rain_mm_h", "visibility_km"])
     'visibility_km'
     """
     given = UnitName.parse(name)
@@ -109,9 +109,9 @@ def other_unit(name: str, candidates: Iterable[str]) -> str | None:
 
 
 def factor_between(name: str, candidate: str) -> float | None:
-    """Return the factor that converts the unit of a name to the unit of another name.
+    """Return the factor that converts from the unit of `name` to the unit of `candidate`.
 
-    Returns None unless both end with units of the same dimension and of different sizes.
+    Returns None unless both names end with units that have the same dimension and different sizes.
 
     Examples
     --------
@@ -125,21 +125,23 @@ def factor_between(name: str, candidate: str) -> float | None:
     return None if given.size == wanted.size else given.size / wanted.size
 
 
-def converted(value: Any, factor: float) -> Any:
-    """Return a number, or a list or mapping of numbers, times a factor; None for other values.
+def convert_value(value: Any, factor: float) -> Any:
+    """Multiply a number, or all numbers in a list or mapping, by a factor.
+
+    Returns None for values of other types.
 
     Examples
     --------
-    >>> converted([60, 1500], 0.001)
+    >>> convert_value([60, 1500], 0.001)
     [0.06, 1.5]
     """
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         number = float(f"{value * factor:.12g}")
         return int(number) if number.is_integer() and abs(number) < 1e15 else number
     if isinstance(value, (list, tuple)):
-        entries = [converted(entry, factor) for entry in value]
+        entries = [convert_value(entry, factor) for entry in value]
         return None if None in entries else entries
     if isinstance(value, dict):
-        changed = {key: converted(entry, factor) for key, entry in value.items()}
+        changed = {key: convert_value(entry, factor) for key, entry in value.items()}
         return None if None in changed.values() else changed
     return None

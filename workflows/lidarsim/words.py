@@ -1,4 +1,4 @@
-"""Words of messages."""
+"""Functions that format numbers, names and suggestions for messages."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ import re
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 
-from .unit_suffixes import factor_between, other_unit, unit_of
+from .unit_suffixes import factor_between, find_other_unit, unit_of
 
 
 def did_you_mean(word: str, candidates: Iterable[str]) -> str:
-    """Return " Did you mean 'x'?" for the most similar candidate, or empty.
+    """Suggest the candidate that is most similar to a misspelled word.
 
-    A candidate with another unit is most similar, and its unit is named.
+    The suggestion starts with a space, so that it can be appended to a sentence. It is empty if no
+    candidate is similar. A candidate that differs only in its unit takes precedence, and the
+    suggestion then states the correct unit.
 
     Examples
     --------
@@ -34,7 +36,9 @@ def did_you_mean(word: str, candidates: Iterable[str]) -> str:
 
 
 def did_you_mean_each(words: Sequence[str], candidates: Iterable[str]) -> str:
-    """Return `did_you_mean` of several words in a question, or empty.
+    """Suggest candidates for several misspelled words in a single question.
+
+    Like that of `did_you_mean`, the suggestion is empty if no candidate is similar.
 
     Examples
     --------
@@ -55,9 +59,9 @@ def did_you_mean_each(words: Sequence[str], candidates: Iterable[str]) -> str:
 
 
 def most_similar(word: str, candidates: Iterable[str]) -> str | None:
-    """Return the most similar candidate, or None if none is similar."""
+    """Return the candidate that is most similar to a word, or None if none is similar."""
     names = [*candidates]
-    if (same_quantity := other_unit(word, names)) is not None:
+    if (same_quantity := find_other_unit(word, names)) is not None:
         return same_quantity
     lower = {name.lower(): name for name in names}
     matches = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=0.6)
@@ -65,10 +69,10 @@ def most_similar(word: str, candidates: Iterable[str]) -> str | None:
 
 
 def name_hint(pattern: str, names: Sequence[str]) -> str:
-    """Return a sentence with the names that are similar to a name or pattern.
+    """Suggest the names that are similar to an unknown name or pattern.
 
-    Without similar names, the sentence lists the first names. Names that differ only in their last
-    number are listed as a pattern, with their number.
+    If no name is similar, the first available names are listed. More than two names that differ
+    only in a trailing number are listed as a pattern, followed by their count.
 
     Examples
     --------
@@ -101,7 +105,7 @@ def name_hint(pattern: str, names: Sequence[str]) -> str:
 
 
 _LAST_NUMBER = re.compile(r"[\s._-]*\d+$")
-# A setting in a note, and the calls of Python that take the settings of a section.
+# Notes contain settings such as <file.up_axis="z">. In Python, each section corresponds to a call.
 _SETTING = re.compile(r'<(file|scene|world|materials)\.(\w+)=("?)(\w+)\3>')
 _CALLS = {
     "file": "Scene.load(path",
@@ -111,27 +115,27 @@ _CALLS = {
 }
 
 
-def as_python(note: str) -> str:
-    """Return a note with its settings as in Python: Scene.load(path, up_axis="z")."""
+def format_as_python(note: str) -> str:
+    """Format the settings in a note as Python, for example `Scene.load(path, up_axis="z")`."""
     return _SETTING.sub(lambda m: f"{_CALLS[m[1]]}, {m[2]}={m[3]}{m[4]}{m[3]})", note)
 
 
-def as_scenario(note: str) -> str:
-    """Return a note with its settings as in a scenario or an actor: {file: …, up_axis: z}."""
+def format_as_scenario(note: str) -> str:
+    """Format the settings in a note as in a scenario, for example `{file: …, up_axis: z}`."""
     form = {"file": "{{file: …, {}: {}}}"}
     return _SETTING.sub(lambda m: form.get(m[1], f"{{}}: {{}} in {m[1]}").format(m[2], m[4]), note)
 
 
-_EXPONENT_FROM = 1e15  # numbers this large are mistakes, and have an exponent
+_EXPONENT_FROM = 1e15  # larger numbers are probably mistakes and keep their exponent
 
 
 def plural(number: float, noun: str, plural_noun: str = "") -> str:
-    """Return number and noun: «1 worker», «1,200 workers»."""
+    """Format a count with its noun, for example "1 worker" or "1,200 workers"."""
     return f"{number:,} {noun if number == 1 else plural_noun or noun + 's'}"
 
 
 def rounded(number: float, digits: int = 3) -> str:
-    """Return a number with some significant digits, large ones without an exponent.
+    """Format a number with `digits` significant digits, without an exponent if it is large.
 
     Examples
     --------
@@ -142,19 +146,22 @@ def rounded(number: float, digits: int = 3) -> str:
     return f"{float(text):,.0f}" if "e+" in text and abs(number) < _EXPONENT_FROM else text
 
 
-def scans_in_words(scans: int, sweeps: int) -> str:
-    """Return counts of scans and of sweeps: «36,000 scans (1,000 sweeps)»."""
+def format_scan_counts(scans: int, sweeps: int) -> str:
+    """Format scan and sweep counts, for example "36,000 scans (1,000 sweeps)"."""
     return f"{plural(scans, 'scan')} ({plural(sweeps, 'sweep')})"
 
 
-def natural(name: str) -> list[tuple[int, str]]:
-    """Return a sort key that puts GPU-2 before GPU-10."""
+def natural_sort_key(name: str) -> list[tuple[int, str]]:
+    """Return a natural sort key, which sorts GPU-2 before GPU-10."""
     pieces = re.split(r"(\d+)", name)
     return [(int(p), "") if p.isdecimal() else (-1, p) for p in pieces]
 
 
-def as_text(name: bytes) -> str:
-    """Decode a name in UTF-8, or in Latin-1 from old programs."""
+def decode_name(name: bytes) -> str:
+    """Decode a name as UTF-8, or as Latin-1 if it is not valid UTF-8.
+
+    Older programs write Latin-1.
+    """
     try:
         return name.decode("utf-8")
     except UnicodeDecodeError:
@@ -162,17 +169,22 @@ def as_text(name: bytes) -> str:
 
 
 def printable(text: str, max_letters: int = 200) -> str:
-    """Return text from a file in a line of limited length, without control characters."""
+    """Sanitize text from a file for printing.
+
+    The result is a single line of at most `max_letters` characters without control characters.
+    """
     cleaned = "".join(letter if letter.isprintable() else " " for letter in text)
     return " ".join(cleaned.split())[:max_letters]
 
 
-def fits(name: str, pattern: str) -> bool:
-    """Return whether a name is a pattern, or fits its * and ?, while brackets are plain letters.
+def matches_pattern(name: str, pattern: str) -> bool:
+    """Return whether a name matches a pattern with `*` and `?`.
+
+    Brackets in the pattern have no special meaning.
 
     Examples
     --------
-    >>> fits("vel_x [m/s]", "vel_x [m/s]"), fits("vel_x [m/s]", "vel_*")
+    >>> matches_pattern("vel_x [m/s]", "vel_x [m/s]"), matches_pattern("vel_x [m/s]", "vel_*")
     (True, True)
     """
     return name == pattern or fnmatchcase(name, pattern.replace("[", "[[]"))
@@ -182,31 +194,30 @@ _PLAIN_IN_YAML = re.compile(r"[A-Za-z_][\w./-]*(?: [\w./-]+)*")
 _WORDS_OF_YAML = {"null", "true", "false", "yes", "no", "on", "off", "y", "n"}
 
 
-def in_yaml(names: Iterable[str]) -> str:
-    """Return names from a file as a list in YAML, each in quotes if YAML needs them.
+def format_yaml_list(names: Iterable[str]) -> str:
+    """Format names from a file as a YAML list, with quotes where YAML requires them.
 
     Examples
     --------
-    >>> print(in_yaml(["fix", "vel_x [m/s]", "on"]))
+    >>> print(format_yaml_list(["fix", "vel_x [m/s]", "on"]))
     [fix, "vel_x [m/s]", "on"]
     """
     return f"[{', '.join(map(_scalar_in_yaml, names))}]"
 
 
 def _scalar_in_yaml(name: str) -> str:
-    """Return one text in YAML."""
     text = printable(name)
     if _PLAIN_IN_YAML.fullmatch(text) and text.lower() not in _WORDS_OF_YAML:
         return text
     return json.dumps(text, ensure_ascii=False)
 
 
-def distinct(names: Iterable[str]) -> list[str]:
-    """Return distinct names: a name that is there already gets a number.
+def make_distinct(names: Iterable[str]) -> list[str]:
+    """Make names distinct by appending a number to each name that occurs again.
 
     Examples
     --------
-    >>> distinct(["x", "ring", "ring", "ring"])
+    >>> make_distinct(["x", "ring", "ring", "ring"])
     ['x', 'ring', 'ring_2', 'ring_3']
     """
     unique: dict[str, None] = {}
@@ -220,31 +231,34 @@ def distinct(names: Iterable[str]) -> list[str]:
     return list(unique)
 
 
-def shortened(name: str, max_letters: int = 18) -> str:
-    """Shorten a name in its middle to `max_letters`, and show control characters."""
+def shorten_name(name: str, max_letters: int = 18) -> str:
+    """Shorten a name to `max_letters` characters by removing its middle.
+
+    Control characters are replaced by the Unicode replacement character.
+    """
     name = "".join(letter if letter.isprintable() else "\ufffd" for letter in name)
     tail = (max_letters - 1) // 2
     return name if len(name) <= max_letters else f"{name[: max_letters - 1 - tail]}…{name[-tail:]}"
 
 
-def without_common_prefix(names: Sequence[str]) -> list[str]:
-    """Remove the common first words of at least three names.
+def remove_common_prefix(names: Sequence[str]) -> list[str]:
+    """Remove the words that all names start with, if there are at least three names.
 
     Examples
     --------
-    >>> without_common_prefix(["site_a_Wall", "site_a_Floor", "site_a_Lamp_1"])
+    >>> remove_common_prefix(["site_a_Wall", "site_a_Floor", "site_a_Lamp_1"])
     ['Wall', 'Floor', 'Lamp_1']
     """
     if len(names) < 3:
         return list(names)
-    prefix = os.path.commonprefix(list(names))  # noqa: RUF071 - the prefix of letters
+    prefix = os.path.commonprefix(list(names))  # noqa: RUF071 - compares characters on purpose
     end = max(prefix.rfind(mark) for mark in "_./: -") + 1
     shorter = [name[end:] for name in names]
     return shorter if all(shorter) else list(names)
 
 
 def joined(names: Sequence[str]) -> str:
-    """Return names as an enumeration.
+    """Join names with commas and a final "and".
 
     Examples
     --------
@@ -255,7 +269,9 @@ def joined(names: Sequence[str]) -> str:
 
 
 def alternatives(names: Sequence[str]) -> str:
-    """Return alternatives as an enumeration. A quoted alternative may be an enumeration itself.
+    """Join alternatives with commas and a final "or".
+
+    A quoted alternative may itself be such an enumeration.
 
     Examples
     --------
@@ -268,7 +284,7 @@ def alternatives(names: Sequence[str]) -> str:
 
 
 def listed(names: Sequence[str], max_names: int = 3) -> str:
-    """Return the first names, and the number of further names.
+    """Join the first names and state how many more there are.
 
     Examples
     --------

@@ -1,9 +1,9 @@
 """Draw pictures and films of scenes and point clouds, and serve them as browser pages."""
 
-from lidarsim.environment.notebook import draw_with
+from lidarsim.environment.notebook import register_drawers
 
 # Notebooks show these objects with a picture. The drawing code is imported for the first picture.
-draw_with(
+register_drawers(
     {
         name: f"lidarview.cell_pictures:draw_{name.lower()}"
         for name in ("Cloud", "Scene", "Sensor", "StoredCloud", "Survey")

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.columns.table import CAUSES, TABLE, Column, value_names
-from lidarsim.io.archives import open_archive, packed
+from lidarsim.columns.table import CAUSES, TABLE, Column, names_by_value
+from lidarsim.io.archives import open_archive, pack_arrays
 from lidarsim.media.materials import MaterialTable
 from lidarsim.motion.trajectory import ALWAYS, Beyond, Track, presence_ns
 from lidarsim.numerics.arrays import AnyArray, Floats, Floats32, Ints32
@@ -22,7 +22,7 @@ from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.simplified import SimplifiedScene, cut_masks
 from lidarsim.survey.survey import Survey
-from lidarsim.sweeps.sweeps import numbered_places
+from lidarsim.sweeps.sweeps import number_positions
 from lidarsim.words import plural, rounded
 
 PICTURE_FILE = "pictures.npz"
@@ -59,7 +59,7 @@ class SensorPositions:
         """
         if self.moves or not len(self.positions):
             return []
-        numbers = numbered_places(self.positions)
+        numbers = number_positions(self.positions)
         if numbers.max() == 1:
             return [self.name] * len(self.positions)
         return [f"{self.name} {number}".strip() for number in numbers.tolist()]
@@ -151,7 +151,7 @@ class PictureContent:
             reflectance=materials.reflectance[kinds.first[:-1]],
             coordinates=survey.coordinates,
             triangles=scene.triangles,
-            classes=value_names(survey.classes),
+            classes=names_by_value(survey.classes),
             materials=scene.material_names,
             face_materials=drawn.scene.face_materials,
         )
@@ -235,7 +235,7 @@ class PictureContent:
         if self.scene.colors is not None:
             arrays["colors"] = self.scene.colors.mean_colors()
         arrays |= self._track_arrays() | self._mesh_arrays() | self._planning_arrays()
-        path.write_bytes(packed(arrays))
+        path.write_bytes(pack_arrays(arrays))
 
     def _track_arrays(self) -> dict[str, Any]:
         """Return the positions of sensors and the trajectories of actors as named arrays."""

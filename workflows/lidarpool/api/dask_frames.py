@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from lidarsim.columns.cloud import need_packages
+from lidarsim.columns.cloud import require_packages
 from lidarsim.schema.checks import check_type
 
 from ..columns.parts import StoredCloud, read_part
@@ -33,7 +33,7 @@ def to_dask(points: StoredCloud) -> Any:
         If pandas or pyarrow is not installed.
     """
     check_type("points", points, StoredCloud)
-    need_packages("pandas", "pyarrow")
+    require_packages("pandas", "pyarrow")
     import dask.dataframe as dd
 
     # The template omits the scene, which would be sent to all workers, and the list of parts.

@@ -12,9 +12,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import TYPE_CHECKING, Any
 
-from lidarsim.environment.notebook import PICTURE_SIZE, cell_display, image_of, table_of
+from lidarsim.environment.notebook import PICTURE_SIZE, cell_display, html_image, html_table
 from lidarsim.schema.checks import check_fits, check_list
-from lidarsim.words import plural, scans_in_words
+from lidarsim.words import format_scan_counts, plural
 
 from ..clouds.writing import save_cloud
 from ..run.run_result import RunResult
@@ -181,7 +181,7 @@ class Result(RunResult):
             "seconds": f"{self.seconds:.1f}",
             "folder": self.points.storage.url,
         }
-        return table_of([*self._summary(), *further.items()]) + self._images
+        return html_table([*self._summary(), *further.items()]) + self._images
 
     @cached_property
     def _images(self) -> str:
@@ -190,13 +190,13 @@ class Result(RunResult):
 
         with TemporaryDirectory(prefix="lidarpool-") as folder:
             drawn = self.pictures(folder, only=_NOTEBOOK_PICTURES, size=PICTURE_SIZE)
-            return "".join(image_of(compress_png(path.read_bytes()), path.stem) for path in drawn)
+            return "".join(html_image(compress_png(path.read_bytes()), path.stem) for path in drawn)
 
     def _summary(self) -> Iterator[tuple[str, str]]:
         """Yield labels and texts that summarize the result."""
         yield (
             "survey",
-            f"{scans_in_words(self.survey.scan_count, self.survey.sweep_count)}, "
+            f"{format_scan_counts(self.survey.scan_count, self.survey.sweep_count)}, "
             f"{self.rays:,} rays, {self.hit_count:,} hits, "
             f"{plural(len(self.objects), 'object')} in the scene ({self.backend}, "
             f"{self.survey_seconds:.1f} s)",

@@ -10,7 +10,7 @@ from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
 from lidarsim.scene.scene import Scene
 from lidarsim.schema.checks import check_number
-from lidarsim.schema.declared import declared
+from lidarsim.schema.declared import declared_values
 from lidarsim.simulator.casting.scene_caster import check_backend_here
 from lidarsim.survey.survey import Survey
 from lidarsim.words import did_you_mean
@@ -150,7 +150,7 @@ def simulate(
         check_backend_here(run_options.backend)
     with page_of(jobs, run_options.live) as page:
         result = cast_to_store(jobs, run_options, Screen(on_progress), page, on_frame)
-    return Result(**declared(result, RunResult))
+    return Result(**declared_values(result, RunResult))
 
 
 class Campaign(CampaignSpec):  # noqa: D101 - inherits the docstring

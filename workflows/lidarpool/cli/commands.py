@@ -21,7 +21,7 @@ from lidarsim.environment.interrupts import (
     INTERRUPTED,
     STOPPED,
     UNTOUCHED,
-    deferred_interrupts,
+    defer_interrupts,
     interrupt_on_signals,
 )
 from lidarsim.environment.plugins import find_plugin, plugins_of
@@ -139,7 +139,7 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
         if cluster is None and settings.get("scheduler") is None:
             start_fork_server()
         try:
-            with deferred_interrupts():  # an interrupted import cannot be repeated
+            with defer_interrupts():  # an interrupted import cannot be repeated
                 from ..run.cluster_file import ClusterFile
                 from ..run.options import RunOptions
                 from . import run_command  # noqa: F401

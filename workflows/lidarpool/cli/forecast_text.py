@@ -14,7 +14,7 @@ from distributed import Client
 
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
-from lidarsim.words import listed, plural, rounded, scans_in_words
+from lidarsim.words import format_scan_counts, listed, plural, rounded
 
 from ..identity.job_errors import summarize_errors
 from ..report.output import SurveyOutput
@@ -197,7 +197,7 @@ def _campaign_lines(campaign: CampaignSpec, figures: dict[str, Any]) -> Iterator
             points = f", about {job['estimate']['points']:,} points"
         yield (
             f"            {plural(job['objects'], 'object')}, "
-            f"{scans_in_words(job['scans'], job['sweeps'])}, {job['rays']:,} rays{points}"
+            f"{format_scan_counts(job['scans'], job['sweeps'])}, {job['rays']:,} rays{points}"
         )
     if figures["jobs"]:
         share = campaign.count / len(figures["jobs"])
@@ -207,7 +207,7 @@ def _campaign_lines(campaign: CampaignSpec, figures: dict[str, Any]) -> Iterator
         )
         points = sum((job["estimate"] or {"points": 0})["points"] for job in figures["jobs"])
         yield (
-            f"total       about {scans_in_words(scans, sweeps)}, {rays:,} rays and "
+            f"total       about {format_scan_counts(scans, sweeps)}, {rays:,} rays and "
             f"{round(share * points):,} points, estimated from "
             f"{plural(len(figures['jobs']), 'job')}"
         )
@@ -272,7 +272,7 @@ def _survey_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
     path = f"from {plural(figures['poses'], 'pose')}"
     if figures["drive"]:
         path = "along a trajectory"
-    scans = scans_in_words(figures["scans"], figures["sweeps"])
+    scans = format_scan_counts(figures["scans"], figures["sweeps"])
     yield f"survey      {scans} {path}, {figures['rays']:,} rays ({pattern})"
     performance = figures["performance"]
     of_sensors = (f"{name}: " * bool(name) + words for name, words in performance.items())

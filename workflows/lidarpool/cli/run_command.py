@@ -17,7 +17,7 @@ from lidarsim.columns.table import NO_SURFACE
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
 from lidarsim.simulator.casting.scene_caster import check_backend_here
-from lidarsim.words import plural, scans_in_words
+from lidarsim.words import format_scan_counts, plural
 
 from ..clouds.folder import local_result, output_destination, result_folder
 from ..datasets.dataset import DataSet
@@ -252,7 +252,7 @@ def _result_lines(
     yield from terminal.notes(report["notes"])
     hits_elsewhere = result.hit_count - report["hits_on_surfaces"]
     yield (
-        f"{scans_in_words(job.survey.scan_count, job.survey.sweep_count)}, "
+        f"{format_scan_counts(job.survey.scan_count, job.survey.sweep_count)}, "
         f"{plural(result.rays, 'ray')}, {plural(result.hit_count, 'hit')}"
         f"{f' ({hits_elsewhere:,} not on a surface)' if hits_elsewhere > 0 else ''}, "
         f"{plural(len(result.points), 'point')} in the cloud{_objects_with_points(report)}"

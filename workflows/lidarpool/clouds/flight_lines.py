@@ -160,7 +160,7 @@ class FlightLines:
         # digits beyond the precision.
         exact = np.rint(points.positions.astype(np.float64) / sweeps.precision_m)
         exact *= sweeps.precision_m
-        in_world = poses.outward(exact) if sweeps.coordinates == "sensor" else exact
+        in_world = poses.to_world(exact) if sweeps.coordinates == "sensor" else exact
         steps = np.zeros((3, 1)) if poses.steps is None else poses.steps
         ahead = _level(steps.T, sweeps.pose.rotations[sweep][:, 0])
         rays = in_world - poses.positions
@@ -177,7 +177,7 @@ class FlightLines:
         line = mirror.numbers(begin_ns + sweeps.since_ns(sweep, points))
         # A sensor that points backward sees the mirror move in the opposite direction.
         against = sweeps.pose.rotations[sweep][:, 0] @ self._directions[sweep] < 0
-        fields.direction[row_indices] = mirror.leftwards(line) == int(against)
+        fields.direction[row_indices] = mirror.runs_leftward(line) == int(against)
         fields.line[row_indices] = (sensor * sweeps.stations + station) * _LINES + line
 
     @cached_property

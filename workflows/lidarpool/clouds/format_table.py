@@ -15,7 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidarsim.environment.extras import need
+from lidarsim.environment.extras import require_package
 from lidarsim.environment.plugins import Plugin, PluginTable, plugins_of
 from lidarsim.errors import LidarError
 
@@ -68,7 +68,7 @@ class FormatRow:
         are installed.
         """
         for package in self.packages if reading else ():
-            need(package, self.extra, f"Reading {reading}")
+            require_package(package, self.extra, f"Reading {reading}")
         if self.plugin is not None:
             return self.plugin.load(type)
         module, _, name = self.location.partition(":")

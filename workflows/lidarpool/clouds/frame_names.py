@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lidarsim.packets.encoders import START_NS
-from lidarsim.sweeps.sweeps import Sweeps, plain_names
+from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
 
 WORLD = "map"
 VEHICLE = "base_link"
@@ -18,7 +18,7 @@ def frame_names(sensors: Sequence[str], actors: Sequence[str]) -> list[str]:
     The frames are in this order. The name of an unnamed sensor is an empty string.
     """
     named = (*(name or "lidar" for name in sensors), *actors)
-    return plain_names((WORLD, VEHICLE, *named, *INSTRUMENTS))[2:]
+    return make_identifiers((WORLD, VEHICLE, *named, *INSTRUMENTS))[2:]
 
 
 def points_topic(name: str, frame: str) -> str:

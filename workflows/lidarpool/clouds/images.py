@@ -17,12 +17,12 @@ from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.sweep import Sweep
 from lidarsim.environment.extras import reading
 from lidarsim.errors import LidarError
-from lidarsim.io.archives import open_archive, packed
+from lidarsim.io.archives import open_archive, pack_arrays
 from lidarsim.io.input_files import read_input
 from lidarsim.io.numbered_files import sort_by_number
 from lidarsim.numerics.arrays import AnyArray
-from lidarsim.sweeps.ray_image import Image, fired_of
-from lidarsim.sweeps.sweeps import Sweeps, plain_names
+from lidarsim.sweeps.ray_image import RayImage, require_fired_rays
+from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
 
 from .boxes import Boxes
 from .cloud_format import Entry, PointColumns
@@ -61,13 +61,13 @@ class ImageFolder(MultiFileFormat):
 
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         super().__init__(cloud, sweeps, entry)
-        fired_of(sweeps)
+        require_fired_rays(sweeps)
         self.folders = self._folders_of(sweeps, entry)
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], Boxes | None]:
         """Return the file of a sweep, and its boxes if there are actors."""
         sweeps = self.sweeps
-        image = Image.from_points(sweeps, number, points)
+        image = RayImage.from_points(sweeps, number, points)
         positions = sweeps.in_sensor(number, points.positions).astype(np.float32)
         columns = sweeps.columns_in_sensor(number, points)
         columns = {name: values for name, values in columns.items() if name not in _RAY_COLUMNS}
@@ -76,7 +76,7 @@ class ImageFolder(MultiFileFormat):
         arrays["pose"] = sweeps.pose.matrix(number)
         arrays["frame"] = np.array(sweeps.frame_text(compensated=sweeps.coordinates == "world"))
         for name, values in columns.items():
-            for plane, image_of_return in enumerate(image.filled(values)):
+            for plane, image_of_return in enumerate(image.to_images(values)):
                 if (key := _key(name, plane)) in arrays:
                     raise LidarError(
                         f"An image would contain two arrays named {key!r}. Rename one of the "
@@ -84,12 +84,12 @@ class ImageFolder(MultiFileFormat):
                     )
                 arrays[key] = image_of_return
         boxes = Boxes.from_points(sweeps, number, points) if sweeps.actors and self.entry else None
-        return {_file(sweeps, self.folders, number): packed(arrays)}, boxes
+        return {_file(sweeps, self.folders, number): pack_arrays(arrays)}, boxes
 
     @classmethod
     def _folders_of(cls, sweeps: Sweeps, entry: Entry | None) -> list[str]:
         """Return the folder of each sensor."""
-        names = plain_names(name or "lidar" for name in sweeps.sensors)
+        names = make_identifiers(name or "lidar" for name in sweeps.sensors)
         return names if entry is None else [f"{cls.path_of_job(entry)}/{name}" for name in names]
 
     @classmethod

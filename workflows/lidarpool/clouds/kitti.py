@@ -26,7 +26,7 @@ from lidarsim.motion.rotations import matrices
 from lidarsim.numerics.arrays import Floats, Floats32
 from lidarsim.scene.files.float_rows import columns_by_name, read_float_columns
 from lidarsim.scene.files.text_rows import RowReader
-from lidarsim.sweeps.sweeps import Sweeps, plain_names
+from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
 
 from .boxes import Boxes
 from .cloud_format import Entry, PointColumns
@@ -205,7 +205,7 @@ def _names(sweeps: Sweeps, entry: Entry | None) -> list[str]:
     if entry is None:
         return [f"{sensor:02}" for sensor in range(len(sweeps.sensors))]
     first = f"{entry.number:02}"
-    names = plain_names(name or "lidar" for name in sweeps.sensors)[1:]
+    names = make_identifiers(name or "lidar" for name in sweeps.sensors)[1:]
     return [first, *(f"{first}_{name}" for name in names)]
 
 
@@ -241,7 +241,7 @@ def _labels(
     """
     rotation = camera @ matrices(sweeps.pose.quaternions[sweep, None])[0].T
     forward = (rotation @ matrices(boxes.quaternions))[:, :, 0]  # headings of the actors
-    positions = sweeps.pose.inward(sweep, boxes.centers) @ camera.T
+    positions = sweeps.pose.to_body_frame(sweep, boxes.centers) @ camera.T
     positions[:, 1] += boxes.sizes[:, 2] / 2
     rotation_y = np.arctan2(-forward[:, 2], forward[:, 0])
     alpha = rotation_y - np.arctan2(positions[:, 0], positions[:, 2])

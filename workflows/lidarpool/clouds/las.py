@@ -23,7 +23,7 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import COLORS, NORMAL, TABLE, Column
 from lidarsim.columns.waveforms import WAVEFORM, ZERO, records
 from lidarsim.environment.extras import reading
-from lidarsim.environment.interrupts import deferred_interrupts
+from lidarsim.environment.interrupts import defer_interrupts
 from lidarsim.errors import CutShortError, LidarError
 from lidarsim.numerics.arrays import Floats, Floats32
 from lidarsim.sweeps.sweeps import AS_FIRED, IN_WORLD, Sweeps
@@ -137,9 +137,9 @@ class LAS(CloudFormat):
                         points.point_source_id = lines.source
                         if packets is not None:
                             packets.put(points, chunk, packet_file)
-                        with deferred_interrupts():  # lazrs replaces errors raised within it
+                        with defer_interrupts():  # lazrs replaces errors raised within it
                             writer.write_points(points)
-                    with deferred_interrupts():
+                    with defer_interrupts():
                         writer.close()
                 if packets is not None:
                     packets.append(file, packet_file)
@@ -361,7 +361,7 @@ def _open_las(source: RecordingSource) -> Recording:
         length = min(max_points // _SAMPLE_RUNS, count // _SAMPLE_RUNS)
         starts = np.linspace(0, count - length, _SAMPLE_RUNS) // _LAZ_CHUNK * _LAZ_CHUNK
         with open_las(path) as reader:
-            return Sweep.joined([read_run(reader, int(start), length) for start in starts])
+            return Sweep.concatenate([read_run(reader, int(start), length) for start in starts])
 
     parts = -(-count // CHUNK_POINTS)
     return source.recording(

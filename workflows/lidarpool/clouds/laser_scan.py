@@ -10,7 +10,7 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.numerics.arrays import Floats, Floats32
 from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import Survey
-from lidarsim.sweeps.ray_image import Image
+from lidarsim.sweeps.ray_image import RayImage
 from lidarsim.sweeps.sweeps import Sweeps
 
 COLUMNS = "ray", "range"  # columns that a LaserScan requires, in addition to all returns
@@ -65,7 +65,7 @@ class ScanRays:
         sensor = fired.sensors[sweeps.sensor[sweep]]
         if not is_planar(sensor):
             return None
-        image = Image.from_points(sweeps, sweep, points)
+        image = RayImage.from_points(sweeps, sweep, points)
         x, y, _ = sensor.directions(image.firings)[:, 0].T
         angles = np.unwrap(np.arctan2(y, x))
         steps = np.diff(angles)
@@ -74,11 +74,11 @@ class ScanRays:
         begins_ns = sensor.begins_ns(image.firings)
         time_increment_s = float(begins_ns[-1] - begins_ns[0]) / len(steps) / 1e9
         rate_hz = getattr(sensor.head, "rate_hz", None)
-        ranges = image.filled(points["range"].astype(np.float32))[0, 0]
+        ranges = image.to_images(points["range"].astype(np.float32))[0, 0]
         intensity = points.columns.get("intensity", points.columns.get("signal"))
         intensities = np.zeros(len(ranges), np.float32)
         if intensity is not None:
-            intensities = np.nan_to_num(image.filled(intensity.astype(np.float32))[0, 0])
+            intensities = np.nan_to_num(image.to_images(intensity.astype(np.float32))[0, 0])
         return cls(
             angles,
             time_increment_s,

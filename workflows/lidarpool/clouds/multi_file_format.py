@@ -165,7 +165,7 @@ class RangeWriter:
             output = load_format(self.format)(self.cloud, self.sweeps)
         except ImportError:
             return None
-        if not self.storage.sees(_MARK, self._mark):
+        if not self.storage.has_content(_MARK, self._mark):
             return None
         assert isinstance(output, MultiFileFormat)
         output.compensated = self.compensated

@@ -25,7 +25,7 @@ from lidarsim.motion.rotations import matrices
 from lidarsim.numerics.arrays import Bools, Bytes, Floats, Ints
 from lidarsim.scene.files.float_rows import NUSCENES, read_float_columns
 from lidarsim.scene.transform import affine
-from lidarsim.sweeps.sweeps import Sweeps, plain_names
+from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
 
 from ..identity.fingerprint import fingerprint
 from .boxes import Boxes
@@ -242,7 +242,7 @@ class NuScenes(MultiFileFormat):
 
 def _channels(sweeps: Sweeps) -> list[str]:
     """Return the nuScenes channel name of each sensor."""
-    return plain_names([FIRST_SENSOR, *(name or FIRST_SENSOR for name in sweeps.sensors[1:])])
+    return make_identifiers([FIRST_SENSOR, *(name or FIRST_SENSOR for name in sweeps.sensors[1:])])
 
 
 def _samples(sweeps: Sweeps) -> tuple[Ints, Bools]:

@@ -21,7 +21,7 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.motion.rotations import matrices
 from lidarsim.numerics.arrays import AnyArray, Floats, Ints
 from lidarsim.numerics.elementary import arctan2
-from lidarsim.sweeps.sweeps import Sweeps, plain_names
+from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
 
 from .boxes import Boxes, SweepBoxes
 from .cloud_format import CloudFormat
@@ -109,7 +109,7 @@ class OSIInMCAP(OSI):
 
 def _names(sweeps: Sweeps) -> list[str]:
     """Return unique names of the sensors for topics, or empty strings if no sensor has a name."""
-    return plain_names(sweeps.sensors) if any(sweeps.sensors) else ["" for _ in sweeps.sensors]
+    return make_identifiers(sweeps.sensors) if any(sweeps.sensors) else ["" for _ in sweeps.sensors]
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ class _OSIMessages:
         """Return the host vehicle and the actors in world coordinates at the start of a sweep."""
         osi = self._osi
         sweeps = self._sweeps
-        carrier = sweeps.carrier
+        carrier = sweeps.platform
         zero = np.zeros(3)
         attributes = osi.MovingObject.VehicleAttributes(bbcenter_to_rear=_vector(osi, zero))
         host = osi.MovingObject(

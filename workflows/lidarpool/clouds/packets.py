@@ -12,7 +12,7 @@ from lidarsim.packets.encoders import WHITE, PacketSource, decoder_of, encoder_o
 from lidarsim.packets.pcap import PcapWriter
 from lidarsim.packets.shots import Shots, check_columns
 from lidarsim.survey.survey import Survey
-from lidarsim.sweeps.sweeps import plain_names
+from lidarsim.sweeps.sweeps import make_identifiers
 
 from .cloud_format import CloudFormat
 from .recording import Recording, RecordingSource, sweep_from_columns
@@ -57,7 +57,7 @@ class PacketCapture(CloudFormat):
         for encoder in encoders:
             check_columns(cloud_columns, encoder.columns)
         path.mkdir()
-        names = plain_names(name or "lidar" for name in self.sweeps.sensors)
+        names = make_identifiers(name or "lidar" for name in self.sweeps.sensors)
         with ExitStack() as stack:
             writers = [
                 PcapWriter(

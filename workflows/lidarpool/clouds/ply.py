@@ -14,7 +14,7 @@ import numpy as np
 
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
-from lidarsim.columns.ply_format import AXES, as_file_type, header, layout, mapped_rows, row_type
+from lidarsim.columns.ply_format import AXES, as_file_type, header, layout, map_rows, row_type
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import AXES as POSITION
 from lidarsim.columns.table import NORMAL, TABLE, Column, check_names
@@ -307,7 +307,7 @@ def read_cloud(path: str | Path) -> Cloud:
         If the file is missing, truncated, or not a binary PLY file with x, y and z.
     """
     path = Path(path)
-    rows = np.array(mapped_rows(path))
+    rows = np.array(map_rows(path))
     positions = np.stack([rows[axis] for axis in "xyz"], axis=1)
     names = {column.in_files: column.name for column in TABLE.values()}
     columns = {names.get(name, name): rows[name] for name in rows.dtype.names or ()}

@@ -20,7 +20,7 @@ def _scatter(values, fields):
 
 @noinline
 def _round_positions(cells, scale, origin, positions):
-    """Compute the positions of cells, rounded in the same way as by `part_columns.positions_of`.
+    """Compute the positions of cells, rounded in the same way as by `part_columns.cell_positions`.
 
     This is separate from `_scatter`, so that the compiler can vectorize the loop.
     """

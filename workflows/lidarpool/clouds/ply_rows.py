@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarsim.columns.part_columns import decimals_of
+from lidarsim.columns.part_columns import position_decimals
 from lidarsim.columns.ply_format import as_file_type
 from lidarsim.columns.table import AXES, Column
 from lidarsim.numerics.arrays import AnyArray, Floats, Ints32
@@ -89,7 +89,7 @@ class PlyRowEncoder:
             memory.data.view(np.uint64),
             memory.data.view(np.int32),
         )
-        factor = float(10 ** decimals_of(precision_m))
+        factor = float(10 ** position_decimals(precision_m))
         self._scale = Scale(float(precision_m), np.array(origin, np.float64), factor)
         self._rows = np.zeros(memory.max_rows, row)
         self._fields = [self._fields_of(np.dtype(f"u{size}")) for size in _SIZES]

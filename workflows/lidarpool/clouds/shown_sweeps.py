@@ -203,7 +203,7 @@ class SweepSequence:
     def _transforms(self, sweep: int) -> list[FramePose]:
         """Return the poses of the vehicle, its sensors and the actors that are in the scene."""
         sweeps = self.sweeps
-        carrier = sweeps.carrier
+        carrier = sweeps.platform
         frames = [
             FramePose(WORLD, VEHICLE, carrier.positions[sweep], carrier.quaternions[sweep]),
             *self._mounts,

@@ -40,7 +40,7 @@ class TextFormats(CloudFormat):
             scans = read_scans(source.path)
             # Clouds without points have no columns.
             scans = [scan for scan in scans if len(scan)] or scans
-            sweep = Sweep.joined(scans, only_shared=True)
+            sweep = Sweep.concatenate(scans, only_shared=True)
             if source.unit is None and scans[0].units_m is not None:
                 sweep = sweep.replace(points=sweep.points * scans[0].units_m)
             return sweep

@@ -16,12 +16,12 @@ from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.sweep import Sweep
 from lidarsim.environment.extras import reading
 from lidarsim.errors import LidarError
-from lidarsim.io.archives import open_archive, packed, read_npy
+from lidarsim.io.archives import open_archive, pack_arrays, read_npy
 from lidarsim.io.input_files import input_size
 from lidarsim.io.numbered_files import sort_by_number
 from lidarsim.io.storage import Storage
 from lidarsim.numerics.arrays import AnyArray, Ints
-from lidarsim.sweeps.sweeps import Sweeps, plain_names
+from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
 
 from .boxes import Boxes, SweepBoxes
 from .cloud_format import Entry, PointColumns
@@ -64,7 +64,7 @@ class WebDataset(MultiFileFormat):
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         super().__init__(cloud, sweeps, entry)
         self.folders = ["shards"]
-        self.names = plain_names(name or "lidar" for name in sweeps.sensors)
+        self.names = make_identifiers(name or "lidar" for name in sweeps.sensors)
         self.offsets = np.zeros((len(sweeps), 3), np.int64)
         if clash := [column.name for column in cloud.table if column.name in _RESERVED]:
             raise LidarError(
@@ -110,7 +110,7 @@ class WebDataset(MultiFileFormat):
         """Return the offset file of a job in a data set."""
         if self.entry is None:
             return {}
-        return {f"offsets/{self.entry.name}.npz": packed({"at": self.offsets})}
+        return {f"offsets/{self.entry.name}.npz": pack_arrays({"at": self.offsets})}
 
     def _put(self, storage: Storage, start: int, tar: io.BytesIO) -> None:
         # A tar file ends with at least two empty blocks, and is padded to a full record.

@@ -19,7 +19,7 @@ import numpy as np
 
 from lidarsim.columns.table import SCAN, Column
 from lidarsim.errors import LidarError
-from lidarsim.io.archives import StoredArray, stored_arrays
+from lidarsim.io.archives import StoredArray, locate_arrays
 from lidarsim.io.checksum import crc32
 from lidarsim.io.input_files import open_input
 from lidarsim.io.storage import Storage
@@ -127,7 +127,7 @@ class _OpenPart:
         self._file = file
         self._memory = memory
         try:
-            arrays = stored_arrays(file)
+            arrays = locate_arrays(file)
             self._arrays = {name: arrays[name] for name in memory.starts if name != SCAN.name}
         except Exception as error:  # zipfile and NumPy raise many types of errors
             raise LidarError(f"it is damaged ({error})") from error

@@ -28,13 +28,13 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudDisplay
-from lidarsim.columns.part_columns import PartColumns, positions_of
+from lidarsim.columns.part_columns import PartColumns, cell_positions
 from lidarsim.columns.table import AXES, SCAN, Column
 from lidarsim.columns.waveforms import WAVEFORM
 from lidarsim.errors import LidarError
-from lidarsim.io.archives import Piece, read_arrays, read_npy, stored_pieces
+from lidarsim.io.archives import Piece, archive_pieces, read_arrays, read_npy
 from lidarsim.io.input_files import open_input
-from lidarsim.io.storage import Storage, target_of
+from lidarsim.io.storage import Storage, final_name
 from lidarsim.numerics.arrays import AnyArray, Floats, Integers, Ints, Ints32
 from lidarsim.numerics.even_samples import even_indices
 
@@ -88,7 +88,7 @@ def deletable_files(storage: Storage, mark: str | None) -> list[str]:
     names = [*storage.sizes()]
     marks = {_mark_of(name) for name in names if name.endswith("-mark")} - {""}
     marks &= marks if mark is None else {mark}
-    names_with_mark = [name for name in names if _mark_of(target_of(name)) in marks]
+    names_with_mark = [name for name in names if _mark_of(final_name(name)) in marks]
     return sorted(names_with_mark, key=lambda name: name.endswith("-mark"))
 
 
@@ -103,7 +103,7 @@ def pack(part: PartColumns) -> list[Piece]:
 
     Encoding is deterministic. The pieces are views of the columns, which are not copied.
     """
-    return stored_pieces(
+    return archive_pieces(
         {
             ".scans": np.array([part.first, part.stop], np.int64),
             ".counts": part.counts,
@@ -228,7 +228,7 @@ class StoredCloud(CloudDisplay):
         """Minimum and maximum coordinates in meters, or zeros if empty. Shape (2, 3)."""
         if self.cells is None:
             return np.zeros((2, 3))
-        return positions_of(self.cells, self.precision_m, self.origin)
+        return cell_positions(self.cells, self.precision_m, self.origin)
 
     @property
     def table(self) -> tuple[Column, ...]:
@@ -248,7 +248,7 @@ class StoredCloud(CloudDisplay):
     def positions_of(self, columns: Mapping[str, AnyArray]) -> Iterator[tuple[str, Floats]]:
         """Yield the name of each axis and the world coordinates along that axis, in meters."""
         for i, axis in enumerate(AXES):
-            yield axis.name, positions_of(columns[axis.name], self.precision_m, self.origin[i])
+            yield axis.name, cell_positions(columns[axis.name], self.precision_m, self.origin[i])
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
         """Yield the points in order, starting at row `first`, in chunks of `points` points.
@@ -266,7 +266,7 @@ class StoredCloud(CloudDisplay):
             self.report(len(cloud))
             while count + len(cloud) >= points:
                 cut = points - count
-                yield Cloud.joined([*pending, cloud[:cut]])
+                yield Cloud.concatenate([*pending, cloud[:cut]])
                 cloud = cloud[cut:]
                 pending = []
                 count = 0
@@ -274,7 +274,7 @@ class StoredCloud(CloudDisplay):
                 pending.append(cloud)
                 count += len(cloud)
         if pending:
-            yield Cloud.joined(pending)
+            yield Cloud.concatenate(pending)
 
     def row_of(self, scan: int) -> int:
         """Return the row of the first point of a scan."""
@@ -297,13 +297,13 @@ class StoredCloud(CloudDisplay):
             inside = picked[(picked >= start) & (picked < start + self.rows[i])] - start
             start += self.rows[i]
             clouds.append(self.cloud_of(read_part(self.storage, self.names[i]), inside))
-        return Cloud.joined(clouds) if clouds else self.load()
+        return Cloud.concatenate(clouds) if clouds else self.load()
 
     def load(self) -> Cloud:
         """Read the whole cloud into memory."""
         parts = list(self.chunks())
         if parts:
-            return Cloud.joined(parts)
+            return Cloud.concatenate(parts)
         columns_of_parts = (column for column in self.columns if column not in AXES)
         columns = {column.name: np.zeros(0, column.dtype) for column in (SCAN, *columns_of_parts)}
         return Cloud(np.zeros((0, 3)), columns, self.table, self.sweeps)

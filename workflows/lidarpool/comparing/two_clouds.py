@@ -284,12 +284,12 @@ class _Comparing:
                 part = part.select(even_indices(len(part), round(share * len(part))))
             parts.append(part)
         if share == 1 or not parts:
-            return Sweep.joined(parts)
+            return Sweep.concatenate(parts)
         self.note(
             f"{100 * share:.3g} % of the {count:,} points in {recording.name} are compared, "
             "sampled evenly. Distances to this cloud are therefore overestimated"
         )
-        return Sweep.joined(parts)
+        return Sweep.concatenate(parts)
 
     def add_sweeps(self, numbers: tuple[int, int], a: Sweep, b: Sweep, budget: int) -> None:
         """Compare two sweeps in the sensor frame.

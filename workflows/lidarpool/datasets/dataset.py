@@ -23,7 +23,7 @@ import numpy as np
 from lidarsim._version import __version__
 from lidarsim.columns.cloud import CloudLike
 from lidarsim.errors import LidarError, explained
-from lidarsim.io.archives import packed
+from lidarsim.io.archives import pack_arrays
 from lidarsim.io.named_files import leads_outside
 from lidarsim.io.storage import Storage
 from lidarsim.schema.checks import check_fields
@@ -215,7 +215,7 @@ class DataSet:
                     storage.files[path] = Storage(str(folder)).checksum(path)
                     if not storage.is_local:
                         storage.put(folder / path, path)
-            files = {job_file(self.format, name, SWEEPS_FILE): sweeps.packed()}
+            files = {job_file(self.format, name, SWEEPS_FILE): sweeps.to_bytes()}
             if sweeps.actors:
                 boxes = boxes or [
                     Boxes.from_points(sweeps, sweep, points)
@@ -376,7 +376,7 @@ class DataSet:
                     return row, source.path(manifest_name)
                 with suppress(FileNotFoundError):
                     self.storage.prepare(Path(file).parent)
-                    self.storage.take(source, file, file)
+                    self.storage.copy_from(source, file, file)
                     if file == manifest_name or self.storage.checksum(file) == checksum:
                         continue
                     self.storage.remove([file])
@@ -468,7 +468,7 @@ def _write_pieces(output: MultiFileFormat, storage: Storage) -> list[Any]:
 def _packed(boxes: Sequence[Boxes]) -> bytes:
     """Encode the boxes of all sweeps as a NumPy archive with one array per field."""
     # The sizes of the boxes are stored with the sweeps.
-    return packed(
+    return pack_arrays(
         {
             "centers": np.stack([boxes_of_sweep.centers for boxes_of_sweep in boxes]),
             "quaternions": np.stack([boxes_of_sweep.quaternions for boxes_of_sweep in boxes]),

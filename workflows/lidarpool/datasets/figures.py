@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints
-from lidarsim.words import shortened, without_common_prefix
+from lidarsim.words import remove_common_prefix, shorten_name
 
 from .job_table import JobRow
 
@@ -106,7 +106,7 @@ class VariedQuantity:
     @cached_property
     def short_labels(self) -> list[str]:
         """Labels without their common prefix, truncated to 15 characters."""
-        return [shortened(label, 15) for label in without_common_prefix(self.labels)]
+        return [shorten_name(label, 15) for label in remove_common_prefix(self.labels)]
 
     def needs_slanted_labels(self, width: float) -> bool:
         """Return True if the labels are too long to be horizontal on an axis of `width` pixels."""

@@ -9,7 +9,7 @@ from threading import Lock
 from typing import Any
 
 from lidarsim.environment.extras import install_command
-from lidarsim.environment.interrupts import deferred_interrupts
+from lidarsim.environment.interrupts import defer_interrupts
 from lidarsim.errors import LidarError
 
 _LOCK = Lock()  # keeps other threads from finding the temporary package
@@ -29,7 +29,7 @@ def load_open3d() -> Any:
         If Open3D is not installed, or if a system library that it requires is missing.
     """
     # An extension module whose import was interrupted cannot be imported again.
-    with deferred_interrupts(), _LOCK:
+    with defer_interrupts(), _LOCK:
         try:
             return _import_extension("open3d.pybind")
         except (ImportError, OSError) as error:

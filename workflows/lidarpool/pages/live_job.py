@@ -121,7 +121,7 @@ class LiveJob:
                     clouds.append(self._points.cloud_of(part, rows))
             if not names:
                 return
-            cloud = Cloud.joined(clouds)
+            cloud = Cloud.concatenate(clouds)
             while len(cloud) > self._max_points:
                 self._share /= 2
                 cloud = cloud[self._random.random(len(cloud)) < 0.5]

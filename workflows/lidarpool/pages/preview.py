@@ -79,7 +79,7 @@ def job_preview(job: Job, note: str, title: str) -> View:
     """Simulate the first sweeps of a job, and return their view."""
     planning = planning_picture(job.planning)
     content, _ = PictureContent.before_casting(job.scene, job.survey, planning)
-    cloud = Cloud.joined([*first_sweeps(job)])
+    cloud = Cloud.concatenate([*first_sweeps(job)])
     if not job.scene.material_names:
         columns = {name: values for name, values in cloud.columns.items() if name != MATERIAL.name}
         cloud = replace(cloud, columns=columns)

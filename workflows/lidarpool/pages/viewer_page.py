@@ -165,7 +165,7 @@ class SweepReader:
             ]
         clouds = [self._read(part.name) for part in sorted(parts, key=lambda part: part.first)]
         selected = [cloud[(start <= cloud["scan"]) & (cloud["scan"] < stop)] for cloud in clouds]
-        return self.sequence.show(sweep, Cloud.joined(selected))
+        return self.sequence.show(sweep, Cloud.concatenate(selected))
 
     def _read(self, name: str) -> Cloud:
         """Return the points of a part.

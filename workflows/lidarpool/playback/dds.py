@@ -22,7 +22,7 @@ from rosbags.interfaces import Nodetype
 
 from lidarsim.environment.ports import port_number
 from lidarsim.errors import LidarError
-from lidarsim.words import joined, shortened
+from lidarsim.words import joined, shorten_name
 
 from ..clouds.ros.messages import LATCHED_TOPICS, RosMessage, message_store
 
@@ -93,7 +93,7 @@ class Network:
         domain = port_number(text)
         if domain is None or domain > _MAX_DOMAIN:
             raise LidarError(
-                f"{DOMAIN_VARIABLE} is {shortened(text)!r}; it must be a number from 0 to "
+                f"{DOMAIN_VARIABLE} is {shorten_name(text)!r}; it must be a number from 0 to "
                 f"{_MAX_DOMAIN}."
             )
         return cls(interfaces.pop(), peers, domain)

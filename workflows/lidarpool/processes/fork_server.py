@@ -14,7 +14,7 @@ import sys
 from multiprocessing import forkserver
 from typing import Any
 
-from lidarsim.environment.interrupts import children_spared
+from lidarsim.environment.interrupts import block_child_signals
 
 # Numerical libraries are limited to one thread, because workers share the cores and threads do not
 # survive a fork.
@@ -39,7 +39,7 @@ def start_fork_server() -> bool:
     )
     os.environ.update(_ENVIRONMENT)
     try:
-        with children_spared():
+        with block_child_signals():
             server.ensure_running()
     finally:
         server.set_forkserver_preload(preload)

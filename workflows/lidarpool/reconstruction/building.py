@@ -20,7 +20,7 @@ from lidarscenes.writers.scene_file import write_scene
 from lidarsim._version import __version__
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.sweep import Sweep
-from lidarsim.environment.extras import need
+from lidarsim.environment.extras import require_package
 from lidarsim.errors import LidarError, explained
 from lidarsim.motion.rotations import quaternions_of
 from lidarsim.numerics.arrays import Floats, Ints
@@ -291,7 +291,7 @@ def twin(
         different twin.
     """
     check_number("voxel_m", voxel_m, gt=0, le=10)
-    need("scipy", "twin", "Reconstructing a recording")
+    require_package("scipy", "twin", "Reconstructing a recording")
     base = None if model is None else read_model(model)  # before the recording, which takes long
     if isinstance(recording, (str, Path)):
         recorded = RecordedSweeps.open(Path(recording), sensor, intensity)

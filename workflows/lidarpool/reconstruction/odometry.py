@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.environment.extras import need, reading
+from lidarsim.environment.extras import reading, require_package
 from lidarsim.errors import LidarError
 from lidarsim.motion.trajectory_files import load_trajectory, read_kitti_poses
 from lidarsim.numerics.arrays import Floats
@@ -198,7 +198,7 @@ def _register_sweeps(sweeps: RecordedSweeps) -> Floats:
     same way, and compensation with an estimated motion makes the estimates oscillate. Registration
     uses one thread, because multithreading changes the results.
     """
-    need("small_gicp", "twin", "Registering sweeps without poses")
+    require_package("small_gicp", "twin", "Registering sweeps without poses")
     import small_gicp
 
     # The first sweeps may be empty or incomplete.

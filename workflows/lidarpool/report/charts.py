@@ -11,10 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from lidarsim.columns.sweep import Sweep
-from lidarsim.columns.table import TABLE, Z, value_names
+from lidarsim.columns.table import TABLE, Z, names_by_value
 from lidarsim.numerics.arrays import Bools, Floats, Indices
 from lidarsim.numerics.even_samples import even_indices
-from lidarsim.words import plural, rounded, shortened
+from lidarsim.words import plural, rounded, shorten_name
 from lidarview.render import theme
 from lidarview.render.coloring import make_coloring
 from lidarview.render.picture_page import FONT, Page, label_logarithms
@@ -131,7 +131,7 @@ class _Layout(NamedTuple):
                 axes.yaxis.set_label_coords(-78 / self.width, 0.5)
         upper.tick_params(which="both", labelbottom=False, bottom=False)
         lower.tick_params(labelleft=is_first)
-        name = shortened(scale.name, int(self.width / 13.8))
+        name = shorten_name(scale.name, int(self.width / 13.8))
         page.heading(upper, name, weight="bold", pad=4 * page.unit)
 
 
@@ -152,7 +152,7 @@ def _remarks(figures: DataSetStatistics, informative: VariedQuantity | None, hid
     """Return a sentence about the colors, failed jobs, and omitted dots and quantities."""
     remarks = []
     if informative is not None:
-        remarks.append(f"colored by {shortened(informative.name, 40)}")
+        remarks.append(f"colored by {shorten_name(informative.name, 40)}")
     if failed := int(figures.failures.sum()):
         remarks.append(f"red: {plural(failed, 'failed job')}")
     if figures.done > MAX_DOTS:
@@ -419,7 +419,7 @@ def draw_sweep(sweep: Sweep, names: Mapping[int, str]) -> Page:
     classes = None if sweep.classes is None else sweep.classes[rows]
     known = [(name, value) for name, value in sweep.values.items() if value is not None]
     values = [
-        f"{name} {rounded(value, 4) if isinstance(value, float) else shortened(str(value))}"
+        f"{name} {rounded(value, 4) if isinstance(value, float) else shorten_name(str(value))}"
         for name, value in known[:MAX_VALUES]
     ]
     page.title(
@@ -428,7 +428,7 @@ def draw_sweep(sweep: Sweep, names: Mapping[int, str]) -> Page:
         ", ".join(values),
     )
     if classes is not None and len(np.unique(classes)) > 1:
-        coloring = make_coloring(classes, TABLE["class"], value_names({0: "none", **names}))
+        coloring = make_coloring(classes, TABLE["class"], names_by_value({0: "none", **names}))
         page.legend(coloring.labels, "sensor")
         painted = coloring.paint(classes)
     else:

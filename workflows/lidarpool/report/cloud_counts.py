@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.columns.part_columns import positions_of
+from lidarsim.columns.part_columns import cell_positions
 from lidarsim.columns.table import Column
 from lidarsim.numerics.arrays import AnyArray, Floats, Ints, Ints32
 
@@ -127,7 +127,7 @@ class CloudCounts:
         """Minimum and maximum world coordinates in meters, or zeros if empty. Shape (2, 3)."""
         if self._squares.box is None:
             return np.zeros((2, 3))
-        return positions_of(self._squares.box, self._precision_m, self._origin)
+        return cell_positions(self._squares.box, self._precision_m, self._origin)
 
     @property
     def above(self) -> Ints:
@@ -145,7 +145,7 @@ class CloudCounts:
     @property
     def corner(self) -> Floats:
         """World position of the southwest corner of `above` in meters. Shape (2,)."""
-        return positions_of(self._pixels.lowest, self._precision_m, self._origin[:2])
+        return cell_positions(self._pixels.lowest, self._precision_m, self._origin[:2])
 
     @property
     def _pixels(self) -> GridCounts:

@@ -545,7 +545,7 @@ def _copy_points(
             explained(f"{source.path(part_file.name)} cannot be copied"),
             suppress(FileNotFoundError),
         ):
-            store.storage.take(source, part_file.name, name)
+            store.storage.copy_from(source, part_file.name, name)
             receipt = only.receipt(name)
             if receipt and replace(receipt, name=part_file.name, summaries=b"") == part_file:
                 return receipt

@@ -16,7 +16,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from lidarsim.columns.table import optional_columns
-from lidarsim.environment.interrupts import deferred_interrupts
+from lidarsim.environment.interrupts import defer_interrupts
 from lidarsim.errors import LidarError, explained
 from lidarsim.io.storage import Storage, flush
 from lidarsim.io.writing_progress import WritingProgress
@@ -331,7 +331,7 @@ class SurveyOutput:
                 if not sent:
                     _remove_earlier(target, further, earlier)
                 _upload(staged, target, further)
-                with deferred_interrupts():
+                with defer_interrupts():
                     on_written()
             else:
                 _move_into_place(staged, folder, report["files"], earlier, on_written)
@@ -494,7 +494,7 @@ def _move_into_place(
     """
     for name in files:  # `on_written` removes the parts, the only other copy of the points
         flush(staged / name)
-    with deferred_interrupts():
+    with defer_interrupts():
         _remove_earlier(Storage.at(folder), files, earlier)
         for name in (*_known_optional_files(files), *FILES):
             if name in files:

@@ -18,7 +18,7 @@ from lidarsim.columns.table import NO_SURFACE
 from lidarsim.io.storage import Storage
 from lidarsim.media.weather import Weather
 from lidarsim.scene.scene import Scene
-from lidarsim.schema.declared import declared
+from lidarsim.schema.declared import declared_values
 from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import CloudOptions, Survey
 
@@ -130,7 +130,7 @@ def summarize_report(folder: Path | Storage, report: dict[str, Any]) -> dict[str
 
 def _describe_parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
     """Describe the scene, the sensors and the options of a survey."""
-    options = declared(survey, CloudOptions) | declared(survey, Weather)
+    options = declared_values(survey, CloudOptions) | declared_values(survey, Weather)
     del options["columns"]  # the report has a separate entry for the columns
     sensors = [
         _describe_sensor(mounted.sensor)
@@ -244,7 +244,7 @@ def _describe_planning(result: RunResult) -> dict[str, Any] | None:
         "start": (planning.start + origin).tolist(),
         "target": (planning.target + origin).tolist(),
         "obstacles": len(planning.radii),
-        **declared(planning, Search),
+        **declared_values(planning, Search),
         "trials": plan.trials,
         "collision_free_trials": sum(trial.collision_free for trial in result.trials),
         "best_trial": plan.trial,

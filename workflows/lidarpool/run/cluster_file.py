@@ -13,10 +13,10 @@ from distributed.deploy import ssh
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
 from lidarsim.environment.extras import install_command
-from lidarsim.environment.interrupts import deferred_interrupts
+from lidarsim.environment.interrupts import defer_interrupts
 from lidarsim.errors import LidarError
 from lidarsim.io.yamlfile import read_yaml
-from lidarsim.schema.error_sentences import sentences
+from lidarsim.schema.error_sentences import convert_validation_errors
 from lidarsim.words import did_you_mean, plural
 from poolpart.deploy import start_partitions
 from poolpart.deploy.clusters import INFO_MARK
@@ -93,7 +93,7 @@ class ClusterFile(BaseModel):
             not a supported cluster.
         """
         content = read_yaml(path, "a cluster file contains cluster:, arguments: and partitions:")
-        with sentences(cls, path, content):
+        with convert_validation_errors(cls, path, content):
             file = cls.model_validate(content)
         file._source = str(path)
         for name, workers in file.partitions.items():
@@ -186,7 +186,7 @@ class ClusterFile(BaseModel):
         package, _, name = self.cluster.rpartition(".")
         try:
             # dask-jobqueue installs signal handlers, which must not replace those of this process.
-            with deferred_interrupts():
+            with defer_interrupts():
                 factory = getattr(import_module(package), name, None)
         except ModuleNotFoundError as error:
             raise LidarError(

@@ -16,7 +16,7 @@ import numpy as np
 from lidarsim.errors import LidarError
 from lidarsim.media.weather import Weather
 from lidarsim.scene.scene import Scene
-from lidarsim.schema.declared import declared
+from lidarsim.schema.declared import declared_values
 from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import CloudOptions, Mounted, Survey
 
@@ -67,10 +67,10 @@ def describe_inputs(scene: Scene, survey: Survey, planning: Planning | None) -> 
     }
     for carried in survey.carried:
         path = f"sensors.{carried.name}" if carried.name else "sensor"
-        values[path] = declared(carried, Mounted) | declared(carried.sensor, Sensor)
+        values[path] = declared_values(carried, Mounted) | declared_values(carried.sensor, Sensor)
         values[path] |= {"model": carried.sensor.name or "grid", "name": None, "sensor": None}
     for section, kind in (("cloud", CloudOptions), ("weather", Weather)):
-        values[section] = declared(survey, kind)
+        values[section] = declared_values(survey, kind)
     values["cloud"]["columns"] = [getattr(column, "name", column) for column in survey.columns]
     for name in ("poses", "trajectory", "steps", "materials", "returns", "noise", "navigation"):
         values[name] = getattr(survey, name)

@@ -14,7 +14,7 @@ from pydantic import Field
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
 from lidarsim.schema.checks import check_fields
-from lidarsim.schema.declared import declared
+from lidarsim.schema.declared import declared_values
 from lidarsim.schema.value_texts import one_line
 from lidarsim.schema.vocabulary import BACKENDS, PATIENCE_S, WAIT_S
 from lidarsim.words import did_you_mean
@@ -87,7 +87,7 @@ class RunOptions(TaskOptions):
 
         Values in `overrides` that are not None take precedence over the section.
         """
-        options = declared(pool, TaskOptions)
+        options = declared_values(pool, TaskOptions)
         options |= {name: overrides[name] for name in options if overrides.get(name) is not None}
         options["gpu_workers"] = self.gpu_workers or pool.gpu
         options["other_workers"] = self.other_workers or pool.other

@@ -153,7 +153,7 @@ class _StreamedSweeps:
         # The table has the same columns as a `StoredCloud`.
         stored = [c for c in survey.stored_columns if c not in AXES and c.name != WAVEFORM]
         table = (SCAN, *stored)
-        cloud = Cloud.joined([part.cloud(table, survey.precision_m, origin) for part in parts])
+        cloud = Cloud.concatenate([part.cloud(table, survey.precision_m, origin) for part in parts])
         self.points_read += len(cloud)
         if self.keep.compensated_actors:
             cloud = sweeps.with_actors_at_start(number, cloud)

@@ -77,7 +77,7 @@ def write_jobs(
     are None if the worker cannot access both locations.
     """
     recorder = Recorder(EXPORT, LIDAR)
-    if not all(storage.sees(name, content) for storage, name, content in probes):
+    if not all(storage.has_content(name, content) for storage, name, content in probes):
         return None, recorder.finish()
     outcomes = [_write_job(dataset, job) for job in jobs]
     scan_count = sum(int(job.sweeps.scans[-1]) for job in jobs)  # entry -1 is the number of scans

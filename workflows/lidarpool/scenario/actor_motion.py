@@ -23,7 +23,15 @@ from lidarsim.motion.trajectory_files import (
     load_trajectory,
 )
 from lidarsim.numerics.arrays import Floats
-from lidarsim.schema.declared import Several, Text, TextOrTexts, about, by_text, declared, one_of
+from lidarsim.schema.declared import (
+    Several,
+    Text,
+    TextOrTexts,
+    about,
+    accept_text,
+    declared_values,
+    require_one_of,
+)
 from lidarsim.survey.survey import Mounted, StepCount
 
 from .ground import SupportSurfaces, follow_surfaces
@@ -64,7 +72,7 @@ class MountSection(Section, InstrumentPose):
 
     def pose(self) -> Pose:
         """Return the position and angles as a pose."""
-        return Pose(**declared(self, Pose))
+        return Pose(**declared_values(self, Pose))
 
 
 MountEntry = Annotated[MountSection, by_position(MountSection)]
@@ -110,7 +118,7 @@ class MountedSensorSection(SensorSection):
         return replace(mounted, sensor=sensor, steps=self.steps)
 
 
-MountedSensorEntry = Annotated[MountedSensorSection, by_text("model", MountedSensorSection)]
+MountedSensorEntry = Annotated[MountedSensorSection, accept_text("model", MountedSensorSection)]
 
 
 class TimedPose(Section, Pose):
@@ -225,7 +233,7 @@ class TrajectorySection(Section):
         ),
     ] = "refuse"
 
-    _one_source = one_of("file", "points", "vehicle")
+    _one_source = require_one_of("file", "points", "vehicle")
 
     def track(
         self,
@@ -327,7 +335,7 @@ class TrajectorySection(Section):
         )
 
 
-TrajectoryEntry = Annotated[TrajectorySection, by_text("file", TrajectorySection)]
+TrajectoryEntry = Annotated[TrajectorySection, accept_text("file", TrajectorySection)]
 
 
 class JointTable(Section):
@@ -376,7 +384,7 @@ class ActorSection(DeformingSection):
         about("whether the actor raises spray if weather.spray_g_m3 is set; robots never do"),
     ] = True
     joints: Annotated[
-        Annotated[JointTable, by_text("file", JointTable)] | None,
+        Annotated[JointTable, accept_text("file", JointTable)] | None,
         about("table with time_s and the joint values of a robot, in radians or meters", "arm.csv"),
     ] = None
 

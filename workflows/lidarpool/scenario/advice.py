@@ -22,7 +22,7 @@ from lidarsim.sensor.optics import TWO_RETURNS
 from lidarsim.simulator.steps.particles import WeatherStep
 from lidarsim.simulator.steps.step_list import setup_of
 from lidarsim.survey.survey import START_FROM, Survey
-from lidarsim.words import as_scenario, listed, plural, rounded
+from lidarsim.words import format_as_scenario, listed, plural, rounded
 
 from .georeference import missing_epsg_note
 from .prepare import PreparedScenario
@@ -73,7 +73,7 @@ def advice(prepared: PreparedScenario) -> list[str]:
         *(notes, axes, likely, _heading_notes(prepared.findings.without_angles)),
         *(settings, light, _timing_notes(prepared)),
     )
-    return [as_scenario(line) for line in chain.from_iterable(groups)]
+    return [format_as_scenario(line) for line in chain.from_iterable(groups)]
 
 
 def unlabeled_notes(scene: Scene, survey: Survey) -> list[str]:

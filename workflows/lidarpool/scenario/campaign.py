@@ -19,7 +19,7 @@ from lidarsim.errors import LidarError, Mistakes
 from lidarsim.io.input_files import not_found, read_input_text
 from lidarsim.io.yamlfile import read_yaml
 from lidarsim.schema.checks import check_list, check_number
-from lidarsim.schema.error_sentences import sentences
+from lidarsim.schema.error_sentences import convert_validation_errors
 
 from ..clouds.writing import with_format_columns
 from ..datasets.job_table import Value
@@ -128,7 +128,7 @@ class CampaignSpec:
         """
         path = Path(path)
         content = read_yaml(path, _FORM)
-        with sentences(CampaignSection, path, content):
+        with convert_validation_errors(CampaignSection, path, content):
             section = CampaignSection.model_validate(content)
         jobs = SampledJobs(section, path)
         self = cls.__new__(cls)
@@ -335,5 +335,5 @@ class CampaignSpec:
 def _section(**fields: Any) -> CampaignSection:
     """Validate arguments from Python, and return them as a section."""
     plain = {name: dict(v) if isinstance(v, Mapping) else v for name, v in fields.items()}
-    with sentences(CampaignSection):
+    with convert_validation_errors(CampaignSection):
         return CampaignSection.model_validate({"base": "-", **plain})

@@ -44,16 +44,16 @@ from lidarsim.schema.declared import (
     TextOrTexts,
     UnitShare,
     about,
+    accept_short_form,
     allowed,
     is_text,
-    must_be,
-    one_of,
-    short,
+    not_allowed_error,
+    require_one_of,
 )
-from lidarsim.schema.error_sentences import sentences
+from lidarsim.schema.error_sentences import convert_validation_errors
 from lidarsim.schema.section_fields import sections_in
 from lidarsim.schema.value_texts import one_line
-from lidarsim.words import did_you_mean_each, in_yaml, joined, printable
+from lidarsim.words import did_you_mean_each, format_yaml_list, joined, printable
 
 from ..clouds.format_table import DATA_SETS, LAYOUTS
 from ..clouds.writing import ExportSpec
@@ -256,7 +256,7 @@ class RowSample(Section):
     ]
     count: Annotated[
         MinMax[Annotated[int, Field(ge=0)]],
-        short(lambda v: type(v) is int, lambda v: [v, v], int | list[int]),
+        accept_short_form(lambda v: type(v) is int, lambda v: [v, v], int | list[int]),
         about("number of rows in a job, or [minimum, maximum]"),
     ]
     ignore: IgnoredColumns = ()
@@ -310,7 +310,7 @@ class ValueRule(Section):
         ),
     ] = None
 
-    _one_kind = one_of(*_KINDS)
+    _one_kind = require_one_of(*_KINDS)
 
     @model_validator(mode="after")
     def _check_weights(self) -> ValueRule:
@@ -394,7 +394,7 @@ class ValueRule(Section):
 def _check_rule(value: Any) -> Any:
     """Return an entry of `vary`. Raise an error if the entry is not a choice."""
     if not isinstance(value, (dict, ValueRule)):
-        raise must_be(
+        raise not_allowed_error(
             "a mapping that defines the choice, such as {uniform: [0, 1]} or {choice: [1, 4]}"
         )
     return value
@@ -481,7 +481,7 @@ class DatasetFormat(FileSection):
 
 DatasetFormatEntry = Annotated[
     DatasetFormat,
-    short(
+    accept_short_form(
         lambda v: v is None or is_text(v),
         lambda v: {"format": v} if v else {},
         Text | DatasetFormat | None,
@@ -638,7 +638,7 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
     rows = []
     for line, cells in table.rows:
         source = f"{path}, line {line}"
-        with mistakes.noted(), sentences(model, source):
+        with mistakes.noted(), convert_validation_errors(model, source):
             if len(cells) > len(table.header):
                 raise LidarError(
                     f"{source}: The line has {len(cells)} cells, but the header has "
@@ -690,7 +690,7 @@ def _check_columns(names: Sequence[str], model: Any) -> None:
         shown = joined([printable(name) for name in unknown])
         raise ValueError(
             f"it contains the unknown {noun} {shown}.{did_you_mean_each(unknown, fields)} Rename "
-            f"{pronoun}, or set `ignore: {in_yaml(unknown)}`. The available columns are "
+            f"{pronoun}, or set `ignore: {format_yaml_list(unknown)}`. The available columns are "
             f"{', '.join(fields)}"
         )
 

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 from lidarsim.errors import LidarError
 from lidarsim.schema.field_advice import owner_of_file, owners_by_level
 from lidarsim.schema.section_fields import fields_by_name, fields_of, is_section, sections_in
-from lidarsim.words import did_you_mean, listed, plural, shortened
+from lidarsim.words import did_you_mean, listed, plural, shorten_name
 
 from .scenario import Scenario
 
@@ -153,7 +153,7 @@ def _match_entry(entries: Sequence[Any], path_parts: Sequence[str], path: str) -
             return index, 1
         raise LidarError(
             f"{path} of the base has {plural(len(entries), 'entry', 'entries')}, so entry "
-            f"{shortened(path_parts[0])} does not exist. Entries are numbered from 0."
+            f"{shorten_name(path_parts[0])} does not exist. Entries are numbered from 0."
         )
     names = [getattr(entry, "name", None) for entry in entries]
     name, part_count = _match_name(

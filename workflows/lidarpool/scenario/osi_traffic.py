@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lidarsim.columns.mcap_chunks import check_chunks
-from lidarsim.environment.extras import need, reading
+from lidarsim.environment.extras import reading, require_package
 from lidarsim.errors import LidarError
 from lidarsim.io.input_files import input_size
 from lidarsim.motion.rotations import quaternions_of, rotations_of
@@ -181,7 +181,7 @@ def read_osi(
     LidarError
         If betterosi is not installed, or if the file cannot be read or has no ground truth.
     """
-    need("betterosi", "osi", f"Reading {path}")
+    require_package("betterosi", "osi", f"Reading {path}")
     collector = _PassageCollector(section, first_s, travelers)
     stationary = 0
     for truth in _iter_ground_truth(path):

@@ -18,7 +18,7 @@ from lidarsim.scene.scene import Scene
 from lidarsim.sensor.sensor import LineSensor
 from lidarsim.simulator.casting.visibility import static_key, unseen_objects, without_objects
 from lidarsim.survey.survey import Survey
-from lidarsim.words import as_scenario, printable, rounded
+from lidarsim.words import format_as_scenario, printable, rounded
 
 from .default_poses import (
     as_yaml_line,
@@ -105,7 +105,7 @@ def plausibility_warnings(prepared: PreparedScenario) -> list[str]:
         warnings += _speed_warnings(motion, is_airborne=is_airborne)
         warnings += _up_axis_warnings(motion, scene.bounds[0, 2])
         warnings += _orientation_warnings(motion)
-    return [as_scenario(warning) for warning in dict.fromkeys(warnings)]
+    return [format_as_scenario(warning) for warning in dict.fromkeys(warnings)]
 
 
 # -- positions -------------------------------------------------------------------------------

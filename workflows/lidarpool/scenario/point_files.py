@@ -174,7 +174,7 @@ def _read_scans(recording: Recording, keep_noise: bool) -> _Content:
             scan = scan if usable is None else scan.select(usable)
             omitted = OmittedPoints(*np.add(omitted, omitted_here).tolist())
         scans.append(_to_file_frame(_with_used_columns(scan, missing_if_zero)))
-    joined = scans[0] if len(scans) == 1 else Sweep.joined(scans)
+    joined = scans[0] if len(scans) == 1 else Sweep.concatenate(scans)
     joined = joined.replace(
         units_m=scans[0].units_m if scans else None,
         skipped=[*dict.fromkeys(name for scan in scans for name in scan.skipped)],

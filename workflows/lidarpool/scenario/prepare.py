@@ -29,7 +29,7 @@ from lidarsim.motion.trajectory import CENTER, Pose, Track
 from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene import Scene
-from lidarsim.schema.declared import declared
+from lidarsim.schema.declared import declared_values
 from lidarsim.sensor import Noise, Returns, Sensor
 from lidarsim.survey.survey import CloudOptions, Mounted, Survey
 from lidarsim.words import name_hint, plural
@@ -575,7 +575,7 @@ def _build_survey(
     scenario = survey_parts.scenario
     sensors = survey_parts.sensors
     format_columns = scenario.output.needs
-    cloud = declared(scenario.cloud, CloudOptions)
+    cloud = declared_values(scenario.cloud, CloudOptions)
     cloud["columns"] = (*scenario.cloud.columns, *format_columns, *columns)
     if not any(mounted.sensor.optics.resolution_m for mounted in sensors):
         cloud["precision_m"] = cloud["precision_m"] or MESH_PRECISION_M
@@ -600,7 +600,7 @@ def _build_survey(
         navigation=scenario.navigation,
         faults=scenario.faults,
         epsg=scenario.world.epsg or survey_parts.epsg,
-        **declared(scenario.weather, Weather),
+        **declared_values(scenario.weather, Weather),
         **cloud,
     )
     return with_format_columns(survey, scenario.output.write)
@@ -656,7 +656,7 @@ def _build_planning(scenario: Scenario, scene: Scene) -> Planning | None:
                 f"{discs[first, 2]:.2f} m of the center of {labels[first]}. Move it, or change "
                 "`planning.obstacles`."
             )
-    search_options = declared(section, Search)
+    search_options = declared_values(section, Search)
     return Planning(start_xy, target_xy, centers=discs[:, :2], radii=discs[:, 2], **search_options)
 
 

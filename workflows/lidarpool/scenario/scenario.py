@@ -22,8 +22,8 @@ from lidarsim.motion.navigation import Navigation
 from lidarsim.motion.trajectory import CENTER
 from lidarsim.motion.trajectory_files import list_trajectory_files
 from lidarsim.scene.files.mesh_formats import endings, format_of
-from lidarsim.schema.declared import Several, Text, about, by_text
-from lidarsim.schema.error_sentences import sentences
+from lidarsim.schema.declared import Several, Text, about, accept_text
+from lidarsim.schema.error_sentences import convert_validation_errors
 from lidarsim.schema.section_fields import FieldPath, dotted, fields_of, is_section
 from lidarsim.sensor.models import plugin_model_file
 from lidarsim.survey.faults import Fault
@@ -148,7 +148,7 @@ class Scenario(Section):
     scene: Annotated[SceneSection, allow_scene_short_form] = SceneSection()
     world: Annotated[WorldSection, allow_empty(WorldSection)] = WorldSection()
     sensor: Annotated[
-        SensorSection, allow_empty(SensorSection), by_text("model", SensorSection | None)
+        SensorSection, allow_empty(SensorSection), accept_text("model", SensorSection | None)
     ] = SensorSection()
     poses: Annotated[
         Several[PoseEntry] | None,
@@ -311,7 +311,7 @@ class Scenario(Section):
 
         Unchanged sections are not validated again. Raise LidarError if the scenario is invalid.
         """
-        with sentences(Scenario, source, data, _is_contradictory):
+        with convert_validation_errors(Scenario, source, data, _is_contradictory):
             sections = Scenario.model_validate(data)
         changes = {name: getattr(sections, name) for name in sections.model_fields_set}
         scenario = self.model_copy(update=changes)

@@ -45,10 +45,10 @@ from lidarsim.schema.declared import (
     Triple,
     Two,
     about,
-    by_text,
-    must_be,
-    one_of,
-    short,
+    accept_short_form,
+    accept_text,
+    not_allowed_error,
+    require_one_of,
 )
 from lidarsim.schema.section_fields import fields_of
 from lidarsim.schema.vocabulary import BACKENDS
@@ -74,7 +74,8 @@ Pair = Two[Coordinate]
 
 Factors = Three[Factor]
 Scale = Annotated[
-    Factors, short(lambda v: type(v) in (int, float), lambda v: [v] * 3, Factor | Factors)
+    Factors,
+    accept_short_form(lambda v: type(v) in (int, float), lambda v: [v] * 3, Factor | Factors),
 ]
 Length = Annotated[float, Field(gt=0, le=1e4)]
 
@@ -213,7 +214,7 @@ def _kind_of_file(options: type | None) -> type[MeshFile]:
     return create_model(options.__name__, __base__=MeshFile, __module__=__name__, **further)
 
 
-MeshEntry = Annotated[MeshFile, SerializeAsAny(), by_text("file", MeshFile)]
+MeshEntry = Annotated[MeshFile, SerializeAsAny(), accept_text("file", MeshFile)]
 MeshEntries = Several[MeshEntry]
 
 
@@ -222,7 +223,7 @@ def _as_pose_mapping(value: Any) -> Any:
     if isinstance(value, list):
         return {"position": value}
     if not isinstance(value, (dict, Pose)):
-        raise must_be(
+        raise not_allowed_error(
             "x, y and z in meters, such as [0, 0, 1], or a position and angles, such as "
             "{position: [0, 0, 1], yaw_deg: 90}"
         )
@@ -320,7 +321,7 @@ class ShapeSection(Section):
         about("semantic class of the points (default: the class of the material)", alias="class"),
     ] = None
 
-    _one_shape = one_of("file", "box")
+    _one_shape = require_one_of("file", "box")
 
 
 class AnimationSection(Section):
@@ -355,7 +356,7 @@ class DeformingSection(ShapeSection):
     """A shape that may be animated or have wheels."""
 
     animation: Annotated[
-        Annotated[AnimationSection, by_text("name", AnimationSection)] | None,
+        Annotated[AnimationSection, accept_text("name", AnimationSection)] | None,
         about("animation in the file that deforms the object", {"name": "Walk"}),
     ] = None
     wheels: Annotated[
@@ -396,7 +397,7 @@ class CopiesSection(ShapeSection):
         ),
     ] = ()
     table: Annotated[
-        Annotated[CopyTable, by_text("file", CopyTable)] | None,
+        Annotated[CopyTable, accept_text("file", CopyTable)] | None,
         about("table with poses; replaces at", "trees.csv"),
     ] = None
     scatter: Annotated[
@@ -404,7 +405,7 @@ class CopiesSection(ShapeSection):
         about("copies at random positions on surfaces; replaces at", {"count": 100}),
     ] = None
 
-    _one_list = one_of("at", "table", "scatter")
+    _one_list = require_one_of("at", "table", "scatter")
 
 
 class Ground(Section):
@@ -434,7 +435,9 @@ class SceneSection(Section):
     ] = None
     files: Annotated[
         MeshEntries,
-        short(lambda v: isinstance(v, (str, dict)), lambda v: [v], MeshEntry | MeshEntries),
+        accept_short_form(
+            lambda v: isinstance(v, (str, dict)), lambda v: [v], MeshEntry | MeshEntries
+        ),
         about(
             "mesh files and height rasters, as file names or with options such as unit, up_axis, "
             "scale, rotation_deg and translation",
@@ -489,7 +492,7 @@ class WorldSection(Section):
     ] = None
     origin: Annotated[
         Triple,
-        short(
+        accept_short_form(
             lambda v: isinstance(v, (list, tuple)) and len(v) == 2,
             lambda v: [*v, 0.0],
             Pair | Triple,
@@ -713,7 +716,7 @@ class OutputSection(Section):
     """
 
     write: Annotated[
-        Several[Annotated[ExportSpec, by_text("format", ExportSpec)]],
+        Several[Annotated[ExportSpec, accept_text("format", ExportSpec)]],
         about("additional formats of the cloud", ["laz", {"format": "mcap", "layout": "autoware"}]),
     ] = ()
 
@@ -765,7 +768,7 @@ class Obstacle(Section):
         return self
 
 
-Obstacles = Several[Annotated[Obstacle, by_text("object", Obstacle)]]
+Obstacles = Several[Annotated[Obstacle, accept_text("object", Obstacle)]]
 
 
 class _Route:
@@ -782,7 +785,9 @@ class _Route:
     target: Annotated[Pair | None, about("x and y of the target, in meters", [-30, -20])] = None
     obstacles: Annotated[
         Obstacles | None,
-        short(lambda v: v == "auto", lambda v: None, Literal["auto"] | Obstacles | None),
+        accept_short_form(
+            lambda v: v == "auto", lambda v: None, Literal["auto"] | Obstacles | None
+        ),
         about(
             "list of obstacles, or auto for the bounding circles of all objects that are not flat",
             "auto",
@@ -861,12 +866,11 @@ def allow_empty(kind: Any) -> Any:
 
     In YAML, the value of a section is null if all of its lines are commented out.
     """
-    return short(lambda v: v is None, lambda v: {}, kind | None)
+    return accept_short_form(lambda v: v is None, lambda v: {}, kind | None)
 
 
-# Accepts the short forms of a scene, which are the name of a mesh file or preset, or a list of
-# files.
-allow_scene_short_form = short(
+# Short forms of a scene: the name of a mesh file or preset, or a list of files.
+allow_scene_short_form = accept_short_form(
     lambda v: v is None or isinstance(v, (str, list)),
     lambda v: {"preset" if v == "seed" else "files": v} if v else {},
     Text | MeshEntries | SceneSection | None,

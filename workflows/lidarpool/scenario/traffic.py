@@ -32,7 +32,7 @@ from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.schema.declared import Several, Text, TextOrTexts, Triple, about
-from lidarsim.words import fits, in_yaml, name_hint, plural, printable
+from lidarsim.words import format_yaml_list, matches_pattern, name_hint, plural, printable
 
 from .actor_motion import TimeUnitEntry, TrajectorySection
 from .ground import SupportSurfaces, follow_surfaces
@@ -129,7 +129,7 @@ class TrafficSection(Section):
     def find_entry(self, vehicle_type: str) -> VehicleSection | None:
         """Return the first entry that matches a vehicle type, or None if no entry matches."""
         for entry in self.vehicles:
-            if any(fits(vehicle_type, pattern) for pattern in entry.types):
+            if any(matches_pattern(vehicle_type, pattern) for pattern in entry.types):
                 return entry
         return None
 
@@ -448,10 +448,10 @@ def read_fcd(
 def _check_ignored(tag: str, names: Set[str], ignore: Sequence[str]) -> None:
     """Raise ValueError if an attribute name does not match any pattern in `ignore`."""
     for name in sorted(names):
-        if not any(fits(name, pattern) for pattern in ignore):
+        if not any(matches_pattern(name, pattern) for pattern in ignore):
             raise ValueError(
                 f"its {tag} has the attribute {printable(name)!r}, which SUMO does not define. To "
-                f"ignore it, set `ignore: {in_yaml([name])}`"
+                f"ignore it, set `ignore: {format_yaml_list([name])}`"
             )
 
 

@@ -18,7 +18,7 @@ from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.actors import Actor
 from lidarsim.schema.checks import check_type
 from lidarsim.simulator import Scanner
-from lidarsim.sweeps.sweeps import type_of
+from lidarsim.sweeps.sweeps import actor_type
 
 from ..clouds.frame_names import VEHICLE, WORLD, frame_names, points_topic
 from ..clouds.shown_sweeps import (
@@ -210,7 +210,7 @@ def _boxes(scanner: Scanner, cloud: Cloud, poses: list[Pose], time_ns: float) ->
     names = [actor.name for actor in actors]
     return ActorBoxes(
         names=names,
-        types=[type_of(name) for name in names],
+        types=[actor_type(name) for name in names],
         centers=positions + middles,
         quaternions=quaternions_of(rotations),
         sizes=np.ptp(bounds, axis=1),

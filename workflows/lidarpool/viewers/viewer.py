@@ -18,7 +18,7 @@ from lidarsim.environment.ports import port_number
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Floats
 from lidarsim.schema.checks import check_type
-from lidarsim.words import shortened
+from lidarsim.words import shorten_name
 
 from ..clouds.shown_sweeps import ShownSweep, Surroundings
 from .viewer_table import VIEWERS
@@ -147,7 +147,7 @@ class Address(NamedTuple):
         host, _, digits = text.rpartition(":") if has_port else (text, "", "")
         number = port_number(digits) if digits else port
         if number is None:
-            shown = shortened(text, _SHOWN_LETTERS)
+            shown = shorten_name(text, _SHOWN_LETTERS)
             raise LidarError(
                 f"{shown!r} is not a valid address. Expected ADDRESS:PORT, such as "
                 f"{LOOPBACK}:{port}."

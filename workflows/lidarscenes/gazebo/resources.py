@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element
 from lidarsim.errors import LidarError
 from lidarsim.io.input_files import read_input
 from lidarsim.io.named_files import is_inside
-from lidarsim.words import natural, printable
+from lidarsim.words import natural_sort_key, printable
 
 from ..files.lenient_xml import parse_lenient_xml
 
@@ -223,7 +223,9 @@ class Resources:
                 for part in (owner, "models", name):
                     folders = [f for g in folders for f in _existing_folders(g, part)]
                 for model in folders:
-                    versions = sorted(_existing_folders(model, "*"), key=lambda f: natural(f.name))
+                    versions = sorted(
+                        _existing_folders(model, "*"), key=lambda f: natural_sort_key(f.name)
+                    )
                     chosen = [f for f in versions if f.name == version] or versions[-1:]
                     yield from (Candidate(folder / file, _resolved(folder)) for folder in chosen)
         yield from self._in_folders(f"{name}/{file}", "model")

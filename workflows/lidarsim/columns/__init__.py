@@ -1,1 +1,1 @@
-"""Columns of points, and clouds in memory."""
+"""Point columns, sweeps, and in-memory point clouds."""

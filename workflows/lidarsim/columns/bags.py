@@ -1,4 +1,4 @@
-"""Bags of ROS 2 through rosbags: the files, types of messages, and columns of points."""
+"""Functions that read ROS 2 bags and the point columns of their messages with rosbags."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from ..environment.extras import need, reading
+from ..environment.extras import reading, require_package
 from ..errors import CutShortError, LidarError
 from ..io.input_files import input_size
 from ..numerics.arrays import AnyArray
-from ..words import distinct, printable
+from ..words import make_distinct, printable
 from .mcap_chunks import check_chunks, check_packed
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 BAG_FILES = (".mcap", ".db3")
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
-# Points of Livox's drivers: of livox_ros_driver2, and of its predecessors.
+# Point cloud messages of the Livox drivers: livox_ros_driver2 and its predecessors.
 LIVOX_CLOUDS = tuple(
     f"{package}/msg/CustomMsg"
     for package in ("livox_ros_driver2", "livox_ros_driver", "livox_interfaces")
@@ -36,32 +36,35 @@ LIVOX_POINT = np.dtype(
         "itemsize": 20,
     }
 )
-LIVOX_PADDING = 1  # bytes between points; the last point of a message has none
-# {type of a field of a point: number of the type in PointField}
+LIVOX_PADDING = 1  # bytes between points; the last point in a message has no padding
+# {NumPy type of a point field: number of the type in PointField}
 POINT_FIELDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
 
 class BagMessage(NamedTuple):
-    """A message of a bag."""
+    """A deserialized message from a bag."""
 
     topic: str
-    time_ns: int  # at which the message was recorded
+    time_ns: int  # time at which the message was recorded
     content: Any  # the deserialized message
 
 
 def is_bag(path: Path) -> bool:
-    """Return True for an .mcap or .db3, and for the folder of a bag."""
+    """Return True if a path is an .mcap file, a .db3 file, or the folder of a bag."""
     if path.is_dir():
         return (path / "metadata.yaml").exists()
     return path.suffix.lower() in BAG_FILES
 
 
 def open_bag(path: Path, name: str) -> Reader:
-    """Open a bag, which is closed when it is no longer used.
+    """Open a bag that is closed once it is no longer used.
 
-    Raises LidarError, which begins with `name`, if that is impossible.
+    Raises
+    ------
+    LidarError
+        If the bag cannot be opened. The message starts with `name`.
     """
-    need("rosbags", "ros", f"Reading {name}")
+    require_package("rosbags", "ros", f"Reading {name}")
     from rosbags.rosbag2 import ReaderError
 
     from .closing_bag import ClosingBag
@@ -94,15 +97,18 @@ def open_bag(path: Path, name: str) -> Reader:
 
 @contextmanager
 def opened_bag(path: Path, name: str) -> Iterator[Reader]:
-    """Open a bag until the context exits, and turn errors of reading the bag into a LidarError."""
+    """Open a bag and close it when the context exits.
+
+    Errors that occur while the bag is read are converted into a LidarError.
+    """
     with closing(open_bag(path, name)) as bag, reading(name):
         yield bag
 
 
-def messages_of(bag: Reader, topics: Sequence[str]) -> Iterator[BagMessage]:
-    """Yield the messages of `topics` in the order of the bag."""
+def read_messages(bag: Reader, topics: Sequence[str]) -> Iterator[BagMessage]:
+    """Yield the messages on the given topics in the order of the bag."""
     connections = [entry for entry in bag.connections if entry.topic in topics]
-    if connections:  # without connections, rosbags would yield the messages of all topics
+    if connections:  # given no connections, rosbags would yield the messages on all topics
         for connection, time_ns, data in bag.messages(connections):
             content = message_types().deserialize_cdr(data, connection.msgtype)
             yield BagMessage(connection.topic, time_ns, content)
@@ -110,19 +116,27 @@ def messages_of(bag: Reader, topics: Sequence[str]) -> Iterator[BagMessage]:
 
 @cache
 def message_types() -> Typestore:
-    """Return the types of messages of ROS 2."""
+    """Return the type store for ROS 2 messages."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
 def point_columns(data: bytes) -> dict[str, AnyArray]:
-    """Return the fields of a PointCloud2, {name: (n,)}.
+    """Return the fields of a serialized PointCloud2 message as columns.
 
-    Raises ValueError if its lengths disagree, or a field has no type or count.
+    A field with several numbers per point becomes the columns `name_0`, `name_1`, and so on. If two
+    fields have the same name, the second is renamed to `name_2`.
 
-    A field of several numbers is the columns `name_0`, `name_1`, …; the second field of a name is
-    `name_2`.
+    Returns
+    -------
+    dict
+        Mapping from column names to arrays of shape (n,).
+
+    Raises
+    ------
+    ValueError
+        If the lengths in the message are inconsistent, or if a field has an invalid type or count.
     """
     message: Any = message_types().deserialize_cdr(data, POINT_CLOUD)
     kinds = {number: kind for kind, number in POINT_FIELDS.items()}
@@ -134,7 +148,7 @@ def point_columns(data: bytes) -> dict[str, AnyArray]:
                 f"{field.count}, but a PointField has datatypes 1 to {len(kinds)} and a count of "
                 "at least 1. Record it again with a driver that sets both"
             )
-        if field.offset + field.count > message.point_step:  # each number has a byte or more
+        if field.offset + field.count > message.point_step:  # a number has at least one byte
             raise ValueError(
                 f"its field {printable(field.name)!r} has {field.count:,} numbers starting at "
                 f"byte {field.offset:,}, but a point has only {message.point_step:,} bytes"
@@ -149,7 +163,7 @@ def point_columns(data: bytes) -> dict[str, AnyArray]:
     formats = [order + kinds[field.datatype] for _, field, _ in numbers]
     row = np.dtype(
         {
-            "names": distinct(name for name, _, _ in numbers),
+            "names": make_distinct(name for name, _, _ in numbers),
             "formats": formats,
             "offsets": [
                 field.offset + index * np.dtype(kind).itemsize
@@ -165,19 +179,27 @@ def point_columns(data: bytes) -> dict[str, AnyArray]:
 
 
 def livox_columns(data: bytes) -> dict[str, AnyArray]:
-    """Return the points of a CustomMsg of Livox, {name: (n,)}.
+    """Return the points in a serialized Livox CustomMsg as columns.
 
-    ValueError if the message is cut short.
+    Returns
+    -------
+    dict
+        Mapping from column names to arrays of shape (n,).
+
+    Raises
+    ------
+    ValueError
+        If the message is truncated.
     """
     order: Literal["<", ">"] = "<" if data[1] & 1 else ">"
 
     def number(offset: int) -> int:
         return int(np.frombuffer(data, f"{order}u4", 1, offset)[0])
 
-    name_start = 16  # after encoding, stamp, and length of the name of the frame
-    # The time of the first point is aligned to 8 bytes, not counting the encoding.
+    name_start = 16  # after the encapsulation header, the stamp, and the length of the frame name
+    # The time of the first point is aligned to 8 bytes, not counting the encapsulation header.
     header_size = -(-(name_start - 4 + number(name_start - 4)) // 8) * 8
-    start = 4 + header_size + 20  # time, number of points, identifier, length of the points
+    start = 4 + header_size + 20  # after time, point count, lidar identifier, and array length
     count = number(start - 4)
     row = LIVOX_POINT.newbyteorder(order)
     if len(data) < start + count * row.itemsize - LIVOX_PADDING * bool(count):

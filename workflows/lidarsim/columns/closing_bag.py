@@ -1,4 +1,4 @@
-"""Bags of ROS 2 that are closed with the last object that reads them."""
+"""A ROS 2 bag reader that closes its files when it is garbage-collected."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from rosbags.rosbag2 import Reader
 
 
 class ClosingBag(Reader):
-    """A bag that is closed when it is no longer used, unless it was closed before.
+    """A bag reader that closes its files when it is garbage-collected.
 
-    Recordings and data sets read their bags lazily and have no end of their own. rosbags leaves the
-    files open, which Python reports by a ResourceWarning.
+    Recordings and data sets read their bags lazily and are never closed explicitly. `Reader` leaves
+    the files open, which causes a ResourceWarning.
     """
 
     def messages(self, *args: Any, **options: Any) -> Iterator[Any]:  # type: ignore[override]
-        """Yield messages as `Reader.messages` does, and keep the bag open meanwhile."""
+        """Yield messages like `Reader.messages`, keeping the bag open during the iteration."""
         yield from super().messages(*args, **options)
 
     def __del__(self) -> None:

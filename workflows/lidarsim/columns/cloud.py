@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from ..environment.extras import install_command
-from ..environment.notebook import picture_of
+from ..environment.notebook import html_picture
 from ..errors import LidarError
 from ..numerics.arrays import AnyArray, AnyFloats
 from ..schema.checks import as_array, check_choice, check_fields
@@ -23,32 +23,38 @@ from ..schema.value_texts import shown
 from .table import TABLE, Column
 from .waveforms import WAVEFORM, Waveforms
 
-CHUNK_POINTS = 1_000_000  # points in memory at a time while a cloud is read in order
+CHUNK_POINTS = 1_000_000  # points in memory at a time while a cloud is read sequentially
 SHOWN_POINTS = 5
 
 
 class CloudLike(Protocol):
-    """A cloud in memory or in parts that is read in order, piece by piece."""
+    """A cloud, in memory or in parts, whose points can be read sequentially in chunks."""
 
     def __len__(self) -> int: ...
 
     @property
     def bounds(self) -> AnyFloats:
-        """Lowest and highest coordinates, (2, 3), meters, in the type of the positions."""
+        """Minimum and maximum coordinates in meters, with the dtype of the positions.
+
+        Shape (2, 3).
+        """
 
     @property
     def table(self) -> tuple[Column, ...]:
-        """The columns apart from the positions, in the order in which files store them."""
+        """Columns other than the positions, in the order in which files store them."""
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
-        """Yield the points in order, from row `first` on, in clouds of at most `points`."""
+        """Yield the points in order, starting at row `first`, in clouds of at most `points`."""
 
     def row_of(self, scan: int) -> int:
-        """Return the row of the first point of a scan. Requires points in scan order."""
+        """Return the row of the first point in a scan.
+
+        The points must be ordered by scan.
+        """
 
 
 class CloudDisplay:
-    """Representations of a cloud for prompts and notebooks."""
+    """Mixin that displays a cloud at the Python prompt and in notebooks."""
 
     def __repr__(self: CloudLike) -> str:
         names = ", ".join(("x", "y", "z", *(column.name for column in self.table)))
@@ -56,7 +62,7 @@ class CloudDisplay:
         return f"<{type(self).__name__} of {len(self):,} points: {shown_names}>"
 
     def _repr_html_(self: CloudLike) -> str:
-        """Return an HTML table of the columns, their types, and the first points, and a picture."""
+        """Return an HTML table of the columns and first points, followed by a picture."""
         first = next(self.chunks(SHOWN_POINTS), None)
         values = {} if first is None else first.by_name
         kinds = [array.dtype for array in values.values()]
@@ -65,7 +71,7 @@ class CloudDisplay:
         body = "".join(f"<tr>{row}</tr>" for row in cells)
         sides = " × ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0).tolist())
         caption = f"<caption>{len(self):,} points, {sides} m</caption>"
-        return f"<table>{caption}{body}</table>{picture_of(self)}"
+        return f"<table>{caption}{body}</table>{html_picture(self)}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -163,7 +169,7 @@ class Cloud(CloudDisplay):
         raise AttributeError(f"a cloud has no attribute or column {name!r}")
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"sweeps": None}  # the scene would be pickled as well
+        return self.__dict__ | {"sweeps": None}  # the function would pickle the scene as well
 
     @property
     def table(self) -> tuple[Column, ...]:
@@ -228,7 +234,7 @@ class Cloud(CloudDisplay):
             If the library is not installed.
         """
         check_choice("library", library, ("pandas", "polars"))
-        need_packages(library)
+        require_packages(library)
         return import_module(library).DataFrame(self.by_name)
 
     def head(self, points: int = SHOWN_POINTS) -> Cloud:
@@ -251,7 +257,7 @@ class Cloud(CloudDisplay):
         return int(np.searchsorted(self["scan"], scan))
 
     @classmethod
-    def joined(cls, clouds: list[Cloud]) -> Cloud:
+    def concatenate(cls, clouds: list[Cloud]) -> Cloud:
         """Concatenate one or more clouds with the same columns."""
         first = clouds[0]
         if len(clouds) == 1:
@@ -263,9 +269,9 @@ class Cloud(CloudDisplay):
         return cls(positions, columns, first.custom_columns, first.sweeps)
 
 
-def need_packages(*packages: str) -> None:
+def require_packages(*packages: str) -> None:
     """Raise LidarError if packages are not installed."""
-    # A module that a program has created has no spec.
+    # `find_spec` fails for modules without a spec, such as modules that a program creates itself.
     missing = [
         name for name in packages if sys.modules.get(name) is None and find_spec(name) is None
     ]
@@ -276,9 +282,9 @@ def need_packages(*packages: str) -> None:
 
 
 def _fitting(column: Column, values: ArrayLike) -> AnyArray:
-    """Convert `values` to the column's type.
+    """Convert values to the dtype of the column.
 
-    Raises LidarError if a cast would wrap around.
+    Raise LidarError if an integer dtype cannot represent the values.
     """
     array = np.asarray(values)
     dtype = np.dtype(column.dtype)

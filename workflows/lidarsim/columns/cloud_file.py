@@ -1,4 +1,4 @@
-"""A cloud in a PLY file, whose points stay on disk until they are selected."""
+"""Point clouds in PLY files, whose points are read from disk only when they are selected."""
 
 from __future__ import annotations
 
@@ -12,25 +12,35 @@ import numpy as np
 from ..numerics.arrays import AnyArray, AnyFloats, Ints, Records
 from ..numerics.even_samples import even_indices
 from .cloud import CHUNK_POINTS, Cloud
-from .ply_format import AXES, mapped_rows
+from .ply_format import AXES, map_rows
 from .table import TABLE, Column
 
 
 class CloudFile:
-    """A cloud in PLY format, whose points stay on disk until they are selected.
+    """A cloud in a PLY file, whose points are read from disk only when they are selected.
 
-    A PLY file cannot store units: `custom_columns` describes columns that are not in the table of
-    columns, if known. LidarError if the file cannot be read, or is not a point cloud of lidarpool.
+    Parameters
+    ----------
+    path
+        PLY file written by lidarpool.
+    custom_columns
+        Descriptions of columns that are not in `lidarsim.columns.table`, if known. A PLY file
+        cannot store them.
+
+    Raises
+    ------
+    LidarError
+        If the file cannot be read or is not a point cloud written by lidarpool.
     """
 
     def __init__(self, path: Path, custom_columns: Sequence[Column] = ()) -> None:
-        self._rows = mapped_rows(path)
+        self._rows = map_rows(path)
         dtype = self._rows.dtype
         self.table = _table(dtype, custom_columns)
         scans = self._rows["scan"] if "scan" in (dtype.names or ()) else np.empty(0, np.int32)
         sampled_scans = scans[even_indices(len(scans), 100_000)]
         ordered = scans.dtype.kind in "iu" and bool((np.diff(sampled_scans) >= 0).all())
-        # First and last scan; (0, 0) if the points are not in scan order.
+        # First and last scan, or (0, 0) if the points are not ordered by scan.
         self.scans = (int(scans[0]), int(scans[-1])) if ordered and len(scans) else (0, 0)
 
     def __len__(self) -> int:
@@ -38,57 +48,64 @@ class CloudFile:
 
     @property
     def bounds(self) -> AnyFloats:
-        """Lowest and highest coordinates, (2, 3), meters.
+        """Minimum and maximum coordinates in meters. Shape (2, 3).
 
-        All points are read.
+        Computing them reads all points.
         """
         chunk_bounds = [chunk.bounds for chunk in self.chunks()] or [np.zeros((2, 3))]
         lows, highs = zip(*chunk_bounds, strict=True)
         return np.stack([np.min(lows, axis=0), np.max(highs, axis=0)])
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
-        """Yield the points in order, from row `first` on, in clouds of at most `points`."""
+        """Yield the points in order, starting at row `first`, in clouds of at most `points`."""
         for start in range(first, len(self), points):
             yield self._cloud(self._rows[start : start + points])
 
     def choose(self, max_points: int) -> Cloud:
-        """Return the finite points among at most `max_points` evenly spaced points, in order."""
+        """Return at most `max_points` evenly spaced points in order, without nonfinite ones."""
         rows = self._rows[even_indices(len(self), max_points)]
         finite = np.isfinite(_positions(rows)).all(axis=1)
         return self._cloud(rows if finite.all() else rows[finite], np.float64)
 
     def row_of(self, scan: int) -> int:
-        """Return the row of the first point of a scan, for points in the order of scans."""
+        """Return the row of the first point in a scan.
+
+        The points must be ordered by scan.
+        """
         return bisect_left(self._rows["scan"], scan)
 
     def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
-        """Return the rows of scans, start and stop, or all rows if not in the order of scans."""
+        """Return the start and stop row of a range of scans, given its first and last scan.
+
+        If the points are not ordered by scan, the range covers all rows.
+        """
         if self.scans[0] >= self.scans[1] or scans == self.scans:
             return 0, len(self)
         scan_column = self._rows["scan"]
         return bisect_left(scan_column, scans[0]), bisect_right(scan_column, scans[1])
 
     def values(self, name: str, row_selection: Ints | slice) -> AnyArray:
-        """Return values of a column, or of x, y or z.
+        """Return selected values of a column or coordinate.
 
-        Values of a slice stay on the disk.
+        The values are copied to memory if the rows are given as indices, but not if they are given
+        as a slice.
         """
         files = {column.name: column.in_files for column in self.table}
         return np.asarray(self._rows[files.get(name, name)][row_selection])
 
     def _cloud(self, rows: Records, dtype: Any = None) -> Cloud:
-        """Return a cloud of rows, with positions of `dtype`, by default as in the file."""
+        """Convert rows to a cloud whose positions have `dtype` (default: as in the file)."""
         columns = {column.name: rows[column.in_files] for column in self.table}
         return Cloud(_positions(rows, dtype), columns, self.table)
 
 
 def _positions(rows: Records, dtype: Any = None) -> AnyArray:
-    """Return the positions of rows, (n, 3), of `dtype`, by default as in the file."""
+    """Return the positions of rows, converted to `dtype` (default: as in the file)."""
     return np.stack([rows[axis] for axis in AXES], axis=1, dtype=dtype)
 
 
 def _table(row: np.dtype[np.void], custom_columns: Sequence[Column]) -> tuple[Column, ...]:
-    """Return the columns of a row type: columns of the table, custom columns, then the rest."""
+    """Describe the columns of a row in this order: standard columns, custom columns, the rest."""
     names = [name for name in row.names or () if name not in AXES]
     described = [
         column for column in (*TABLE.values(), *custom_columns) if column.in_files in names

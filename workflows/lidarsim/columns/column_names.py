@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Mapping
 from functools import lru_cache
 
 from ..numerics.arrays import AnyArray
-from ..words import distinct
+from ..words import make_distinct
 
 AXES = ("x", "y", "z")
 COLORS = ("red", "green", "blue")
@@ -48,7 +48,7 @@ for _name, _aliases in ALIASES.items():
 
 
 def standard_names(names: Iterable[str], among: Collection[str] | None = None) -> list[str]:
-    """Replace column names by standard names, and make them distinct.
+    """Replace column names with standard names, and make them distinct.
 
     Only one column gets a standard name: the column that already has it, or else the column whose
     name comes first in `ALIASES`. All other columns keep their names. A number is appended to names
@@ -81,7 +81,7 @@ def _standard_names(names: tuple[str, ...], among: frozenset[str] | None) -> tup
             continue
         best[standard] = min(best.get(standard, (rank, index)), (rank, index))
     renamed = {index: standard for standard, (_, index) in best.items()}
-    return tuple(distinct(renamed.get(index, name) for index, name in enumerate(names)))
+    return tuple(make_distinct(renamed.get(index, name) for index, name in enumerate(names)))
 
 
 def with_standard_names(
@@ -103,5 +103,8 @@ def columns_for(columns: Mapping[str, AnyArray], name: str) -> dict[str, AnyArra
 
 
 def _known(name: str) -> tuple[str, int]:
-    """Return the standard name of a column, or an empty string, and the rank of its alias."""
+    """Return the standard name of a column and the rank of its alias.
+
+    The standard name is empty if the column has none.
+    """
     return _STANDARD.get(name.lower().removeprefix("scalar_"), ("", 0))

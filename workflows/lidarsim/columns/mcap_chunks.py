@@ -1,7 +1,7 @@
-"""Records of MCAP files, and packed bags: what they unpack to is known before they are unpacked.
+"""Records of MCAP files, and size checks that run before MCAP or Zstandard data is decompressed.
 
-After the specifications of MCAP (https://mcap.dev/spec) and of Zstandard (RFC 8878). LZ4, the other
-compression, unpacks to at most 255 times its size.
+The formats are specified at https://mcap.dev/spec and in RFC 8878 (Zstandard). MCAP also supports
+LZ4, which expands data by a factor of at most 255.
 """
 
 from __future__ import annotations
@@ -19,43 +19,45 @@ _MAGIC_BYTES = 8
 _CHUNK = 0x06
 _CHUNK_INDEX = 0x08
 _METADATA = 0x0C
-_RECORD = Struct("<BQ")  # kind, and length of the content
-_LENGTH_BYTES = 8  # bytes of the length of the packed messages
-_CHUNK_HEAD = Struct("<QQQII")  # first and last time, unpacked size, checksum, length of a name
-# First and last time, start and length of the chunk, length of offsets of messages.
+_RECORD = Struct("<BQ")  # record type and content length
+_LENGTH_BYTES = 8  # size of the field that states the length of the compressed messages
+# First and last time, decompressed size, checksum, length of the compression name.
+_CHUNK_HEAD = Struct("<QQQII")
+# First and last time, start and length of the chunk, length of the message offsets.
 _INDEX_HEAD = Struct("<QQQQI")
 _NAME_LENGTH = Struct("<I")
-_SIZES = Struct("<QQ")  # packed and unpacked
+_SIZES = Struct("<QQ")  # compressed and decompressed size
 _ZSTD = b"zstd"
 _ADVICE = "record it with smaller chunks or without compression"
 
 _FRAME = 0xFD2FB528
 _SKIPPABLE_FRAMES = range(0x184D2A50, 0x184D2A60)
 _BLOCK_HEADER_BYTES = 3
-_BLOCK_BYTES = 128 << 10  # size of a compressed block, unpacked, at most
+_BLOCK_BYTES = 128 << 10  # maximum decompressed size of a block
 _RAW = 0
 _REPEATED = 1
 
 
 def check_chunks(path: Path) -> None:
-    """Check that the chunks of an MCAP file unpack to no more than its size allows.
+    """Check that the chunks of an MCAP file do not decompress to an implausible size.
 
-    Chunks that are cut short, and files other than MCAP, are left to the library that reads them.
+    Truncated chunks and files in other formats are not checked. The library that reads them reports
+    such errors.
 
     Raises
     ------
     LidarError
-        If a chunk alone takes more memory than the file allows, or all chunks together unpack to
-        far more than the file has bytes.
+        If a single chunk or all chunks together decompress to more than is allowed for a file of
+        this size.
     OSError
         If the file cannot be read.
     """
     size = input_size(path)
     if size < _MAGIC_BYTES:
         return
-    # Of the chunks, and of those that the index names.
+    # Chunks and the index entries that refer to them are counted separately.
     totals = {kind: Allowance(size, _ADVICE, in_parts=True) for kind in (_CHUNK, _CHUNK_INDEX)}
-    # Only the headers of chunks and blocks are touched: a bag may have any length.
+    # The file is mapped because a bag may be large and only the headers are accessed.
     with open_input(path) as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
         for kind, unpacked_bytes in _unpacked_sizes(data):
             Allowance(size, _ADVICE).take(unpacked_bytes)
@@ -63,9 +65,19 @@ def check_chunks(path: Path) -> None:
 
 
 def read_metadata(path: Path) -> dict[str, dict[str, str]]:
-    """Read the metadata records of an MCAP file, {name of a record: its content}.
+    """Read the metadata records of an MCAP file.
 
-    Truncated records are skipped. Raises OSError if the file cannot be read.
+    Truncated records are skipped.
+
+    Returns
+    -------
+    dict
+        Mapping from the name of each record to its content.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
     """
     records: dict[str, dict[str, str]] = {}
     if input_size(path) < _MAGIC_BYTES:
@@ -79,7 +91,7 @@ def read_metadata(path: Path) -> dict[str, dict[str, str]]:
 
 
 def _strings(content: bytes) -> Iterator[str]:
-    """Yield the strings of a metadata record: its name, then keys and values in turn."""
+    """Yield the name of a metadata record, followed by alternating keys and values."""
     position = 0
     is_first = True
     while position + _NAME_LENGTH.size <= len(content):
@@ -88,14 +100,19 @@ def _strings(content: bytes) -> Iterator[str]:
         yield content[position : position + length].decode(errors="replace")
         position += length
         if is_first:
-            position += _NAME_LENGTH.size  # length of the map
+            position += _NAME_LENGTH.size  # skip the length of the map
             is_first = False
 
 
 def check_packed(path: Path) -> None:
-    """Check that a file packed by Zstandard unpacks to no more than its size allows, on the disk.
+    """Check that a Zstandard file does not decompress to an implausible size on disk.
 
-    LidarError and OSError are as for `check_chunks`.
+    Raises
+    ------
+    LidarError
+        If the file decompresses to more than is allowed for a file of this size.
+    OSError
+        If the file cannot be read.
     """
     size = input_size(path)
     if not size:
@@ -106,7 +123,7 @@ def check_packed(path: Path) -> None:
 
 
 def _records(data: mmap) -> Iterator[tuple[int, int, int]]:
-    """Yield the kind of each complete record, and the start and stop of its content."""
+    """Yield the type of each complete record and the start and stop of its content."""
     position = _MAGIC_BYTES
     while position + _RECORD.size <= len(data):
         kind, length = _RECORD.unpack_from(data, position)
@@ -118,9 +135,9 @@ def _records(data: mmap) -> Iterator[tuple[int, int, int]]:
 
 
 def _unpacked_sizes(data: mmap) -> Iterator[tuple[int, int]]:
-    """Yield the kind of each record of a chunk, and the bytes that the chunk may unpack to.
+    """Yield the type and maximum decompressed size for each chunk record and chunk index record.
 
-    Libraries find chunks by their records, or by the records of an index, which may differ.
+    Both are checked because they may disagree, and libraries find chunks through either of them.
     """
     for kind, start, stop in _records(data):
         try:
@@ -128,12 +145,12 @@ def _unpacked_sizes(data: mmap) -> Iterator[tuple[int, int]]:
                 yield kind, _chunk_bytes(data, start, stop)
             elif kind == _CHUNK_INDEX:
                 yield kind, _indexed_bytes(data, start)
-        except struct.error:  # a record that is too short
+        except struct.error:  # the record is too short
             continue
 
 
 def _chunk_bytes(data: mmap, start: int, stop: int) -> int:
-    """Return the number of bytes that the chunk of a record may unpack to."""
+    """Return the maximum decompressed size of the chunk in a chunk record, in bytes."""
     *_, stated_bytes, _, name_length = _CHUNK_HEAD.unpack_from(data, start)
     name_start = start + _CHUNK_HEAD.size
     packed_start = name_start + name_length + _LENGTH_BYTES
@@ -143,7 +160,7 @@ def _chunk_bytes(data: mmap, start: int, stop: int) -> int:
 
 
 def _indexed_bytes(data: mmap, start: int) -> int:
-    """Return the number of bytes that the chunk of a record of the index may unpack to."""
+    """Return the maximum decompressed size of the chunk in a chunk index record, in bytes."""
     *_, chunk_start, _, offsets_length = _INDEX_HEAD.unpack_from(data, start)
     name_start = start + _INDEX_HEAD.size + offsets_length + _LENGTH_BYTES
     (name_length,) = _NAME_LENGTH.unpack_from(data, name_start)
@@ -157,15 +174,15 @@ def _indexed_bytes(data: mmap, start: int) -> int:
 
 
 def max_unpacked_bytes(data: bytes | mmap, start: int, stop: int) -> int:
-    """Return the maximum number of bytes that frames of Zstandard unpack to.
+    """Return an upper bound on the decompressed size of Zstandard frames, in bytes.
 
-    The frames are the bytes of `data` from `start` to `stop`.
+    The frames are stored in `data` from `start` to `stop`.
     """
     total = 0
     position = start
 
     def number(length: int) -> int:
-        """Return the number of some bytes at the position."""
+        """Decode the next `length` bytes as an unsigned integer."""
         return int.from_bytes(data[position : min(position + length, stop)], "little")
 
     while position + 8 <= stop:

@@ -1,7 +1,7 @@
-"""Columns of the points of consecutive scans, as a batch returns and a part stores them.
+"""Point columns of consecutive scans, as returned by a batch and stored in a part.
 
-`x`, `y` and `z` are cells: whole multiples of the precision from the scene's local origin, so that
-positions are rounded only once.
+`x`, `y` and `z` are stored as cells, which are integer multiples of the precision, relative to the
+scene's local origin. Positions are therefore rounded only once.
 """
 
 from __future__ import annotations
@@ -18,22 +18,23 @@ from .cloud import Cloud
 from .table import AXES, SCAN, Column
 from .waveforms import WAVEFORM
 
-_BLOCK_CELLS = 1 << 13  # cells that are turned into positions at a time
+_BLOCK_CELLS = 1 << 13  # cells converted to positions at a time
 
 
 @dataclass(frozen=True)
 class PartColumns:
-    """Content of a part."""
+    """Contents of a part."""
 
     first: int  # number of the first scan
-    counts: Ints  # (scans,): rows of each scan
-    columns: Mapping[str, AnyArray]  # {name: (rows,)}, positions as cells
-    # (k,): hit counters that are not 0 (`Scene.counters`); an instance has one for all triangles
+    counts: Ints  # (scans,), rows per scan
+    columns: Mapping[str, AnyArray]  # {name: (rows,)}, with positions as cells
+    # (k,), indices of the nonzero hit counters (`Scene.counters`). All triangles of an instance
+    # share one counter.
     triangles: Ints32
-    hits: Ints  # (k,): number of hits of each of these counters
-    # (scans,) and (scans, samples, 3): hits of each scan, and ends of sampled rays, meters, local
-    # coordinates, NaN in unused rows; empty in a part that is not stored.
-    scan_hits: UInts32 = field(default_factory=lambda: np.zeros(0, np.uint32))
+    hits: Ints  # (k,), number of hits for each index in `triangles`
+    # Both arrays are empty in a part that is not stored.
+    scan_hits: UInts32 = field(default_factory=lambda: np.zeros(0, np.uint32))  # (scans,)
+    # (scans, samples, 3), end points of sampled rays in local coordinates, meters; NaN if unused
     samples: Floats32 = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))
 
     def __len__(self) -> int:
@@ -46,14 +47,14 @@ class PartColumns:
 
     @property
     def cell_box(self) -> Ints | None:
-        """Lowest and highest cells, (2, 3), or None without rows."""
+        """Minimum and maximum cells, or None if the part has no rows. Shape (2, 3)."""
         if not len(self):
             return None
         axes = [self.columns[axis.name] for axis in AXES]
         return np.array([[a.min() for a in axes], [a.max() for a in axes]], np.int64)
 
     def scan_column(self) -> Ints32:
-        """Return the scan of each row."""
+        """Return the scan number of each row."""
         scans = np.arange(self.first, self.stop, dtype=np.int32)
         return np.repeat(scans, self.counts)
 
@@ -65,20 +66,20 @@ class PartColumns:
         row_selection: Integers | slice = slice(None),
         sweeps: Callable[[], Any] | None = None,
     ) -> Cloud:
-        """Return a cloud of the points of the part, or of selected rows.
+        """Convert the part, or selected rows, to a cloud.
 
         Parameters
         ----------
         table
-            Columns beside the positions.
+            Columns to include in addition to the positions.
         precision_m
-            Size of a cell, meters.
+            Cell size in meters.
         origin
-            (3,): world position of cell 0, meters.
+            World position of cell 0 in meters. Shape (3,).
         row_selection
-            Rows of the points, as integers or a slice.
+            Rows to include, as integers or a slice.
         sweeps
-            Function that returns the sweeps of the survey (`Cloud`).
+            Function that returns the sweeps of the survey; see `Cloud`.
         """
         cells = np.stack([self.columns[axis.name][row_selection] for axis in AXES], axis=1)
         columns = {
@@ -89,25 +90,27 @@ class PartColumns:
         }
         if WAVEFORM in self.columns:
             columns[WAVEFORM] = self.columns[WAVEFORM][row_selection]
-        return Cloud(positions_of(cells, precision_m, origin), columns, tuple(table), sweeps)
+        return Cloud(cell_positions(cells, precision_m, origin), columns, tuple(table), sweeps)
 
 
-def decimals_of(precision_m: float) -> int:
-    """Return the number of decimals that positions in cells of `precision_m` are rounded to.
+def position_decimals(precision_m: float) -> int:
+    """Return the number of decimals to which positions are rounded, given the cell size.
 
-    Multiplying gives 0.07000000000000001 for 0.07; positions are the nearest short decimals.
+    Multiplying a cell by its size may return 0.07000000000000001 instead of 0.07, which rounding
+    corrects.
     """
     return max(0, 3 - decade(precision_m))
 
 
-def positions_of(cells: AnyArray, precision_m: float, origin: Floats | float) -> Floats:
-    """Return world coordinates, meters, of points in cells of `precision_m`.
+def cell_positions(cells: AnyArray, precision_m: float, origin: Floats | float) -> Floats:
+    """Convert cells of size `precision_m` to world coordinates in meters.
 
-    Cells are whole numbers, (n, 3) with an origin (3,), or (n,) along an axis with a coordinate.
+    The cells have shape (n, 3) if `origin` is a position of shape (3,), or shape (n,) if they are
+    the cells along one axis and `origin` is a coordinate.
     """
-    digits = decimals_of(precision_m)
+    digits = position_decimals(precision_m)
     positions = np.empty(cells.shape)
-    for start in range(0, len(cells), _BLOCK_CELLS):  # intermediate values stay in the cache
+    for start in range(0, len(cells), _BLOCK_CELLS):  # keeps intermediate values in the CPU cache
         block = slice(start, start + _BLOCK_CELLS)
         unrounded = cells[block] * precision_m
         unrounded += origin

@@ -1,4 +1,7 @@
-"""Layout of point clouds of lidarpool as binary PLY: the header, and a row for each point."""
+"""Layout of the binary PLY files in which lidarpool stores point clouds.
+
+A file consists of a header and one row per point.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,8 @@ _PLY_TYPES = {
 }  # fmt: skip
 
 
-# Types in files: types that Open3D writes, or wider types.
+# {type of a column: type in files}. A file uses only types that Open3D writes, which may be wider
+# than the type of the column.
 _FILE_TYPES = {
     "u1": "u1", "u2": "<u2", "i1": "<i4", "i2": "<i4", "i4": "<i4", "f4": "<f4", "f8": "<f8",
     "u4": "<f8", "i8": "<f8", "u8": "<f8",
@@ -41,18 +45,21 @@ class PlyLayout(NamedTuple):
 
     start: int  # offset of the first point, bytes
     points: int  # number of points
-    row: np.dtype[np.void]  # type of a point
+    row: np.dtype[np.void]  # dtype of a row
 
 
 def file_type(column: Column) -> np.dtype[Any]:
-    """Return the type of a column in a file."""
+    """Return the dtype with which a column is stored in a file."""
     return np.dtype(_FILE_TYPES.get(np.dtype(column.dtype).str[1:], "<f8"))
 
 
 def as_file_type(column: Column, values: AnyArray) -> AnyArray:
-    """Convert values of a column to the type in a file.
+    """Convert the values of a column to the dtype with which the column is stored in a file.
 
-    Raises LidarError if a value would be inexact.
+    Raises
+    ------
+    LidarError
+        If a value cannot be represented exactly.
     """
     dtype = file_type(column)
     if dtype == np.float64 and values.dtype.kind in "iu" and len(values):
@@ -66,16 +73,19 @@ def as_file_type(column: Column, values: AnyArray) -> AnyArray:
 
 
 def row_type(position_type: np.dtype[np.floating], table: Sequence[Column]) -> np.dtype[np.void]:
-    """Return the type of a row of a file, with columns in the order of the table.
+    """Return the dtype of a row in a file, with the columns in the order of the table.
 
-    A row of Open3D has the same size and a different order, the order of a hash table.
+    Rows written by Open3D have the same size, but the columns are in the order of a hash table.
     """
     kind = "<f8" if position_type == np.float64 else "<f4"
     return np.dtype([(axis, kind) for axis in AXES] + [(c.in_files, file_type(c)) for c in table])
 
 
 def header(row: np.dtype[np.void], count: int, comments: str = "") -> bytes:
-    """Return the header of a file of `count` points in the format of Open3D, with comment lines."""
+    """Return the header of a file with `count` points, as Open3D would write it.
+
+    `comments` contains additional comment lines, each of which ends with a newline.
+    """
     lines = [f"property {_NAMES[row[name].str]} {name}" for name in row.names or ()]
     lines = ["comment Created by Open3D", f"{comments}element vertex {count}", *lines]
     return (_MAGIC + "\n".join([*lines, "end_header\n"])).encode()
@@ -89,12 +99,12 @@ def layout(path: Path) -> PlyLayout:
     OSError
         If the file cannot be read.
     ValueError
-        If the file is not a complete binary PLY file of lidarpool; the message is a clause.
+        If the file is not a complete binary PLY file written by lidarpool. The message is a clause.
     """
     with open_input(path) as file:
         size = os.fstat(file.fileno()).st_size
         data = file.read(_HEADER_LIMIT)
-        if b"end_header\n" not in data:  # names of many classes, perhaps
+        if b"end_header\n" not in data:  # the header may list many class names
             data += file.read(_COMMENTS_LIMIT)
     head, end_marker, _ = data.partition(b"end_header\n")
     text = head.decode("ascii", errors="replace")
@@ -110,10 +120,13 @@ def layout(path: Path) -> PlyLayout:
     return PlyLayout(start, count, dtype)
 
 
-def mapped_rows(path: Path) -> Records:
-    """Return the points of a PLY file, as rows that stay on the disk until they are used.
+def map_rows(path: Path) -> Records:
+    """Memory-map the points of a PLY file as rows.
 
-    LidarError if the file cannot be read, or is not a complete binary PLY file of lidarpool.
+    Raises
+    ------
+    LidarError
+        If the file cannot be read or is not a complete binary PLY file written by lidarpool.
     """
     try:
         with explained(f"{path} cannot be read"):
@@ -125,9 +138,9 @@ def mapped_rows(path: Path) -> Records:
 
 
 def _parse_header(text: str) -> tuple[int, np.dtype[np.void]]:
-    """Return number and type of the rows of a header.
+    """Return the number and dtype of the rows that a header describes.
 
-    Raises ValueError for files not of lidarpool.
+    Raise ValueError if the header was not written by lidarpool.
     """
     elements = [line.split() for line in text.splitlines() if line.startswith("element")]
     properties = [line.split() for line in text.splitlines() if line.startswith("property")]

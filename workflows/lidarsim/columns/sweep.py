@@ -1,4 +1,4 @@
-"""Points of one sweep of a lidar, as they were recorded or simulated."""
+"""The recorded or simulated points of a single lidar sweep."""
 
 from __future__ import annotations
 
@@ -15,51 +15,51 @@ Columns = Mapping[str, AnyArray]
 
 
 class Sweep:
-    """Points of one sweep of a sensor, or of one part of a large cloud.
+    """The points of a single sensor sweep, or of one part of a large cloud.
 
     Parameters
     ----------
     points
-        Positions in meters, of shape (n, 3), in the sensor frame. x is forward, y is left and z is
-        up, unless the mount is rotated. Parts of a cloud are in the frame of the cloud. Pulses
-        without a return are NaN or zero in organized sweeps; `returns` removes them.
+        Positions in meters in the sensor frame, with shape (n, 3). x points forward, y left and z
+        up, unless the mount is rotated. Parts of a cloud are in the frame of the cloud. In
+        organized sweeps, pulses without a return are NaN or zero; `returns` removes them.
     columns
-        Further values of each point as {name: array of shape (n,)}. Columns with a known meaning
-        have the standard names of lidarpool, and the others have the names of the file.
+        Other point values as a mapping from names to arrays of shape (n,). Columns with a known
+        meaning have the standard names of lidarpool. All others keep their names from the file.
     pose
-        Transformation from the sensor frame to the world frame, of shape (4, 4), or None if it is
-        unknown. If it is a function, it is called when the pose is requested.
+        Transformation from the sensor frame to the world frame, with shape (4, 4), or None if it is
+        unknown. A function is called when the pose is requested.
     time_ns
         Timestamp of the sweep in nanoseconds, or None if it is unknown. For results, this is the
         time since the start of the survey.
     compensated
-        Whether the points are compensated for the motion during the sweep, or None if unknown.
+        Whether the points are compensated for motion during the sweep, or None if unknown.
     firing_poses
-        Poses of the sensor when the points were fired
-        (`lidarsim.sweeps.sweep_motion.FiringPoses`), or None if they are unknown. They only apply
+        Sensor poses at the times when the points were measured
+        (`lidarsim.sweeps.sweep_motion.FiringPoses`), or None if they are unknown. They apply only
         to points that are not compensated.
     scanner
-        Position of the scanner in the frame of the file in meters, of shape (3,), or None.
+        Scanner position in meters in the frame of the file, with shape (3,), or None.
     units_m
-        Units of x, y and z in meters, if the file states them for this sweep.
+        Units of x, y and z in meters, if the file specifies them for this sweep.
     boxes
-        Bounding boxes of the actors in the sensor frame, or a function that returns them, or None.
+        Bounding boxes of the actors in the sensor frame, a function that returns them, or None.
     sensor, number
-        Name of the sensor, and index of the sweep among the sweeps of the sensor.
+        Name of the sensor, and index of the sweep among the sweeps from this sensor.
     job, job_number, split, values
-        Name, number and split of the job in a data set to which the sweep belongs, and the varied
-        values of this job as {path: value}.
+        Name, number and split of the data set job to which the sweep belongs, and a mapping from
+        the paths of the varied fields to their values in this job.
     object_names
-        Names of the objects. The column `object` contains indices into this tuple.
+        Names of the objects. The `object` column contains indices into this tuple.
     faults
-        Faults of the sensor during the sweep.
+        Sensor faults during the sweep.
     notes
-        Notes on the points, as clauses that follow the name of the file.
+        Notes on the points, phrased as clauses that follow the file name.
     skipped
         Names of columns in the file that could not be read.
     recording
-        Recording to which the sweep belongs. It determines `rings` and `times_s` where the file
-        does not state them.
+        Recording to which the sweep belongs. It determines `rings` and `times_s` if the file does
+        not contain them.
     """
 
     def __init__(
@@ -106,12 +106,12 @@ class Sweep:
         self._pose = pose
         self._boxes = boxes
         self._recording = recording
-        # The sweep from which these points were selected or moved, and their rows in it. The
+        # The sweep from which these points were selected or transformed, and their rows in it. The
         # recording determines rings and times from that sweep.
         self._origin: tuple[Self, Bools | Indices | slice] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        # Values that the recording determines are computed before the sweep leaves the process.
+        # The recording is not pickled, so the values that it determines are computed now.
         known = None if self._recording is None else _RingsAndTimes(self.rings, self.times_s)
         return self.__dict__ | {
             "_pose": self.pose,
@@ -129,10 +129,10 @@ class Sweep:
         return f"<Sweep {self.number}{sensor}{job}: {len(self):,} points>"
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with other values for some parameters of the constructor.
+        """Return a copy of the sweep in which some constructor parameters have new values.
 
-        New points must be in the order of the old ones. They keep their rings and times, even if
-        these follow from the old positions.
+        New points must be in the same order as the old points. They keep their rings and times,
+        even if those were derived from the old positions.
         """
         other = object.__new__(type(self))
         cached = ("pose", "boxes", "rings", "times_s")
@@ -150,7 +150,10 @@ class Sweep:
 
     @cached_property
     def pose(self) -> Floats | None:
-        """Transformation from the sensor frame to the world frame, (4, 4), or None if unknown."""
+        """Transformation from the sensor frame to the world frame, or None if it is unknown.
+
+        Shape (4, 4).
+        """
         pose: Floats | None = self._pose() if callable(self._pose) else self._pose
         return pose
 
@@ -161,11 +164,11 @@ class Sweep:
 
     @cached_property
     def rings(self) -> AnyArray | None:
-        """Ring of each point, integers of shape (n,), or None if the rings are unknown.
+        """Ring index of each point, or None if the rings are unknown.
 
-        If there is no column `channel`, the recording determines the rings from the order or the
-        elevation angles of the points. They are then counted from the lowest ring, and points that
-        belong to no ring have the value -1.
+        The indices are integers of shape (n,). If there is no `channel` column, the recording
+        determines the rings from the order or the elevation angles of the points. In this case, the
+        lowest ring has index 0, and points that do not belong to a ring have index -1.
         """
         if "channel" in self.columns:
             return np.asarray(self.columns["channel"])
@@ -176,9 +179,9 @@ class Sweep:
 
     @cached_property
     def times_s(self) -> Floats | None:
-        """Time of each point relative to the timestamp of the sweep, or None if it is unknown.
+        """Point times in seconds relative to the timestamp of the sweep, or None if unknown.
 
-        The times are in seconds and have the shape (n,).
+        Shape (n,).
         """
         if self._origin is not None:
             sweep, rows = self._origin
@@ -187,43 +190,44 @@ class Sweep:
 
     @property
     def intensity(self) -> AnyArray | None:
-        """Intensity of each point, of shape (n,), or None if it is unknown.
+        """Intensity of each point, or None if it is unknown. Shape (n,).
 
-        This is the column `intensity`, which contains the received energies in results of
-        lidarpool, or else the column `reflectivity`.
+        This is the `intensity` column, or the `reflectivity` column if there is no `intensity`
+        column. In lidarpool results, the intensity is the received energy.
         """
         return next((self.columns[name] for name in STRENGTHS if name in self.columns), None)
 
     @property
     def classes(self) -> AnyArray | None:
-        """Semantic class of each point, integers of shape (n,), or None if it is unknown.
+        """Semantic class of each point, or None if it is unknown.
 
-        In files of lidarpool, points without a class have the value 0.
+        The classes are integers of shape (n,). In files written by lidarpool, class 0 means that a
+        point has no class.
         """
         return self.columns.get("class")
 
     @property
     def objects(self) -> Ints32 | None:
-        """Index of each point's object in `object_names`, of shape (n,), or None."""
+        """Index of each point's object in `object_names`, or None if it is unknown. Shape (n,)."""
         return self.columns.get("object")
 
     @property
     def has_return(self) -> Bools:
-        """Mask of the points that have a return, bool of shape (n,).
+        """Boolean mask of the points that have a return. Shape (n,).
 
         Drivers store NaN or zeros for pulses without a return.
         """
         return np.asarray(np.isfinite(self.points).all(axis=1) & self.points.any(axis=1))
 
     def returns(self) -> Self:
-        """Return the points that have a return, in double precision."""
+        """Select the points that have a return, and convert them to double precision."""
         mask = self.has_return
         sweep = self if mask.all() else self.select(mask)
         points = np.asarray(sweep.points, np.float64)
         return sweep if points is sweep.points else sweep.replace(points=points)
 
     def select(self, rows: Bools | Indices | slice) -> Self:
-        """Return some of the points, given a mask, indices or a slice."""
+        """Select points with a mask, indices or a slice."""
         columns = {name: np.asarray(values)[rows] for name, values in self.columns.items()}
         poses = self.firing_poses
         selected = self.replace(
@@ -236,8 +240,9 @@ class Sweep:
         return selected
 
     def with_columns(self, **columns: AnyArray | None) -> Self:
-        """Return the points with only the given columns, except those that are None.
+        """Return a copy of the sweep that has only the given columns.
 
+        Columns that are None are omitted.
         The copy no longer has rings and times that its recording determines.
         """
         return self.replace(
@@ -251,11 +256,11 @@ class Sweep:
         return np.asarray(self.points @ self.pose[:3, :3].T + self.pose[:3, 3])
 
     @classmethod
-    def joined(cls, sweeps: Sequence[Self], *, only_shared: bool = False) -> Self:
-        """Concatenate the points of sweeps.
+    def concatenate(cls, sweeps: Sequence[Self], *, only_shared: bool = False) -> Self:
+        """Concatenate the points of several sweeps.
 
-        The result has all columns, with NaN for sweeps that lack a column. If `only_shared` is
-        true, it has only the columns that all sweeps have.
+        By default, the result has the columns of all sweeps, filled with NaN where a sweep lacks a
+        column. If `only_shared` is true, the result has only the columns that all sweeps share.
         """
         filled = [sweep for sweep in sweeps if len(sweep)] or sweeps[:1]
         if not filled:
@@ -277,7 +282,7 @@ class Sweep:
 
 
 class _RingsAndTimes(NamedTuple):
-    """Rings and times of a sweep, which replace its recording in other processes."""
+    """Precomputed rings and times of a sweep, which replace its recording in other processes."""
 
     rings: AnyArray | None
     times_s: Floats | None

@@ -1,7 +1,8 @@
-"""The table of columns: all quantities of points, and their sources.
+"""The column table, which lists all point quantities and their sources.
 
-Sensors, stages, parts, exporters, viewer, coloring, report and documentation read this table;
-nothing else lists columns. Your own columns are `Column` objects in `Survey.columns`.
+This is the only list of columns. Sensors, simulation steps, parts, exporters, the viewer, the
+report and the documentation all use it. To define a custom column, add a `Column` to
+`Survey.columns`.
 """
 
 from __future__ import annotations
@@ -19,18 +20,19 @@ from ..schema.value_texts import one_line
 from ..words import did_you_mean
 from .waveforms import WAVEFORM, column_type
 
-Kind = Literal["number", "label"]  # a color scale, or a color for each value
+Kind = Literal["number", "label"]  # displayed with a color scale, or with one color per value
 Scale = Literal["linear", "logarithmic"]
 
-NO_SURFACE = "no surface"  # instead of an object's name
-CAUSES = ("surface", "air", "false alarm", "crosstalk", "blooming", "ghost", "spray")  # of a return
+NO_SURFACE = "no surface"  # shown in place of an object name
+# Causes of a return. The column `cause` contains indices into this tuple.
+CAUSES = ("surface", "air", "false alarm", "crosstalk", "blooming", "ghost", "spray")
 VELOCITY = "radial_velocity"
-COORDINATES = ("world", "sensor")  # coordinate systems of points
+COORDINATES = ("world", "sensor")  # coordinate systems in which points can be stored
 NORMAL = ("normal_x", "normal_y", "normal_z")
 ORIGIN = ("origin_x", "origin_y", "origin_z")
-VECTORS = (NORMAL, ORIGIN)  # columns that are useful only together
+VECTORS = (NORMAL, ORIGIN)  # columns that must be selected together
 SURFACE_COLUMNS = (*NORMAL, "incidence_deg", *ORIGIN)
-_OPEN3D = ("positions", "normals", "colors")  # Open3D, which writes the files
+_OPEN3D = ("positions", "normals", "colors")  # names to which Open3D assigns three numbers
 
 
 @dataclass(frozen=True)
@@ -155,8 +157,8 @@ OBJECT = Column(
     kind="label",
 )
 
-AXES = (X, Y, Z)  # in a part: whole multiples of the precision from the scene's local origin
-ALWAYS = (*AXES, CHANNEL, OBJECT)  # columns of every part; `scan` follows from the row
+AXES = (X, Y, Z)  # parts store integer multiples of the precision, from the local scene origin
+ALWAYS = (*AXES, CHANNEL, OBJECT)  # columns in every part; `scan` follows from the row
 OPTIONAL = (
     Column("ray", "uint32", "", "index of the ray in its scan"),
     Column("time", "int64", "ns", "time of the ray since the start of the survey"),
@@ -294,14 +296,20 @@ OPTIONAL = (
 )
 COLORS = ("red", "green", "blue")
 
-TABLE = {column.name: column for column in (SCAN, *ALWAYS, *OPTIONAL)}  # {name: column}
+TABLE = {column.name: column for column in (SCAN, *ALWAYS, *OPTIONAL)}
 
 
 def optional_columns(columns: Iterable[str | Column]) -> tuple[Column, ...]:
-    """Return the columns in addition to `ALWAYS`, without repetitions, named as in `TABLE`.
+    """Resolve a selection of columns to the optional columns that it contains.
 
-    LidarError if a name is unknown, two columns have the same name, a vector lacks an axis, or a
-    name cannot be written.
+    Names may be those in `TABLE` or those in files. Duplicates, and columns that every part has,
+    are removed.
+
+    Raises
+    ------
+    LidarError
+        If a name is unknown, two columns have the same name, a vector is incomplete, or a name
+        cannot be written to files.
     """
     by_name: dict[str, Column] = {}
     names = {column.in_files: column for column in TABLE.values()} | TABLE
@@ -331,7 +339,7 @@ def optional_columns(columns: Iterable[str | Column]) -> tuple[Column, ...]:
 
 
 def check_names(columns: Iterable[Column]) -> None:
-    """Raise LidarError unless columns have distinct and valid names in files."""
+    """Raise LidarError unless the columns have distinct and valid names in files."""
     used_names: set[str] = set()
     for name in (column.in_files for column in columns):
         if not name.isascii() or not name.isprintable() or " " in name:
@@ -349,16 +357,22 @@ def check_names(columns: Iterable[Column]) -> None:
         used_names.add(name)
 
 
-def value_names(names: Mapping[int, str]) -> list[str]:
-    """Return the names of the values 0, 1, 2, … of a column, empty for values not in `names`."""
+def names_by_value(names: Mapping[int, str]) -> list[str]:
+    """Convert a mapping from column values to names into a list indexed by value.
+
+    The list contains an empty string for each value without a name.
+    """
     return [names.get(value, "") for value in range(max(names, default=-1) + 1)]
 
 
 def waveform_column(samples: int) -> Column:
-    """Return the column of recorded waveforms, which only parts and clouds in memory have."""
+    """Return the column for recorded waveforms with the given number of samples.
+
+    Only parts and in-memory clouds have this column.
+    """
     return Column(WAVEFORM, column_type(samples), "", "waveform of the pulse", "waveform")
 
 
-def stored(optional: Sequence[Column]) -> tuple[Column, ...]:
-    """Return all columns of a part, in the order of the file."""
+def columns_in_parts(optional: Sequence[Column]) -> tuple[Column, ...]:
+    """Return all columns stored in a part, in file order."""
     return (*ALWAYS, *optional)

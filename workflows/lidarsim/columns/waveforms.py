@@ -1,4 +1,4 @@
-"""Recorded waveforms of points: a column of records with samples."""
+"""Recorded waveforms of points, stored as a column of records that contain samples."""
 
 from __future__ import annotations
 
@@ -8,18 +8,20 @@ import numpy as np
 
 from ..numerics.arrays import AnyArray, Floats, Records
 
-WAVEFORM = "waveform"  # name of the column in parts; of cloud files, only LAS holds waveforms
-ZERO = 2048  # digitized value of 0; noise is also negative
-FAINTEST = -126  # exponent of the faintest waveforms: 2**FAINTEST is a normal float32
+# Name of the column in parts. Among cloud files, only LAS and LAZ files can store waveforms.
+WAVEFORM = "waveform"
+ZERO = 2048  # digitized value that represents 0, since noise may be negative
+FAINTEST = -126  # exponent of the weakest waveforms; 2**FAINTEST is a normal float32
 
 
 def record(samples: int) -> np.dtype[np.void]:
-    """Return the type of the record of a waveform of a number of samples.
+    """Return the dtype of a waveform record with the given number of samples.
 
-    A sample is `(samples - ZERO) * 2.0**exponent`, in units of energy: the height of a returned
-    pulse that is as narrow as the sent pulse is its energy. Sample 0 is `begin` sample steps after
-    firing. The return is at `location_ps` after sample 0. `toward` is the direction to the sensor,
-    times half the distance that light travels in a picosecond, meters, in the frame of the points.
+    The value of a sample is `(samples - ZERO) * 2.0**exponent` in units of energy, scaled such that
+    the peak of an echo that is as narrow as the emitted pulse equals its energy. Sample 0 is taken
+    `begin` sample steps after firing, and the return follows `location_ps` after sample 0. `toward`
+    is the direction to the sensor in the frame of the points, multiplied by half the distance in
+    meters that light travels in a picosecond.
     """
     return np.dtype(
         [
@@ -38,28 +40,29 @@ _RECORD_BYTES = record(0).itemsize
 
 
 def column_type(samples: int) -> str:
-    """Return NumPy's name of the type of the column."""
+    """Return the NumPy dtype string of the waveform column."""
     return f"V{record(samples).itemsize}"
 
 
 def records(column: AnyArray) -> Records:
-    """Return a column (n,) as records (`record`)."""
+    """View a waveform column as records; see `record`."""
     return column.view(record((column.dtype.itemsize - _RECORD_BYTES) // 2))
 
 
 @dataclass(frozen=True, eq=False)
 class Waveforms:
-    """Waveforms of points in the order of points (`Cloud.waveforms`).
+    """Waveforms of points, in the order of the points in the cloud.
 
     Parameters
     ----------
     samples
-        Heights (n, samples), in units of `intensity`: the height of a returned pulse that is as
-        narrow as the sent pulse is its energy.
+        Amplitudes in units of `intensity`, with shape (n, samples). The peak of an echo that is as
+        narrow as the emitted pulse equals its energy.
     times_ns
-        Times of the samples after firing, (n, samples), nanoseconds.
+        Times of the samples after firing, in nanoseconds, with shape (n, samples).
     location_ns
-        Times of the returns after firing, (n,), nanoseconds: ranges over half the speed of light.
+        Times of the returns after firing, in nanoseconds, with shape (n,). They equal the range
+        divided by half the speed of light.
     """
 
     samples: Floats
@@ -68,7 +71,7 @@ class Waveforms:
 
     @classmethod
     def from_records(cls, column: AnyArray) -> Waveforms:
-        """Return the waveforms of a column of records."""
+        """Decode the waveforms in a column of records."""
         rows = records(column)
         heights = rows["samples"].astype(np.float64) - ZERO
         heights = np.ldexp(heights, rows["exponent"].astype(int)[:, None])

@@ -1,1 +1,1 @@
-"""Optional libraries, plug-ins, signals, notebooks and network ports of the current process."""
+"""Environment of the current process: optional libraries, plug-ins, signals and notebooks."""

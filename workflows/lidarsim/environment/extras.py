@@ -1,4 +1,4 @@
-"""Libraries that are extras: checks for their installation, and errors as sentences."""
+"""Checks for optional libraries, and conversion of their exceptions to readable errors."""
 
 from __future__ import annotations
 
@@ -13,18 +13,16 @@ _PARTS = ("./kernels", "./scheduler", "./workflows/lidarsim", ".")  # distributi
 
 
 def install_command(*requirements: str) -> str:
-    """Return the command that installs requirements, such as ``lidarpool[las]``, here.
+    """Return the command that installs requirements, such as ``lidarpool[las]``.
 
-    lidarpool is not on a package index. It is installed from a checkout, and so are its extras.
+    Since lidarpool is not available from a package index, its extras are installed from a checkout.
     """
     from raybeam.installation import install_command  # raybeam imports NumPy
 
     words: list[str] = []
     for name in requirements:
-        # Editable, because a copy next to a checkout would hide changes of the checkout.
-        if name == "lidarpool":
-            words += [word for part in _PARTS for word in ("-e", part)]
-        elif name.startswith("lidarpool["):
+        if name.partition("[")[0] == "lidarpool":
+            # The installation is editable so that changes to the checkout take effect.
             words += ["-e", f".{name.removeprefix('lidarpool')}"]
         else:
             words.append(name)
@@ -32,12 +30,15 @@ def install_command(*requirements: str) -> str:
     return command if words == [*requirements] else f"{command} in {CHECKOUT}"
 
 
-def need(package: str, extra: str, purpose: str) -> None:
-    """Check that the package of an extra is installed.
+def require_package(package: str, extra: str, purpose: str) -> None:
+    """Check that a package from an extra is installed.
 
-    Raises LidarError if not.
+    `purpose` is the subject of the error message, for example "Reading clouds".
 
-    `purpose` is the subject of the error message, such as "Reading clouds".
+    Raises
+    ------
+    LidarError
+        If the package is not installed.
     """
     if find_spec(package) is None:
         raise LidarError(
@@ -48,7 +49,10 @@ def need(package: str, extra: str, purpose: str) -> None:
 
 @contextmanager
 def reading(name: str) -> Iterator[None]:
-    """Turn the errors of a library that reads a file into a LidarError of a line."""
+    """Convert exceptions from a library that reads a file into a LidarError.
+
+    The message is a single line that starts with the name of the file.
+    """
     try:
         with prefixed(name):
             yield
@@ -58,5 +62,5 @@ def reading(name: str) -> Iterator[None]:
         file = "" if error.filename in (None, name) else f", {error.filename}"
         reason = message_of(error).rstrip(".")
         raise LidarError(f"{name} cannot be read: {reason}{file}.") from error
-    except Exception as error:  # libraries raise errors of any class
+    except Exception as error:  # libraries may raise exceptions of any class
         raise LidarError(unreadable(name, error)) from error

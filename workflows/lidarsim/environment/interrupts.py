@@ -1,4 +1,8 @@
-"""Ctrl-C, SIGTERM, SIGHUP: the first stops cleanly, the second at once, without workers."""
+"""Handling of SIGINT (Ctrl-C), SIGTERM and SIGHUP.
+
+The first signal shuts the program down cleanly. The second ends the process immediately, without
+waiting for its workers.
+"""
 
 from __future__ import annotations
 
@@ -13,29 +17,29 @@ from multiprocessing import resource_tracker
 from types import FrameType
 from typing import NoReturn
 
-INTERRUPTED = 130  # exit code of shells for a program ended by Ctrl-C
+INTERRUPTED = 130  # exit code that shells report for a program ended by Ctrl-C
 STOPPED = "Interrupted. All processes were stopped"
 UNTOUCHED = f"{STOPPED}, and the output folder is unchanged."
 
-# From the keyboard, from a job manager, and from a terminal that is closed.
+# These signals are sent by the keyboard, by job managers, and when a terminal is closed.
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_IMPATIENT_S = 1.0  # a second signal sooner than this counts as the first
+_IMPATIENT_S = 1.0  # a second signal within this time is considered part of the first
 _RETRY_S = 0.01
-# Files with the callbacks of weak references.
+# Files that define weak reference callbacks.
 _WEAK = {weakref.__file__, weakref.WeakSet.add.__code__.co_filename}
 
 
 class _Interrupt:
-    """A signal handler: KeyboardInterrupt the first time, the end of the process the next."""
+    """Signal handler that raises KeyboardInterrupt first and ends the process the second time."""
 
     def __init__(self) -> None:
         self.first_at: float | None = None
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         if self.first_at is None:
-            if _drops_errors(frame):  # send the signal again, a little later, from a thread
+            if _drops_errors(frame):  # resend the signal from a thread after a short delay
                 main = threading.main_thread().ident
-                # A signal to the thread also interrupts its waiting for a lock.
+                # A signal sent to the thread itself also interrupts a wait for a lock.
                 threading.Timer(_RETRY_S, signal.pthread_kill, (main, signal.SIGINT)).start()
                 return
             self.first_at = time.monotonic()
@@ -47,7 +51,10 @@ class _Interrupt:
 
 
 def _drops_errors(frame: FrameType | None) -> bool:
-    """Return True if an object may be being finalized: Python drops errors raised there."""
+    """Return True if a finalizer or weak reference callback is running.
+
+    Python ignores exceptions that are raised there.
+    """
     while frame is not None:
         code = frame.f_code
         if code.co_name == "__del__" or code.co_filename in _WEAK:
@@ -56,46 +63,47 @@ def _drops_errors(frame: FrameType | None) -> bool:
     return False
 
 
-def end_on_signals() -> None:
-    """Let the signals end the process at once, as long as no work has started."""
+def exit_on_signals() -> None:
+    """End the process immediately on a signal. Use this function before any work has started."""
     _on_signals(lambda number, frame: _exit_at_once(f"lidarpool: {UNTOUCHED}\n".encode()))
 
 
 def interrupt_on_signals() -> None:
-    """Turn the first signal into KeyboardInterrupt, and end the process at once at the second."""
+    """Raise KeyboardInterrupt on the first signal, and end the process on the second."""
     _on_signals(_Interrupt())
 
 
 def _on_signals(handler: Callable[[int, FrameType | None], object]) -> None:
-    """Handle the signals by a handler, except signals that `nohup` ignores."""
+    """Install a handler for all signals except those that `nohup` ignores."""
     for number in _SIGNALS:
-        # With `nohup` a run survives the closing of its terminal.
+        # Under `nohup`, a run must survive when its terminal is closed.
         if signal.getsignal(number) is not signal.SIG_IGN or number == signal.SIGINT:
             signal.signal(number, handler)
 
 
 def _exit_at_once(message: bytes) -> NoReturn:
-    """End the process at once, with a message on stderr."""
-    with suppress(OSError):  # the terminal may be gone
+    """End the process immediately with a message on stderr."""
+    with suppress(OSError):  # the terminal may already be closed
         os.write(2, message)
     os._exit(INTERRUPTED)
 
 
 @contextmanager
-def deferred_interrupts() -> Iterator[None]:
-    """Defer signals while the body runs, then raise KeyboardInterrupt for the first signal.
+def defer_interrupts() -> Iterator[None]:
+    """Defer signals until the context exits, and then handle the first one.
 
-    For indivisible actions: starting and stopping processes, moving a result to its folder. Only
-    the main thread of a program gets signals; in other threads, the body just runs. A second signal
-    to an interrupted program is not deferred.
+    Use this context for operations that must not be interrupted, such as starting and stopping
+    processes or moving a result to its folder. It has no effect outside the main thread, because
+    only the main thread receives signals. A second signal to a program that has already been
+    interrupted is not deferred.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     signals: list[int] = []
     handlers = {n: signal.getsignal(n) for n in _SIGNALS}
-    # A handler that has seen a first signal raises no errors, and the user is impatient. A handler
-    # from outside of Python (None) could not be restored.
+    # A handler that has already received a signal no longer raises exceptions, and must end the
+    # process without delay. A handler that was not installed from Python (None) cannot be restored.
     deferred = [
         number
         for number, handler in handlers.items()
@@ -113,17 +121,17 @@ def deferred_interrupts() -> Iterator[None]:
 
 
 @contextmanager
-def children_spared() -> Iterator[None]:
-    """Protect processes and threads started in the body from Ctrl-C.
+def block_child_signals() -> Iterator[None]:
+    """Block Ctrl-C in processes and threads that are started in the context.
 
-    A terminal sends SIGINT and SIGQUIT to the whole process group, and SIGHUP when it is closed.
-    Workers would die with a traceback each before they can be stopped cleanly, and so would their
-    nannies. A blocked signal stays blocked in later threads and processes, including a worker that
-    a nanny restarts.
+    A terminal sends SIGINT and SIGQUIT to the entire process group, as well as SIGHUP when it is
+    closed. Without protection, every worker and nanny would exit with a traceback before it could
+    be stopped cleanly. Threads and processes inherit blocked signals, which includes workers that a
+    nanny restarts.
     """
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGQUIT})
     try:
-        # The tracker would start with the first process, and starting it unblocks SIGINT.
+        # Starting the tracker unblocks SIGINT, so it must not start later with the first process.
         resource_tracker.ensure_running()
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         yield

@@ -1,4 +1,4 @@
-"""Notebooks: displays in their cells, and how objects are shown there as tables and pictures."""
+"""Display of objects in notebooks as HTML tables and pictures."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import sys
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-PICTURE_SIZE = (800, 500)  # pixels; letters of smaller pictures could not be read
+PICTURE_SIZE = (800, 500)  # pixels; text would be illegible in smaller pictures
 
-# {name of a class: "module:function" that draws an instance as a PNG}, of packages that draw.
+# {class name: "module:function" that draws an instance as a PNG}
 _drawers: dict[str, str] = {}
 
 
 def cell_display() -> Any:
-    """Return `IPython.display` in a notebook, whose cells show printed text, else None."""
+    """Return the `IPython.display` module in a notebook, or None elsewhere."""
     if "ipykernel" not in sys.modules:
         return None
     from IPython import display, get_ipython
@@ -22,7 +22,7 @@ def cell_display() -> Any:
     return display if type(shell).__name__ == "ZMQInteractiveShell" else None
 
 
-def draw_with(drawers: Mapping[str, str]) -> None:
+def register_drawers(drawers: Mapping[str, str]) -> None:
     """Register functions that draw objects in notebooks.
 
     `drawers` maps class names to functions, which are specified as "module:function". A function
@@ -32,8 +32,8 @@ def draw_with(drawers: Mapping[str, str]) -> None:
     _drawers.update(drawers)
 
 
-def table_of(rows: Iterable[tuple[str, str]]) -> str:
-    """Return an HTML table of names and values, in the colors of the notebook."""
+def html_table(rows: Iterable[tuple[str, str]]) -> str:
+    """Return an HTML table of names and values in the color theme of the notebook."""
     from html import escape
 
     left = " style='text-align:left'"
@@ -44,8 +44,8 @@ def table_of(rows: Iterable[tuple[str, str]]) -> str:
     return f"<table>{''.join(lines)}</table>"
 
 
-def picture_of(instance: object) -> str:
-    """Return the picture of an instance as HTML, or "" if no package draws its class."""
+def html_picture(instance: object) -> str:
+    """Return a picture of an instance as HTML, or "" if no function draws its class."""
     from importlib import import_module
 
     from ..errors import LidarError
@@ -57,13 +57,13 @@ def picture_of(instance: object) -> str:
     module, _, function = drawer.partition(":")
     try:
         png: bytes | None = getattr(import_module(module), function)(instance)
-    except LidarError:  # a scene that cannot be cast is shown as a table
+    except LidarError:  # if the scene cannot be rendered, only the table is shown
         return ""
-    return "" if png is None else image_of(png, type(instance).__name__)
+    return "" if png is None else html_image(png, type(instance).__name__)
 
 
-def image_of(png: bytes, name: str) -> str:
-    """Return a PNG as HTML, as wide as drawn at most."""
+def html_image(png: bytes, name: str) -> str:
+    """Return a PNG as an HTML image that is at most as wide as the PNG."""
     from base64 import b64encode
     from html import escape
 

@@ -1,8 +1,8 @@
-"""Plug-ins: extensions by other distributions through entry points.
+"""Plug-ins that other distributions provide through entry points.
 
-A table of this package answers first. Entry points are looked up only for names that no table has,
-since importing `importlib.metadata` takes 30 ms. Each group is named beside the table that it adds
-to.
+Built-in names take precedence. Entry points are searched only for other names, because importing
+`importlib.metadata` takes 30 ms. The name of each entry point group is defined next to the table
+that it extends.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Plugin:
-    """An entry point of a distribution, with a `value` «module» or «module:attribute»."""
+    """An entry point of a distribution.
+
+    `value` has the form "module" or "module:attribute".
+    """
 
     group: str
     name: str
@@ -38,12 +41,12 @@ class Plugin:
         return self.value.partition(":")[0].strip()
 
     def load(self, kind: type[T]) -> T:
-        """Import and return the value of the plug-in.
+        """Import the plug-in and return its value.
 
         Raises
         ------
         LidarError
-            If the value cannot be imported, or is not of the kind.
+            If the value cannot be imported or is not an instance of `kind`.
         """
         value = _imported(self)
         if not isinstance(value, kind):
@@ -54,14 +57,14 @@ class Plugin:
         return value
 
     def lacks(self, field: str) -> LidarError:
-        """Return the error of a plug-in that lacks a field or function."""
+        """Return the error to raise if the plug-in lacks a field or function."""
         return LidarError(
             f"{self} lacks {field}, which {self.group} requires. Install a different version of "
             f"{self.distribution}."
         )
 
     def broken(self, error: BaseException) -> LidarError:
-        """Return the error of a plug-in that cannot be imported, or whose import failed later."""
+        """Return the error to raise if the plug-in cannot be imported."""
         reason = printable(str(error)) or type(error).__name__
         return LidarError(
             f"{self} cannot be imported: {reason}. Install the dependencies of "
@@ -71,22 +74,19 @@ class Plugin:
 
 @cache
 def _imported(plugin: Plugin) -> Any:
-    """Return the value of a plug-in.
-
-    Raises LidarError if the import fails.
-    """
+    """Import the value of a plug-in. Raise LidarError if the import fails."""
     from importlib.metadata import EntryPoint
 
     try:
         return EntryPoint(plugin.name, plugin.value, plugin.group).load()
-    except Exception as error:  # a module may raise anything while it is imported
+    except Exception as error:  # importing a module may raise any exception
         raise plugin.broken(error) from error
 
 
 def plugins_of(group: str) -> Mapping[str, tuple[Plugin, ...]]:
-    """Return the plug-ins of a group by name, sorted.
+    """Return the plug-ins in an entry point group, sorted by name.
 
-    Several plug-ins may share a name.
+    The result maps each name to all plug-ins that share it.
     """
     from importlib.metadata import entry_points
 
@@ -102,12 +102,12 @@ def plugins_of(group: str) -> Mapping[str, tuple[Plugin, ...]]:
 
 
 def find_plugin(group: str, name: str) -> Plugin | None:
-    """Return the plug-in of a group with a name, or None.
+    """Return the plug-in with a given name in an entry point group, or None if there is none.
 
     Raises
     ------
     LidarError
-        If two distributions provide a plug-in of the name.
+        If several distributions provide a plug-in with this name.
     """
     candidates = plugins_of(group).get(name, ())
     if len(candidates) > 1:
@@ -117,18 +117,19 @@ def find_plugin(group: str, name: str) -> Plugin | None:
 
 
 class PluginTable(Generic[T]):
-    """A table by names that plug-ins of a group add to.
+    """Lookup table of named entries that plug-ins can extend.
 
     Parameters
     ----------
     group
-        The group of entry points, whose names are names of the table.
+        Entry point group. The names of its entry points are names in the table.
     noun
-        What the table has, for errors: «a format of clouds».
+        Noun for the entries in error messages, for example "point cloud format".
     built_in
-        The entries of this package, {name: entry}.
+        Mapping from names to the entries in this package.
     load
-        Returns the entry of a plug-in; LidarError if the plug-in cannot be used.
+        Function that returns the entry for a plug-in, or raises LidarError if the plug-in cannot be
+        used.
     """
 
     def __init__(
@@ -141,16 +142,16 @@ class PluginTable(Generic[T]):
 
     @property
     def names(self) -> list[str]:
-        """Names of the table, then names of plug-ins."""
+        """Built-in names, followed by the names of plug-ins."""
         return [*self._built_in, *plugins_of(self.group)]
 
     def __getitem__(self, name: str) -> T:
-        """Return the entry of a name.
+        """Return the entry with a given name.
 
         Raises
         ------
         LidarError
-            If no entry has that name, or its plug-in cannot be used.
+            If there is no entry with that name, or if its plug-in cannot be used.
         """
         if name in self._built_in:
             return self._built_in[name]
@@ -164,5 +165,5 @@ class PluginTable(Generic[T]):
 
 
 def _a(noun: str) -> str:
-    """Put the indefinite article before a name: «a dict», «an int»."""
+    """Prefix a name with the indefinite article, for example "a dict" or "an int"."""
     return f"an {noun}" if noun[0].lower() in "aeiou" else f"a {noun}"

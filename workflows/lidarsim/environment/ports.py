@@ -1,4 +1,4 @@
-"""Ports of TCP and UDP as text."""
+"""Parsing of TCP and UDP port numbers."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ _MAX_DIGITS = 5
 
 
 def port_number(text: str) -> int | None:
-    """Return the number from 0 to 65,535 that a text is, or None for other text, however long."""
+    """Parse a port number from 0 to 65,535, or return None if the text is not a port number."""
     if not (text.isascii() and text.isdecimal() and len(text) <= _MAX_DIGITS):
         return None
     number = int(text)

@@ -1,4 +1,4 @@
-"""Limits on the memory that the content of a file may take: a few lines can unpack to any size."""
+"""Memory limits for the content of input files, because a small file can expand to any size."""
 
 from __future__ import annotations
 
@@ -10,27 +10,30 @@ import psutil
 
 from ..errors import LidarError, as_sentence
 
-UNPACKED_TIMES = 100  # multiple of the file's bytes
+UNPACKED_TIMES = 100  # limit as a multiple of the file size
 MIN_LIMIT_BYTES = 256 * 2**20  # limit for small files
-CONTROL_GROUPS = Path("/sys/fs/cgroup")  # Linux states limits of memory in this folder
+CONTROL_GROUPS = Path("/sys/fs/cgroup")  # folder in which Linux publishes memory limits
 _PREFIXES = {"Pi": 2**50, "Ti": 2**40, "Gi": 2**30, "Mi": 2**20, "ki": 2**10}
-_SHARE = 4  # a fraction of the memory: a scene is copied while its objects are placed and joined
+# A file may use one quarter of the memory, because a scene is copied while its objects are placed
+# and merged.
+_SHARE = 4
 
 
 class Allowance:
-    """Memory that the content of a file may take, and the bytes taken so far.
+    """Memory budget for the content of a file.
 
-    The limit is 100 times the file's size or 256 MiB, whichever is larger, and at most a quarter of
+    The limit is 100 times the file size or 256 MiB, whichever is larger, but at most a quarter of
     the memory.
 
     Parameters
     ----------
     size
-        Size of the file, bytes.
+        File size in bytes.
     advice
-        Advice to the user if the content is larger, at the end of the error.
+        Advice to the user at the end of the error message.
     in_parts
-        Whether the content is never in memory as a whole: the memory does not limit it.
+        Whether the content is processed in parts. If it is never entirely in memory, the size of
+        the memory does not limit it.
 
     Examples
     --------
@@ -49,36 +52,45 @@ least 2.70 GiB, and the limit is 256.00 MiB. Export it again.
 
     @property
     def limit(self) -> int:
-        """Limit, bytes."""
+        """Limit in bytes."""
         limit = max(UNPACKED_TIMES * self._size, MIN_LIMIT_BYTES)
         return limit if self._in_parts else min(limit, memory_share())
 
     def grow(self, size: int) -> None:
-        """Add the size of further data of the file, bytes."""
+        """Raise the limit because the file has more data, with the given size in bytes."""
         self._size += size
 
     def add_file(self, file: Path) -> None:
-        """Add the size of a file that the file names, once for each file."""
+        """Raise the limit because the file refers to another file.
+
+        Each file is counted only once.
+        """
         if file not in self._files:
             self._files.add(file)
             self.grow(file.stat().st_size)
 
     def fits(self, count: int) -> bool:
-        """Return True if a number of further bytes may be taken."""
+        """Return True if `count` more bytes are within the limit."""
         return self.used_bytes + count <= self.limit
 
     def take(self, count: int) -> None:
-        """Take a number of bytes, before they are allocated.
+        """Count bytes toward the limit before they are allocated.
 
-        Raises LidarError above the limit.
+        Raises
+        ------
+        LidarError
+            If the limit is exceeded.
         """
         self.check(count)
         self.used_bytes += count
 
     def check(self, count: int) -> None:
-        """Check that a number of bytes fits that is freed again.
+        """Check that a temporary allocation is within the limit, without counting it.
 
-        Raises LidarError above the limit.
+        Raises
+        ------
+        LidarError
+            If the limit would be exceeded.
         """
         if not self.fits(count):
             raise LidarError(
@@ -90,17 +102,18 @@ least 2.70 GiB, and the limit is 256.00 MiB. Export it again.
 
 @cache
 def memory() -> int:
-    """Return the memory that this process may use, bytes.
+    """Return the memory in bytes that this process may use.
 
-    The minimum of the machine's memory and the limits of control groups and of `ulimit -m`.
+    This is the smallest of the physical memory, the limits of the control groups, and `ulimit -m`.
     """
     return min([psutil.virtual_memory().total, *_control_group_limits(), *_resident_limit()])
 
 
 def _control_group_limits() -> list[int]:
-    """Return the limits of the control groups, version 1 and 2, that contain this process, bytes.
+    """Return the memory limits in bytes of all control groups that contain this process.
 
-    Batch systems and containers limit a group that contains the process, at any depth.
+    Batch systems and containers may set the limit on any ancestor of the group. Versions 1 and 2 of
+    control groups are supported.
     """
     try:
         memberships = Path("/proc/self/cgroup").read_text("utf-8").splitlines()
@@ -121,29 +134,30 @@ def _control_group_limits() -> list[int]:
         for ancestor in (folder, *folder.parents):
             if not ancestor.is_relative_to(top):
                 break
-            # A file says «max» without a limit; a container may not see the folders of its group.
+            # The file contains "max" if there is no limit. In a container, the folder of the group
+            # may be missing.
             with suppress(OSError, ValueError):
                 limits.append(int((ancestor / file_name).read_text("utf-8")))
     return limits
 
 
 def _resident_limit() -> list[int]:
-    """Return the limit of resident memory (`ulimit -m`), bytes, or [] without a limit."""
+    """Return the limit on resident memory (`ulimit -m`) in bytes, or an empty list if unlimited."""
     try:
         import resource
-    except ImportError:  # Windows has no such limits
+    except ImportError:  # not available on Windows
         return []
     limit = resource.getrlimit(resource.RLIMIT_RSS)[1]
     return [limit] if limit > 0 else []
 
 
 def memory_share() -> int:
-    """Return the maximum memory of the objects of a file, bytes."""
+    """Return the maximum memory in bytes that the content of a single file may use."""
     return memory() // _SHARE
 
 
 def bytes_of(count: int) -> str:
-    """Return bytes as text: «1.43 MiB»."""
+    """Format a number of bytes, for example "1.43 MiB"."""
     for prefix, size in _PREFIXES.items():
         if count >= 0.9 * size:
             return f"{count / size:.2f} {prefix}B"

@@ -1,4 +1,4 @@
-"""Archives of arrays, as this package writes and reads them."""
+"""NPZ archives: deterministic writing, lazy access, and reading that validates the contents."""
 
 from __future__ import annotations
 
@@ -22,62 +22,63 @@ from .allowance import Allowance
 from .checksum import crc32
 from .input_files import read_input
 
-# Head of an array of numbers or text in format 1.0 of NumPy, after ten bytes that end with its
-# length.
+# Header of an array of numbers or text in NPY format 1.0. It follows ten bytes, the last two of
+# which contain its length.
 _HEADER = re.compile(
     rb"\{'descr': '([<>|][a-zUV]\d+)', 'fortran_order': (False|True), "
     rb"'shape': \(((?:\d+, ?)*\d*)\), \} *\n"
 )
-# Records of an archive: the header of a file, a file in the directory, sizes in 64 bits, the end of
-# the directory, and the same in 64 bits with its place (PKWARE's APPNOTE.TXT, 4.3.7 to 4.5.3).
+# Records in a ZIP archive: local file header, central directory entry, ZIP64 extra field, end of
+# central directory, ZIP64 end of central directory, and its locator. Source: PKWARE's APPNOTE.TXT,
+# sections 4.3.7 to 4.5.3.
 _FILE = struct.Struct("<4s5HIIIHH")
 _ENTRY = struct.Struct("<4s6HIII5HII")
 _SIZES = struct.Struct("<HHQQ")
 _END = struct.Struct("<4s4HIIH")
 _LARGE_END = struct.Struct("<4sQHHIIQQQQ")
 _LARGE_END_PLACE = struct.Struct("<4sIQI")
-_MAX_SIZE = (1 << 31) - 1  # larger numbers need 64 bits, as zipfile has it
-_IN_64_BITS = 0xFFFFFFFF  # in place of a number that is stored in 64 bits
-_VERSION = 45  # of the format with numbers of 64 bits
-_UNIX = 3 << 8  # system whose permissions the directory has
+_MAX_SIZE = (1 << 31) - 1  # larger numbers are stored in 64 bits, as in zipfile
+_IN_64_BITS = 0xFFFFFFFF  # placeholder for a number that is stored in 64 bits
+_VERSION = 45  # version of the ZIP format that introduced 64-bit numbers
+_UNIX = 3 << 8  # the permissions are those of Unix
 _PERMISSIONS = 0o600 << 16
-_UTF8 = 0x800  # flag of a file's name
-_DATE = 1 << 5 | 1  # 1980-01-01: the same arrays give the same bytes
+_UTF8 = 0x800  # flag for file names in UTF-8
+_DATE = 1 << 5 | 1  # always 1980-01-01, so that equal arrays result in equal bytes
 _ADVICE = "download or copy it again, or read it on a machine with more memory"
 
 
-Piece = bytes | memoryview  # of a file that is written in pieces
+Piece = bytes | memoryview  # a piece of a file that is written in pieces
 
 
-def packed(arrays: Mapping[str, Any]) -> bytes:
-    """Return an archive of arrays: the same arrays give the same bytes."""
+def pack_arrays(arrays: Mapping[str, Any]) -> bytes:
+    """Create a compressed archive of arrays. Equal arrays result in equal bytes."""
     memory = io.BytesIO()  # NumPy leaves a file open if writing fails
     np.savez_compressed(memory, **arrays)
     return memory.getvalue()
 
 
 class StoredArray(NamedTuple):
-    """An array in an archive without compression, which is read piece by piece."""
+    """Location and type of an array in an uncompressed archive, for reading it in pieces."""
 
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
-    offset: int  # of the first element in the archive, bytes
-    head_crc: int  # CRC-32 of the file of NumPy up to the first element
-    crc: int  # CRC-32 of the whole file of NumPy
+    offset: int  # position of the first element in the archive, bytes
+    head_crc: int  # CRC-32 of the NPY file up to the first element
+    crc: int  # CRC-32 of the entire NPY file
 
 
 class _StoredFile(NamedTuple):
-    """A file in an archive, without compression."""
+    """An uncompressed file in an archive."""
 
     name: bytes
     flags: int
     crc: int
     size: int  # bytes
-    offset: int  # of its header in the archive, bytes
+    offset: int  # position of the local file header in the archive, bytes
 
     @property
     def header(self) -> bytes:
-        """Header before the content, with sizes in 64 bits."""
+        """Local file header, with 64-bit sizes."""
         named = (len(self.name), _SIZES.size)
         numbers = (_VERSION, self.flags, zipfile.ZIP_STORED, 0, _DATE, self.crc)
         fixed = _FILE.pack(b"PK\3\4", *numbers, _IN_64_BITS, _IN_64_BITS, *named)
@@ -85,7 +86,7 @@ class _StoredFile(NamedTuple):
 
     @property
     def entry(self) -> bytes:
-        """Entry in the directory, with 64 bits for numbers that need them."""
+        """Central directory entry, with 64-bit numbers only where they are required."""
         large: list[int] = []
         size = self.size
         offset = self.offset
@@ -104,12 +105,13 @@ class _StoredFile(NamedTuple):
         )
 
 
-def stored_pieces(arrays: Mapping[str, AnyArray]) -> list[Piece]:
-    """Return the pieces of an archive of arrays without compression.
+def archive_pieces(arrays: Mapping[str, AnyArray]) -> list[Piece]:
+    """Create an uncompressed archive of arrays, and return it in pieces to be written in order.
 
-    The bytes of a contiguous array are not copied: its piece is a view, to be written before the
-    array changes. The same arrays give the same bytes, which are zipfile's. zipfile itself would
-    copy each array into a file in memory, whose growth copies its content again.
+    Contiguous arrays are not copied. Their pieces are views, which must be written before the
+    arrays change. Equal arrays result in equal bytes, which are the same as those that zipfile
+    would write. zipfile is not used because it would copy each array to an in-memory file, and copy
+    it again whenever that file grows.
     """
     pieces: list[Piece] = []
     files: list[_StoredFile] = []
@@ -131,14 +133,17 @@ def stored_pieces(arrays: Mapping[str, AnyArray]) -> list[Piece]:
 
 
 def _npy_head(array: AnyArray) -> bytes:
-    """Return the head of a file of NumPy, before the elements."""
+    """Return the start of an NPY file, up to the first element."""
     head = io.BytesIO()
     np.lib.format.write_array_header_1_0(head, np.lib.format.header_data_from_array_1_0(array))
     return head.getvalue()
 
 
 def _directory_end(count: int, size: int, offset: int) -> bytes:
-    """Return the end of an archive, after a directory of files: its size and offset in bytes."""
+    """Return the records after a central directory with the given entry count, size and offset.
+
+    The size and offset are in bytes.
+    """
     end = b""
     if max(size, offset) > _MAX_SIZE:
         numbers = (_LARGE_END.size - 12, _VERSION, _VERSION, 0, 0, count, count, size, offset)
@@ -152,9 +157,11 @@ def _directory_end(count: int, size: int, offset: int) -> bytes:
 def open_archive(
     path: Path | str, read: Callable[[], bytes] | None = None
 ) -> Iterator[dict[str, Any]]:
-    """Read an archive, without running code, for the body, whose errors become LidarError.
+    """Read an archive without unpickling objects, and provide its arrays.
 
-    With `read`, which returns the content of the file, the path is only a name in errors.
+    Exceptions raised while the archive is read or in the context are converted to LidarError. If
+    `read` is set, it is called to obtain the content of the file, and the path is used only in
+    error messages.
     """
     try:
         with explained(f"{path} cannot be read"), prefixed(path):
@@ -162,7 +169,7 @@ def open_archive(
             yield read_arrays(data, Allowance(len(data), _ADVICE))
     except LidarError:
         raise
-    except Exception as error:  # zipfile, zlib, NumPy and Scene have many
+    except Exception as error:  # zipfile, zlib, NumPy and Scene raise many types of exceptions
         reason = " ".join(str(error).split())
         raise LidarError(
             f"{path} is damaged or was written by a different version of lidarpool ({reason}). Run "
@@ -171,10 +178,15 @@ def open_archive(
 
 
 def read_arrays(data: bytes, allowance: Allowance | None = None) -> dict[str, AnyArray]:
-    """Read all arrays of an archive, and compare their checksums.
+    """Read all arrays in an archive and verify their checksums.
 
-    The bytes of the arrays are taken from `allowance`. LidarError if they exceed the allowance; any
-    exception if the archive is damaged.
+    The size of the arrays counts toward `allowance`. If the archive is damaged, the exception may
+    be of any class.
+
+    Raises
+    ------
+    LidarError
+        If the arrays exceed the allowance.
     """
     entries = _entries(io.BytesIO(data))
     if allowance is not None:
@@ -183,10 +195,15 @@ def read_arrays(data: bytes, allowance: Allowance | None = None) -> dict[str, An
     return {name.removesuffix(".npy"): read_npy(content, name) for name, content in files}
 
 
-def stored_arrays(file: IO[bytes]) -> dict[str, StoredArray]:
-    """Find the arrays of an archive without compression, {name: array}, and read no element.
+def locate_arrays(file: IO[bytes]) -> dict[str, StoredArray]:
+    """Locate the arrays in an uncompressed archive without reading their elements.
 
-    Any exception if the archive is damaged.
+    If the archive is damaged, the exception may be of any class.
+
+    Returns
+    -------
+    dict
+        Mapping from array names to locations.
     """
     return {
         entry.filename.removesuffix(".npy"): _stored_array(file, entry) for entry in _entries(file)
@@ -194,10 +211,10 @@ def stored_arrays(file: IO[bytes]) -> dict[str, StoredArray]:
 
 
 def _entries(file: IO[bytes]) -> list[zipfile.ZipInfo]:
-    """Return the list of files of an archive."""
+    """Return the files in an archive. Raise ValueError if the central directory is damaged."""
     with zipfile.ZipFile(file) as archive:
         entries = archive.infolist()
-    # A damaged entry of the file list may hide later ones.
+    # A damaged entry in the central directory may hide later entries.
     file.seek(-12, os.SEEK_END)
     if len(entries) != int.from_bytes(file.read(2), "little"):
         raise ValueError(f"{len(entries)} arrays")
@@ -205,9 +222,9 @@ def _entries(file: IO[bytes]) -> list[zipfile.ZipInfo]:
 
 
 def _stored_array(file: IO[bytes], entry: zipfile.ZipInfo) -> StoredArray:
-    """Return the array in a file of an archive.
+    """Locate the array in a file in an archive.
 
-    Raises ValueError for a damaged or compressed file.
+    Raise ValueError if the file is damaged or compressed.
     """
     name = entry.orig_filename.encode()
     file.seek(entry.header_offset)
@@ -224,11 +241,9 @@ def _stored_array(file: IO[bytes], entry: zipfile.ZipInfo) -> StoredArray:
 
 
 def _content(data: bytes, entry: zipfile.ZipInfo) -> bytes | memoryview:
-    """Return the content of a file in an archive.
+    """Return the content of a file in an archive. Raise ValueError if the file is damaged.
 
-    Raises ValueError for a damaged file.
-
-    zipfile takes far longer to find the file than to unpack it.
+    zipfile is not used because it takes far longer to find a file than to decompress it.
     """
     name_start = entry.header_offset + 30
     length, extra = (
@@ -248,12 +263,16 @@ def _content(data: bytes, entry: zipfile.ZipInfo) -> bytes | memoryview:
 
 
 def read_npy(content: bytes | memoryview, name: str) -> AnyArray:
-    """Read an array of numbers or text from a file of NumPy.
+    """Read an array of numbers or text from the content of an NPY file.
 
-    Raises ValueError for a damaged file.
+    This function is safe to call from several threads. `numpy.load` parses headers with `ast`,
+    which occasionally fails in threads in Python 3.11 with the error "AST constructor recursion
+    depth mismatch".
 
-    Archives are read by several threads. NumPy's reader parses headers with `ast`, which failed now
-    and then in threads of Python 3.11: "AST constructor recursion depth mismatch".
+    Raises
+    ------
+    ValueError
+        If the file is damaged.
     """
     kind, shape, is_fortran, start = _array_type(content, name)
     data = bytearray(memoryview(content)[start:])
@@ -264,19 +283,16 @@ def read_npy(content: bytes | memoryview, name: str) -> AnyArray:
 
 
 class _ArrayType(NamedTuple):
-    """Content of the head of a file of NumPy."""
+    """Contents of an NPY header."""
 
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
     is_fortran: bool
-    start: int  # of the elements in the file, bytes
+    start: int  # position of the first element in the file, bytes
 
 
 def _array_type(content: bytes | memoryview, name: str) -> _ArrayType:
-    """Read the head of a file of NumPy.
-
-    Raises ValueError for a damaged head.
-    """
+    """Parse the header of an NPY file. Raise ValueError if it is damaged."""
     start = 10 + int.from_bytes(content[8:10], "little")
     if (header := _HEADER.fullmatch(content, 10, start)) is None:
         raise ValueError(f"{name} is not an array of numbers or text")

@@ -1,4 +1,4 @@
-"""CRC-32 of files, with the polynomial of ZIP: the numbers of zlib, at a multiple of its speed."""
+"""CRC-32 checksums that equal those of zlib and ZIP files, but are computed much faster."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from isal import isal_zlib
 
 
 def crc32(data: bytes | memoryview, crc: int = 0) -> int:
-    """Return the CRC-32 of bytes that follow bytes of a CRC-32, 0 at the start of a file.
+    """Update a CRC-32 checksum with more bytes, starting from 0 at the start of a file.
 
-    Other threads run meanwhile.
+    The function releases the GIL.
     """
     return isal_zlib.crc32(data, crc)

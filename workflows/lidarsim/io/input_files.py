@@ -1,6 +1,7 @@
-"""Input files: plain files of a known size, never devices, pipes, sockets or folders.
+"""Safe access to input files, which must be regular files of known size.
 
-Every reader opens its file here, or calls `check_input` before a library opens the file.
+Every reader opens its file with `open_input`, or calls `check_input` before a library opens the
+file. Devices, pipes, sockets and folders are rejected.
 """
 
 from __future__ import annotations
@@ -17,23 +18,23 @@ from ..errors import LidarError
 from ..words import did_you_mean
 from .allowance import bytes_of, memory
 
-# Opening a pipe waits for a writer, and opening a terminal may make it the process's terminal. Both
-# flags only matter if the path changes its kind between the check and the opening.
+# Opening a pipe blocks until there is a writer, and opening a terminal may make it the controlling
+# terminal. The flags prevent this if the file is replaced between the check and the call to open.
 _FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_BINARY"))
-_KINDS = {  # {file type in the mode: name}
+_KINDS = {  # {file type bits of the mode: description}
     stat.S_IFIFO: "a pipe",
     stat.S_IFSOCK: "a socket",
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
 }
 _LFS_POINTER = b"version https://git-lfs.github.com/spec/"
-_LFS_MAX_BYTES = 1024  # size of a pointer, by the specification of Git LFS
+_LFS_MAX_BYTES = 1024  # maximum size of a pointer file according to the Git LFS specification
 
 
 class InputFileError(OSError):
-    """An error of a path that does not lead to a plain file with content.
+    """An error for an input path that is not a regular file with content.
 
-    `strerror` is a line that says what the path leads to and what to do.
+    `strerror` is a single line that states what the path refers to and what to do.
     """
 
     def __init__(self, path: str | Path, reason: str) -> None:
@@ -41,19 +42,19 @@ class InputFileError(OSError):
 
 
 def open_input(path: str | Path) -> BufferedReader:
-    """Open a plain file for reading.
+    """Open a regular file for reading.
 
     Parameters
     ----------
     path
-        A file, or a link to a file.
+        A file or a link to a file.
 
     Raises
     ------
     InputFileError
-        If the path leads to a pipe, a socket or a device, or if the file is a Git LFS pointer.
+        If the path refers to a pipe, socket or device, or if the file is a Git LFS pointer.
     OSError
-        If the path leads to a folder or does not exist, or the file cannot be opened.
+        If the path refers to a folder or does not exist, or if the file cannot be opened.
     """
     _check_kind(path, Path(path).stat().st_mode)
     handle = os.open(path, _FLAGS)
@@ -73,9 +74,9 @@ def open_input(path: str | Path) -> BufferedReader:
 
 
 def not_found(path: str | Path, endings: Collection[str] = ()) -> str:
-    """Return a sentence on a file that does not exist, with a similar name in its folder.
+    """Return a message about a file that does not exist, suggesting a similar name in its folder.
 
-    Similar names have one of the `endings`, by default the ending of the file.
+    Suggested names end with one of `endings` (default: the suffix of the file).
     """
     file = Path(path)
     names: list[str] = []
@@ -87,10 +88,7 @@ def not_found(path: str | Path, endings: Collection[str] = ()) -> str:
 
 
 def _check_kind(path: str | Path, mode: int) -> None:
-    """Check that a path leads to a plain file, by its mode.
-
-    Raises OSError if not.
-    """
+    """Raise OSError if the mode is not that of a regular file."""
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not stat.S_ISREG(mode):
@@ -99,23 +97,26 @@ def _check_kind(path: str | Path, mode: int) -> None:
 
 
 def input_size(path: str | Path) -> int:
-    """Return the size of a plain file in bytes.
+    """Return the size of a regular file in bytes.
 
-    Raises OSError if the file cannot be opened.
+    Raises
+    ------
+    OSError
+        If the file is not a regular file or cannot be opened.
     """
     with open_input(path) as file:
         return os.fstat(file.fileno()).st_size
 
 
 def check_input(path: str | Path) -> int:
-    """Check a file that is read as a whole, and return its size in bytes.
+    """Check that a regular file fits into memory, and return its size in bytes.
 
     Raises
     ------
     LidarError
         If the file is larger than the memory.
     OSError
-        If the file is not a plain file, or cannot be read.
+        If the file is not a regular file or cannot be read.
     """
     size = input_size(path)
     if size > memory():
@@ -127,14 +128,14 @@ def check_input(path: str | Path) -> int:
 
 
 def read_input(path: str | Path, max_bytes: int | None = None) -> bytes:
-    """Read a file, or at most `max_bytes` of its start.
+    """Read a file, or only its first `max_bytes` bytes.
 
     Raises
     ------
     LidarError
-        If the file is read as a whole and is larger than the memory.
+        If `max_bytes` is None and the file is larger than the memory.
     OSError
-        If the file is not a plain file, or cannot be read.
+        If the file is not a regular file or cannot be read.
     """
     size = check_input(path) if max_bytes is None else max_bytes
     with open_input(path) as file:
@@ -142,14 +143,15 @@ def read_input(path: str | Path, max_bytes: int | None = None) -> bytes:
 
 
 def read_input_text(path: str | Path, errors: str = "strict") -> str:
-    """Read a text file in UTF-8 without its byte order mark, with a newline alone at line ends.
+    """Read a text file in UTF-8.
 
-    `errors` is passed to `bytes.decode`.
+    A byte order mark is removed, and line endings are converted to newlines. `errors` is passed to
+    `bytes.decode`.
 
     Raises
     ------
     ValueError
-        If the file is not in UTF-8.
+        If the file is not encoded in UTF-8.
     LidarError
         If the file is larger than the memory.
     OSError

@@ -1,28 +1,30 @@
-"""Files that data names: which of them are read.
+"""Checks of file references in input data, which prevent path traversal.
 
-Data may have been downloaded, so the names in it must not lead to other files of this machine. A
-file that data names is read only if it lies in a folder that belongs to the data, or below, after
-links have been followed. Everything else is an error that quotes the name: absolute paths, names
-with `..` and links that lead outside. What a user writes, such as a file in a scenario or an
-argument, is the user's choice and is not checked; nor is a link among files that are found by
-listing a folder that the user names.
+Input data may have been downloaded, so references in it must not lead to other files on this
+machine. A referenced file is read only if it is in a folder that belongs to the data, or in one of
+its subfolders, after symbolic links have been resolved. Absolute paths, names with `..`, and links
+that lead outside are errors. Paths that the user specifies, for example in a scenario or as an
+argument, are not checked. Neither are links among the files that are found by listing a folder that
+the user specified.
 
-These folders belong to the data:
+The following folders belong to the data:
 
-- meshes (glTF, OBJ, Collada, OpenUSD, OmniLidar) and models of MuJoCo: the folder of the file. A
-  mesh that names `../textures/wood.png` needs that folder as `assets`
-- URDF: the package, or the folder of a file without a package, and packages found by their names
+- Meshes (glTF, OBJ, Collada, OpenUSD, OmniLidar) and MuJoCo models: the folder that contains the
+  file. If a mesh refers to `../textures/wood.png`, that folder must be listed in `assets`.
+- URDF: the package, or the folder that contains the file if there is no package, and packages that
+  are found by name.
 - SDFormat: the package or folder of the world, the folder of each model, and the folders and caches
-  that Gazebo is set up with
-- surveys and scanners of HELIOS++: their folder, up to five folders above, in which names start,
-  and the working folder; neither the home folder nor the folders above it
-- nuScenes: the root of the data set; its folders, such as `samples`, may be links to other disks
-- data sets and results of lidarpool: their folder, in which jobs and splits are plain names; links
-  that the user made in it are followed
+  for which Gazebo is configured.
+- HELIOS++ surveys and scanners: their folder, up to five parent folders to which names may be
+  relative, and the working directory, but neither the home folder nor its parents.
+- nuScenes: the root of the data set. Its subfolders, such as `samples`, may be links to other
+  disks.
+- lidarpool data sets and results: their folder, in which jobs and splits are plain names. Links
+  that the user created there are followed.
 
-Folders that the user gives as `assets` belong to the data as well. CityJSON, IFC, rasters, 3MF,
-E57, LAS, OpenDRIVE, OSI, KITTI and WebDataset name no files that are read; of a bag, only files in
-its folder are.
+Folders that the user lists in `assets` also belong to the data. References to other files in
+CityJSON, IFC, raster, 3MF, E57, LAS, OpenDRIVE, OSI, KITTI and WebDataset files are never followed.
+For a bag, only files in its folder are read.
 """
 
 from __future__ import annotations
@@ -33,58 +35,68 @@ from pathlib import Path, PurePath
 from ..errors import LidarError
 from ..words import printable
 
-_MAX_LETTERS = 200  # of a name in a message
+_MAX_LETTERS = 200  # maximum length of a name in a message
 
 
 def is_inside(file: Path, folders: Iterable[Path]) -> bool:
-    """Return True if a file lies in one of some folders or below, after links are followed.
+    """Return True if a file is in one of the given folders or their subfolders.
 
-    `folders` must be resolved. OSError, ValueError or RuntimeError if no file can have this name.
+    Symbolic links in the path of the file are resolved. `folders` must already be resolved.
+
+    Raises
+    ------
+    OSError, ValueError, RuntimeError
+        If the path is invalid.
     """
     resolved = file.resolve()
     return any(resolved.is_relative_to(folder) for folder in folders)
 
 
 def is_plain(name: str) -> bool:
-    """Return True for the name of a file in a folder, without separators: no path, no `..`."""
+    """Return True if a name is a plain file name, which is neither a path nor `..`."""
     return name not in ("", ".", "..") and not any(letter in name for letter in "/\\\0")
 
 
 def leads_outside(name: str | PurePath) -> bool:
-    """Return True if a name is an absolute path or has `..`, whatever files exist."""
+    """Return True if a name is an absolute path or contains `..`.
+
+    The file need not exist.
+    """
     path = PurePath(name)
     return path.is_absolute() or ".." in path.parts
 
 
 def check_name(name: str, entry: str) -> None:
-    """Check that a name in data is neither an absolute path nor has `..`, whatever files exist.
+    """Check that a file reference in data is not an absolute path and does not contain `..`.
 
-    `entry` is the place in the data that has the name, for the message.
+    The file need not exist. `entry` describes the location of the reference in the data and is used
+    in the error message.
 
     Raises
     ------
     LidarError
-        If the name leads to a file outside of the folder of the data.
+        If the name leads outside the data folder.
     """
     if leads_outside(name):
         raise _outside(name, entry)
 
 
 def file_below(root: Path, name: str, entry: str) -> Path:
-    """Return the path of a file that data names, relative to the root of the data.
+    """Resolve a file reference that is relative to the root folder of the data.
+
+    A folder directly below the root, such as `samples`, may be a link to another disk.
 
     Parameters
     ----------
     root
-        Folder of the data.
+        Root folder of the data.
     name, entry
-        Name of the file and its place in the data, as of `check_name`.
+        Name of the file and location of the reference; see `check_name`.
 
     Raises
     ------
     LidarError
-        If the name leads to a file outside of the folder, also by a link. A folder directly in
-        the root, such as `samples`, may be a link to another disk.
+        If the name leads outside the root folder, either directly or through a link.
     """
     check_name(name, entry)
     path = root / name

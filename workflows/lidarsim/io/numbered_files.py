@@ -1,7 +1,8 @@
-"""Files whose names hold numbers, such as the frames of a sequence or the stamps of sweeps.
+"""Files whose names contain numbers, such as frame numbers or timestamps.
 
-In a sequence of KITTI, row k of a table such as `poses.txt` belongs to the file numbered k, even if
-other files were deleted. So rows are found by the number in the name, not by the order of files.
+In a KITTI sequence, row k of a table such as `poses.txt` belongs to the file with number k, even if
+other files have been deleted. Rows are therefore looked up by the number in the file name, not by
+the position of the file.
 """
 
 from __future__ import annotations
@@ -16,20 +17,20 @@ from ..numerics.arrays import Ints
 from ..words import plural
 
 _NUMBER = re.compile(r"(\d+(?:\.\d+)?)")
-_FRAME_DIGITS = 10  # of KITTI's raw data; longer numbers are stamps
-_MAX_RUNS = 4  # of frames that a message names
+_FRAME_DIGITS = 10  # number of digits in KITTI raw data; longer numbers are timestamps
+_MAX_RUNS = 4  # maximum number of frame ranges in a message
 
 
 def sort_by_number(files: Iterable[Path]) -> list[Path]:
-    """Sort files by the numbers in their paths, so that 2.pcd comes before 10.pcd.
+    """Sort files by the numbers in their paths, so that 2.pcd precedes 10.pcd.
 
-    A number may have decimals: 1000.05.pcd comes before 1000.1.pcd.
+    Numbers may have decimals, so that 1000.05.pcd precedes 1000.1.pcd.
     """
     return sorted(files, key=lambda file: _order(file.as_posix()))
 
 
 def _order(path: str) -> list[tuple[int, str]]:
-    """Return a sort key in which numbers have their value, to any number of digits."""
+    """Return a sort key that compares numbers by value, with any number of digits."""
     key = []
     for piece in _NUMBER.split(path):
         whole, _, decimals = piece.partition(".")
@@ -39,23 +40,28 @@ def _order(path: str) -> list[tuple[int, str]]:
 
 
 def rows_of_frames(files: Sequence[Path], row_count: int, table: str, kind: str) -> Ints:
-    """Return the index of the row that belongs to each file (k,).
+    """Return the index of the table row that belongs to each file.
 
     Parameters
     ----------
     files
-        Files in ascending order. If all names are frame numbers, row k belongs to file k.
-        Otherwise rows and files are in the same order.
+        Files in ascending order. If all names are frame numbers, row k belongs to the file with
+        number k. Otherwise, the rows and files are in the same order.
     row_count
         Number of rows in the table.
     table, kind
-        Name of the table, and plural of what a file is, for messages.
+        Name of the table and plural noun for the files, for error messages.
+
+    Returns
+    -------
+    ndarray
+        Row indices with shape (k,).
 
     Raises
     ------
     ValueError
-        If a file has no row; or if rows have no file, and no gap between the files shows that
-        their numbers are those of the table.
+        If a file has no row. Also if rows have no file, unless gaps in the file numbers show that
+        the numbers are those of the table.
     """
     count = len(files)
     if not all(file.stem.isdecimal() and len(file.stem) <= _FRAME_DIGITS for file in files):
@@ -83,13 +89,13 @@ def rows_of_frames(files: Sequence[Path], row_count: int, table: str, kind: str)
 
 
 def frames_without_file(files: Sequence[Path], row_count: int) -> list[int]:
-    """Return the numbers of the rows that belong to none of some numbered files."""
+    """Return the numbers of the table rows that have no file."""
     frames = {int(file.stem) for file in files if file.stem.isdecimal()}
     return sorted({*range(row_count)} - frames) if frames else []
 
 
 def frames_in_words(frames: Sequence[int]) -> str:
-    """Return ascending frame numbers in words: «frames 3, 5 to 9»."""
+    """Format ascending frame numbers as ranges, for example "frames 3, 5 to 9"."""
     numbers = np.asarray(frames)
     runs = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
     words = [f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs]

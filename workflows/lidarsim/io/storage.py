@@ -1,7 +1,7 @@
-"""Storage of runs and results: a folder, or any URL that fsspec opens.
+"""Storage for runs and results in a local folder or at any URL that fsspec supports.
 
-Files appear completely or not at all: in a folder they are written under a temporary name and
-renamed, and an object store shows only complete objects.
+Writes are atomic: local files are written under a temporary name and then renamed, and object
+stores only make complete objects visible.
 """
 
 from __future__ import annotations
@@ -26,44 +26,45 @@ from ..words import printable
 from .checksum import crc32
 from .input_files import open_input
 
-_BLOCK_BYTES = 1 << 20  # read at a time of a file that is copied or checked
-TEMPORARY = ".lidarpool-tmp-"  # prefix of the name of an unfinished file
-WRITING = ".lidarpool-writing-"  # prefix of the name of a folder of unfinished files
+_BLOCK_BYTES = 1 << 20  # bytes to read at a time when a file is copied or its checksum computed
+TEMPORARY = ".lidarpool-tmp-"  # name prefix of unfinished files
+WRITING = ".lidarpool-writing-"  # name prefix of folders that contain unfinished files
 _LEFTOVER = re.compile(rf"(?:{re.escape(TEMPORARY)}(.+)-|{re.escape(WRITING)})[0-9a-f]{{8}}")
 
 
-def target_of(name: str) -> str:
-    """Return the name of the file for which a temporary file was written, or the name itself."""
+def final_name(name: str) -> str:
+    """Return the final name of a temporary file, or the name itself if it is not temporary."""
     match = _LEFTOVER.fullmatch(name)
     return match[1] or name if match else name
 
 
 def is_url(location: str | Path) -> bool:
-    """Return True if a location is a URL, not a path."""
+    """Return True if a location is a URL rather than a path."""
     return "://" in str(location)
 
 
 @dataclass(frozen=True)
 class Storage:
-    """A folder of files, by path or URL, small when pickled.
+    """A folder, specified by a path or URL, that stores files.
 
-    Files are not opened, written or removed through a link below the folder that the user named.
-    Writing or removing a file that is a link replaces or removes the link, not its target.
+    Storage objects are cheap to pickle. Symbolic links below the folder that the user specified are
+    not followed when files are opened, written or removed. Writing or removing a file that is
+    itself a link replaces or removes the link, not its target.
 
-    The methods raise OSError if the storage fails, and LidarError if the storage cannot be opened
-    or a path leads through such a link.
+    All methods raise OSError if an operation fails, and LidarError if the storage cannot be opened
+    or if a path contains a symbolic link that is not followed.
 
     Parameters
     ----------
     url
-        A folder's path, or a URL such as ``s3://bucket/folder``. The library of the storage finds
-        the credentials.
+        Path of a folder, or a URL such as ``s3://bucket/folder``. The storage library is
+        responsible for finding the credentials.
     durable
-        Whether files must survive a power failure: flushing takes milliseconds for each file, and
-        is not needed for a temporary folder.
+        Whether files must survive a power failure. Flushing takes a few milliseconds per file and
+        is unnecessary in a temporary folder.
     named
-        The folder that the user named, this folder or a parent, which may be a link; "" follows all
-        links.
+        The folder that the user specified, which is this folder or one of its parents and may be a
+        link. If it is empty, all links are followed.
     """
 
     url: str
@@ -72,10 +73,15 @@ class Storage:
 
     @classmethod
     def at(cls, location: str | Path | Storage, *, durable: bool = True) -> Storage:
-        """Return the storage at a path that the user named, or at a URL, or a given storage.
+        """Open the storage at a path or URL that the user specified.
 
-        LidarError if the URL has a password, which would get into databases and reports, or only
-        a scheme.
+        A location that already is a `Storage` is returned unchanged.
+
+        Raises
+        ------
+        LidarError
+            If the URL consists only of a scheme, or if it contains a password, which would end up
+            in databases and reports.
         """
         if isinstance(location, Storage):
             return location
@@ -92,7 +98,7 @@ class Storage:
                 f"A URL for {text.partition(':')[0]} must not contain a password. Set it in the "
                 "environment or in the configuration of the storage library."
             )
-        # Else `s3://$BUCKET`, with no such variable, would be a local folder.
+        # If the variable in `s3://$BUCKET` is undefined, the URL would refer to a local folder.
         if not is_url(text.rstrip("/")):
             raise LidarError(
                 f"{text} does not name a folder. Add one, for example {text}bucket/run."
@@ -104,19 +110,23 @@ class Storage:
 
     @property
     def is_local(self) -> bool:
-        """True for a folder in a local file system."""
+        """Whether the folder is in a local file system."""
         return not is_url(self.url)
 
     def below(self, name: str) -> Storage:
-        """Return the storage of a folder below, which need not exist."""
+        """Return the storage for a subfolder, which need not exist."""
         if self.is_local:
             self.local(name)
         return replace(self, url=f"{self.url}/{name}")
 
     def local(self, name: str | Path = "") -> Path:
-        """Return the path of a file or folder in a local folder, or of the folder itself.
+        """Return the local path of a file or subfolder, or of the folder itself.
 
-        LidarError if the name leads outside of the folder, by `..` or as another absolute path.
+        Raises
+        ------
+        LidarError
+            If the name contains `..`, is an absolute path outside the folder, or leads through a
+            symbolic link that is not followed.
         """
         path = Path(self.url, name)
         if ".." in Path(name).parts or not path.is_relative_to(self.url):
@@ -133,22 +143,27 @@ class Storage:
                 raise LidarError(
                     f"{ancestor} is a symbolic link, but links in {self.named} are not followed. "
                     "Replace the link with its target."
-                ) from OSError(errno.ELOOP, os.strerror(errno.ELOOP))  # for every caller
+                ) from OSError(
+                    errno.ELOOP, os.strerror(errno.ELOOP)
+                )  # some callers check the cause
         return path
 
     def _target(self, name: str) -> Path:
-        """Return the path of a file or folder to replace or remove."""
+        """Return the path of a file or folder to be replaced or removed, without following it."""
         path = Path(name)
         return self.local(path.parent) / path.name
 
     @contextmanager
     def _remote(self) -> Iterator[tuple[Any, str]]:
-        """Return file system and folder of a URL, and turn errors of its library into OSError."""
+        """Provide the file system and folder of a URL.
+
+        Exceptions that the storage library raises in the context are converted to OSError.
+        """
         try:
-            if self._opened[0] != os.getpid():  # a fork cannot use its parent's connections
+            if self._opened[0] != os.getpid():  # connections do not survive a fork
                 self.__dict__.pop("_opened", None)
             _, system, folder = self._opened
-            system.invalidate_cache()  # other processes write to the storage, too
+            system.invalidate_cache()  # other processes may write to the storage
             yield system, folder
         except (OSError, LidarError):
             raise
@@ -157,7 +172,7 @@ class Storage:
 
     @cached_property
     def _opened(self) -> tuple[int, Any, str]:
-        """Process that has opened the storage, file system and folder."""
+        """ID of the process that opened the storage, the file system, and the folder."""
         try:
             import fsspec
         except ImportError as error:
@@ -174,7 +189,7 @@ class Storage:
         return os.getpid(), system, folder
 
     def file_system(self) -> tuple[Any, str]:
-        """Return the file system of fsspec and the folder, for libraries that open files."""
+        """Return the fsspec file system and the folder, for libraries that open files."""
         with self._remote() as opened:
             return opened
 
@@ -182,23 +197,26 @@ class Storage:
         return Storage, (self.url, self.durable, self.named)
 
     def path(self, name: str) -> str:
-        """Return the path or URL of a file, for messages."""
+        """Return the path or URL of a file for use in messages."""
         return f"{self.url}/{name}"
 
     def prepare(self, name: str | Path = "") -> None:
-        """Make the folder, or a folder below."""
+        """Create the folder or a subfolder, if it does not exist."""
         if self.is_local:
             self.local(name).mkdir(parents=True, exist_ok=True)
             return
         with suppress(FileExistsError), self._remote() as (system, folder):
-            # An object store has no folders, and s3fs would make a bucket for a mistyped name.
+            # Object stores have no folders, and s3fs would create a bucket with a misspelled name.
             if folder.startswith("/"):
                 system.makedirs(f"{folder}/{name}".rstrip("/"), exist_ok=True)
 
     def claim(self) -> None:
-        """Make the folder.
+        """Create the folder and check that files can be written and removed.
 
-        Raises LidarError if files cannot be written and removed.
+        Raises
+        ------
+        LidarError
+            If files cannot be written or removed.
         """
         name = f"{TEMPORARY}{secrets.token_hex(4)}"
         try:
@@ -217,7 +235,10 @@ class Storage:
             ) from error
 
     def write(self, name: str, content: Any) -> None:
-        """Write bytes, or a list of pieces, completely or not at all, and flush if durable."""
+        """Write a file atomically, and flush it to disk if the storage is durable.
+
+        The content is either bytes or a list of pieces to concatenate.
+        """
         pieces = content if isinstance(content, list) else [content]
         if self.is_local:
             with self._replacing(self._target(name)) as file:
@@ -228,9 +249,9 @@ class Storage:
 
     @contextmanager
     def writing(self, name: str) -> Iterator[IO[bytes]]:
-        """Open a file for writing, which appears once the body has ended without an error.
+        """Open a file for writing that becomes visible when the context exits without an error.
 
-        Folders in the name are made.
+        Subfolders in the name are created.
         """
         if self.is_local:
             target = self._target(name)
@@ -246,12 +267,12 @@ class Storage:
 
     @contextmanager
     def _replacing(self, target: Path) -> Iterator[IO[bytes]]:
-        """Open a temporary file that replaces a file after the body."""
+        """Open a temporary file that replaces the target when the context exits."""
         temporary = target.with_name(f"{TEMPORARY}{target.name}-{secrets.token_hex(4)}")
         try:
             with temporary.open("xb") as file:
                 yield file
-                if self.durable:  # before the name: else a power failure may leave an empty file
+                if self.durable:  # otherwise, a power failure after renaming may leave it empty
                     file.flush()
                     os.fsync(file.fileno())
             temporary.replace(target)
@@ -259,11 +280,11 @@ class Storage:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
             raise
-        if self.durable:  # the receipt of a part is committed only once its name lasts, too
+        if self.durable:  # the receipt of a part may be committed only after the rename is durable
             flush(target.parent)
 
     def read(self, name: str, first: int = 0, stop: int | None = None) -> bytes:
-        """Read a file, or its bytes from `first` to `stop`, or to its end."""
+        """Read the bytes of a file from `first` up to `stop` (default: the entire file)."""
         if self.is_local:
             with open_input(self.local(name)) as file:
                 file.seek(first)
@@ -273,7 +294,7 @@ class Storage:
 
     @contextmanager
     def _reading(self, name: str) -> Iterator[IO[bytes]]:
-        """Open a file for the body."""
+        """Open a file for reading."""
         if self.is_local:
             with open_input(self.local(name)) as file:
                 yield file
@@ -282,7 +303,7 @@ class Storage:
                 yield file
 
     def checksum(self, name: str) -> list[int]:
-        """Return the size of a file in bytes and its CRC-32."""
+        """Return the size in bytes and the CRC-32 of a file."""
         size = crc = 0
         with self._reading(name) as file:
             while piece := file.read(_BLOCK_BYTES):
@@ -291,7 +312,7 @@ class Storage:
         return [size, crc]
 
     def put(self, path: Path, name: str) -> None:
-        """Copy a file of this machine, or a folder of files, into the storage."""
+        """Copy a local file, or all files in a local folder, to the storage."""
         with self._remote() as (system, folder):
             for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
                 if file.is_file():
@@ -299,18 +320,18 @@ class Storage:
                     system.put_file(str(file), f"{folder}/{name}/{below}".rstrip("/"))
 
     def get(self, name: str, path: Path) -> None:
-        """Copy a file of the storage to this machine."""
+        """Copy a file from the storage to a local path."""
         with self._remote() as (system, folder):
             system.get_file(f"{folder}/{name}", str(path))
 
-    def take(self, source: Storage, name: str, new_name: str) -> None:
-        """Copy a file of another storage, completely or not at all, to a name in this storage.
+    def copy_from(self, source: Storage, name: str, new_name: str) -> None:
+        """Copy a file atomically from another storage.
 
-        Where possible, the file is linked (a hard link), or an object store copies it.
+        If possible, the copy is a hard link or is made by the object store itself.
         """
         if self.is_local and source.is_local:
             self.remove([new_name])
-            with suppress(OSError):  # on another disk, or on a disk without links, copy the file
+            with suppress(OSError):  # fall back to copying if the disk does not support the link
                 os.link(source.local(name), self._target(new_name))
                 return
         with source._remote() as (source_system, folder), self._remote() as (system, target_folder):
@@ -320,27 +341,34 @@ class Storage:
         with source._reading(name) as source_file, self.writing(new_name) as file:
             shutil.copyfileobj(source_file, file, _BLOCK_BYTES)
 
-    def sees(self, name: str, data: bytes) -> bool:
-        """Return True if a file has this content: then this process sees the same storage."""
+    def has_content(self, name: str, data: bytes) -> bool:
+        """Return True if a file has the given content.
+
+        Use this method to check whether this process has access to the same storage as another
+        process, which wrote the file.
+        """
         try:
             return self.read(name) == data
-        except Exception:  # any error of a storage or its missing library
+        except Exception:  # the storage may fail in any way, or its library may be missing
             return False
 
     def sizes(self) -> dict[str, int]:
-        """Return all plain files and their sizes, bytes, or {} if the folder is missing."""
+        """Return the names of all regular files in the folder and their sizes in bytes.
+
+        The mapping is empty if the folder does not exist.
+        """
         return {name: size for name, size in self.entries().items() if size is not None}
 
     def entries(self) -> dict[str, int | None]:
-        """Return all entries of the folder: {name: bytes of a file, None for a folder or link}.
+        """Return the names of all entries in the folder and their sizes in bytes.
 
-        A missing folder has no entries.
+        The size of a subfolder or link is None. The mapping is empty if the folder does not exist.
         """
         sizes: dict[str, int | None] = {}
         if self.is_local:
             with suppress(FileNotFoundError), os.scandir(self.local()) as entries:
                 for entry in entries:
-                    with suppress(FileNotFoundError):  # just renamed or removed
+                    with suppress(FileNotFoundError):  # the entry may have just been removed
                         plain = entry.is_file(follow_symlinks=False)
                         sizes[entry.name] = entry.stat().st_size if plain else None
             return sizes
@@ -351,7 +379,10 @@ class Storage:
         return sizes
 
     def remove(self, names: Iterable[str], *, folder: bool = False) -> None:
-        """Remove files, some of them missing perhaps, and with `folder` the empty folder."""
+        """Remove files, which need not exist.
+
+        If `folder` is true, the folder is removed as well, unless it still contains files.
+        """
         for name in names:
             if self.is_local:
                 self._target(name).unlink(missing_ok=True)
@@ -363,9 +394,12 @@ class Storage:
                 self.local().rmdir()
 
     def tree(self, name: str = "") -> list[str]:
-        """Return the names of all files in a folder and below.
+        """Return the names of all files in a folder and its subfolders.
 
-        Raises LidarError for a link.
+        Raises
+        ------
+        LidarError
+            If the folder contains a symbolic link that is not followed.
         """
         if self.is_local:
             paths_below: list[Path] = []
@@ -380,14 +414,14 @@ class Storage:
             return [entry.removeprefix(f"{folder}/") for entry in below]
 
     def prune(self, names: Collection[str]) -> None:
-        """Remove files below, in this order, and then the folders without further files."""
+        """Remove files in the given order, and then the subfolders that have become empty."""
         self.remove(names)
         folders = {str(folder) for name in names for folder in Path(name).parents}
         for folder in sorted(folders - {"."}, key=len, reverse=True):
             self.below(folder).remove([], folder=True)
 
     def discard(self, name: str) -> None:
-        """Remove a file or a folder with its content, which may be missing."""
+        """Remove a file, or a folder and its contents, if it exists."""
         if self.is_local:
             path = self._target(name)
             if path.is_dir() and not path.is_symlink():
@@ -399,7 +433,10 @@ class Storage:
                 system.rm(f"{folder}/{name}", recursive=True)
 
     def tidy(self, *, deep: bool = True) -> None:
-        """Remove the files of killed writers in a local folder, and in folders below if `deep`."""
+        """Remove unfinished files that killed processes left in a local folder.
+
+        If `deep` is true, subfolders are cleaned up as well.
+        """
         if not self.is_local:
             return
         for folder, folders, files in os.walk(self.local()):
@@ -411,7 +448,7 @@ class Storage:
 
 
 def flush(path: Path) -> None:
-    """Flush a file, or the names in a folder, to the disk."""
+    """Flush a file, or the directory entries of a folder, to disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -1,7 +1,8 @@
-"""Tables of numbers with a header: spellings of columns, and units that headers state.
+"""Numeric tables with a header, whose columns may have various spellings and units.
 
-A column is either understood, with its unit, or named by the user to be ignored, or the table is
-refused: a column that is silently left out may be the one that turns the sensor.
+Every column must either be known, including its unit, or be ignored explicitly. Otherwise, the
+table is rejected, because a column that is silently skipped may, for example, contain the rotation
+of the sensor.
 """
 
 from __future__ import annotations
@@ -18,10 +19,18 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from ..numerics.arrays import Floats
-from ..words import alternatives, did_you_mean_each, fits, in_yaml, joined, printable, rounded
+from ..words import (
+    alternatives,
+    did_you_mean_each,
+    format_yaml_list,
+    joined,
+    matches_pattern,
+    printable,
+    rounded,
+)
 from .time_units import SECONDS, TimeUnit, seconds_of
 
-# {unit: number of these units in the first unit}
+# {unit: number of units per first unit}
 METERS = {"m": 1.0, "cm": 1e2, "mm": 1e3, "km": 1e-3}
 DEGREES = {"deg": 1.0, "rad": np.pi / 180}
 RADIANS = {"rad": 1.0, "deg": 180 / np.pi}
@@ -42,37 +51,38 @@ _UNIT_SPELLINGS = {
 }
 _UNITS = {word: unit for unit, words in _UNIT_SPELLINGS.items() for word in (unit, *words)}
 _BRACKETS = re.compile(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]")
-# A name of a header that spaces separate, with its unit: q_w []
+# A column name with its unit, such as "q_w []", in a header that is separated by spaces.
 _WORD = re.compile(r"[^\s\[(]+(?:\s*[\[(][^\[(\])]*[\])])?")
 _IN_BRACKETS = re.compile(r"[\[(][^\[(\])]*[\])]")
 _SEPARATORS = ",;\t"
-_HEADER_MARK = re.compile(r"^[#%\s]*(?:HEADER:)?")  # before a header in a remark
-_BETWEEN = re.compile(r"[\s_\-./:]+")  # words of a name
+_HEADER_MARK = re.compile(r"^[#%\s]*(?:HEADER:)?")  # prefix of a header in a comment
+_BETWEEN = re.compile(r"[\s_\-./:]+")  # separator between the words of a name
 _SUFFIX = re.compile(r"(.+?)[\s_\-./:]+([^\s_\-./:]+)")
-_CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")  # between the words of timeStamp
-_SHOWN = 40  # columns that a message names
-_MAX_NAME = 200  # letters of a name with its unit; to split longer text takes time
+_CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")  # word boundary in names such as timeStamp
+_SHOWN = 40  # maximum number of columns listed in a message
+_MAX_NAME = 200  # characters in a name with its unit; longer text takes too long to split
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity that a column of a table may hold.
+    """A quantity that a table column may contain.
 
     Parameters
     ----------
     name
-        Name of the column as it is returned, with its unit: yaw_deg.
+        Name under which the column is returned, including its unit, for example "yaw_deg".
     spellings
-        Names in headers, without a unit; case, spaces, underscores, hyphens and dots are ignored.
+        Names in headers, without a unit. Case and separators such as spaces, underscores, hyphens
+        and dots are ignored.
     units
-        Units that a header may state, such as `SECONDS`; values are returned in the first unit.
+        Units that a header may state, for example `SECONDS`. Values are returned in the first unit.
     bare
-        Unit of a column whose header states no unit; None to refuse such a column.
+        Unit of a column whose header does not state one, or None to reject such a column.
     evident_above
-        A column without a stated unit is refused if its largest magnitude is above zero and at most
-        this number: the values may have another unit.
+        A column without a stated unit is rejected as ambiguous if its largest magnitude is greater
+        than zero but does not exceed this value.
     exact
-        Names with the same letters in another case are the only other spellings.
+        Whether `name` itself is the only additional spelling. Case is ignored.
     """
 
     name: str
@@ -85,18 +95,18 @@ class Quantity:
 
 @dataclass(frozen=True)
 class TableFormat:
-    """A table whose columns a specification defines.
+    """A table format with columns that are defined in a specification.
 
     Parameters
     ----------
     name
         Name of the format.
     marker
-        A column that only this format has.
+        Name of a column that only this format has.
     bare
-        {quantity: unit, if the header states no unit}.
+        Mapping from quantities to the units that apply if the header does not state one.
     unused
-        Columns that the specification defines and that readers do not use, with * and ?.
+        Columns that the specification defines but that are not read. May contain `*` and `?`.
     """
 
     name: str
@@ -108,22 +118,25 @@ class TableFormat:
 class Header(NamedTuple):
     """Header of a table."""
 
-    cells: list[str]  # names of the columns, as the file has them
-    separator: str | None  # None for spaces
-    body: int  # index of the line after the header, or of the first row
-    comment: bool  # True if the header is a remark that starts with #
+    cells: list[str]  # column names as they appear in the file
+    separator: str | None  # None if the cells are separated by spaces
+    body: int  # index of the line at which the rows start
+    comment: bool  # whether the header is a comment that starts with #
 
 
 class ColumnName(NamedTuple):
-    """A name in a header: «Yaw [deg]»."""
+    """A column name in a header, split into its parts.
 
-    stem: str  # without the unit: Yaw
-    words: str  # the same without case and separators: yaw
-    unit: str | None  # unit in small letters; None if the header states none
+    The comments show the parts of the name "Yaw [deg]".
+    """
+
+    stem: str  # name without the unit: "Yaw"
+    words: str  # stem in lowercase without separators: "yaw"
+    unit: str | None  # unit in lowercase, or None if the header does not state one: "deg"
 
 
 def column_name(cell: str) -> ColumnName:
-    """Split a name in a header into its words and its unit."""
+    """Split a column name in a header into its stem and its unit."""
     text = cell.strip()
     if len(text) > _MAX_NAME:
         return ColumnName(text, text, None)
@@ -138,14 +151,21 @@ def column_name(cell: str) -> ColumnName:
 
 
 def ignored_columns(names: Sequence[str], ignore: Sequence[str]) -> set[int]:
-    """Return the indices of the columns that patterns with * and ? name, in any case.
+    """Return the indices of the columns that match patterns with `*` and `?`, ignoring case.
 
-    ValueError for a pattern that matches no column.
+    Raises
+    ------
+    ValueError
+        If a pattern does not match any column.
     """
     indices = set[int]()
     unmatched: list[str] = []
     for pattern in ignore:
-        matches = {index for index, name in enumerate(names) if fits(name.lower(), pattern.lower())}
+        matches = {
+            index
+            for index, name in enumerate(names)
+            if matches_pattern(name.lower(), pattern.lower())
+        }
         unmatched += [] if matches else [repr(pattern)]
         indices |= matches
     if unmatched:
@@ -158,18 +178,18 @@ def ignored_columns(names: Sequence[str], ignore: Sequence[str]) -> set[int]:
 
 
 def _letters(name: str) -> str:
-    """Return a name without case and separators."""
+    """Convert a name to lowercase and remove its separators."""
     return _BETWEEN.sub("", name).lower()
 
 
 def find_header(
     lines: Sequence[str], is_known: Callable[[str], bool] = lambda name: True
 ) -> Header | None:
-    """Return the header of a table, or None without a header.
+    """Find the header of a table, or return None if the table has no header.
 
-    The header is the first line that is neither empty nor a remark, if it has a word among its
-    cells. Else the header is the last remark before the numbers that has as many names as the rows
-    have numbers, and `is_known` half of the names, or four.
+    The header is the first line that is neither empty nor a comment, unless all its cells are
+    numbers. In that case, the header is the last comment before the rows that has as many names as
+    the first row has cells, provided that `is_known` is true for at least half or four of them.
     """
     body = next((i for i, line in enumerate(lines) if not _is_remark(line)), len(lines))
     if body < len(lines) and not _all_numbers(lines[body]):
@@ -178,7 +198,7 @@ def find_header(
         return Header(_cells(names, separator), separator, body + 1, False)
     for line in reversed(lines[:body]):
         names = _HEADER_MARK.sub("", line).strip()
-        # A remark may separate names otherwise than the rows separate numbers.
+        # A comment may use a different separator than the rows.
         cells = _cells(names, _separator_of(names))
         separator = _separator_of(lines[body]) if body < len(lines) else _separator_of(names)
         count = len(_cells(lines[body], separator)) if body < len(lines) else len(cells)
@@ -188,18 +208,18 @@ def find_header(
 
 
 def _is_remark(line: str) -> bool:
-    """Return True for an empty line or a remark."""
+    """Return True if a line is empty or a comment."""
     return not line.strip() or line.lstrip().startswith("#")
 
 
 def _all_numbers(line: str) -> bool:
-    """Return True if all cells of a line are numbers or empty."""
+    """Return True if every cell in a line is empty or a number."""
     cells = [cell for cell in _cells(line, _separator_of(line)) if cell]
     return all(map(_is_number, cells))
 
 
 def _is_number(cell: str) -> bool:
-    """Return True for a number, also infinite or NaN."""
+    """Return True if a cell is a number, which may be infinite or NaN."""
     try:
         float(cell)
     except ValueError:
@@ -208,21 +228,20 @@ def _is_number(cell: str) -> bool:
 
 
 def _is_finite(cell: str) -> bool:
-    """Return True for a finite number."""
     return _is_number(cell) and bool(np.isfinite(float(cell)))
 
 
 def _separator_of(line: str) -> str | None:
-    """Return the most frequent of comma, semicolon and tab outside brackets, or None for spaces."""
+    """Return the most frequent separator outside brackets, or None if spaces separate the cells."""
     outside = _IN_BRACKETS.sub("", line)
     separator = max(_SEPARATORS, key=outside.count)
     return separator if separator in outside else None
 
 
 def _cells(line: str, separator: str | None) -> list[str]:
-    """Return the cells of a line without quotes.
+    """Split a line into cells and remove quotes.
 
-    Raises ValueError for a cell that is too long.
+    Raise ValueError if the line cannot be parsed, for example because a cell is too long.
     """
     if separator is None:
         return [word.strip('"') for word in _WORD.findall(line)]
@@ -249,43 +268,46 @@ def read_table(
     bare: Mapping[str, str] | None = None,
     time_unit: TimeUnit | None = None,
 ) -> dict[str, Floats]:
-    """Read a table of numbers, and refuse each column that is not understood.
+    """Read a numeric table, rejecting columns that are neither known nor ignored.
 
     Parameters
     ----------
     text
-        A header, and rows; commas, semicolons, tabs or spaces separate the cells, and lines that
-        begin with # are remarks.
+        A header and rows. Cells are separated by commas, semicolons, tabs or spaces. Lines that
+        start with # are comments.
     quantities
-        Quantities that columns may hold.
+        Quantities that the columns may contain.
     required
-        Returns the names of the quantities that a table with the given columns must have.
+        Function that returns the names of the quantities that a table with the given columns must
+        have.
     columns
-        {name of a quantity, with its unit: name in the file}, for other spellings; None where users
-        cannot give it, so that messages do not name it.
+        Mapping from quantity names, including their units, to column names in the file. Use it for
+        columns with other spellings. If it is None, users cannot set it, and error messages do not
+        mention it.
     ignore
-        Names of columns to leave out, with * and ?.
+        Names of columns to skip. May contain `*` and `?`.
     formats
-        Formats with specified columns.
+        Table formats with specified columns.
     unused
-        Further columns to accept and leave out silently.
+        Names of additional columns to skip silently.
     refused
-        {spelling: why such a column cannot be used}.
+        Mapping from spellings to the reason why such a column cannot be used.
     bare
-        {quantity: unit of a column whose header states no unit}.
+        Mapping from quantities to the units that apply if the header does not state one.
     time_unit
-        Unit of times that the user states, which counts instead of the header's.
+        Unit of times that the user specified. It overrides the unit in the header.
 
     Returns
     -------
     dict
-        {name of a quantity: float64 (k,)} in the first unit of the quantity.
+        Mapping from quantity names to float64 arrays with shape (k,), in the first unit of each
+        quantity.
 
     Raises
     ------
     ValueError
-        If the header is missing, a column is not known, missing or not unique, a unit is missing or
-        not known, a cell holds no finite number, or times have another unit than the header states.
+        If the header is missing, a column is unknown, missing or ambiguous, a unit is unknown or
+        missing, a cell is not a finite number, or the unit of times is implausible.
     """
     lines = text.splitlines()
     spellings = {_letters(name): quantity for quantity in quantities for name in quantity.spellings}
@@ -315,11 +337,11 @@ def read_table(
 
 
 class _UnitMissingError(ValueError):
-    """An error of a column whose unit is not stated."""
+    """An error for a column without a unit."""
 
 
 class _ColumnReader:
-    """Assignment of the columns of a header to quantities."""
+    """Assigns the columns in a header to quantities."""
 
     def __init__(
         self,
@@ -334,13 +356,13 @@ class _ColumnReader:
         self.spellings = spellings
         self.exact = exact
         self.time_unit = time_unit
-        # {name of a quantity: index of its column, and the unit; None if no header states it}
+        # {quantity name: (column index, unit, or None if the header does not state one)}
         self.assigned: dict[str, tuple[int, str | None]] = {}
-        self.left_out: set[int] = set()  # indices of columns
-        self.can_choose = False  # whether users can name columns, which messages advise then
+        self.left_out: set[int] = set()  # indices of ignored columns
+        self.can_choose = False  # whether users can set `columns`, so that messages recommend it
 
     def quantity_of(self, cell: str) -> tuple[Quantity, str | None] | None:
-        """Return the quantity and the stated unit of a name, or None if the name is not known."""
+        """Return the quantity and stated unit of a column name, or None if the name is unknown."""
         if (quantity := self.exact.get(cell) or self.exact.get(cell.lower())) is not None:
             return quantity, None
         name = column_name(cell)
@@ -348,7 +370,7 @@ class _ColumnReader:
         return None if quantity is None else (quantity, name.unit)
 
     def choose(self, columns: Mapping[str, str] | None) -> None:
-        """Assign the columns that the user names, or nothing if users cannot name columns."""
+        """Assign the columns that the user specified."""
         self.can_choose = columns is not None
         faults: list[str] = []
         for name, file_name in (columns or {}).items():
@@ -359,7 +381,7 @@ class _ColumnReader:
         _refuse(faults)
 
     def _choose(self, name: str, file_name: str) -> None:
-        """Assign the column that the user names for a quantity."""
+        """Assign a single column that the user specified."""
         match = self.quantity_of(name)
         if match is None:
             raise ValueError(
@@ -391,7 +413,7 @@ class _ColumnReader:
         self._add(quantity, matches[0], unit)
 
     def leave_out(self, ignore: Sequence[str]) -> None:
-        """Leave out the columns that the user ignores."""
+        """Skip the columns that the user ignores."""
         self.left_out |= ignored_columns(self.cells, ignore)
 
     def assign(
@@ -401,9 +423,9 @@ class _ColumnReader:
         refused: Mapping[str, str],
         bare: Mapping[str, str],
     ) -> None:
-        """Assign the remaining columns by their names.
+        """Assign the remaining columns by name.
 
-        ValueError names all columns that are not understood.
+        Raise ValueError with a message about all columns that cannot be assigned.
         """
         chosen = {index for index, _ in self.assigned.values()} | self.left_out
         words = [column_name(cell).words for cell in self.cells]
@@ -416,7 +438,7 @@ class _ColumnReader:
         faults: list[str] = []
         for index, cell in enumerate(self.cells):
             if index in chosen or not cell or re.fullmatch(r"unnamed: \d+", cell.lower()):
-                continue  # columns without a name are checked with the rows
+                continue  # columns without a name are checked together with the rows
             if (match := self.quantity_of(cell)) is not None:
                 quantity, unit = match
                 try:
@@ -427,16 +449,16 @@ class _ColumnReader:
                     faults.append(str(error))
             elif reason := next((refused[w] for w in refused if _letters(w) == words[index]), ""):
                 faults.append(f"its column {printable(cell)!r} {reason}")
-            elif not any(fits(words[index], pattern) for pattern in patterns):
+            elif not any(matches_pattern(words[index], pattern) for pattern in patterns):
                 unknown.append(cell)
         if without_unit:
             faults.insert(0, self._lacking_units(without_unit))
-        if unknown:  # at the end, with the long list of the known columns
+        if unknown:  # last, because this message ends with the long list of known columns
             faults.append(self._unknown(unknown))
         _refuse(faults)
 
     def _unknown(self, cells: Sequence[str]) -> str:
-        """Return a message on columns that are not known."""
+        """Return a message about unknown columns."""
         columns = "columns" if len(cells) > 1 else "column"
         pronoun = "them" if len(cells) > 1 else "it"
         hint = did_you_mean_each(cells, [quantity.name for quantity in self.quantities])
@@ -447,7 +469,10 @@ class _ColumnReader:
         )
 
     def _lacking_units(self, columns: Sequence[tuple[Quantity, str]]) -> str:
-        """Return a message on columns without a unit: quantity and name in the file of each."""
+        """Return a message about columns without a unit.
+
+        Each column is specified by its quantity and its name in the file.
+        """
         if len(columns) == 1:
             return str(self._unit_missing(*columns[0]))
         names = [
@@ -461,7 +486,7 @@ class _ColumnReader:
         )
 
     def _unit_missing(self, quantity: Quantity, cell: str) -> _UnitMissingError:
-        """Return the error on a column without a unit."""
+        """Return the error to raise for a column without a unit."""
         first, *other_units = quantity.units
         stem = quantity.name.removesuffix(f"_{first}")
         choice = f", or set `columns: {{{quantity.name}: {printable(cell)}}}`" * self.can_choose
@@ -476,7 +501,10 @@ class _ColumnReader:
     def _unit(
         self, quantity: Quantity, cell: str, unit: str | None, units: Mapping[str, str]
     ) -> str | None:
-        """Return the unit of a column, or None for the bare unit, which is yet to be checked."""
+        """Return the unit of a column, or None if the bare unit of the quantity applies.
+
+        In the latter case, the values must be checked as well.
+        """
         if quantity.units is SECONDS and self.time_unit is not None:
             return self.time_unit
         if unit is not None:
@@ -494,10 +522,7 @@ class _ColumnReader:
         return None
 
     def _add(self, quantity: Quantity, index: int, unit: str | None) -> None:
-        """Assign a column to a quantity.
-
-        Raises ValueError if the quantity has a column.
-        """
+        """Assign a column to a quantity. Raise ValueError if the quantity already has a column."""
         if (earlier := self.assigned.get(quantity.name)) is not None:
             earlier_cell = self.cells[earlier[0]]
             cell = self.cells[index]
@@ -510,7 +535,10 @@ class _ColumnReader:
         self.assigned[quantity.name] = index, unit
 
     def converted(self, name: str, values: Floats) -> Floats:
-        """Convert the values of a quantity to its first unit."""
+        """Convert the values of a quantity to its first unit.
+
+        Raise ValueError if the unit is ambiguous or implausible.
+        """
         index, unit = self.assigned[name]
         quantity = next(quantity for quantity in self.quantities if quantity.name == name)
         if unit is None:
@@ -532,7 +560,7 @@ class _ColumnReader:
 
     @property
     def possible(self) -> str:
-        """Names of the quantities, with the names for further units."""
+        """Names of all quantities, followed by the names for their other units."""
         names = []
         for quantity in self.quantities:
             first, *other_units = quantity.units
@@ -547,28 +575,29 @@ class _ColumnReader:
 
 
 def _refuse(faults: Sequence[str]) -> None:
-    """Raise ValueError with all faults, if there are faults."""
+    """Raise ValueError if there are faults, with a message that lists all of them."""
     if faults:
         first, *others = faults
         raise ValueError(". ".join([first, *(fault[0].upper() + fault[1:] for fault in others)]))
 
 
 def _listed(cells: Sequence[str]) -> str:
-    """Return the first names of columns in a row, with an ellipsis for the rest."""
+    """Join the first column names, with an ellipsis if there are more."""
     return ", ".join(printable(cell) for cell in cells[:_SHOWN]) + ", …" * (len(cells) > _SHOWN)
 
 
 def _ignoring(cells: Sequence[str]) -> str:
-    """Return the mapping of a scenario that leaves columns out."""
-    return f"{{file: …, ignore: {in_yaml(cells)}}}"
+    """Return the scenario setting that ignores columns."""
+    return f"{{file: …, ignore: {format_yaml_list(cells)}}}"
 
 
 def _numbers(
     lines: Sequence[str], header: Header, names: Mapping[str, int], required_names: Sequence[str]
 ) -> Floats:
-    """Return the numbers of the named columns, (rows, columns).
+    """Parse the numbers in the named columns.
 
-    Raises ValueError, with the cell's name, for a bad cell.
+    The result has shape (rows, columns). Raise ValueError, naming the column and line, if a cell is
+    not a finite number.
     """
     body = lines[header.body :]
     rows = [line for line in body if not _is_remark(line)]
@@ -608,16 +637,16 @@ def _numbers(
 
 
 def _rows_of(lines: Sequence[str], header: Header) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number of the line, counted from 1, and the cells of each row."""
+    """Yield the line number, starting at 1, and the cells of each row."""
     for number, line in enumerate(islice(lines, header.body, None), header.body + 1):
         if not _is_remark(line):
             yield number, _cells(line, header.separator)
 
 
 def _check_widths(lines: Sequence[str], header: Header) -> None:
-    """Check that each row has as many cells as the header.
+    """Raise ValueError unless each row has as many cells as the header.
 
-    A row may end with an empty cell.
+    A row may have an additional empty cell at the end.
     """
     width = len(header.cells)
     for number, line in enumerate(islice(lines, header.body, None), header.body + 1):
@@ -636,10 +665,7 @@ def _check_widths(lines: Sequence[str], header: Header) -> None:
 
 
 def _check_unnamed(rows: Sequence[str], header: Header) -> None:
-    """Check that columns without a name are empty or number the rows from 0.
-
-    Raises ValueError if not.
-    """
+    """Raise ValueError unless columns without a name are empty or count the rows from 0."""
     for index, cell in enumerate(header.cells):
         if cell and not re.fullmatch(r"unnamed: \d+", cell.lower()):
             continue

@@ -1,4 +1,4 @@
-"""Text files, and names of the formats of files that hold no text."""
+"""Text file reading, with error messages that identify common binary formats."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from pathlib import Path
 
 from .input_files import open_input, read_input
 
-_START_BYTES = 4096  # bytes that tell text from other content
-# {first bytes of a file that is not a text: format and advice}
+_START_BYTES = 4096  # bytes to read in order to distinguish text from binary content
+# {first bytes of a file that is not UTF-8 text: format and advice}
 _KINDS = {
     b"\x89MCAP0\r\n": "an MCAP bag. Its name must end with .mcap",
     b"SQLite format 3": (
@@ -29,16 +29,16 @@ _KINDS = {
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file in UTF-8.
+    """Read a text file encoded in UTF-8, and convert its line endings to newlines.
 
     Raises
     ------
     ValueError
-        If the file is empty, or is not a text; the message names the format.
+        If the file is empty or is not a text file. The message names the format if it is known.
     LidarError
         If the file is larger than the memory.
     OSError
-        If the file is not a plain file, or cannot be read.
+        If the file is not a regular file or cannot be read.
     """
     with open_input(path) as file:
         first = file.read(_START_BYTES)

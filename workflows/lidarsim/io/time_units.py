@@ -1,4 +1,4 @@
-"""Times in files: their units, and times that must have another unit than their file states."""
+"""Time units in files, and detection of times whose stated unit is implausible."""
 
 from __future__ import annotations
 
@@ -11,39 +11,39 @@ from ..numerics.arrays import Floats
 from ..words import rounded
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
-# {unit: number of these units in a second}
+# {unit: number of units per second}
 SECONDS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
-# Seconds since 1970 reach this number in the year 5138; milliseconds since 1970 reached it in 1973.
+# Unix time reaches this value in the year 5138 if it is in seconds, but reached it in 1973 if it is
+# in milliseconds.
 _MAX_TIME_S = 1e11
 _YEAR_S = 366 * 86400.0
-# Seconds since 1970 of files that programs of today write: 1990 to 2100.
-_EPOCH_S = (6.3e8, 4.1e9)
-_MAX_STEP_S = 3600.0  # limit from one pose to the next of a recording
-_USUAL_STEP_S = 0.05  # geometric mean of the steps of lidars, cameras and simulations
+_EPOCH_S = (6.3e8, 4.1e9)  # range of plausible Unix times, from 1990 to 2100
+_MAX_STEP_S = 3600.0  # maximum plausible interval between consecutive poses
+_USUAL_STEP_S = 0.05  # geometric mean of the usual intervals for lidars, cameras and simulations
 
 
 def seconds_of(
     times: Floats, time_unit: TimeUnit | None, stated: TimeUnit = "s", advice: str = ""
 ) -> Floats:
-    """Convert the times of a file to seconds.
+    """Convert the times in a file to seconds.
 
     Parameters
     ----------
     times
-        (k,): times in their unit, in any order.
+        Times in any order, with shape (k,).
     time_unit
-        Unit that the user states; None if the user states none.
+        Unit that the user specified, or None.
     stated
-        Unit by the file's format or header, which counts without `time_unit`.
+        Unit according to the file format or header, which applies if `time_unit` is None.
     advice
-        Words for the end of the message; by default the message advises to give `time_unit`.
+        Advice at the end of the error message (default: set `time_unit`).
 
     Raises
     ------
     ValueError
-        If `time_unit` is missing, and a time is 1e11 s or more, or the times span more than a
-        year. The message names the unit that the times probably have.
+        If `time_unit` is None and the times are implausible because a time is 1e11 s or more, or
+        because the times span more than a year. The message states the probable unit.
     """
     if time_unit is not None:
         return times / SECONDS[time_unit] if time_unit != "s" else times
@@ -68,12 +68,15 @@ def seconds_of(
 
 
 def are_plausible(first_s: float, last_s: float) -> bool:
-    """Return False if times between two times, seconds, must have another unit."""
+    """Return whether the first and last time, in seconds, are plausible.
+
+    If they are not, the times probably have a different unit.
+    """
     return max(-first_s, last_s) < _MAX_TIME_S and last_s - first_s <= _YEAR_S
 
 
 def _probable_unit(times: Floats, stated: TimeUnit) -> TimeUnit:
-    """Return the unit that finite times (k,) probably have, or `stated` if no unit fits."""
+    """Return the most probable unit of finite times, or `stated` if none is more probable."""
     steps = np.diff(np.unique(times))
     step = float(np.median(steps)) if len(steps) else 0.0
     largest = float(np.abs(times).max())

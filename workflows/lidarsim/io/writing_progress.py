@@ -1,6 +1,7 @@
-"""Type of functions that show the progress of writing an output."""
+"""Type of the callbacks that report the progress of writing an output."""
 
 from collections.abc import Callable
 
-# Shows the progress of an output: name, number of items done, number of all items, their unit.
+# The arguments are the name of the output, the number of items written, the total number of items,
+# and their unit.
 WritingProgress = Callable[[str, int, int, str], None]

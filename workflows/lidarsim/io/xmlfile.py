@@ -1,4 +1,4 @@
-"""XML files without entities: a few entities expand to any length."""
+"""XML parsing that rejects entity declarations, because a few entities can expand to any size."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from xml.parsers import expat
 from ..errors import CutShortError
 from .allowance import bytes_of
 
-PIECE_BYTES = 2**20  # size of a piece of files that are parsed piece by piece
-# Length of a tag or remark in files that are parsed piece by piece. Expat keeps what is unfinished,
-# and before version 2.6 begins again with each piece. Text of any length does no harm.
+PIECE_BYTES = 2**20  # piece size for incremental parsing
+# Maximum length of a tag or comment in incremental parsing. Expat buffers unfinished tokens, and
+# versions before 2.6 parse them again with each piece. Text is not buffered and has no limit.
 MAX_TAG_BYTES = 16 * 2**20
-# Codes of the errors of a text that ends too early.
+# Codes of the errors that expat reports for a truncated document.
 AT_END = tuple(
     expat.errors.codes[message]
     for message in (
@@ -28,27 +28,27 @@ AT_END = tuple(
 
 
 class _RootFoundError(Exception):
-    """The first element has begun, before which all entities are declared."""
+    """Signal that parsing has reached the root element, which follows all entity declarations."""
 
 
 def xml_root(data: bytes) -> Element:
-    """Return the root element of a file, without comments.
+    """Parse an XML file and return its root element without comments.
 
     Raises
     ------
     ValueError
-        If the file declares entities, or a tag up to the root's is longer than
-        `MAX_TAG_BYTES`. Tags after the root take a time that is proportional to their length.
+        If the file declares entities, or if a tag up to and including the root tag is longer than
+        `MAX_TAG_BYTES`. Later tags have no limit, because they are parsed in linear time.
     CutShortError
-        If the file ends before its root element does.
+        If the file is truncated.
     ElementTree.ParseError
-        If the file is not XML.
+        If the file is not valid XML.
     """
     parser = expat.ParserCreate()
     parser.EntityDeclHandler = refuse_entity
     parser.StartElementHandler = _stop
     pieces = (data[start : start + PIECE_BYTES] for start in range(0, len(data), PIECE_BYTES))
-    with suppress(expat.ExpatError, _RootFoundError):  # ElementTree raises errors of the file below
+    with suppress(expat.ExpatError, _RootFoundError):  # ElementTree reports syntax errors below
         for _ in parse_pieces(parser, pieces):
             pass
     try:
@@ -62,19 +62,18 @@ def xml_root(data: bytes) -> Element:
 
 
 def _stop(tag: str, attributes: object) -> NoReturn:
-    """Handle the start of the first element."""
     raise _RootFoundError
 
 
 def parse_pieces(parser: expat.XMLParserType, pieces: Iterable[bytes]) -> Iterator[None]:
-    """Parse the pieces of a file, and yield after each piece.
+    """Parse a file incrementally, and yield after each piece.
 
     Raises
     ------
     ValueError
-        If a tag is longer than `MAX_TAG_BYTES`, which are all that expat keeps.
+        If a tag or comment is longer than `MAX_TAG_BYTES`.
     expat.ExpatError
-        If the file is not XML.
+        If the file is not valid XML.
     """
     count = 0
     for piece in pieces:
@@ -88,9 +87,9 @@ def parse_pieces(parser: expat.XMLParserType, pieces: Iterable[bytes]) -> Iterat
 
 
 def refuse_entity(name: str, *details: object) -> NoReturn:
-    """Handle the declaration of an entity: raise ValueError.
+    """Handle an entity declaration by raising ValueError.
 
-    Expat itself stops an expansion only at a hundred times the file, of text; elements take thirty
-    times their text.
+    The protection in expat is not sufficient. It stops the expansion only when the text has grown
+    to a hundred times the file size, and elements take thirty times as much memory as their text.
     """
     raise ValueError(f"it declares the XML entity {name[:20]!r}, which may expand without limit")

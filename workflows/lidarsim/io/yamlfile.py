@@ -1,4 +1,7 @@
-"""YAML files as plain data: no tags, no duplicate keys, numbers as in YAML 1.2."""
+"""YAML loading that accepts plain data only.
+
+Tags and duplicate keys are rejected. Numbers follow YAML 1.2.
+"""
 
 from __future__ import annotations
 
@@ -12,24 +15,24 @@ from ..errors import LidarError, MissingFileError, as_sentence, prefixed
 from .allowance import Allowance
 from .input_files import not_found, read_input_text
 
-_NODE_BYTES = 500  # memory of a value in the loader
+_NODE_BYTES = 500  # memory that the loader requires per value
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader that refuses duplicate keys, and aliases that repeat too much.
+    """SafeLoader that rejects duplicate keys and excessive expansion of aliases.
 
-    PyYAML silently takes the last of two keys. Aliases of a value share an object, but merging or
-    reading aliases takes as long as if they were written out.
+    PyYAML silently uses the last of several duplicate keys. Although all aliases of a value share
+    one object, processing them takes as long as if each alias were a copy of the value.
     """
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
         self._allowance = Allowance(len(text), "shorten it, or do not use aliases (*name)")
-        # {value with an anchor: bytes with aliases written out}
+        # {node with an anchor: size in bytes with all aliases expanded}
         self._node_bytes: dict[yaml.Node, int] = {}
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Compose a node, and count each use of an alias towards the memory."""
+        """Compose a node, counting every use of an alias toward the allowance."""
         event: Any = self.peek_event()
         used_bytes = self._allowance.used_bytes
         self._allowance.take(_NODE_BYTES)
@@ -45,10 +48,7 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Build a mapping.
-
-        Raises ConstructorError, with the line, for a duplicate key.
-        """
+        """Construct a mapping. Raise ConstructorError if a key is duplicated."""
         keys: set[str] = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
@@ -61,7 +61,7 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-# In YAML 1.1, which PyYAML implements, 1e-3 is text; in YAML 1.2 it is a number.
+# PyYAML implements YAML 1.1, in which 1e-3 is a string. In YAML 1.2, it is a number.
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float",
     re.compile(r"^[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$"),
@@ -70,16 +70,16 @@ _Loader.add_implicit_resolver(
 
 
 def load_yaml(text: str) -> Any:
-    """Return the content of a YAML text.
+    """Parse YAML text.
 
     Raises
     ------
     LidarError
-        If the text has too many values, with aliases written out.
+        If the text has too many values once all aliases are expanded.
     yaml.YAMLError
-        If the text is not YAML.
+        If the text is not valid YAML.
     ValueError, OverflowError, RecursionError
-        For a number, a date or a depth that Python cannot represent.
+        If Python cannot represent a number, a date or the nesting depth.
     """
     loader = _Loader(text)
     try:
@@ -91,13 +91,15 @@ def load_yaml(text: str) -> Any:
 def read_yaml(
     path: Path, form: str = "A scenario is a mapping with sections such as scene, sensor and poses"
 ) -> dict[str, Any]:
-    """Read a YAML file of a mapping, for errors that describe the expected mapping by `form`.
+    """Read a YAML file that contains a mapping.
+
+    `form` describes the expected mapping in error messages.
 
     Raises
     ------
     LidarError
-        If the file is missing, unreadable, too large, not UTF-8, not YAML, empty, or holds
-        something other than a mapping.
+        If the file does not exist, cannot be read, is too large, is not valid YAML in UTF-8, or
+        does not contain a mapping.
     """
     try:
         with prefixed(path):
@@ -111,7 +113,7 @@ def read_yaml(
         line = f", line {mark.line + 1}" if mark else ""
         raise LidarError(f"{path}{line}: {error.problem or 'not valid YAML'}.") from error
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
-        # ValueError: not UTF-8, or a date or number that Python cannot hold, such as 2026-99-99.
+        # A ValueError means that the file is not UTF-8, or that a date or number is invalid.
         reason = " ".join(str(error).partition(";")[0].split())[:200]
         raise LidarError(f"{path} is not valid YAML: {reason}.") from error
     if content is None:

@@ -20,7 +20,7 @@ from ..errors import LidarError
 from ..numerics.arrays import Bools, Floats, Indices, Integers
 from ..numerics.elementary import exp, power
 from ..schema.checks import check_fields
-from ..schema.declared import FileSection, TextOrTexts, UnitShare, about, allowed, written_as
+from ..schema.declared import FileSection, TextOrTexts, UnitShare, about, allowed, scenario_type
 from ..schema.value_texts import one_line, shown
 from ..words import did_you_mean, name_hint
 from .leaves import LeafAngle
@@ -115,7 +115,7 @@ class Material(FileSection):
 
     objects: Annotated[
         str | Sequence[str] | None,
-        written_as(TextOrTexts | None),
+        scenario_type(TextOrTexts | None),
         about("names of objects, which may contain * and ? (default: all)", min_length=1),
     ] = None
     reflectance: Annotated[
@@ -207,7 +207,7 @@ class Material(FileSection):
     ] = "spherical"
     material: Annotated[
         str | Sequence[str] | None,
-        written_as(TextOrTexts | None),
+        scenario_type(TextOrTexts | None),
         about(
             "names of materials in the scene files, which may contain * and ? (default: all)",
             "Glass",

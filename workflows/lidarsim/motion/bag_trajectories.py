@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..columns.bags import messages_of, opened_bag
+from ..columns.bags import opened_bag, read_messages
 from ..errors import LidarError
 from ..numerics.arrays import Floats, Ints
 from ..numerics.vectors import matmul, matvec
@@ -170,7 +170,7 @@ def _topic_poses(bag: Reader, topic: str, get_pose: Callable[[Any], Any]) -> Tim
     times = []
     rows = []
     frames = set()
-    for _, time_ns, message in messages_of(bag, [topic]):
+    for _, time_ns, message in read_messages(bag, [topic]):
         stamps.append(_stamp_ns(message.header))
         times.append(time_ns)
         rows.append(_row_of(get_pose(message)))
@@ -190,7 +190,7 @@ def _gnss_poses(
     """Return the positions of a GNSS receiver, with orientations of an IMU if the bag has any."""
     times_ns = []
     fixes = []
-    for _, _, fix in messages_of(bag, [topic]):
+    for _, _, fix in read_messages(bag, [topic]):
         geodetic = [fix.latitude, fix.longitude, fix.altitude]
         if fix.status.status >= 0 and np.isfinite(geodetic).all():
             times_ns.append(_stamp_ns(fix.header))
@@ -223,7 +223,7 @@ def _orientations(bag: Reader, kinds: Mapping[str, str], imu: str) -> tuple[Ints
     if imu and imu not in topics:
         raise LidarError(f"it has no IMU topic {imu!r}.{did_you_mean(imu, topics)}")
     measured: dict[str, tuple[list[int], list[list[float]]]] = {}
-    for topic, _, message in messages_of(bag, [imu] if imu else topics):
+    for topic, _, message in read_messages(bag, [imu] if imu else topics):
         if message.orientation_covariance[0] != -1:  # -1 marks an IMU without orientation
             orientation = message.orientation
             times, rows = measured.setdefault(topic, ([], []))
@@ -245,7 +245,7 @@ def _edges_of(bag: Reader, kinds: Mapping[str, str]) -> dict[str, _Edge]:
     """Return the poses of each frame in its parent frame, from all tf topics."""
     edges: dict[str, _Edge] = {}
     topics = [topic for topic, kind in kinds.items() if kind == _FRAMES]
-    for topic, _, message in messages_of(bag, topics):
+    for topic, _, message in read_messages(bag, topics):
         for stamped in message.transforms:
             parent, child = (
                 frame.lstrip("/") for frame in (stamped.header.frame_id, stamped.child_frame_id)

@@ -15,7 +15,7 @@ from ..numerics.arrays import Bools, Floats, Indices
 from ..numerics.elementary import arctan2, sin_cos
 from ..numerics.vectors import hypot, matmul, matmul_of_components, matvec, norm
 from ..schema.checks import as_array, check_fields
-from ..schema.declared import AngleDeg, FileSection, Triple, about, short, written_as
+from ..schema.declared import AngleDeg, FileSection, Triple, about, accept_short_form, scenario_type
 from ..schema.value_texts import one_line, shown
 from ..words import joined, rounded
 from .headings import CurveHeadings, Heading, headed_poses
@@ -53,7 +53,7 @@ class Pose(FileSection):
     """
 
     position: Annotated[
-        tuple[float, float, float], written_as(Triple), about("x, y and z in meters")
+        tuple[float, float, float], scenario_type(Triple), about("x, y and z in meters")
     ]
     yaw_deg: Annotated[AngleDeg, about("rotation about z in degrees, applied first")] = 0.0
     pitch_deg: Annotated[
@@ -164,7 +164,7 @@ class InstrumentPose(Pose):
 
 
 # A pose in a file, whose position is optional. A list of numbers is a position without angles.
-AT_CENTER = short(
+AT_CENTER = accept_short_form(
     lambda v: isinstance(v, (dict, list)),
     lambda v: {"position": v} if isinstance(v, list) else {"position": [0] * 3} | v,
     Triple | InstrumentPose,

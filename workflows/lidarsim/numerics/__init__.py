@@ -1,1 +1,1 @@
-"""Bit-identical vector and elementary functions on every processor, and random numbers."""
+"""Random numbers, vector operations and functions that are bit-identical on every processor."""

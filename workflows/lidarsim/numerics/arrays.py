@@ -1,4 +1,4 @@
-"""Types of arrays, by their elements."""
+"""Type aliases for arrays, named after their element types."""
 
 from __future__ import annotations
 
@@ -23,5 +23,9 @@ AnyArray = NDArray[Any]
 
 
 def owned(array: AnyArray, kind: type = np.float64) -> AnyArray:
-    """Return an array for compiled loops: of a given type, contiguous and writable."""
+    """Convert an array to the form that compiled loops require.
+
+    The result has the given dtype and is contiguous and writable. The array is copied only if
+    necessary.
+    """
     return np.require(array, kind, ["C", "W"])

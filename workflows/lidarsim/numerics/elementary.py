@@ -1,8 +1,8 @@
-"""Sine, exponential, logarithm and the like of arrays, with the same bits on every processor.
+"""Elementary functions of arrays that are bit-identical on every processor.
 
-Functions of NumPy and of C libraries differ in their last bits between versions and processors.
-The functions of this module apply `elementary_scalars` to each number: compiled, or in Python for
-few numbers, since numba takes half a second to import.
+The results of NumPy and C library functions differ in the last bits between versions and
+processors. The functions in this module apply `elementary_scalars` to each element. They use
+compiled loops, or plain Python for small arrays because importing numba takes half a second.
 """
 
 from __future__ import annotations
@@ -17,54 +17,54 @@ from numpy.typing import ArrayLike
 from .arrays import Floats, owned
 from .elementary_scalars import arctan2_of, exp_of, log_of, sin_cos_of
 
-_MAX_INTERPRETED = 1 << 12  # numbers that Python computes, in about 20 ms
+_MAX_INTERPRETED = 1 << 12  # maximum array size for plain Python, which takes about 20 ms
 
 
 def sin_cos(x: ArrayLike) -> tuple[Floats, Floats]:
-    """Return sines and cosines of angles in radians, of any shape."""
+    """Return the sines and cosines of angles in radians."""
     sine, cosine = _apply("sin_cos", sin_cos_of, 2, x)
     return sine, cosine
 
 
 def sin(x: ArrayLike) -> Floats:
-    """Return sines of angles in radians."""
+    """Return the sines of angles in radians."""
     return sin_cos(x)[0]
 
 
 def cos(x: ArrayLike) -> Floats:
-    """Return cosines of angles in radians."""
+    """Return the cosines of angles in radians."""
     return sin_cos(x)[1]
 
 
 def exp(x: ArrayLike) -> Floats:
-    """Return exponentials of numbers."""
+    """Return the exponentials of numbers."""
     return _apply("exp", exp_of, 1, x)[0]
 
 
 def log(x: ArrayLike) -> Floats:
-    """Return natural logarithms of numbers."""
+    """Return the natural logarithms of numbers."""
     return _apply("log", log_of, 1, x)[0]
 
 
 def arctan2(y: ArrayLike, x: ArrayLike) -> Floats:
-    """Return angles of vectors (x, y), radians."""
+    """Return the angles in radians of vectors with the components `x` and `y`."""
     return _apply("arctan2", arctan2_of, 1, *np.broadcast_arrays(y, x))[0]
 
 
 def arcsin(x: ArrayLike) -> Floats:
-    """Return angles of given sines, radians."""
+    """Return the angles in radians whose sines are `x`."""
     x = np.asarray(x, np.float64)
     return arctan2(x, np.sqrt((1 - x) * (1 + x)))
 
 
 def arccos(x: ArrayLike) -> Floats:
-    """Return angles of given cosines, radians."""
+    """Return the angles in radians whose cosines are `x`."""
     x = np.asarray(x, np.float64)
     return arctan2(np.sqrt((1 - x) * (1 + x)), x)
 
 
 def log1p(x: ArrayLike) -> Floats:
-    """Return logarithms of 1 + x, exact for small x too (Kahan 1982)."""
+    """Return the logarithms of 1 + x, which are also accurate for small x (Kahan 1982)."""
     x = np.asarray(x, np.float64)
     argument = 1 + x
     rounded = argument - 1
@@ -73,7 +73,7 @@ def log1p(x: ArrayLike) -> Floats:
 
 
 def expm1(x: ArrayLike) -> Floats:
-    """Return exponentials of x, minus 1, exact for small x too (Kahan 1982)."""
+    """Return exp(x) - 1, which is also accurate for small x (Kahan 1982)."""
     x = np.asarray(x, np.float64)
     exponential = exp(x)
     is_plain = (exponential == 1) | (exponential < 0.5) | (exponential > 2)
@@ -83,17 +83,17 @@ def expm1(x: ArrayLike) -> Floats:
 
 
 def power(x: ArrayLike, exponent: float) -> Floats:
-    """Return powers of numbers from 0 up.
+    """Raise nonnegative numbers to a power.
 
-    Powers of a large exponent are less exact.
+    The results are less accurate if the exponent is large.
     """
     return exp(exponent * log(x))
 
 
 def cbrt(x: ArrayLike) -> Floats:
-    """Return cube roots of numbers except 0.
+    """Return the cube roots of nonzero numbers.
 
-    Roots of cubes are exact.
+    The roots of perfect cubes are exact.
     """
     size = np.abs(x)
     root = power(size, 1 / 3)
@@ -102,31 +102,34 @@ def cbrt(x: ArrayLike) -> Floats:
 
 
 def geomspace(start: float, stop: float, count: int) -> Floats:
-    """Return numbers (count,) from `start` to `stop`, both above 0, of a constant ratio."""
+    """Return `count` geometrically spaced numbers from `start` to `stop`, both positive."""
     numbers = start * exp(np.linspace(0, float(log(stop / start)), count))
     numbers[-1] = stop
     return numbers
 
 
 def interp(x: ArrayLike, knots: Floats, values: Floats) -> Floats:
-    """Interpolate values (k,) at ascending knots (k,), constant beyond the first and last knot."""
+    """Interpolate linearly between values at ascending knots.
+
+    `knots` and `values` have shape (k,). Beyond the first and last knot, the result is constant.
+    """
     x = np.asarray(x, np.float64)
     row = np.clip(np.searchsorted(knots, x, "right") - 1, 0, max(len(knots) - 2, 0))
-    with np.errstate(divide="ignore", invalid="ignore"):  # slopes between equal knots are not used
+    with np.errstate(divide="ignore", invalid="ignore"):  # slopes between equal knots are unused
         slopes = np.diff(values, append=values[-1]) / np.diff(knots, append=np.inf)
     interpolated = (x - knots[row]) * slopes[row] + values[row]
     return np.where(x < knots[0], values[0], np.where(x >= knots[-1], values[-1], interpolated))
 
 
 def decade(x: float) -> int:
-    """Return the exponent of the largest power of ten up to a number above 0, of 16 digits."""
+    """Return the decimal exponent of a positive number, rounded to 16 digits."""
     return int(f"{x:.15e}".partition("e")[2])
 
 
 def _apply(
     name: str, function: Callable[..., Any], results: int, *arguments: ArrayLike
 ) -> tuple[Floats, ...]:
-    """Apply a function to each number, with results in the shape of the first argument."""
+    """Apply a function elementwise. The results have the shape of the first argument."""
     arrays = [np.asarray(array, np.float64) for array in arguments]
     shape = arrays[0].shape
     output = np.empty((results, arrays[0].size))

@@ -1,4 +1,4 @@
-"""The functions of `elementary_scalars`, compiled."""
+"""Compiled loops that apply the functions in `elementary_scalars` to arrays."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -16,27 +16,27 @@ arctan2 = inlined(elementary_scalars.arctan2_of)
 
 @compiled()
 def sin_cos_each(x, sine, cosine):
-    """Write sines and cosines of numbers (n,)."""
+    """Write the sine and cosine of each number to the output arrays."""
     for k in range(len(x)):
         sine[k], cosine[k] = sin_cos(x[k])
 
 
 @compiled()
 def exp_each(x, result):
-    """Write exponentials of numbers (n,)."""
+    """Write the exponential of each number to the output array."""
     for k in range(len(x)):
         result[k] = exp(x[k])
 
 
 @compiled()
 def log_each(x, result):
-    """Write logarithms of numbers (n,)."""
+    """Write the natural logarithm of each number to the output array."""
     for k in range(len(x)):
         result[k] = log(x[k])
 
 
 @compiled()
 def arctan2_each(y, x, result):
-    """Write angles of vectors with coordinates y (n,) and x (n,)."""
+    """Write the angle of each vector to the output array."""
     for k in range(len(x)):
         result[k] = arctan2(y[k], x[k])

@@ -1,9 +1,9 @@
-"""Sine, cosine, exponential, logarithm and arc tangent with the same bits on every processor.
+"""Elementary functions of scalars that are bit-identical on every processor.
 
-These functions consist of +, -, *, / and sqrt, which IEEE 754 rounds in one way, and of exact
-scaling by powers of two. Results are within 2 units in the last place. Methods and polynomials are
-from fdlibm (Sun Microsystems 1993). `elementary` applies the functions to arrays, and
-`elementary_loops` compiles them.
+The functions use only +, -, *, / and sqrt, whose rounding IEEE 754 defines exactly, and scaling by
+powers of two, which is exact. The maximum error is 2 units in the last place. The methods and
+polynomials are taken from fdlibm (Sun Microsystems 1993). `elementary` applies the functions to
+arrays, and `elementary_loops` compiles them.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ _POWERS_OF_TWO = np.ldexp(1.0, np.arange(-539, 514))
 
 
 def sin_cos_of(x: float) -> tuple[float, float]:  # noqa: PLR0914 - compiled loops inline it
-    """Return sine and cosine of an angle in radians, below 2^50."""
+    """Return the sine and cosine of an angle in radians whose magnitude is below 2^50."""
     if not 0.0 < abs(x) < math.inf:
         return (x, 1.0) if x == 0.0 else (math.nan, math.nan)
-    # x - k pi / 2, with pi / 2 as a sum of three numbers; products in two parts (Dekker 1971).
+    # Compute x - k pi / 2, where pi / 2 is a sum of three numbers and each product is computed in
+    # two parts (Dekker 1971).
     k = float(math.floor(x * 0.6366197723675814 + 0.5))
     a = k * 134217729.0
     leading = a - (a - k)
@@ -68,9 +69,9 @@ def sin_cos_of(x: float) -> tuple[float, float]:  # noqa: PLR0914 - compiled loo
 
 def exp_of(x: float) -> float:
     """Return the exponential of a number."""
-    # Without branches, so that loops become vector instructions.
+    # The code has no branches, so that the compiler can vectorize loops.
     bounded = x if x < 710.0 else 710.0
-    bounded = bounded if bounded > -746.0 else -746.0  # true for NaN, too
+    bounded = bounded if bounded > -746.0 else -746.0  # also bounds NaN
     k = math.floor(bounded * 1.4426950408889634 + 0.5)
     reduced = bounded - k * 6.93147180369123816490e-01
     correction = k * 1.90821492927058770002e-10
@@ -81,7 +82,7 @@ def exp_of(x: float) -> float:
     )
     c = y - t * (1.66666666666666019037e-01 + t * (-2.77777777770155933842e-03 + t * c))
     y = 1.0 - ((correction - (y * c) / (2.0 - c)) - reduced)
-    half = k >> 1  # two factors: each neither overflows nor is rounded
+    half = k >> 1  # scaling by two factors avoids overflow, and each factor is exact
     y = float(y * _POWERS_OF_TWO[half + 539] * _POWERS_OF_TWO[k - half + 539])
     return y if x == x else x
 
@@ -107,13 +108,16 @@ def log_of(x: float) -> float:
 
 
 def arctan2_of(y: float, x: float) -> float:
-    """Return the angle of a vector (x, y), radians, decided by the signs for (±0, ±0)."""
+    """Return the angle in radians of a vector with the components `x` and `y`.
+
+    For the zero vector, the signs of the zeros determine the angle.
+    """
     if x != x or y != y:
         return math.nan
     larger = max(abs(x), abs(y))
     smaller = min(abs(x), abs(y))
     t = smaller / larger if 0.0 < larger < math.inf else (1.0 if smaller == math.inf else 0.0)
-    # arctan 1/2 and 1, in two parts
+    # Values of arctan 1/2 and arctan 1, each in two parts.
     base_angle = 0.0
     base_error = 0.0
     if t > 0.6875:

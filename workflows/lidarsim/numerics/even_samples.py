@@ -1,4 +1,4 @@
-"""Evenly spaced samples."""
+"""Selection of evenly distributed samples."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from .arrays import Ints
 
 
 def even_indices(count: int, max_count: int) -> Ints:
-    """Return at most `max_count` indices below `count`, ascending, of equal parts.
+    """Return at most `max_count` ascending indices that are evenly distributed below `count`.
 
-    All indices are returned if `count` is at most `max_count`; else the choice within each part is
-    random, and the same each time: of points ordered by scan and ray, every n-th could be of few
-    rings or directions.
+    If `count` does not exceed `max_count`, all indices are returned. Otherwise, the range is
+    divided into equal intervals, and one index is selected from each interval at random with a
+    fixed seed. A constant stride would not be representative: if points are ordered by scan and
+    ray, every n-th point may belong to only a few rings or directions.
     """
     parts = min(count, max_count)
     edges = np.arange(parts + 1, dtype=np.int64) * count // max(parts, 1)

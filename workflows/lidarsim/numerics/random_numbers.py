@@ -1,7 +1,8 @@
-"""Random numbers of the simulation: hashes, which depend on nothing but their key.
+"""Counter-based random numbers for the simulation.
 
-A random number is a hash of (seed, name, purpose, scan, ray, number): the same on every worker and
-in every batch, whatever the order of drawing.
+Each random number is a hash of its key, which consists of the seed, name, purpose, scan, ray and
+number. It is therefore the same on every worker and in every batch, regardless of the order in
+which numbers are drawn.
 """
 
 from __future__ import annotations
@@ -17,29 +18,30 @@ from numpy.typing import ArrayLike, NDArray
 from .arrays import Floats
 
 _GAMMA = 0x9E3779B97F4A7C15
-_NUMBERS = 256  # random numbers of one ray
+_NUMBERS = 256  # maximum number of random numbers per ray and purpose
 
 
 class Purpose:
-    """A use of random numbers, declared by the module that draws the numbers.
+    """A purpose for which random numbers are drawn, declared by the module that draws them.
 
-    Several instances of a use, such as kinds of particles or instruments, have a seed each
-    (`named_seed`).
+    If a purpose has several instances, such as kinds of particles or instruments, each instance has
+    its own seed (`named_seed`).
 
     Parameters
     ----------
     number
-        The number of the purpose in hashes, below 2**32; it never changes, for bytes depend on it.
+        Number of the purpose in hashes, less than 2**32. It must never change because results
+        depend on it.
     use
-        Description of the use, in a few words.
+        Description of the purpose in a few words.
 
     Raises
     ------
     ValueError
-        If another purpose has the number.
+        If the number is already used by a different purpose.
     """
 
-    declared: ClassVar[dict[int, Purpose]] = {}  # {number: purpose}, of imported modules
+    declared: ClassVar[dict[int, Purpose]] = {}  # {number: purpose}, for imported modules
 
     number: int
     use: str
@@ -59,7 +61,7 @@ class Purpose:
 
 
 def _mixed(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Mix 64-bit numbers in place: the last step of SplitMix64 (Steele, Lea and Flood 2014)."""
+    """Mix 64-bit numbers in place with the finalizer of SplitMix64 (Steele, Lea and Flood 2014)."""
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         x ^= x >> np.uint64(shift)
         x *= np.uint64(factor)
@@ -68,14 +70,20 @@ def _mixed(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def named_seed(seed: int, name: str) -> int:
-    """Return a seed for a name, the same on every machine, or `seed` without a name."""
+    """Derive a seed from a seed and a name.
+
+    The result is the same on every machine. If the name is empty, `seed` is returned unchanged.
+    """
     if not name:
         return seed
     return int.from_bytes(sha256(f"{seed}\n{name}".encode()).digest()[:8], "little") >> 1
 
 
 def starts(seed: int, *purposes: Purpose) -> NDArray[np.uint64]:
-    """Return the starts of the hashes of purposes, with a seed below 2**63: uint64 (k,)."""
+    """Return the initial hash state for each purpose.
+
+    The seed must be less than 2**63. The result has dtype uint64 and shape (k,).
+    """
     start = _mixed(np.array([int(seed) * _GAMMA % 2**64], np.uint64))
     steps = [purpose.number * _GAMMA % 2**64 for purpose in purposes]
     return _mixed(start + np.array(steps, np.uint64))
@@ -84,13 +92,14 @@ def starts(seed: int, *purposes: Purpose) -> NDArray[np.uint64]:
 def raw(
     seed: int, purpose: Purpose, scan: ArrayLike, ray: ArrayLike, number: ArrayLike = 0
 ) -> NDArray[np.uint64]:
-    """Return 64 random bits for each ray: uint64 (n,).
+    """Return 64 random bits for each ray.
 
-    The seed is below 2**63. Scan, ray and number are (n,), or a scalar for all: `ray` is the ray
-    within its scan, below 2**32, and `number` is below 256.
+    The seed must be less than 2**63. `scan`, `ray` and `number` are scalars or have shape (n,).
+    `ray` is the index of the ray in its scan and must be less than 2**32, and `number` must be less
+    than 256. The result has dtype uint64 and shape (n,).
     """
     start = starts(seed, purpose)
-    # A stream of SplitMix64 for each scan. A ray has 256 numbers of the stream.
+    # Each scan has its own SplitMix64 stream, in which each ray has 256 numbers.
     streams = _mixed(start + np.asarray(scan).astype(np.uint64) * np.uint64(_GAMMA))
     steps = np.asarray(ray).astype(np.uint64) * np.uint64(_NUMBERS)
     steps = steps + np.asarray(number).astype(np.uint64) + np.uint64(1)
@@ -100,10 +109,9 @@ def raw(
 def uniform(
     seed: int, purpose: Purpose, scan: ArrayLike, ray: ArrayLike, number: ArrayLike = 0
 ) -> Floats:
-    """Return numbers uniform in [0, 1), multiples of 2**-53: (n,).
+    """Draw numbers that are uniformly distributed in [0, 1).
 
-    The seed is below 2**63. Scan, ray and number are (n,), or a scalar for all: `ray` is the ray
-    within its scan, below 2**32, and `number` is below 256.
+    The numbers are multiples of 2**-53 and have shape (n,). See `raw` for the parameters.
     """
     bits = raw(seed, purpose, scan, ray, number) >> np.uint64(11)
     return bits.astype(np.float64) * 2.0**-53
@@ -112,20 +120,19 @@ def uniform(
 def normal(
     seed: int, purpose: Purpose, scan: ArrayLike, ray: ArrayLike, number: ArrayLike = 0
 ) -> Floats:
-    """Return normally distributed numbers of mean 0 and variance 1: (n,).
+    """Draw numbers from a normal distribution with mean 0 and variance 1.
 
-    The numbers are quantiles of 65,536 equal shares of the distribution, so none is beyond 4.3. The
-    seed is below 2**63. Scan, ray and number are (n,), or a scalar for all: `ray` is the ray within
-    its scan, below 2**32, and `number` is below 256.
+    The distribution is approximated by 65,536 quantiles, so no magnitude exceeds 4.3. The result
+    has shape (n,). See `raw` for the parameters.
     """
     return quantiles()[raw(seed, purpose, scan, ray, number) >> np.uint64(48)]
 
 
 @cache
 def quantiles() -> Floats:
-    """Return the quantiles of 65,536 equal shares of the normal distribution."""
+    """Return 65,536 quantiles of the standard normal distribution with equal probabilities."""
     shares = (np.arange(2**15) + 0.5) / 2**16
     lower_half = np.array([NormalDist().inv_cdf(share) for share in shares])
     table = np.concatenate([lower_half, -lower_half[::-1]])
-    # Rounded to single precision, where C libraries agree about logarithms.
+    # The logarithms of different C libraries agree once they are rounded to single precision.
     return (table / np.sqrt((table**2).mean())).astype(np.float32).astype(np.float64)

@@ -1,8 +1,8 @@
 """Operations on vectors and small matrices that are bit-identical on every processor.
 
-Sums of products have a fixed order, and each product is rounded. BLAS, LAPACK and `numpy.einsum`
-use fused multiply-add where the processor supports it, and `pow` of different C libraries differs
-in the last bit.
+Products are summed in a fixed order, and each product is rounded. In contrast, BLAS, LAPACK and
+`numpy.einsum` use fused multiply-add instructions if the processor supports them, and `pow` differs
+in the last bit between C libraries.
 """
 
 from __future__ import annotations
@@ -14,12 +14,15 @@ from numpy.typing import ArrayLike
 
 from .arrays import Floats, Ints
 
-# Same as in numpy.linalg.matrix_rank, with a margin for rounding errors of cofactors.
+# Tolerance of numpy.linalg.matrix_rank, with a margin for rounding errors in cofactors.
 _FLAT = 16 * 2.0**-52
 
 
 def rotate(vectors: Floats, rotation: Floats | None) -> Floats:
-    """Rotate vectors (n, 3) by a matrix (k, 3), or return them unchanged if it is None."""
+    """Multiply vectors by a matrix, or return them unchanged if it is None.
+
+    The vectors have shape (n, 3). The matrix has shape (k, 3), where k is 3 for a rotation.
+    """
     if rotation is None:
         return vectors
     x, y, z = vectors.T
@@ -27,9 +30,10 @@ def rotate(vectors: Floats, rotation: Floats | None) -> Floats:
 
 
 def rotate_into_frames(vectors: Floats, rotations: Floats | None) -> Floats:
-    """Rotate vectors (m, 3) from the scene frame to the frames with the given rotations (m, 3, 3).
+    """Rotate each vector from the scene frame to the frame with the corresponding rotation.
 
-    Vectors are returned unchanged if `rotations` is None.
+    The vectors have shape (m, 3), and the rotations have shape (m, 3, 3). If `rotations` is None,
+    the vectors are returned unchanged.
     """
     if rotations is None:
         return vectors
@@ -55,14 +59,20 @@ def dot(first: Floats, second: Floats) -> Floats:
 
 
 def cross(first: Floats, second: Floats) -> Floats:
-    """Return the cross products of two arrays of vectors, each of shape (3, ...)."""
+    """Return the cross products of two arrays of vectors.
+
+    All arrays have shape (3, ...).
+    """
     a, b, c = first
     d, e, f = second
     return np.array([b * f - c * e, c * d - a * f, a * e - b * d])
 
 
 def matmul(first: ArrayLike, second: ArrayLike) -> Floats:
-    """Multiply small matrices of shapes (..., i, j) and (..., j, k)."""
+    """Multiply small matrices.
+
+    The matrices have the shapes (..., i, j) and (..., j, k).
+    """
     first = np.asarray(first, np.float64)
     second = np.asarray(second, np.float64)
     axes = max(first.ndim, second.ndim)
@@ -71,9 +81,10 @@ def matmul(first: ArrayLike, second: ArrayLike) -> Floats:
 
 
 def matmul_of_components(first: Floats, second: Floats) -> Floats:
-    """Multiply small matrices of shapes (i, j, ...) and (j, k, ...).
+    """Multiply small matrices whose components are on the first two axes.
 
-    This is faster than `matmul` for many matrices, because the long axis is the last.
+    The matrices have the shapes (i, j, ...) and (j, k, ...). For many matrices, this function is
+    faster than `matmul` because the longest axis is contiguous.
     """
     product: Floats = first[:, 0, None] * second[None, 0]
     for number in range(1, first.shape[1]):
@@ -82,13 +93,19 @@ def matmul_of_components(first: Floats, second: Floats) -> Floats:
 
 
 def _components_first(matrices: Floats, axes: int) -> Floats:
-    """Return matrices (..., i, j) as a contiguous array (i, j, ...) with `axes` dimensions."""
+    """Move the components of matrices to the first two axes of a contiguous array.
+
+    The result has `axes` dimensions.
+    """
     matrices = matrices[(None,) * (axes - matrices.ndim)]
     return np.ascontiguousarray(matrices.transpose(axes - 2, axes - 1, *range(axes - 2)))
 
 
 def matvec(matrices: ArrayLike, vectors: ArrayLike) -> Floats:
-    """Multiply matrices (..., i, j) by vectors (..., j)."""
+    """Multiply matrices by vectors.
+
+    The matrices have shape (..., i, j), and the vectors have shape (..., j).
+    """
     return matmul(matrices, np.asarray(vectors)[..., None])[..., 0]
 
 
@@ -107,10 +124,11 @@ def hypot(x: Any, y: Any) -> Any:
 
 
 def adjugates(matrices: Floats) -> tuple[Floats, Floats]:
-    """Return the adjugates and the determinants of matrices (..., 3, 3), from cofactors."""
+    """Compute the adjugates and determinants of 3x3 matrices from their cofactors."""
     rows = np.moveaxis(matrices, (-2, -1), (0, 1))  # (3, 3, ...)
     (a, b, c), (d, e, f), (g, h, i) = rows
-    # Columns are cross products of rows. `numpy.cross` takes four times as long for few matrices.
+    # The columns are cross products of the rows. For few matrices, `numpy.cross` takes four times
+    # as long.
     columns = [
         [e * i - f * h, f * g - d * i, d * h - e * g],
         [h * c - i * b, i * a - g * c, g * b - h * a],
@@ -121,20 +139,23 @@ def adjugates(matrices: Floats) -> tuple[Floats, Floats]:
 
 
 def inverse(matrices: Floats) -> Floats:
-    """Return the inverses of invertible matrices (..., 3, 3)."""
+    """Return the inverses of invertible 3x3 matrices."""
     adjugate, determinant = adjugates(matrices)
     return np.asarray(adjugate / determinant[..., None, None])
 
 
 def determinant(matrices: Floats) -> Floats:
-    """Return the determinants of matrices (..., 3, 3), bit-identical to those of `adjugates`."""
+    """Return the determinants of 3x3 matrices, bit-identical to those from `adjugates`."""
     axes = matrices.ndim - 2, matrices.ndim - 1, *range(matrices.ndim - 2)
     (a, b, c), (d, e, f), (g, h, i) = matrices.transpose(axes)
     return np.asarray((a * (e * i - f * h) + b * (f * g - d * i)) + c * (d * h - e * g))
 
 
 def rank(matrices: Floats) -> Ints:
-    """Return the ranks (...), at least 1, of matrices (..., 3, 3), up to rounding errors."""
+    """Return the ranks of 3x3 matrices, ignoring rounding errors.
+
+    The rank is at least 1, even for a matrix of zeros.
+    """
     shape = (*matrices.shape[:-2], 9)
     largest = np.abs(matrices).reshape(shape).max(axis=-1)
     unit = matrices / np.where(largest > 0, largest, 1)[..., None, None]

@@ -20,7 +20,7 @@ import numpy as np
 from ..environment.ports import port_number
 from ..errors import LidarError
 from ..numerics.arrays import Bytes, Ints
-from ..words import shortened
+from ..words import shorten_name
 from .encoders import Datagrams
 from .sender_process import DATAGRAM, END, HEADER, ROUTE
 from .service import Destination, is_single_receiver
@@ -271,7 +271,7 @@ class ReceiverAddress:
             )
         port = port_number(number) if separator else None
         if separator and not port:
-            shown = shortened(text, _SHOWN_LETTERS)
+            shown = shorten_name(text, _SHOWN_LETTERS)
             raise LidarError(
                 f"{shown!r} is not a valid address. Use HOST or HOST:PORT, with a port of at most "
                 "65535."

@@ -12,7 +12,7 @@ from ..errors import LidarError
 from ..numerics.arrays import AnyArray, Bools, Floats, Floats32, Ints
 from ..sensor import Sensor
 from ..sensor.packet_settings import PacketSettings
-from ..sweeps.ray_image import Image, fired_of
+from ..sweeps.ray_image import RayImage, require_fired_rays
 from ..sweeps.sweeps import Sweeps
 
 
@@ -77,9 +77,9 @@ class Shots:
             rays of the survey are unknown.
         """
         names = tuple(columns)
-        settings_of(fired_of(sweeps).sensors[sweeps.sensor[sweep]])
+        settings_of(require_fired_rays(sweeps).sensors[sweeps.sensor[sweep]])
         check_columns(points.columns, names)
-        shots = cls.from_image(Image.from_points(sweeps, sweep, points), points, names)
+        shots = cls.from_image(RayImage.from_points(sweeps, sweep, points), points, names)
         faults = sweeps.faults_in(sweep)
         return replace(
             shots,
@@ -89,7 +89,7 @@ class Shots:
         )
 
     @classmethod
-    def from_image(cls, image: Image, points: Cloud, columns: Iterable[str] = ()) -> Shots:
+    def from_image(cls, image: RayImage, points: Cloud, columns: Iterable[str] = ()) -> Shots:
         """Return the shots of the points in an image, without faults.
 
         Raises LidarError if the sensor has no packet format, or if the points lack a column.
@@ -139,7 +139,7 @@ def _dropped(sweeps: Sweeps, sweep: int, firings: Ints, starts_ns: Ints) -> Bool
     sensor = int(sweeps.sensor[sweep])
     sweeps_per_station = int(np.count_nonzero(sweeps.sensor == sensor)) // sweeps.stations
     station = int(sweeps.numbers[sweep]) // sweeps_per_station
-    seed = fired_of(sweeps).seeds[sensor]
+    seed = require_fired_rays(sweeps).seeds[sensor]
     dropped = np.zeros(len(firings), np.bool_)
     for number, fault in enumerate(sweeps.faults):
         if fault.kind == "dropped_packets" and fault.sensor in (None, sweeps.sensors[sensor]):

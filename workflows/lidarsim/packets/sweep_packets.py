@@ -14,7 +14,7 @@ from ..sensor.optics import TWO_RETURNS
 from ..simulator import Scanner
 from ..simulator.scanner import StartSeconds, SweepNumber
 from ..survey.survey import Mounted, Survey, nanoseconds
-from ..sweeps.ray_image import Image
+from ..sweeps.ray_image import RayImage
 from .encoders import START_NS, Datagrams, PacketEncoder, PacketSource, encoder_of
 from .shots import Shots, check_columns
 
@@ -148,7 +148,7 @@ class Packets:
         late_ns = 0
         if start_s is not None:
             late_ns = round(start_s * 1e9 - self._sensor.revolution_start_ns(number))
-        image = Image.from_steps(self._sensor, steps, steps.start, late_ns, self._returns, sweep)
+        image = RayImage.from_steps(self._sensor, steps, steps.start, late_ns, self._returns, sweep)
         datagrams = self.encoder.encode(Shots.from_image(image, sweep, self.encoder.columns))
         self._next_number = number + 1
         return datagrams

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import yaml
 
-from ..environment.extras import need
+from ..environment.extras import require_package
 from ..numerics.arrays import AnyArray, Ints
 from .capture import Capture, CapturedDatagram
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
@@ -164,7 +164,7 @@ class VelodyneDecoder(PacketDecoder):
 
     def __init__(self, path: Path, name: str) -> None:
         super().__init__(path, name)
-        need("velodyne_decoder", "fit", f"Reading {name}")
+        require_package("velodyne_decoder", "fit", f"Reading {name}")
         self._capture = Capture(path, name)
         units = dict.fromkeys(map(_unit_of, self._packets()))
         self._units = [*units]

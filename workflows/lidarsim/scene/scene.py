@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..environment.notebook import picture_of, table_of
+from ..environment.notebook import html_picture, html_table
 from ..errors import LidarError
 from ..media.materials import SurfaceKinds
 from ..motion.trajectory import Track
@@ -117,7 +117,7 @@ class Scene:
             rows["actors"] = listed([actor.name for actor in self.actors], 8)
         if names := [name for name in self.material_names if name]:
             rows["materials"] = listed(names, 8)
-        return table_of(rows.items()) + picture_of(self)
+        return html_table(rows.items()) + html_picture(self)
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -1,1 +1,1 @@
-"""Names, limits and error messages of the settings in scenario files and function calls."""
+"""Names, limits and error messages for settings in scenario files and function calls."""

@@ -1,7 +1,7 @@
-"""Checks of arguments and of the fields of dataclasses, which raise ArgumentError.
+"""Validation of arguments and dataclass fields, which raises ArgumentError.
 
-A dataclass whose fields users set calls `check_fields` in its `__post_init__`. The limits are
-those that `Field` or `about` state in the annotations, which scenario files use as well.
+Dataclasses with fields that users set call `check_fields` in `__post_init__`. The limits are
+declared in the annotations with `Field` or `about`, and also apply to scenario files.
 """
 
 from __future__ import annotations
@@ -31,47 +31,51 @@ _LISTS = (tuple, list, Sequence, Collection, Iterable)
 
 
 def check_type(name: str, value: object, *kinds: type, advice: str = "") -> None:
-    """Check that an argument is an instance of one of several classes."""
+    """Check that an argument is an instance of one of the given classes."""
     if not isinstance(value, kinds):
         words = ["None" if kind is NoneType else with_article(kind.__name__) for kind in kinds]
         raise _wrong(name, value, alternatives(words), advice)
 
 
 def check_items(name: str, values: object, *kinds: type, advice: str = "") -> None:
-    """Check that an argument is a list of instances of one of several classes."""
+    """Check that an argument is a list whose items are instances of the given classes."""
     check_list(name, values)
     for index, item in enumerate(values):  # type: ignore[arg-type, var-annotated]
         check_type(f"{name}[{index}]", item, *kinds, advice=advice)
 
 
 def check_list(name: str, value: object) -> None:
-    """Check that an argument can be iterated over, and is not a single text."""
+    """Check that an argument is iterable but not a string."""
     if isinstance(value, (str, bytes)) or not isinstance(value, Iterable):
         raise _wrong(name, value, "a list")
 
 
 def check_order(name: str, limits: Sequence[float]) -> None:
-    """Check that the second of two numbers is not less than the first."""
+    """Check that a pair of numbers is in ascending order."""
     if not limits[0] <= limits[1]:
         raise _wrong(name, limits, "[least, largest]")
 
 
 def check_choice(name: str, value: object, choices: Collection[str]) -> None:
-    """Check that an argument is one of several names."""
+    """Check that an argument is one of the given names."""
     if value not in choices:
         hint = did_you_mean(value, choices) if isinstance(value, str) else ""
         raise _wrong(name, value, alternatives([*map(repr, choices)]), hint)
 
 
 def check_number(name: str, value: object, *, whole: bool = False, **limits: float) -> None:
-    """Check that an argument is a finite number within limits: ge, gt, le and lt."""
+    """Check that an argument is a finite number within limits.
+
+    The limits are the keyword arguments `ge`, `gt`, `le` and `lt`, with the same meaning as in
+    pydantic.
+    """
     rule = _number_rule(whole, limits)
     if not rule.fits(value):
         raise _wrong(name, value, rule.allowed)
 
 
 def check_fits(name: str, value: object, hint: Any) -> None:
-    """Check that an argument has the type, the choices and the limits of an annotation."""
+    """Check an argument against the type, choices and limits in an annotation."""
     rule = _cached_rule(hint)
     if not rule.fits(value):
         raise _wrong(name, value, rule.allowed)
@@ -90,9 +94,12 @@ def check_fields(instance: Any) -> None:
 
 
 def as_array(name: str, values: ArrayLike, dtype: DTypeLike = np.float64) -> AnyArray:
-    """Return values as an array of numbers.
+    """Convert values to a numeric array.
 
-    Raises ArgumentError for values that are not numbers.
+    Raises
+    ------
+    ArgumentError
+        If the values are not numbers.
     """
     try:
         return np.asarray(values, dtype)
@@ -101,26 +108,28 @@ def as_array(name: str, values: ArrayLike, dtype: DTypeLike = np.float64) -> Any
 
 
 def _wrong(name: str, value: object, allowed: str, advice: str = "") -> ArgumentError:
-    """Return the error of an argument."""
     return ArgumentError(f"{name} must be {allowed}, but is {shown(value)}.{advice}")
 
 
 class _Rule(NamedTuple):
-    """The values that an annotation allows."""
+    """Validation rule that follows from an annotation."""
 
     fits: Callable[[Any], bool]
-    allowed: str  # «a number from 1 to 10 or None»
+    allowed: str  # description of the valid values, such as "a number from 1 to 10 or None"
 
 
 @cache
 def _field_rules(kind: type) -> Sequence[tuple[str, Any, _Rule]]:
-    """Return the fields of a dataclass: name, default, and allowed values."""
+    """Return the name, default and validation rule of each field of a dataclass."""
     hints = get_type_hints(kind, include_extras=True)
     return [(field.name, field.default, _rule(hints[field.name])) for field in fields(kind)]
 
 
 def _rule(hint: Any, limits: Mapping[str, Any] = _NO_LIMITS) -> _Rule:
-    """Return the values that an annotation allows, within limits of the annotation around it."""
+    """Return the validation rule for an annotation.
+
+    `limits` are those of the enclosing `Annotated`.
+    """
     origin = get_origin(hint)
     args = get_args(hint)
     if notes := getattr(hint, "__metadata__", ()):
@@ -142,7 +151,8 @@ def _rule(hint: Any, limits: Mapping[str, Any] = _NO_LIMITS) -> _Rule:
         return _Rule(lambda value: isinstance(value, (bool, np.bool_)), "true or false")
     if hint is Any or origin or not isinstance(hint, type) or Protocol in hint.__bases__:
         name = getattr(origin or hint, "__name__", str(hint))
-        return _Rule(lambda value: True, with_article(name))  # functions, mappings and arrays
+        # Functions, mappings and arrays are not checked.
+        return _Rule(lambda value: True, with_article(name))
     words = "None" if hint is NoneType else with_article(hint.__name__)
     return _Rule(lambda value: isinstance(value, hint), words)
 
@@ -151,9 +161,9 @@ _cached_rule = cache(_rule)
 
 
 def _list_rule(items: Sequence[_Rule], limits: Mapping[str, Any]) -> _Rule:
-    """Return the rule of a list of items, or of a tuple with a rule for each item.
+    """Return the rule for a list whose items share a rule, or for a tuple with one rule per item.
 
-    Iterators are not read.
+    Iterators are accepted without being consumed.
     """
     count = limits.get("max_length") if len(items) == 1 else len(items)
 
@@ -176,7 +186,7 @@ def _list_rule(items: Sequence[_Rule], limits: Mapping[str, Any]) -> _Rule:
 
 
 def _number_rule(whole: bool, limits: Mapping[str, Any]) -> _Rule:
-    """Return the rule of a number, which is finite by default."""
+    """Return the rule for a number, which must be finite unless the limits allow infinity."""
     kinds = _WHOLE if whole else (float, np.floating, *_WHOLE)
     bounds = [(_WITHIN[name], limits[name]) for name in LIMITS if name in limits]
     may_be_infinite = limits.get("allow_inf_nan", False)
@@ -196,5 +206,4 @@ def _number_rule(whole: bool, limits: Mapping[str, Any]) -> _Rule:
 
 
 def _has_length(value: Any, limits: Mapping[str, Any]) -> bool:
-    """Return whether a list or text is neither too short nor too long."""
     return limits.get("min_length", 0) <= len(value) <= limits.get("max_length", len(value))

@@ -1,9 +1,9 @@
-"""Declarations of quantities that users set, with descriptions and limits for scenario files.
+"""Declarations of user settings, with descriptions and limits for scenario files.
 
-A quantity is a field of a dataclass: `Annotated[type, about(description, limits)] = default`. The
-dataclass checks the limits itself (`lidarsim.schema.checks.check_fields`). In scenario files it is
-a section if it derives from `FileSection`; other sections inherit its fields
-(`lidarpool.scenario.sections`).
+A setting is a dataclass field that is declared as
+`Annotated[type, about(description, limits)] = default`. The dataclass validates the limits with
+`lidarsim.schema.checks.check_fields`. A dataclass that derives from `FileSection` is a section in
+scenario files. Other sections inherit its fields (`lidarpool.scenario.sections`).
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from ..words import joined
 UnitShare = Annotated[float, Field(ge=0, le=1)]
 Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Text = Annotated[str, Field(min_length=1)]
-# No point on Earth is farther from the origin of its map.
+# No coordinate in a map projection of the Earth exceeds this limit.
 Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
 AngleDeg = Annotated[float, Field(ge=-36_000, le=36_000)]
 
-# No further fields, finite numbers, no conversion of text to numbers.
+# Rejects unknown fields and nonfinite numbers, and does not convert text to numbers.
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 T = TypeVar("T")
-# YAML has only lists, which strict validation does not accept as tuples.
+# YAML sequences are loaded as lists, which strict validation would not accept as tuples.
 Several = Annotated[tuple[T, ...], Strict(False)]
 Two = Annotated[tuple[T, T], Strict(False)]
 Three = Annotated[tuple[T, T, T], Strict(False)]
@@ -49,33 +49,33 @@ Triple = Three[Coordinate]
 
 
 def _in_order(value: Any, handler: Callable[[Any], Any]) -> Any:
-    """Validate two finite numbers in ascending order."""
+    """Validate a pair of finite numbers in ascending order."""
     limits = handler(value)
     if not 0 <= limits[1] - limits[0] < inf:
-        raise must_be("[least, largest]")
+        raise not_allowed_error("[least, largest]")
     return limits
 
 
-MinMax = Annotated[Two[T], WrapValidator(_in_order)]  # least and largest number
+MinMax = Annotated[Two[T], WrapValidator(_in_order)]  # minimum and maximum
 
 
 def _upright(value: Any, handler: Callable[[Any], Any]) -> Any:
-    """Validate a rectangle, whose lowest x and y come first."""
+    """Validate a rectangle whose minimum x and y come first."""
     sides = handler(value)
     if sides[0] >= sides[2] or sides[1] >= sides[3]:
-        raise must_be("[x0, y0, x1, y1] with the lower corner first")
+        raise not_allowed_error("[x0, y0, x1, y1] with the lower corner first")
     return sides
 
 
-# Lowest x and y, highest x and y.
+# Minimum x, minimum y, maximum x, maximum y.
 Rectangle = Annotated[Four[Coordinate], WrapValidator(_upright)]
 
-# A field that may be empty in a scenario, because lidarpool then fills it in.
+# A field that may be null in a scenario, in which case lidarpool computes its value.
 FILLED_IN = GetPydanticSchema(lambda kind, handler: handler(kind | None))
 
 
 class FileSection:
-    """Base class of dataclasses that are sections of files, as a mapping of their fields."""
+    """Base class for dataclasses that scenario files represent as a mapping of their fields."""
 
     __pydantic_config__ = STRICT
 
@@ -95,34 +95,45 @@ class FileSection:
 
 
 def about(description: str, *examples: Any, **limits: Any) -> Any:
-    """Describe a field, with examples if its default is computed."""
+    """Declare the description, examples and limits of a field.
+
+    Examples are useful if the default is computed.
+    """
     return Field(description=description, examples=[*examples] or None, **limits)
 
 
-def declared(instance: Any, base: type) -> dict[str, Any]:
-    """Return the values of an instance for the fields of a base class: {name: value}."""
+def declared_values(instance: Any, base: type) -> dict[str, Any]:
+    """Return the values of those fields of an instance that are declared in a base class.
+
+    The result maps field names to values.
+    """
     return {field.name: getattr(instance, field.name) for field in fields(base)}
 
 
-def written_as(kind: Any) -> GetPydanticSchema:
-    """Give a field a type in scenarios that differs from its type in Python."""
+def scenario_type(kind: Any) -> GetPydanticSchema:
+    """Declare that a field has a different type in scenarios than in Python."""
     return GetPydanticSchema(lambda _, handler: handler.generate_schema(kind))
 
 
-def short(is_short: Callable[[Any], bool], long: Callable[[Any], Any], allowed: Any) -> Any:
-    """Expand the short form of a value in scenarios, of type `allowed` in the schema."""
+def accept_short_form(
+    is_short: Callable[[Any], bool], long: Callable[[Any], Any], allowed: Any
+) -> Any:
+    """Accept a short form of a value in scenarios, and expand it.
+
+    `allowed` is the type of the input in the JSON schema, including the short form.
+    """
     return BeforeValidator(
         lambda value: long(value) if is_short(value) else value, json_schema_input_type=allowed
     )
 
 
-def by_text(field: str, kind: Any) -> Any:
-    """Accept the text of a single field in place of a section: «hall.glb»."""
-    return short(is_text, lambda value: {field: value}, Text | kind)
+def accept_text(field: str, kind: Any) -> Any:
+    """Accept a string such as "hall.glb" in place of a section, as the value of one field."""
+    return accept_short_form(is_text, lambda value: {field: value}, Text | kind)
 
 
-def one_of(*fields: str) -> Any:
-    """Check that a section has exactly a single value among given fields."""
+def require_one_of(*fields: str) -> Any:
+    """Check that exactly one of the given fields is set in a section."""
 
     def check(section: Any) -> Any:
         if sum(bool(getattr(section, field)) for field in fields) != 1:
@@ -133,32 +144,36 @@ def one_of(*fields: str) -> Any:
 
 
 def allowed(words: str) -> WrapValidator:
-    """Replace pydantic's errors for a field of several types by a line: «be a number or text»."""
+    """Replace the pydantic errors for a field of several types with a single line.
+
+    `words` describes the allowed values, for example "from 0 to 1, or texture".
+    """
 
     def validated(value: Any, handler: Callable[[Any], Any]) -> Any:
         try:
             return handler(value)
         except ValidationError:
-            raise must_be(words) from None
+            raise not_allowed_error(words) from None
 
     return WrapValidator(validated)
 
 
-def must_be(words: str) -> PydanticCustomError:
-    """Return a validator's error on the allowed values.
+def not_allowed_error(words: str) -> PydanticCustomError:
+    """Return the error for a validator to raise if a value is not allowed.
 
-    Messages name the value before.
+    `words` describes the allowed values. In the message for the user, it follows the location of
+    the value and "must be".
     """
     return PydanticCustomError("allowed", "Input should be {words}", {"words": words})
 
 
 def is_text(value: Any) -> bool:
-    """Return True if a value is text."""
+    """Return True if a value is a string."""
     return isinstance(value, str)
 
 
-# A list of texts, or a single text.
+# A list of strings, or a single string.
 Texts = Several[Text]
-TextOrTexts = Annotated[Texts, short(is_text, lambda v: [v], Text | Texts)]
-# The same as an argument in Python.
-Names = Annotated[str | Sequence[Text], written_as(TextOrTexts)]
+TextOrTexts = Annotated[Texts, accept_short_form(is_text, lambda v: [v], Text | Texts)]
+# The corresponding type of arguments in Python.
+Names = Annotated[str | Sequence[Text], scenario_type(TextOrTexts)]

@@ -1,4 +1,7 @@
-"""Sentences on pydantic's errors: the field, its value, the allowed values, and advice."""
+"""Translation of pydantic errors into sentences.
+
+A sentence states the field, its value, the allowed values, and advice.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ from .section_fields import (
 )
 from .value_texts import shown
 
-# {kind of pydantic's error: allowed values}
+# {pydantic error type: allowed values}
 _ALLOWED = {
     "bool_type": "true or false",
     "dataclass_type": "a mapping",
@@ -35,21 +38,22 @@ _ALLOWED = {
     "model_type": "a mapping",
     "string_type": "text",
 }
-_ITEMS = {float: "numbers", int: "whole numbers", str: "text"}  # items of lists
+_ITEMS = {float: "numbers", int: "whole numbers", str: "text"}  # {type of list items: noun}
 _UNKNOWN_FIELD = ("extra_forbidden", "invalid_key", "unexpected_keyword_argument")
 
 
 @contextmanager
-def sentences(
+def convert_validation_errors(
     section: Any,
     source: object = "",
     content: Any = None,
     contradictory: Contradictory = lambda content: False,
 ) -> Iterator[None]:
-    """Turn pydantic's error of the body into a LidarError with a line for each mistake.
+    """Convert a pydantic ValidationError raised in the context into a LidarError.
 
-    `content` is the content of the file, if it is known, for advice on unknown fields;
-    `contradictory` returns True for a content whose fields contradict each other.
+    The message has one line per mistake, prefixed with `source`. `content` is the content of the
+    file, if known, which enables advice on unknown fields. `contradictory` returns True if the
+    fields in a content contradict each other.
     """
     try:
         yield
@@ -62,11 +66,11 @@ def sentences(
 
 
 def _alike(error: ValidationError) -> Iterable[Sequence[ErrorDetails]]:
-    """Return the errors in a file, in groups of the same kind in the entries of the same list."""
+    """Group the errors in a file by type, combining the entries of each list."""
     details_by_path = {detail["loc"]: detail for detail in error.errors(include_url=False)}
     groups: dict[Any, list[ErrorDetails]] = {}  # {field and kind of error: errors}
     for path, detail in details_by_path.items():
-        # pydantic reports a list whose entries are all wrong as empty, too.
+        # If all entries of a list are invalid, pydantic also reports the list as too short.
         deeper = (other_path[: len(path)] == path != other_path for other_path in details_by_path)
         if detail["type"] == "too_short" and any(deeper):
             continue
@@ -78,7 +82,10 @@ def _alike(error: ValidationError) -> Iterable[Sequence[ErrorDetails]]:
 def _line(
     details: Sequence[ErrorDetails], section: Any, content: Any, contradictory: Contradictory
 ) -> str:
-    """Return a line on errors of the same kind: the first error, advice, and how many follow."""
+    """Return a line about a group of errors.
+
+    The line describes the first error, gives advice, and states how many errors follow.
+    """
     detail, *further_details = details
     kind = detail["type"]
     path = detail["loc"]
@@ -102,16 +109,13 @@ def _line(
 
 
 def _in_file(value: Any) -> str:
-    """Return a value as in a YAML file, for messages."""
+    """Format a value as in a YAML file."""
     plain = str(value).lower() if isinstance(value, bool) else shown(value)
     return "empty" if value is None else plain
 
 
 def _sentence(path: FieldPath, detail: ErrorDetails, hint: Any, advice: str) -> str:
-    """Return a sentence on an error, with the location, the value and the allowed values.
-
-    `advice` follows.
-    """
+    """Return a sentence that states the location, the value, the allowed values and the advice."""
     location = dotted(path)
     kind = detail["type"]
     value = detail["input"]
@@ -125,13 +129,13 @@ def _sentence(path: FieldPath, detail: ErrorDetails, hint: Any, advice: str) -> 
     required = f"must {_requirement(detail, hint)}"
     if kind == "literal_error" and isinstance(value, str):
         suggestion = did_you_mean(value, re.findall(r"'([^']*)'", detail["ctx"]["expected"]))
-        if suggestion:  # before the allowed values, which may be many
+        if suggestion:  # precedes the allowed values, because their list may be long
             return f"{location} cannot be {_in_file(value)}.{suggestion} It {required}."
     return f"{location} {required}, but is {_in_file(value)}.{advice}"
 
 
 def _requirement(detail: ErrorDetails, hint: Any) -> str:
-    """Return the requirement on a value: «be from 1 to 10»."""
+    """Return the requirement that a value violates, for example "be from 1 to 10"."""
     kind = detail["type"]
     context = detail.get("ctx", {})
     if kind in ("list_type", "tuple_type"):
@@ -145,7 +149,7 @@ def _requirement(detail: ErrorDetails, hint: Any) -> str:
 
 
 def _annotation_at(path: FieldPath, hint: Any) -> tuple[Any, Fields]:
-    """Return the annotation at a path in a file, and the fields of the section around."""
+    """Return the annotation at a path in a file and the fields of the enclosing section."""
     fields: Fields = {}
     inner = fields_by_name(hint)
     for step in path:

@@ -1,7 +1,8 @@
-"""Advice on faults of files: where an unknown field belongs, and the smallest right example.
+"""Advice for correcting a file, such as the section to which an unknown field belongs.
 
-A field is said to belong to another section only if the file is valid with the field there. Where
-the name of that section does not tell how the field is written, the advice is an example.
+The advice recommends moving a field to a different section only if the file would then be valid. If
+the name of that section does not show how to write the field, the advice contains the smallest
+valid example.
 """
 
 from __future__ import annotations
@@ -13,41 +14,41 @@ from typing import Any, NamedTuple, get_args, get_origin
 from pydantic import GetPydanticSchema, ValidationError
 from pydantic.fields import FieldInfo
 
-from ..unit_suffixes import converted, factor_between, other_unit
+from ..unit_suffixes import convert_value, factor_between, find_other_unit
 from ..words import did_you_mean, joined, most_similar
 from .section_fields import FieldPath, classes_in, fields_by_name, is_section
 from .value_texts import shown
 
-# Returns True for the content of a file whose fields contradict each other.
+# Function that returns True if the fields in the content of a file contradict each other.
 Contradictory = Callable[[Any], bool]
 
 _SYNONYMS = {
     "position": "translation",
     "translation": "position",
     "formats": "write",
-}  # too different for `did_you_mean`
-# {name that is tried anywhere: the section and the field, a list, that are meant}
+}  # pairs that are too different for `did_you_mean`
+# {name that users try in any section: (section, field) to use instead, where the field is a list}
 _OTHER_PLACES = {"formats": ("output", "write")}
-_MAX_DEPTH = 4  # sections within sections
+_MAX_DEPTH = 4  # maximum nesting depth of sections
 _SUGGESTION = re.compile(r"Did you mean '([^']*)'\?")
 
 
 class Owner(NamedTuple):
     """A section that has a field."""
 
-    names: tuple[str, ...]  # names of the fields that lead to the section
-    forms: tuple[str, ...]  # how each of these fields is written: "%s", or "[%s]" for a list
-    field: FieldInfo | None  # the last of these fields; None for the file itself
+    names: tuple[str, ...]  # names of the fields on the path to the section
+    forms: tuple[str, ...]  # format of each of these fields: "%s", or "[%s]" for a list
+    field: FieldInfo | None  # last field on the path, or None for the file itself
     kind: Any  # class of the section
 
     @property
     def is_direct(self) -> bool:
-        """Whether no list or mapping leads to the section, so that its path tells all."""
+        """Whether the path contains no list or mapping, so that field names suffice."""
         return all(form == "%s" for form in self.forms)
 
 
 def owners_by_level(name: str, start: Owner) -> Iterator[list[Owner]]:
-    """Yield the sections that have a field, from one inwards, a list for each level."""
+    """Yield lists of the sections that have a field, one per nesting level below `start`."""
     level = [start]
     for _ in range(_MAX_DEPTH):
         yield [owner for owner in level if name in fields_by_name(owner.kind)]
@@ -55,7 +56,7 @@ def owners_by_level(name: str, start: Owner) -> Iterator[list[Owner]]:
 
 
 def owner_of_file(kind: Any) -> Owner:
-    """Return the section of a whole file."""
+    """Return the owner that represents the entire file."""
     return Owner((), (), None, kind)
 
 
@@ -63,14 +64,17 @@ def _inner_sections(outer: Owner) -> Iterator[Owner]:
     """Yield the sections in the fields of a section."""
     for name, field in fields_by_name(outer.kind).items():
         if any(isinstance(note, GetPydanticSchema) for note in field.metadata):
-            continue  # a field of Python only
+            continue  # the field is available only in Python
         key = next((next(iter(e), "") for e in field.examples or () if isinstance(e, dict)), "NAME")
         for form, kind in _forms_of(field.annotation, key):
             yield Owner((*outer.names, name), (*outer.forms, form), field, kind)
 
 
 def _forms_of(annotation: Any, key: str, form: str = "%s") -> Iterator[tuple[str, Any]]:
-    """Yield the sections in an annotation, each with its form. `key` is an example of a name."""
+    """Yield the sections in an annotation together with their formats.
+
+    `key` is an example of a name in a mapping.
+    """
     if isinstance(annotation, type) and is_section(annotation):
         yield form, annotation
     if (origin := get_origin(annotation)) in (list, tuple, Sequence):
@@ -89,17 +93,18 @@ def place_advice(
     content: Any,
     contradictory: Contradictory,
 ) -> str:
-    """Return advice on an unknown field: a similar name, and where the field is valid, or "".
+    """Return advice on an unknown field, or an empty string.
 
-    `field_names` are the fields of its section, `file` is the class of the whole file, and
-    `content` its content, or None.
+    The advice states a similar name and where the field would be valid. `field_names` are the
+    fields of its section, `file` is the class of the entire file, and `content` is the content of
+    the file or None.
     """
     name = str(path[-1])
     if known := _known_place(name, value, field_names, file):
         return known
     content = dict(content) if isinstance(content, Mapping) else {}
     starts = [owner_of_file(file)]
-    if path[1:]:  # first in the section at fault
+    if path[1:]:  # search the section that contains the field first
         starts[:0] = [owner for owner in _inner_sections(starts[0]) if owner.names == path[:-1]]
         if isinstance(section := content.get(path[0]), Mapping):
             content[path[0]] = {key: v for key, v in section.items() if key != name}
@@ -112,12 +117,12 @@ def place_advice(
         for owner in owners:
             right = _right_value(owner.kind, name, value)
             changed = None
-            if owner.is_direct:  # other faults of the file itself do not matter
+            if owner.is_direct:  # other mistakes at the top level do not matter
                 kind = owner.kind if owner.names else None
                 changed = _with_field(content, owner.names, kind, {name: right})
             if right is None or (changed is not None and contradictory(changed)):
                 continue
-            if not kinds or kinds[0] not in owner.kind.__mro__[1:]:  # no copy of the same section
+            if not kinds or kinds[0] not in owner.kind.__mro__[1:]:  # skip derived sections
                 kinds.append(owner.kind)
                 valid = changed is not None and right == value
                 direct += [".".join(owner.names)] if valid else []
@@ -130,7 +135,7 @@ def place_advice(
 
 
 def _known_place(name: str, value: Any, field_names: Collection[str], file: Any) -> str:
-    """Return advice on a name that is often tried for a field of another name, or ""."""
+    """Return advice on a name that is commonly mistaken for a different field, or ""."""
     if (synonym := _SYNONYMS.get(name)) in field_names:
         return f" Did you mean {synonym!r}?"
     section, field = _OTHER_PLACES.get(name, ("", ""))
@@ -142,21 +147,21 @@ def _known_place(name: str, value: Any, field_names: Collection[str], file: Any)
 
 
 def _similar_name(name: str, value: Any, field_names: Collection[str]) -> str:
-    """Return `did_you_mean`, or the field to write instead if only its unit differs."""
+    """Suggest a similar field, with a converted value if only the unit differs."""
     similar = most_similar(name, field_names)
     factor = None if similar is None else factor_between(name, similar)
-    right = None if factor is None else converted(value, factor)
+    right = None if factor is None else convert_value(value, factor)
     return (
         did_you_mean(name, field_names) if right is None else f" Write {similar}: {shown(right)}."
     )
 
 
 def _other_unit_elsewhere(name: str, value: Any, file: Any) -> str:
-    """Return an example of a field of another section that differs in its unit only, or ""."""
+    """Return an example of a field in another section that differs only in its unit, or ""."""
     for owner in _inner_sections(owner_of_file(file)):
-        similar = other_unit(name, fields_by_name(owner.kind))
+        similar = find_other_unit(name, fields_by_name(owner.kind))
         factor = None if similar is None else factor_between(name, similar)
-        right = None if factor is None else converted(value, factor)
+        right = None if factor is None else convert_value(value, factor)
         if similar is not None and right is not None:
             return f" Write {_example(owner, similar, right)}."
     return ""
@@ -165,7 +170,10 @@ def _other_unit_elsewhere(name: str, value: Any, file: Any) -> str:
 def _in_words(
     path: FieldPath, suggestion: str, direct: Sequence[str], examples: Sequence[str]
 ) -> str:
-    """Return the advice on a field, which is valid in `direct` sections, "" for the file itself."""
+    """Phrase the advice on a field that is valid in the `direct` sections.
+
+    An empty string in `direct` represents the top level of the file.
+    """
     sections = [section for section in direct if section]
     listed = joined(sections)
     if suggestion and listed:
@@ -183,11 +191,11 @@ def _in_words(
 
 
 def _right_value(kind: Any, name: str, value: Any) -> Any:
-    """Return a value that a field takes, the value that it is a misspelling of, or else None."""
+    """Return the value if it is valid for a field, a correction if it is misspelled, or None."""
     fields = fields_by_name(kind)
     if value is None:
         return None
-    if next(iter(fields)) == name:  # the section may check it, such as the name of a format
+    if next(iter(fields)) == name:  # the section itself may validate it, such as a format name
         error = _error(kind, {name: value})
     else:
         error = _error(fields[name].rebuild_annotation(), value)
@@ -202,8 +210,8 @@ def _right_value(kind: Any, name: str, value: Any) -> Any:
 
 
 def _with_field(content: Any, names: Sequence[str], kind: Any, field: Mapping[str, Any]) -> Any:
-    """Return a content with a field in a section, or None if the section is not valid then."""
-    if not isinstance(content, Mapping):  # its short form
+    """Add a field to a section of a content. Return None if the section is invalid as a result."""
+    if not isinstance(content, Mapping):  # the content is in its short form
         return None
     if not names:
         section = {**content, **field}
@@ -213,8 +221,8 @@ def _with_field(content: Any, names: Sequence[str], kind: Any, field: Mapping[st
 
 
 def _error(annotation: Any, value: Any) -> ValidationError | None:
-    """Return the error of a value that is not valid for an annotation, else None."""
-    from pydantic import TypeAdapter  # whose import takes long
+    """Validate a value for an annotation, and return the error or None."""
+    from pydantic import TypeAdapter  # slow to import
 
     try:
         TypeAdapter(annotation).validate_python(value)
@@ -224,7 +232,10 @@ def _error(annotation: Any, value: Any) -> ValidationError | None:
 
 
 def _example(owner: Owner, name: str, value: Any) -> str:
-    """Return the smallest example of a field in a section: sensors: {roof: {model: …, …}}."""
+    """Return the smallest valid example of a field in a section.
+
+    An example is `sensors: {roof: {model: …, …}}`.
+    """
     fields = fields_by_name(owner.kind)
     first = next(iter(fields))
     entries = [
@@ -236,7 +247,7 @@ def _example(owner: Owner, name: str, value: Any) -> str:
     samples = {key: v for entry in entries for key, v in entry.items()}
     needed = [key for key, field in fields.items() if field.is_required()]
     if not needed and str in classes_in(fields[first].annotation):
-        needed = [first]  # such as the model of a sensor
+        needed = [first]  # for example, the model of a sensor
     for keys in (needed, *([*entry] for entry in entries if name in entry)):
         sample = {key: samples.get(key, "x") for key in keys}
         if value is None or _error(owner.kind, {**sample, name: value}) is None:
@@ -253,13 +264,16 @@ def _example(owner: Owner, name: str, value: Any) -> str:
 
 
 def list_advice(annotation: Any, value: Any) -> str:
-    """Return the example of a list with a value as its only entry, or "" if it is not valid."""
+    """Suggest writing a value as a list with a single entry, or return "" if that is invalid."""
     is_plain = isinstance(value, (str, int, float))
     return f" Write [{value}]." if is_plain and _error(annotation, [value]) is None else ""
 
 
 def name_advice(path: FieldPath, file: Any) -> str:
-    """Return an example for an entry that lacks its name, or "": sensors: {model: …, mount: …}."""
+    """Return an example for a mapping whose entries lack names, or "".
+
+    For instance, `sensors: {model: …, mount: …}` lacks the name of the sensor.
+    """
     for owner in _inner_sections(owner_of_file(file)):
         is_table = owner.names == path[:-1] and owner.forms[0].startswith("{")
         if is_table and path[-1] in fields_by_name(owner.kind):

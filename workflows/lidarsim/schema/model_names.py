@@ -1,6 +1,7 @@
-"""Names of sensor models, of the package and of plug-ins, quick to import.
+"""Names of the sensor models in this package and in plug-ins.
 
-Completion of the command lists them without their data, which NumPy and pydantic describe.
+This module is quick to import because it does not load the data of the models, which would require
+NumPy and pydantic. Shell completion depends on it.
 """
 
 from __future__ import annotations
@@ -13,19 +14,19 @@ from types import ModuleType
 from ..environment.plugins import Plugin, find_plugin, plugins_of
 
 BUILT_IN = files("lidarsim") / "sensor" / "data"
-# Plug-ins are packages with data files, as MAKER/MODEL.yaml; the maker is the plug-in's name.
+# A plug-in is a package with data files named MAKER/MODEL.yaml. The maker is the plug-in's name.
 GROUP = "lidarsim.sensors"
 
 
 @cache
 def model_names() -> tuple[str, ...]:
-    """Return the names of the models that come with the package, in order."""
+    """Return the sorted names of the models that are included in this package."""
     makers = (entry for entry in BUILT_IN.iterdir() if entry.is_dir())
     return tuple(sorted(name for maker in makers for name in names_in(maker)))
 
 
 def names_in(maker: Traversable) -> list[str]:
-    """Return the names of the models in the folder of a maker, in order."""
+    """Return the sorted names of the models in the folder of a maker."""
     file_names = sorted(entry.name for entry in maker.iterdir())
     return [
         f"{maker.name}/{file.removesuffix('.yaml')}"
@@ -35,14 +36,15 @@ def names_in(maker: Traversable) -> list[str]:
 
 
 def plugin_model_names(start: str = "") -> tuple[str, ...]:
-    """Return the names of the models of plug-ins that begin with `start`, in order.
+    """Return the sorted names of plug-in models that begin with `start`.
 
-    Models of the package are left out. Plug-ins of other makers are not imported.
+    Models that are included in this package are omitted. Plug-ins of makers that do not match
+    `start` are not imported.
 
     Raises
     ------
     LidarError
-        If a plug-in cannot be used, or two have the same maker.
+        If a plug-in cannot be used, or if two plug-ins have the same maker.
     """
     makers = [maker for maker in plugins_of(GROUP) if _may_begin(f"{maker}/", start)]
     plugins = [find_plugin(GROUP, maker) for maker in makers]
@@ -51,17 +53,17 @@ def plugin_model_names(start: str = "") -> tuple[str, ...]:
 
 
 def _may_begin(folder: str, start: str) -> bool:
-    """Return True if names in a folder, such as «acme/», may begin with `start`."""
+    """Return True if names in a folder such as "acme/" may begin with `start`."""
     return folder.startswith(start) or start.startswith(folder)
 
 
 def maker_folder(plugin: Plugin) -> Traversable:
-    """Return the folder with the data files of a plug-in.
+    """Return the folder that contains the data files of a plug-in.
 
     Raises
     ------
     LidarError
-        If the plug-in cannot be imported, or lacks the folder.
+        If the plug-in cannot be imported or lacks the folder.
     """
     package = plugin.load(ModuleType)
     folder = files(package) / plugin.name if hasattr(package, "__path__") else None
@@ -71,6 +73,6 @@ def maker_folder(plugin: Plugin) -> Traversable:
 
 
 def full_name(name: str) -> str:
-    """Return the name of a model with its maker, if the name alone is unambiguous: riegl-vz400."""
+    """Add the maker to the name of a model, such as "riegl-vz400", if it is unambiguous."""
     matches = [model for model in model_names() if model.partition("/")[2] == name]
     return matches[0] if len(matches) == 1 else name

@@ -1,4 +1,4 @@
-"""Sections of files: the fields of models and dataclasses, and the sections in annotations."""
+"""Introspection of file sections, which are pydantic models or dataclasses."""
 
 from __future__ import annotations
 
@@ -14,40 +14,43 @@ Fields = Mapping[str, FieldInfo]
 FieldPath = tuple[int | str, ...]
 
 _LIMIT_WORDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
-LIMITS = tuple(_LIMIT_WORDS)  # limits of numbers, named as in pydantic's `Field`
+LIMITS = tuple(_LIMIT_WORDS)  # limits of numbers, with the names used by `pydantic.Field`
 
 
 def fields_by_name(hint: Any) -> Fields:
-    """Return the fields of all kinds of the sections in an annotation: {name in a file: field}."""
+    """Return the fields of all sections in an annotation, including all kinds of each section.
+
+    The result maps names in files to fields.
+    """
     kinds = (kind for section in sections_in(hint) for kind in (section, *kinds_of(section)))
     fields = (pair for kind in kinds for pair in fields_of(kind).items())
     return {field.alias or name: field for name, field in fields}
 
 
 def kinds_of(section: Any) -> Sequence[Any]:
-    """Return the sections that a section becomes by its content, such as of files with options.
+    """Return the more specific sections that a section may become, depending on its content.
 
-    A section names these by a function `kinds`, which is called only for messages and schemas,
-    since it imports what declares their fields.
+    For example, the section for a file has a kind for each format with options. A section declares
+    its kinds in a function `kinds`, which is called only for messages and schemas because it
+    imports the modules that declare their fields.
     """
     return section.kinds() if "kinds" in vars(section) else ()
 
 
 def fields_of(section: Any) -> Fields:
-    """Return the fields of a section of files: {attribute: field}."""
+    """Return a mapping from the attributes of a section to its fields."""
     return getattr(section, "model_fields", None) or _dataclass_fields(section)
 
 
 @cache
 def _dataclass_fields(section: Any) -> Fields:
-    """Return the fields of a dataclass: {attribute: field}."""
     hints = get_type_hints(section, include_extras=True)
     make_field = FieldInfo.from_annotated_attribute
     return {field.name: make_field(hints[field.name], field) for field in dataclass_fields(section)}
 
 
 def is_section(kind: Any) -> bool:
-    """Return True for a section of files: a model, or a dataclass."""
+    """Return True if a class is a section, which is a pydantic model or a dataclass."""
     return hasattr(kind, "model_fields") or is_dataclass(kind)
 
 
@@ -65,7 +68,10 @@ def classes_in(annotation: Any) -> Iterator[type]:
 
 
 def own_limits(notes: Iterable[Any]) -> dict[str, Any]:
-    """Return the limits in the notes of an annotation, named as in pydantic's `Field`."""
+    """Return the limits in the metadata of an annotation, with the names used by `pydantic.Field`.
+
+    Nested annotations are not searched.
+    """
     return {
         name: getattr(limit, name)
         for note in notes
@@ -76,7 +82,7 @@ def own_limits(notes: Iterable[Any]) -> dict[str, Any]:
 
 
 def limits_of(hint: Any) -> dict[str, Any]:
-    """Return the limits of the numbers in an annotation: {name: limit}."""
+    """Return a mapping from names to limits for the numbers in an annotation."""
     inner = get_args(hint)[:1] if get_origin(hint) is Annotated else get_args(hint)
     limits = {name: limit for arg in inner for name, limit in limits_of(arg).items()}
     own = own_limits(getattr(hint, "__metadata__", ()))
@@ -84,7 +90,7 @@ def limits_of(hint: Any) -> dict[str, Any]:
 
 
 def range_words(limits: Mapping[str, Any]) -> str:
-    """Return limits as text: «from 1 to 10», «at least 1 and below 10»."""
+    """Format limits as text, for example "from 1 to 10" or "at least 1 and below 10"."""
     bounds = {name: limits[name] for name in _LIMIT_WORDS if name in limits}
     numbers = {name: limit if limit % 1 else int(limit) for name, limit in bounds.items()}
     if numbers.keys() == {"ge", "le"}:
@@ -93,6 +99,6 @@ def range_words(limits: Mapping[str, Any]) -> str:
 
 
 def dotted(path: Sequence[int | str]) -> str:
-    """Return a path as text: poses[0].position."""
+    """Format a path as text, for example "poses[0].position"."""
     steps = (f"[{step}]" if isinstance(step, int) else f".{step}" for step in path)
     return "".join(steps).removeprefix(".")

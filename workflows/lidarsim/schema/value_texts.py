@@ -1,4 +1,4 @@
-"""Values as text: in messages, and as the `repr` of a dataclass."""
+"""Text representations of values for messages and for the `repr` of dataclasses."""
 
 from __future__ import annotations
 
@@ -12,29 +12,35 @@ from typing import Any
 import numpy as np
 
 _PLAIN = (bool, int, float, str, bytes, NoneType, list, tuple, dict)
-_MAX_LETTERS = 160  # letters of a value in a message
-_MAX_LINE = 119  # letters of a `repr`
-_MAX_VALUE = 64  # letters of the value of a field
+_MAX_LETTERS = 160  # maximum length of a value in a message
+_MAX_LINE = 119  # maximum length of a `repr`
+_MAX_VALUE = 64  # maximum length of a field value in a `repr`
 
 
 def shown(value: object) -> str:
-    """Return a value as text: a plain value, cut to a readable length, else its type."""
+    """Format a value for a message, shortened to a readable length.
+
+    Objects other than plain Python values are represented by their type.
+    """
     if not isinstance(value, _PLAIN):
         return "an array" if isinstance(value, np.ndarray) else with_article(type(value).__name__)
     short = reprlib.Repr()
     short.maxstring = short.maxother = short.maxlong = 60
-    short.maxlevel = 3  # YAML aliases make deeply nested lists of a few letters
-    text = " ".join(short.repr(value).split())  # arrays within have several lines
+    short.maxlevel = 3  # with YAML aliases, a few characters can expand to deeply nested lists
+    text = " ".join(short.repr(value).split())  # nested arrays have several lines
     return text if len(text) <= _MAX_LETTERS else f"{text[:_MAX_LETTERS]}…"
 
 
 def with_article(name: str) -> str:
-    """Return a name of a class with the indefinite article."""
+    """Prefix the name of a class with the indefinite article."""
     return f"{'an' if name[0].lower() in 'aeio' else 'a'} {name}"
 
 
 def one_line(instance: Any) -> str:
-    """Return the `repr` of a dataclass: fields that differ from their defaults, within a line."""
+    """Return a `repr` of a dataclass that fits on one line.
+
+    Only fields that differ from their defaults are shown.
+    """
     name = type(instance).__name__
     texts = list[str]()
     left_out = False
@@ -53,7 +59,7 @@ def one_line(instance: Any) -> str:
 
 
 def _short(value: Any) -> str:
-    """Return the value of a field as short text."""
+    """Return a short text representation of the value of a field."""
     if isinstance(value, np.ndarray):
         return f"{value.dtype}{value.shape}"
     if is_dataclass(value) and (name := getattr(value, "name", "")):

@@ -1,14 +1,14 @@
-"""Names and figures shared by scenario files, commands and functions, quick to import.
+"""Names and constants that scenario files, commands and functions share.
 
-Help and completion of the command import no other module.
+This module is quick to import. Command-line help and shell completion import no other module.
 """
 
 from __future__ import annotations
 
 BACKENDS = ("auto", "cuda", "tiles", "numpy")
-PICTURES = ("scene", "hits", "intensity", "cloud", "path")  # drawn pictures
+PICTURES = ("scene", "hits", "intensity", "cloud", "path")
 
-# Names of the columns of `lidarsim.columns.table.TABLE`, in its order; a test compares both.
+# Names of the columns in `lidarsim.columns.table.TABLE`, in the same order. A test compares them.
 ALWAYS_COLUMNS = ("scan", "x", "y", "z", "channel", "object")
 OPTIONAL_COLUMNS = (
     "ray",
@@ -41,9 +41,9 @@ OPTIONAL_COLUMNS = (
     "green",
     "blue",
 )
-COMPOSED_COLUMNS = ("rgb", "normals")  # colors that pictures make of several columns
+COMPOSED_COLUMNS = ("rgb", "normals")  # colors in pictures that combine several columns
 
-# Meters in each unit.
+# Length of each unit in meters.
 UNITS_M = {
     "um": 1e-6,
     "mm": 1e-3,
@@ -57,12 +57,12 @@ UNITS_M = {
     "mi": 1609.344,
 }
 
-WAIT_S = 10.0  # wait for partitions that are empty at the start of a run
-QUEUE_S = 3600.0  # limit for both waits, if workers are jobs in a queue
-PATIENCE_S = 60.0  # wait for partitions that become empty; a nanny needs a few seconds
+WAIT_S = 10.0  # time to wait for partitions without workers at the start of a run
+QUEUE_S = 3600.0  # time to wait in both cases if the workers are jobs in a batch queue
+PATIENCE_S = 60.0  # time to wait if a partition loses its workers; a nanny takes a few seconds
 
-# EPSG codes of systems for maps of the whole Earth, whose meters are true along a line at most:
-# Mercator and cylindrical projections, such as Web Mercator, EPSG:3857.
+# EPSG codes of projections for world maps, such as Web Mercator (EPSG:3857). These Mercator and
+# cylindrical projections preserve distances only along certain lines.
 WORLD_EPSG = frozenset({3395, 3410, 3785, 3832, 3857, 3975, 4087, 4088, 6933, 32662, 54004})
 OF_THE_WORLD = (
     "a world map projection that does not preserve distances. Use a UTM zone or a national grid"

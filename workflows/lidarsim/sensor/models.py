@@ -22,7 +22,7 @@ from ..numerics.arrays import Floats, Ints
 from ..numerics.elementary import log1p, sin_cos
 from ..schema.checks import check_fits
 from ..schema.declared import UnitShare
-from ..schema.error_sentences import sentences
+from ..schema.error_sentences import convert_validation_errors
 from ..schema.model_names import BUILT_IN, GROUP, full_name, maker_folder, model_names, names_in
 from ..words import did_you_mean
 from .beams import Beams, Duty, Mirror, MirrorMotion, Spin, Width
@@ -409,7 +409,7 @@ def _read(path: Path | Traversable) -> SensorModel:
     with converted(f"{path} is not a valid sensor model"):
         text = read_input_text(path) if isinstance(path, Path) else path.read_text("utf-8")
         content = load_yaml(text)
-        with sentences(SensorModel, path, content):
+        with convert_validation_errors(SensorModel, path, content):
             return SensorModel.model_validate(content)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from ..environment.notebook import picture_of, table_of
+from ..environment.notebook import html_picture, html_table
 from ..errors import LidarError
 from ..numerics.arrays import Floats, Ints
 from ..numerics.elementary import arcsin, arctan2, sin_cos
@@ -131,7 +131,7 @@ class Sensor:
             + (f" to {self.max_range_m:g} m" if self.max_range_m < float("inf") else ""),
             "wavelength": f"{self.optics.wavelength_nm:g} nm",
         }
-        return table_of(rows.items()) + picture_of(self)
+        return html_table(rows.items()) + html_picture(self)
 
     def _revolution_firings(self) -> tuple[int, int]:
         """Return the half-open range of the firing indices in the first revolution or frame."""

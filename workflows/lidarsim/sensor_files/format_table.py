@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..environment.extras import need
+from ..environment.extras import require_package
 from ..errors import LidarError
 from ..words import did_you_mean
 
@@ -81,7 +81,7 @@ class SensorFormat:
         Raises LidarError if a package that the module needs is not installed.
         """
         for package in self.packages:
-            need(package, self.extra, f"The sensor format {self.name}")
+            require_package(package, self.extra, f"The sensor format {self.name}")
         return getattr(import_module(self.module), name)
 
 

@@ -14,7 +14,7 @@ from ..media.weather import Weather
 from ..numerics.arrays import Floats, Ints
 from ..numerics.even_samples import even_indices
 from ..scene.scene import Scene
-from ..schema.declared import declared
+from ..schema.declared import declared_values
 from ..sensor import Noise, Returns, Sensor
 from ..sensor.beams import Beams
 from ..survey.survey import Mounted, Survey
@@ -90,7 +90,7 @@ def sample_ranges(scene: Scene, survey: Survey, scans: range | None = None) -> F
         columns=(),
         waveform_samples=0,
         keep_every=1,
-        **declared(Weather(), Weather),
+        **declared_values(Weather(), Weather),
     )
     # CUDA is never used, because its context would stay in this process.
     backend = "numpy" if available_backends()["tiles"] else "tiles"

@@ -19,11 +19,11 @@ from ..columns.table import (
     OPTIONAL,
     TABLE,
     Column,
+    columns_in_parts,
     optional_columns,
-    stored,
     waveform_column,
 )
-from ..environment.notebook import picture_of, table_of
+from ..environment.notebook import html_picture, html_table
 from ..errors import ArgumentError, LidarError
 from ..media.materials import ClassNames, Material, find_class_names_error
 from ..media.weather import EXIT_M, FAINTEST, Air, Weather, particle_range
@@ -31,13 +31,13 @@ from ..motion.navigation import Navigation, check_navigation
 from ..motion.trajectory import CENTER, Pose, Stations, Trajectory, as_pose, check_trajectory_type
 from ..numerics.arrays import Floats, Ints
 from ..schema.checks import check_fields, check_type
-from ..schema.declared import FILLED_IN, FileSection, Names, Several, about, written_as
+from ..schema.declared import FILLED_IN, FileSection, Names, Several, about, scenario_type
 from ..schema.value_texts import one_line, shown
 from ..schema.vocabulary import OF_THE_WORLD, WORLD_EPSG
 from ..sensor.noise import MAX_ALARMS, Noise
 from ..sensor.optics import WINDOW_SIGMAS, Precision, Returns
 from ..sensor.sensor import Sensor
-from ..words import joined, listed, plural, rounded, scans_in_words
+from ..words import format_scan_counts, joined, listed, plural, rounded
 from .faults import Fault, FaultKind, check_faults
 
 STEPS = 36  # default number of steps per pose, which is one revolution of most sensors
@@ -184,7 +184,7 @@ class CloudOptions(FileSection):
     ] = "world"
     columns: Annotated[
         Sequence[str | Column],
-        written_as(Several[Literal[(*OPTIONAL_NAMES, *TABLE)]]),  # includes the default columns
+        scenario_type(Several[Literal[(*OPTIONAL_NAMES, *TABLE)]]),  # includes the default columns
         about(
             "columns in addition to x, y, z, scan, channel and object: "
             + ", ".join(OPTIONAL_NAMES),
@@ -202,7 +202,7 @@ class CloudOptions(FileSection):
     ] = 0
     start: Annotated[
         datetime | None,
-        written_as(Annotated[AwareDatetime, Strict(False)] | None),
+        scenario_type(Annotated[AwareDatetime, Strict(False)] | None),
         about(
             "start time of the survey with a time zone, for LAS, LAZ and bags",
             "2026-11-21T10:00:00Z",
@@ -337,12 +337,12 @@ class Survey(CloudOptions, Weather):
         rows = {
             "survey": f"{plural(len(models), 'sensor')}: {listed(models, 8)}",
             "poses": poses,
-            "scans": scans_in_words(self.scan_count, self.sweep_count),
+            "scans": format_scan_counts(self.scan_count, self.sweep_count),
             "rays": f"{self.ray_count:,}",
             "duration": f"{self.duration_ns / 1e9:.6g} s",
             "columns": ", ".join(column.name for column in self.stored_columns),
         }
-        return table_of(rows.items()) + picture_of(self)
+        return html_table(rows.items()) + html_picture(self)
 
     def _fill_in(self, name: str, default: Returns | Noise) -> None:
         """Set the returns or noise to those of the sensors or the default, if they are not set."""
@@ -528,7 +528,7 @@ class Survey(CloudOptions, Weather):
     @cached_property
     def stored_columns(self) -> tuple[Column, ...]:
         """All columns that are stored during the run."""
-        columns = stored(optional_columns(self.columns))
+        columns = columns_in_parts(optional_columns(self.columns))
         if self.waveform_samples:
             columns = (*columns, waveform_column(self.waveform_samples))
         return columns

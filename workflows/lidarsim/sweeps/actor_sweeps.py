@@ -1,4 +1,4 @@
-"""Poses of actors at the starts of sweeps and while they last."""
+"""Poses of actors at the start of each sweep and during it."""
 
 from __future__ import annotations
 
@@ -12,36 +12,41 @@ from ..numerics.arrays import Bools, Floats, Floats32, Ints32
 from ..numerics.vectors import cross, matvec
 from ..scene.actors import Actor
 from ..scene.scene import Scene
-from .sweep_motion import STILL, knots_in, relative_knots
+from .sweep_motion import STILL, knot_count, relative_knots
 
-KNOT_NS = 1e7  # between stored poses: at 10 m/s², 0.13 mm from a straight line
+# Interval between stored poses. If an actor accelerates at 10 m/s², the interpolation error is at
+# most 0.13 mm.
+KNOT_NS = 1e7
 NO_ROWS = np.zeros((0, 0), np.int32)
-_POSES = 100_000  # poses that are computed at a time
+_POSES = 100_000  # poses to compute at a time
 
 
 class ActorSweeps(NamedTuple):
-    """Actors during n sweeps, in fields of `Sweeps`."""
+    """Poses and presence of all actors in n sweeps, as stored in the fields of `Sweeps`."""
 
-    positions: Floats  # (a, n, 3): at the starts of the sweeps, meters, world coordinates
-    rotations: Floats  # (a, n, 3, 3): from the actor's frame to the world frame
-    velocities: Floats  # (a, n, 3): of the centers of the boxes, m/s
+    positions: Floats  # (a, n, 3), world coordinates at the start of each sweep, meters
+    rotations: Floats  # (a, n, 3, 3), from the actor frame to the world frame
+    velocities: Floats  # (a, n, 3), velocities of the box centers, m/s
     bounds: Floats  # (a, 2, 3)
     present: Bools  # (a, n)
     comes: Bools  # (a, n)
     leaves: Bools  # (a, n)
-    rows: Ints32  # (a, n): row of `knots`, -1 if the actor is static or absent
-    knots: Floats32  # (r, k, 7), as of `relative_knots`: poses since the start of the sweep
+    rows: Ints32  # (a, n), row index in `knots`, or -1 if the actor is static or absent
+    knots: Floats32  # (r, k, 7), poses relative to the start of the sweep; see `relative_knots`
 
     @classmethod
     def from_scene(cls, scene: Scene, starts_ns: Floats, stops_ns: Floats) -> ActorSweeps:
-        """Return the actors of a scene in sweeps with these starts and last beams (n,).
+        """Compute the poses of the actors in a scene during sweeps.
 
-        An actor that appears after the start of a sweep, or that has left, has the pose that it
-        would have if it moved as fast as at that moment, with the same rotation: its boxes then
-        move evenly from sweep to sweep.
+        The sweeps are specified by the times of their starts and last beams, with shape (n,). If an
+        actor is not present at the start of a sweep, its pose is extrapolated from the time at
+        which it appears or leaves, with constant velocity and rotation. Its boxes then move
+        smoothly from sweep to sweep.
         """
         shape = len(scene.actors), len(starts_ns)
-        actors = [_OneActor.in_sweeps(actor, starts_ns, stops_ns) for actor in scene.actors]
+        actors = [
+            _SingleActorSweeps.in_sweeps(actor, starts_ns, stops_ns) for actor in scene.actors
+        ]
         moving = np.reshape([actor.moving for actor in actors], shape).astype(np.bool_)
         rows = np.where(moving, np.cumsum(moving).reshape(shape) - 1, -1)
         knots = [part for actor in actors for part in actor.knots]
@@ -58,21 +63,21 @@ class ActorSweeps(NamedTuple):
         )
 
 
-class _OneActor(NamedTuple):
-    """An actor during n sweeps."""
+class _SingleActorSweeps(NamedTuple):
+    """Poses and presence of a single actor in n sweeps."""
 
-    positions: Floats  # (n, 3): scene frame, meters
+    positions: Floats  # (n, 3), scene frame, meters
     rotations: Floats  # (n, 3, 3)
-    velocities: Floats  # (n, 3): of the center of the box, m/s
+    velocities: Floats  # (n, 3), velocity of the box center, m/s
     present: Bools  # (n,)
     comes: Bools  # (n,)
     leaves: Bools  # (n,)
-    moving: Bools  # (n,): whether it has knots
-    knots: list[Floats32]  # (…, k, 7) of the sweeps with knots, in parts
+    moving: Bools  # (n,), whether the actor has knots in the sweep
+    knots: list[Floats32]  # parts of shape (…, k, 7), for sweeps in which the actor moves
 
     @classmethod
-    def in_sweeps(cls, actor: Actor, starts_ns: Floats, stops_ns: Floats) -> _OneActor:
-        """Return an actor in sweeps with these starts and last beams (n,)."""
+    def in_sweeps(cls, actor: Actor, starts_ns: Floats, stops_ns: Floats) -> _SingleActorSweeps:
+        """Compute the poses of an actor, given the times of each sweep's start and last beam."""
         appears_ns, leaves_ns = presence_ns(actor.trajectory)
         poses = _poses(actor, starts_ns)
         lever_arms = matvec(poses.rotations, actor.bounds.mean(axis=0))
@@ -80,7 +85,7 @@ class _OneActor(NamedTuple):
         comes = (starts_ns < appears_ns) & (appears_ns <= stops_ns)
         moving = (present | comes) & actor.trajectory.moves
         spans_ns = stops_ns - starts_ns
-        count = knots_in(float(spans_ns.max(initial=0.0)), KNOT_NS)
+        count = knot_count(float(spans_ns.max(initial=0.0)), KNOT_NS)
         return cls(
             poses.positions,
             poses.rotations,
@@ -94,16 +99,16 @@ class _OneActor(NamedTuple):
 
 
 class _Poses(NamedTuple):
-    """Poses of an actor at times (k,), and their derivatives."""
+    """Poses of an actor at k times, and their derivatives."""
 
-    positions: Floats  # (k, 3): scene frame, meters
+    positions: Floats  # (k, 3), scene frame, meters
     rotations: Floats  # (k, 3, 3)
-    speeds: Floats  # (k, 3): m/s
-    rates: Floats  # (k, 3): rad/s
+    speeds: Floats  # (k, 3), velocities, m/s
+    rates: Floats  # (k, 3), angular velocities, rad/s
 
 
 def _poses(actor: Actor, times_ns: Floats) -> _Poses:
-    """Return the poses of an actor, extrapolated before it appears and after it has left."""
+    """Return the poses of an actor, extrapolated to times at which it is not present."""
     trajectory = actor.trajectory
     within_ns = _times_of_presence(times_ns, *presence_ns(trajectory))
     positions, rotations = full_poses(trajectory, 0, within_ns)
@@ -113,7 +118,10 @@ def _poses(actor: Actor, times_ns: Floats) -> _Poses:
 
 
 def _knots(actor: Actor, starts_ns: Floats, spans_ns: Floats, count: int) -> Iterator[Floats32]:
-    """Yield the knots (…, count, 7) of an actor in sweeps, a part of the sweeps at a time."""
+    """Yield the knots of an actor for consecutive parts of the sweeps.
+
+    Each part has shape (…, count, 7).
+    """
     sweeps = np.arange(len(starts_ns))
     for part in np.array_split(sweeps, -(-len(sweeps) * count // _POSES) or 1):
         times_ns = starts_ns[part, None] + np.linspace(0, 1, count) * spans_ns[part, None]
@@ -124,8 +132,8 @@ def _knots(actor: Actor, starts_ns: Floats, spans_ns: Floats, count: int) -> Ite
 
 
 def _times_of_presence(times_ns: Floats, appears_ns: float, leaves_ns: float) -> Floats:
-    """Return the nearest times (n,) at which an actor is in the scene, within the rounding."""
-    # A trajectory may be said to end by a clock of seconds since 1970, in steps of 2.4e-7 s.
+    """Clip times to the interval during which an actor is present, with a margin for rounding."""
+    # Trajectory times may be seconds since 1970, whose resolution is 2.4e-7 s.
     margin_ns = min(1e9 * CLOCK_S, (leaves_ns - appears_ns) / 2)
     present = (appears_ns <= times_ns) & (times_ns <= leaves_ns)
     return np.where(present, times_ns, times_ns.clip(appears_ns + margin_ns, leaves_ns - margin_ns))

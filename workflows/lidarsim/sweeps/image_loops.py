@@ -1,4 +1,4 @@
-"""The loop that finds the pixels of points: see ray_image.py."""
+"""Compiled loop that locates points in range images; see `ray_image`."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -9,11 +9,12 @@ from raybeam.compiled import compiled
 
 @compiled()
 def find_pixels(ray, step, first_rays, ray_count, channels, plane, row, column):  # noqa: PLR0917 - a compiled loop
-    """Write the pixels of points: number among the returns of the pulse, channel, and firing.
+    """Compute the pixel index of each point.
 
-    Points (n,) are of rays `ray` of time steps `step`, whose first rays are `first_rays` of the
-    `ray_count` rays of the image. Returns the largest number of returns of a pulse, or -1 if the
-    points are not in order, or of other steps.
+    Writes the index of the point among the returns of its pulse to `plane`, its channel to `row`,
+    and its firing to `column`. Each point belongs to ray `ray` of time step `step`. The first ray
+    of each step is given by `first_rays`, and the image has `ray_count` rays. Returns the largest
+    number of returns of a pulse, or -1 if the points are not in order or belong to other steps.
     """
     last_ray = -1
     returns = 0

@@ -1,4 +1,4 @@
-"""Instruments of a carrier beside its lidars: an IMU and a GNSS receiver."""
+"""Instruments of a platform other than its lidars: an IMU and a GNSS receiver."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ INSTRUMENT_FILES = (IMU_FILE, GNSS_FILE)
 
 @dataclass(frozen=True)
 class Instrument:
-    """Mount and noise of an instrument, which bags state beside its samples."""
+    """Mount and noise of an instrument, which bags store together with its samples."""
 
-    position: list[float]  # place on the carrier, meters
+    position: list[float]  # position in the platform frame, meters
     quaternion: list[float]  # x, y, z, w
-    # Variances of white noise: of angular velocities and specific forces; or of positions to the
-    # east, the north and up, including drift.
+    # For an IMU, the white noise variances of the angular velocity and the specific force. For a
+    # GNSS receiver, the variances of the east, north and up positions, including drift.
     variances: list[float]
 
 
 @dataclass(frozen=True)
 class Instruments:
-    """The instruments of a survey, and the folder of their files."""
+    """Instruments of a survey and the folder that contains their files."""
 
     imu: Instrument | None
     gnss: Instrument | None
@@ -57,7 +57,7 @@ class Instruments:
 
     @property
     def files(self) -> list[str]:
-        """Names of the files of the instruments."""
+        """Names of the files that the instruments write."""
         instruments = (self.imu, self.gnss)
         return [
             name
@@ -66,15 +66,15 @@ class Instruments:
         ]
 
     def to_json(self) -> dict[str, Any]:
-        """Return a dictionary for JSON of the instruments, without the folder."""
+        """Convert the instruments to a JSON-serializable dictionary, without the folder."""
         instruments = {"imu": self.imu, "gnss": self.gnss}
         return {name: instrument and asdict(instrument) for name, instrument in instruments.items()}
 
     @classmethod
     def from_json(cls, values: dict[str, Any], folder: Path) -> Instruments:
-        """Return the instruments of a dictionary from `to_json`.
+        """Create the instruments from a dictionary that `to_json` returned.
 
-        `folder` is stored if it contains the files of all instruments.
+        `folder` is stored only if it contains the files of all instruments.
         """
         imu = values["imu"] and Instrument(**values["imu"])
         gnss = values["gnss"] and Instrument(**values["gnss"])
@@ -84,7 +84,10 @@ class Instruments:
         return cls(imu, gnss)
 
     def rows(self, name: str) -> Iterator[list[str]]:
-        """Yield the rows of a file, without its header, or no rows if the file is not written."""
+        """Yield the rows of a file after its header.
+
+        If the file has not been written, there are no rows.
+        """
         if self.folder is None or name not in self.files:
             return
         with TextIOWrapper(open_input(self.folder / name), encoding="ascii") as file:
@@ -94,7 +97,7 @@ class Instruments:
 
 
 def _instrument(mount: Pose, variances: list[float]) -> Instrument:
-    """Return an instrument at a mount, with w of the quaternion at or above 0."""
+    """Create an instrument at a mount whose quaternion has a nonnegative w component."""
     quaternion = quaternions_of(mount.rotation_matrix[None])[0]
     quaternion *= -1 if quaternion[3] < 0 else 1
     return Instrument([*mount.position], quaternion.tolist(), variances)

@@ -1,4 +1,4 @@
-"""Traits of a sensor that files state beside its points: modes, firings, lines of its mirror."""
+"""Sensor properties that files store together with points, such as return modes and scan lines."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from ..sensor import Sensor
 from ..sensor.beams import Mirror, Spin
 from ..sensor.sensor import LineSensor
 
-_OUSTER = "ouster"  # scale of reflectivity of sensors of this manufacturer
+_OUSTER = "ouster"  # reflectivity scale of sensors from this manufacturer
 
 
 @dataclass(frozen=True)
 class MirrorLines:
-    """Lines that a mirror sweeps across the direction of flight.
+    """Scan lines of a mirror that sweeps across the flight direction.
 
-    `rate_hz` counts cycles; a swinging mirror sweeps two lines in a cycle, a rotating mirror one
-    line. `start_ns` is the start of cycle 0, nanoseconds since the start of the station. `leftward`
-    is True if the first line of a cycle runs from right to left, seen along the sensor's x axis.
+    `rate_hz` is the number of cycles per second. An oscillating mirror scans two lines per cycle,
+    and a rotating mirror scans one. `start_ns` is the start of cycle 0 in nanoseconds since the
+    start of the station. `leftward` is true if the first line in a cycle runs from right to left,
+    as seen along the x axis of the sensor.
     """
 
     rate_hz: float
@@ -30,34 +31,34 @@ class MirrorLines:
     leftward: bool
 
     def numbers(self, times_ns: Floats) -> Ints:
-        """Return the line of each time (n,), nanoseconds since the start of the station: (n,)."""
+        """Return the line number at each time, in nanoseconds since the start of the station."""
         per_second = self.rate_hz * (2 if self.swings else 1)
-        # Times are rounded to 1 ns: a line starts up to 1 ns before its first firing.
+        # Times are rounded to 1 ns, so a line must start up to 1 ns before its first firing.
         return np.floor((times_ns - self.start_ns + 1) * (per_second / 1e9)).astype(np.int64)
 
-    def leftwards(self, lines: Ints) -> Ints:
-        """Return 1 for the lines (n,) that run from right to left, else 0: (n,)."""
+    def runs_leftward(self, lines: Ints) -> Ints:
+        """Return 1 for each line that runs from right to left, and 0 for the others."""
         returning = lines % 2 if self.swings else np.zeros(len(lines), np.int64)
         return returning ^ int(self.leftward)
 
 
 @dataclass(frozen=True)
 class LidarTraits:
-    """Properties of a sensor that fields of files depend on."""
+    """Sensor properties that determine the values of fields in output files."""
 
     channels: int
-    mode: str  # mode of its returns (`Returns`)
-    zero_deg: float = 0.0  # azimuth at which its head starts: counter-clockwise from x
-    firing_ns: float = 0.0  # time from the first beam of a firing to the last
-    # Difference between the manufacturer's ranges and distances from the beam's origin, meters.
+    mode: str  # return mode; see `Returns`
+    zero_deg: float = 0.0  # azimuth at which the head starts, counterclockwise from the x axis
+    firing_ns: float = 0.0  # time between the first and last beam of a firing
+    # Difference between the ranges that the sensor reports and the distances from the beam origin.
     range_offset_m: float = 0.0
-    lines: MirrorLines | None = None  # lines of sensors that sweep across the direction of flight
-    # The maker's number of the laser of each channel, from 0; empty if unknown.
+    lines: MirrorLines | None = None  # only for sensors that sweep across the flight direction
+    # The manufacturer's laser number for each channel, starting at 0; empty if unknown.
     lasers: tuple[int, ...] = ()
 
     @classmethod
     def from_sensor(cls, sensor: Sensor, mode: str) -> LidarTraits:
-        """Return the traits of a sensor, whose class may be a user's."""
+        """Determine the traits of a sensor, which may be an instance of a custom class."""
         head = sensor.head
         beams = sensor.beams
         spins = isinstance(head, Spin) and not isinstance(head, Mirror)
@@ -76,19 +77,22 @@ class LidarTraits:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Return a dictionary for JSON of the traits."""
+        """Convert the traits to a JSON-serializable dictionary."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> LidarTraits:
-        """Return the traits of a dictionary from `to_json`, whose entries are removed."""
+        """Create the traits from a dictionary that `to_json` returned.
+
+        Entries are removed from the dictionary.
+        """
         lines = values.pop("lines")
         lasers = tuple(values.pop("lasers"))
         return cls(**values, lines=lines and MirrorLines(**lines), lasers=lasers)
 
 
 def _lines_of(sensor: Sensor) -> MirrorLines | None:
-    """Return the lines of a sensor that sweeps about its x axis, else None."""
+    """Return the scan lines if a sensor sweeps about its x axis, or None otherwise."""
     head = sensor.head
     if not isinstance(sensor, LineSensor) or not isinstance(head, Spin):
         return None

@@ -1,4 +1,4 @@
-"""The rays of a sweep as images: a row for each channel, a column for each firing."""
+"""Range images of a sweep, with one row per channel and one column per firing."""
 
 from __future__ import annotations
 
@@ -14,25 +14,32 @@ from .sweeps import MIXED_UP, FiredRays, Sweeps
 
 
 @dataclass(frozen=True, eq=False)
-class Image:
-    """Pixels of the points of a sweep in its image: a row for each channel, firings in order."""
+class RayImage:
+    """Pixel indices of the points in a sweep.
+
+    An image has one row per channel and one column per firing. Additional returns of a pulse are in
+    further planes.
+    """
 
     sensor: Sensor
-    firings: Ints  # (w,): all firings of the sweep, from the start of the station
-    scan: Ints32  # (w,): scan of each firing
-    begin_ns: float  # start of the station, since the survey's start
-    plane: Ints  # (n,): number of a point among the returns of its pulse, from 0
-    row: Ints  # (n,): channel
-    column: Ints  # (n,): firing
+    firings: Ints  # (w,), all firings in the sweep, counted from the start of the station
+    scan: Ints32  # (w,), scan of each firing
+    begin_ns: float  # start of the station, relative to the start of the survey
+    plane: Ints  # (n,), index of each point among the returns of its pulse, starting at 0
+    row: Ints  # (n,), channel
+    column: Ints  # (n,), index in `firings`
     planes: int
 
     @classmethod
-    def from_points(cls, sweeps: Sweeps, sweep: int, points: Cloud) -> Image:
-        """Return the pixels of the points of a sweep.
+    def from_points(cls, sweeps: Sweeps, sweep: int, points: Cloud) -> RayImage:
+        """Locate the points of a sweep in its image.
 
-        LidarError if the points are not in order, or the rays of the survey are unknown.
+        Raises
+        ------
+        LidarError
+            If the points are not in order, or if the rays of the survey are unknown.
         """
-        fired = fired_of(sweeps)
+        fired = require_fired_rays(sweeps)
         number = int(sweeps.sensor[sweep])
         sensor = fired.sensors[number]
         first_scan, stop_scan = sweeps.scans[sweep : sweep + 2].tolist()
@@ -54,13 +61,18 @@ class Image:
         begin_ns: float,
         returns_per_pulse: int,
         points: Cloud,
-    ) -> Image:
-        """Return the pixels of the points of consecutive time steps of a sensor.
+    ) -> RayImage:
+        """Locate the points from consecutive time steps of a sensor in an image.
 
-        `first_scan` is the scan of the first step, `begin_ns` the start of the station, and a pulse
-        has up to `returns_per_pulse`. LidarError if the points are not in order, or of other steps.
+        `first_scan` is the scan of the first step, `begin_ns` is the start of the station, and
+        `returns_per_pulse` is the maximum number of returns of a pulse.
+
+        Raises
+        ------
+        LidarError
+            If the points are not in order or do not belong to these time steps.
         """
-        from . import image_loops  # not before: numba takes half a second to import
+        from . import image_loops  # imported late because numba takes half a second to import
 
         bounds = np.array([sensor.firings(step) for step in steps])
         firings = np.arange(bounds[0, 0], bounds[-1, 1])
@@ -89,10 +101,21 @@ class Image:
             planes=max(returns_per_pulse, max_returns),
         )
 
-    def filled(self, values: AnyArray) -> AnyArray:
-        """Return values (n,) of the points as images (planes, channels, firings).
+    def to_images(self, values: AnyArray) -> AnyArray:
+        """Arrange point values as images.
 
-        Rays without a return have NaN, whole numbers -1, or 0 if their type has no sign.
+        Rays without a return have the value NaN, -1 in signed integer images, or 0 in images of
+        other types.
+
+        Parameters
+        ----------
+        values
+            Values of the points, with shape (n,).
+
+        Returns
+        -------
+        ndarray
+            Images with shape (planes, channels, firings).
         """
         fill_value = {"f": np.nan, "i": -1}.get(values.dtype.kind, 0)
         result = np.full(
@@ -102,10 +125,10 @@ class Image:
         return result
 
     def ray_arrays(self) -> dict[str, AnyArray]:
-        """Return times and nominal angles of all rays, and the scan of each firing.
+        """Return the times and nominal angles of all rays, and the scan of each firing.
 
-        Arrays of rays are (channels, firings). Times are nanoseconds since the survey's start,
-        angles degrees in the sensor's axes.
+        Times are in nanoseconds since the start of the survey. Angles are in degrees in the sensor
+        frame. Ray arrays have shape (channels, firings).
         """
         x, y, z = self.sensor.directions(self.firings).transpose(2, 1, 0)
         return {
@@ -116,11 +139,8 @@ class Image:
         }
 
 
-def fired_of(sweeps: Sweeps) -> FiredRays:
-    """Return the description of all rays of a survey.
-
-    Raises LidarError without a description.
-    """
+def require_fired_rays(sweeps: Sweeps) -> FiredRays:
+    """Return the description of all rays in a survey. Raise LidarError if there is none."""
     if sweeps.fired is None:
         raise LidarError(
             "Range images and organized clouds require all returns of a survey. Run it with "

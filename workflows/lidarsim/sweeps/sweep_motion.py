@@ -1,4 +1,4 @@
-"""Poses of sensors while they sweep, so that points can be moved between frames."""
+"""Sensor poses during a sweep, which are used to transform points between frames."""
 
 from __future__ import annotations
 
@@ -14,27 +14,29 @@ from ..numerics.arrays import Floats, Floats32, Ints
 from ..survey.survey import Survey
 from .lidar_traits import LidarTraits
 
-KNOT_NS = 2e6  # between stored poses: at 10 m/s², 5 µm from a straight line
-_MAX_KNOTS = 1000  # limit for a sweep
-_POSES = 100_000  # poses that are computed at a time
-STILL = np.zeros((0, 0, 7), np.float32)  # knots of sensors that are static while they sweep
+# Interval between stored poses. If a sensor accelerates at 10 m/s², the interpolation error is at
+# most 5 µm.
+KNOT_NS = 2e6
+_MAX_KNOTS = 1000  # maximum number of intervals between knots in a sweep
+_POSES = 100_000  # poses to compute at a time
+STILL = np.zeros((0, 0, 7), np.float32)  # used if no sensor moves during a sweep
 
 
 @dataclass(frozen=True, eq=False)
 class FiringPoses:
-    """Poses of a sensor or actor at the firings of points (k,) of a sweep, or at other times."""
+    """Poses of a sensor or actor at k times during a sweep, usually the firing times of points."""
 
-    position: Floats  # (3,): at the start of the sweep, meters, world coordinates
-    rotation: Floats  # (3, 3): from the sensor frame at the start to the world frame
-    # (3, k): meters from `position`, in the world frame; None if the sensor is static.
+    position: Floats  # (3,), world coordinates at the start of the sweep, meters
+    rotation: Floats  # (3, 3), from the sensor frame at the start of the sweep to the world frame
+    # (3, k), displacement from `position` in the world frame, meters. None if the sensor is static.
     offsets: Floats | None = None
-    quaternions: Floats | None = None  # (4, k): x, y, z, w of the rotations since the start
-    # (3, k): motion of the sensor between the knots around the firing, meters.
+    quaternions: Floats | None = None  # (4, k), x, y, z, w of the rotation since the start
+    # (3, k), displacement of the sensor between the two knots that enclose the time, meters.
     steps: Floats | None = None
 
     @property
     def positions(self) -> Floats:
-        """Positions (k, 3), or (3,) of a static sensor, meters, world coordinates."""
+        """World coordinates in meters. Shape (k, 3), or (3,) if the sensor is static."""
         return self.position if self.offsets is None else self.position + self.offsets.T
 
     def select(self, rows: Any) -> FiringPoses:
@@ -46,48 +48,58 @@ class FiringPoses:
             self.position, self.rotation, *(None if p is None else p[:, rows] for p in parts)
         )
 
-    def inward(self, points: Floats) -> Floats:
-        """Convert points (k, 3) from the world to the sensor frame at the firing of each point."""
-        return self.turned_inward(points - self.positions)
+    def to_body_frame(self, points: Floats) -> Floats:
+        """Transform points from the world frame to the body frame at the time of each point."""
+        return self.rotate_to_body_frame(points - self.positions)
 
-    def outward(self, points: Floats) -> Floats:
-        """Convert points (k, 3) from the sensor frame at their firings to the world."""
-        in_world: Floats = self.turned_outward(points) + self.positions
+    def to_world(self, points: Floats) -> Floats:
+        """Transform points from the body frame at the time of each point to the world frame."""
+        in_world: Floats = self.rotate_to_world(points) + self.positions
         return in_world
 
     def frames(self, count: int) -> tuple[Floats, Floats]:
-        """Return positions (count, 3) and rotations (count, 3, 3), also of a static body."""
+        """Return the positions and rotation matrices, repeated `count` times for a static body.
+
+        The arrays have shapes (count, 3) and (count, 3, 3).
+        """
         positions = np.broadcast_to(self.positions, (count, 3))
         rotations = np.broadcast_to(self.rotation, (count, 3, 3))
         if self.quaternions is not None:
             rotations = rotations @ matrices(self.quaternions.T)
         return positions, rotations
 
-    def to_start(self, points: Floats) -> Floats:
-        """Move points (k, 3), in the world, with the body from their firings to the start."""
-        at_start: Floats = self.inward(points) @ self.rotation.T + self.position
+    def move_to_start(self, points: Floats) -> Floats:
+        """Move points with the body to the start of the sweep.
+
+        The points are in world coordinates before and after.
+        """
+        at_start: Floats = self.to_body_frame(points) @ self.rotation.T + self.position
         return at_start
 
-    def turned_to_start(self, vectors: Floats) -> Floats:
-        """Rotate vectors (k, 3), in the world, with the body from their firings to the start."""
-        at_start: Floats = self.turned_inward(vectors) @ self.rotation.T
+    def rotate_to_start(self, vectors: Floats) -> Floats:
+        """Rotate vectors with the body to the start of the sweep.
+
+        The vectors are in the world frame before and after.
+        """
+        at_start: Floats = self.rotate_to_body_frame(vectors) @ self.rotation.T
         return at_start
 
-    def turned_inward(self, vectors: Floats) -> Floats:
-        """Rotate vectors (k, 3) from the world frame to the sensor frame at their firings."""
+    def rotate_to_body_frame(self, vectors: Floats) -> Floats:
+        """Rotate vectors from the world frame to the body frame at the time of each vector."""
         inside: Floats = vectors @ self.rotation
         return inside if self.quaternions is None else _turned(inside, self.quaternions, -1.0)
 
-    def turned_outward(self, vectors: Floats) -> Floats:
-        """Rotate vectors (k, 3) from the sensor frame at their firings to the world frame."""
+    def rotate_to_world(self, vectors: Floats) -> Floats:
+        """Rotate vectors from the body frame at the time of each vector to the world frame."""
         inside = vectors if self.quaternions is None else _turned(vectors, self.quaternions, 1.0)
         return inside @ self.rotation.T
 
 
 def _turned(vectors: Floats, quaternions: Floats, sign: float) -> Floats:
-    """Rotate vectors (k, 3) by unit quaternions (4, k), or with sign -1 by their inverses: (k, 3).
+    """Rotate vectors by unit quaternions, or by their inverses if `sign` is -1.
 
-    v + 2 w (q x v) + 2 q x (q x v), q the vector of the quaternion (Rodrigues, 1840).
+    The vectors have shape (k, 3), and the quaternions have shape (4, k). The result is
+    v + 2 w (q x v) + 2 q x (q x v), where q is the vector part of the quaternion (Rodrigues 1840).
     """
     a, b, c = sign * quaternions[:3]
     w = quaternions[3]
@@ -103,16 +115,30 @@ def _turned(vectors: Floats, quaternions: Floats, sign: float) -> Floats:
     return np.stack(rows, axis=1)
 
 
-def knots_in(longest_ns: float, knot_ns: float) -> int:
-    """Return the number of knots of sweeps: one every `knot_ns` of the longest, within limits."""
+def knot_count(longest_ns: float, knot_ns: float) -> int:
+    """Return the number of knots per sweep, given the duration of the longest sweep.
+
+    The interval between knots is at most `knot_ns`, unless the sweep is so long that the number of
+    knots is limited.
+    """
     return 1 + int(np.clip(np.ceil(longest_ns / knot_ns), 1, _MAX_KNOTS))
 
 
 def relative_knots(displacements: Floats, rotations: Floats) -> Floats32:
-    """Return knots (n, m, 7): positions since the start of each sweep, and rotations.
+    """Combine displacements and rotations since the start of each sweep into knots.
 
-    `displacements` (n, m, 3) are stored as they are; of the rotations (n, m, 3, 3) from the body's
-    frame to the world, the quaternions x, y, z, w since the first, in the body's frame.
+    Parameters
+    ----------
+    displacements
+        Displacements since the start of the sweep, with shape (n, m, 3).
+    rotations
+        Rotations from the body frame to the world frame, with shape (n, m, 3, 3).
+
+    Returns
+    -------
+    ndarray
+        Knots with shape (n, m, 7), which consist of the displacement and the quaternion x, y, z, w
+        of the rotation since the start of the sweep in the body frame.
     """
     shape = displacements.shape[:2]
     since = rotations[:, :1].swapaxes(2, 3) @ rotations
@@ -122,22 +148,26 @@ def relative_knots(displacements: Floats, rotations: Floats) -> Floats32:
     return np.concatenate([displacements, quaternions], axis=2).astype(np.float32)
 
 
-def knots_of(survey: Survey, lidars: Sequence[LidarTraits], rotations: Floats) -> Floats32:
-    """Return the poses of each sweep's sensor at times that divide the sweep evenly.
+def compute_knots(survey: Survey, lidars: Sequence[LidarTraits], rotations: Floats) -> Floats32:
+    """Compute the sensor poses at evenly spaced times during each sweep.
 
-    The last knot is at the time of the last beam of the sweep. A sweep that a frozen sensor repeats
-    has the poses of the older sweep, moved with the sensor like its points.
+    The last knot is at the time of the last beam in the sweep. If a frozen sensor repeats a sweep,
+    the knots are those of the earlier sweep, relative to the current pose of the sensor.
 
     Parameters
     ----------
+    survey, lidars
+        Survey and the traits of its sensors.
     rotations
-        (n, 3, 3): rotations from the sensor frame to the world frame at the start of each sweep.
+        Rotations from the sensor frame to the world frame at the start of each sweep, with shape
+        (n, 3, 3).
 
     Returns
     -------
-    (n, m, 7): position relative to the start of the sweep, meters, in the world frame; and
-    quaternion x, y, z, w of the rotation since the start, in the sensor frame. `STILL` if no
-    sensor moves while it sweeps.
+    ndarray
+        Knots with shape (n, m, 7). Each knot consists of the displacement since the start of the
+        sweep, in meters in the world frame, and the quaternion x, y, z, w of the rotation since the
+        start in the sensor frame. If no sensor moves, the result is `STILL`.
     """
     path = survey.path
     if not path.moves:
@@ -146,7 +176,7 @@ def knots_of(survey: Survey, lidars: Sequence[LidarTraits], rotations: Floats) -
         stop - start + lidar.firing_ns
         for (_, start, stop), lidar in zip(survey.sweeps_each, lidars, strict=True)
     ]
-    count = knots_in(max(float(span.max(initial=0.0)) for span in spans), KNOT_NS)
+    count = knot_count(max(float(span.max(initial=0.0)) for span in spans), KNOT_NS)
     knots = np.empty((len(rotations), count, 7), np.float32)
     first = 0
     for number, span in enumerate(spans):
@@ -164,16 +194,16 @@ def knots_of(survey: Survey, lidars: Sequence[LidarTraits], rotations: Floats) -
 
 
 def _cast_at(survey: Survey, number: int) -> tuple[Ints, Floats]:
-    """Return the stations and times at which the sweeps of a sensor were cast.
+    """Return the stations and start times at which the sweeps of a sensor were measured.
 
-    A frozen sensor sends a sweep that was cast earlier.
+    A frozen sensor sends a sweep that was measured earlier.
 
     Returns
     -------
     stations
-        (n,): stations.
+        Station indices with shape (n,).
     begins_ns
-        (n,): starts of the sweeps, nanoseconds since the starts of their stations.
+        Start times in nanoseconds since the start of the station, with shape (n,).
     """
     firsts, starts, _ = survey.sweeps_each[number]
     per_station = len(firsts) // survey.path.stations
@@ -191,10 +221,11 @@ def _cast_at(survey: Survey, number: int) -> tuple[Ints, Floats]:
 def _relative_poses(
     path: Trajectory, station: int, times_ns: Floats, mount: Pose, sent_rotations: Floats
 ) -> Floats32:
-    """Return the knots (k, m, 7) of sweeps at times (k, m), for `knots_of`.
+    """Compute the knots of k sweeps for `compute_knots`.
 
-    `sent_rotations` (k, 3, 3) are from the sensor frame at the starts of the sent sweeps to the
-    world frame; they differ from the cast sweeps if the sensor is frozen.
+    `times_ns` has shape (k, m). `sent_rotations` are the rotations from the sensor frame to the
+    world frame at the start of each sweep that is sent, with shape (k, 3, 3). If the sensor is
+    frozen, the sweep was measured earlier with a different rotation.
     """
     flat = np.minimum(times_ns.ravel(), path.duration_ns)
     positions, rotations = full_poses(path, station, flat)
@@ -202,22 +233,26 @@ def _relative_poses(
     positions = (positions + rotations @ np.array(mount.position)).reshape(*shape, 3)
     rotations = (rotations @ mount.rotation_matrix).reshape(*shape, 3, 3)
     starts = rotations[:, :1]
-    # In the sensor frame at the start of the cast sweep, then of the sent sweep.
+    # The displacements are first converted to the sensor frame at the start of the measured sweep,
+    # and then from the sensor frame at the start of the sent sweep to the world frame.
     displacement = (positions - positions[:, :1]) @ starts[:, 0]
     return relative_knots(displacement @ sent_rotations.transpose(0, 2, 1), rotations)
 
 
-def poses_at(knots: Floats32, position: Floats, rotation: Floats, shares: Floats) -> FiringPoses:
+def interpolate_poses(
+    knots: Floats32, position: Floats, rotation: Floats, shares: Floats
+) -> FiringPoses:
     """Interpolate poses within a sweep.
 
     Parameters
     ----------
     knots
-        (m, 7): knots of the sweep (`knots_of`).
+        Knots of the sweep, with shape (m, 7); see `compute_knots`.
     position, rotation
-        (3,) and (3, 3): pose of the sensor at the start of the sweep.
+        Sensor pose at the start of the sweep, with shapes (3,) and (3, 3).
     shares
-        (k,): elapsed parts of the sweep, 0 to 1; just after the sweep, poses are extrapolated.
+        Elapsed fractions of the sweep from 0 to 1, with shape (k,). For values slightly greater
+        than 1, the poses are extrapolated.
     """
     intervals = len(knots) - 1
     if intervals < 1:
@@ -228,6 +263,6 @@ def poses_at(knots: Floats32, position: Floats, rotation: Floats, shares: Floats
     starts = np.ascontiguousarray(knots[:-1].T, np.float64)
     steps = np.diff(np.asarray(knots.T, np.float64), axis=1).take(knot, axis=1)
     interpolated = starts.take(knot, axis=1) + steps * fraction
-    # Between rotations 2 ms apart, a straight line is as good as an arc.
+    # Normalized linear interpolation is accurate enough for rotations that are 2 ms apart.
     interpolated[3:] /= np.sqrt((interpolated[3:] ** 2).sum(axis=0))
     return FiringPoses(position, rotation, interpolated[:3], interpolated[3:], steps[:3])

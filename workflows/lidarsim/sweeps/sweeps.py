@@ -1,4 +1,4 @@
-"""Time and pose of each sweep, for formats of single sweeps."""
+"""Times and poses of the sweeps in a survey, for file formats that store individual sweeps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import numpy as np
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import NORMAL, ORIGIN, TABLE
 from ..errors import LidarError
-from ..io.archives import open_archive, packed
+from ..io.archives import open_archive, pack_arrays
 from ..motion.rotations import matrices, quaternions_of
 from ..motion.trajectory import full_poses
 from ..numerics.arrays import AnyArray, AnyFloats, Bools, Bytes, Floats, Floats32, Ints, Ints32
@@ -30,22 +30,22 @@ from ..survey.survey import Survey, nanoseconds
 from .actor_sweeps import NO_ROWS, ActorSweeps
 from .instruments import Instruments
 from .lidar_traits import LidarTraits
-from .sweep_motion import STILL, FiringPoses, knots_of, poses_at
+from .sweep_motion import STILL, FiringPoses, compute_knots, interpolate_poses
 
 SWEEPS_FILE = "sweeps.npz"
 MIXED_UP = (
     "The points are not in scan order, or come from a different survey than the "
     f"sweeps ({SWEEPS_FILE}). Use both from one run, and keep the order."
 )
-# Descriptions of the frame of points in files.
+# Descriptions of the coordinate frame of points, which are written to files.
 COMPENSATED = "points in the sensor frame at the start of the sweep (motion is compensated)"
 AS_FIRED = "points in the sensor frame at the time of firing (motion is not compensated)"
 IN_WORLD = "points in world coordinates"
 _ACTORS_AT_START = "; points of actors are moved to the start of the sweep"
 _NO_KNOTS = np.empty((0, 7), np.float32)
-_PIECE = 250_000  # points that a thread or task reads at a time; several may read
+_PIECE = 250_000  # points to read at a time; several threads or tasks may read concurrently
 _FORMAT = 9
-# Fields of `Sweeps` in a file, by their names: as arrays, and as JSON.
+# Fields of `Sweeps` that are stored under their own names, either as arrays or as JSON.
 _ARRAY_FIELDS = (
     "scans", "begins_ns", "ends_ns", "sensor", "actor_velocities", "actor_bounds", "actor_there",
     "actor_comes", "actor_leaves", "actor_rows", "actor_knots", "knots",
@@ -57,9 +57,9 @@ _JSON_FIELDS = (
 
 
 def states_compensation(frame_text: str) -> bool | None:
-    """Return whether a description of a frame states that motion is compensated.
+    """Return whether the description of a frame states that motion is compensated.
 
-    Returns None if it states neither.
+    Returns None if the description does not mention motion compensation.
 
     Examples
     --------
@@ -70,12 +70,15 @@ def states_compensation(frame_text: str) -> bool | None:
     return None if match is None else match[1] is None
 
 
-def numbered_places(positions: Floats) -> Ints:
-    """Return a number from 1 for each position (n, 3), the same for equal positions: int64 (n,).
+def number_positions(positions: Floats) -> Ints:
+    """Return the number of each position in order of first occurrence, starting at 1.
+
+    Equal positions have the same number. The positions have shape (n, 3), and the result has dtype
+    int64 and shape (n,).
 
     Examples
     --------
-    >>> numbered_places(np.array([[5.0, 0, 0], [1, 0, 0], [5, 0, 0]]))
+    >>> number_positions(np.array([[5.0, 0, 0], [1, 0, 0], [5, 0, 0]]))
     array([1, 2, 1])
     """
     _, first, group = np.unique(positions, axis=0, return_index=True, return_inverse=True)
@@ -86,182 +89,205 @@ def numbered_places(positions: Floats) -> Ints:
 
 @dataclass(frozen=True, eq=False)
 class SweepPoses:
-    """Poses of a sensor, carrier or actor at the start of each sweep."""
+    """Poses of a sensor, platform or actor at the start of each sweep."""
 
-    positions: Floats  # (n, 3): meters, world coordinates
-    quaternions: Floats  # (n, 4): x, y, z, w of the rotation from the body's frame to the world's
+    positions: Floats  # (n, 3), world coordinates, meters
+    quaternions: Floats  # (n, 4), x, y, z, w of the rotation from the body frame to the world frame
 
     @cached_property
     def rotations(self) -> Floats:
-        """Rotations from the body's frame to the world frame: float64 (n, 3, 3)."""
+        """Rotation matrices from the body frame to the world frame. Shape (n, 3, 3)."""
         return matrices(self.quaternions)
 
     @cached_property
     def quaternion_matrices(self) -> Floats:
-        """Matrices that convert quaternions (k, 4) to the body's frame: float64 (n, 4, 4)."""
-        x, y, z, w = self.quaternions.T  # rotation matrices would take far longer
+        """Matrices that convert quaternions to the body frame. Shape (n, 4, 4).
+
+        Multiplying quaternions with these matrices is much faster than composing rotation matrices.
+        """
+        x, y, z, w = self.quaternions.T
         rows = [[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]]
         return np.moveaxis(np.array(rows), -1, 0)
 
     def matrix(self, sweep: int) -> Floats:
-        """Return the matrix (4, 4) from the body's frame at the start of a sweep to the world."""
+        """Return the transformation from the body frame at the start of a sweep to the world frame.
+
+        Shape (4, 4).
+        """
         return affine(self.rotations[sweep], self.positions[sweep])
 
-    def inward(self, sweep: int, points: Floats) -> Floats:
-        """Convert points (k, 3) from the world to the body's frame at the start of a sweep."""
+    def to_body_frame(self, sweep: int, points: Floats) -> Floats:
+        """Transform points from the world frame to the body frame at the start of a sweep."""
         in_frame: Floats = (points - self.positions[sweep]) @ self.rotations[sweep]
         return in_frame
 
 
 @dataclass(frozen=True, eq=False)
 class FiredRays:
-    """All rays of each sweep, with and without returns."""
+    """Description of all rays in each sweep, with and without returns."""
 
     sensors: tuple[Sensor, ...]
-    returns_per_pulse: tuple[
-        int, ...
-    ]  # reported returns of a pulse of each sensor at most; 1 if unknown
-    steps: Ints  # (n,): first time step of each sweep, counted from the start of its station
-    seeds: tuple[int, ...]  # seeds of each sensor's noise, which dropped packets depend on
+    # Maximum number of reported returns of a pulse for each sensor, or 1 if it is unknown.
+    returns_per_pulse: tuple[int, ...]
+    steps: Ints  # (n,), first time step of each sweep, counted from the start of its station
+    seeds: tuple[int, ...]  # noise seed of each sensor, on which dropped packets depend
 
 
 @dataclass(frozen=True, eq=False)
 class Sweeps:
-    """All sweeps of a survey. A sweep is the scans of a revolution, or of a frame, of a sensor."""
+    """All sweeps in a survey.
 
-    scans: Ints  # (n + 1,): first scan of each sweep, and one past the last scan of the survey
-    begins_ns: Floats  # (n,): start of each sweep, nanoseconds since the survey's start
-    ends_ns: Floats  # (n,): start of the last firing of each sweep
-    sensor: Bytes  # (n,): number of the sensor
-    pose: SweepPoses  # poses of the sensors
-    mounts: SweepPoses  # mounts of each sensor in the carrier frame
+    A sweep consists of the scans in one revolution or frame of a sensor.
+    """
+
+    scans: Ints  # (n + 1,), first scan of each sweep, followed by the total number of scans
+    begins_ns: Floats  # (n,), start of each sweep, nanoseconds since the start of the survey
+    ends_ns: Floats  # (n,), start of the last firing in each sweep
+    sensor: Bytes  # (n,), sensor index
+    pose: SweepPoses  # sensor poses
+    mounts: SweepPoses  # mount of each sensor in the platform frame
     sensors: tuple[str, ...]  # names
     objects: tuple[str, ...]  # names
-    actors: tuple[str, ...]  # names; actors follow the objects in the column `object`
-    actor_poses: SweepPoses  # poses of the actors (a, n)
-    actor_velocities: Floats  # (a, n, 3): of the middles of the actors' boxes, m/s, world
-    # (a, 2, 3): corners of each actor's box in the actor's frame, meters; of all poses if its mesh
-    # deforms.
+    actors: tuple[str, ...]  # names; in the `object` column, actors follow the objects
+    actor_poses: SweepPoses  # actor poses with shape (a, n)
+    actor_velocities: Floats  # (a, n, 3), velocities of the box centers, world frame, m/s
+    # (a, 2, 3), corners of each actor's box in the actor frame, meters. If the mesh deforms, the
+    # box contains all its shapes.
     actor_bounds: Floats
-    actor_there: Bools  # (a, n): whether each actor is in the scene when each sweep begins
-    actor_comes: Bools  # (a, n): whether each actor appears during each sweep
-    actor_leaves: Bools  # (a, n): whether each actor leaves during each sweep
-    coordinates: str  # frame of the cloud's points, "world" or "sensor"
-    precision_m: float  # positions were rounded to multiples of this step
-    epsg: int | None = None  # code of the coordinate system of the world
-    start_ns: int | None = None  # nanoseconds from 1970-01-01 UTC to the survey's start
-    instruments: Instruments | None = None  # instruments of the carrier
-    fired: FiredRays | None = None  # all rays, if the survey keeps every return with its ray
+    actor_there: Bools  # (a, n), whether the actor is present at the start of the sweep
+    actor_comes: Bools  # (a, n), whether the actor appears during the sweep
+    actor_leaves: Bools  # (a, n), whether the actor leaves during the sweep
+    coordinates: str  # frame of the points in the cloud, "world" or "sensor"
+    precision_m: float  # positions are rounded to multiples of this value
+    epsg: int | None = None  # EPSG code of the world coordinate system
+    start_ns: int | None = None  # start of the survey, nanoseconds since 1970-01-01 UTC
+    instruments: Instruments | None = None  # instruments on the platform
+    fired: FiredRays | None = None  # None unless the survey stores every return with its ray
     classes: Mapping[int, str] = field(default_factory=dict, compare=False)  # {number: name}
     faults: tuple[Fault, ...] = ()  # faults of all sensors
-    materials: tuple[str, ...] = ()  # names that the column `material` counts
-    lidars: tuple[LidarTraits, ...] = ()  # traits of each sensor; empty if unknown
-    knots: Floats32 = field(default_factory=lambda: STILL)  # (n, m, 7), from `knots_of`
-    stations: int = 1  # number in the survey, each with as many sweeps of a sensor
-    station_ns: int = 0  # time between the starts of two stations
-    # (a, n): row of `actor_knots` of each actor in each sweep, -1 if it is static or absent; empty
-    # if no actor moves.
+    materials: tuple[str, ...] = ()  # names; the `material` column contains indices
+    lidars: tuple[LidarTraits, ...] = ()  # traits of each sensor, or empty if unknown
+    knots: Floats32 = field(default_factory=lambda: STILL)  # (n, m, 7); see `compute_knots`
+    stations: int = 1  # number of stations, which all have the same number of sweeps per sensor
+    station_ns: int = 0  # time between the starts of consecutive stations
+    # (a, n), row in `actor_knots` for each actor and sweep, or -1 if the actor is static or absent.
+    # The array is empty if no actor moves.
     actor_rows: Ints32 = field(default_factory=lambda: NO_ROWS)
-    actor_knots: Floats32 = field(default_factory=lambda: STILL)  # (r, k, 7), of `ActorSweeps`
-    # `points` moves the points of actors to where they were at the start of the sweep.
+    actor_knots: Floats32 = field(default_factory=lambda: STILL)  # (r, k, 7); see `ActorSweeps`
+    # Whether `points` moves points on actors to their positions at the start of the sweep.
     actors_at_start: bool = False
 
     def __len__(self) -> int:
         return len(self.begins_ns)
 
     def in_sensor(self, sweep: int, points: AnyFloats) -> Floats:
-        """Return points (k, 3) of a sweep in the sensor frame: at its start, or as stored."""
+        """Return the points of a sweep in the sensor frame at the start of the sweep.
+
+        If the points are already stored in the sensor frame, they are returned unchanged.
+        """
         exact = points.astype(np.float64)
-        return exact if self.coordinates == "sensor" else self.pose.inward(sweep, exact)
+        return exact if self.coordinates == "sensor" else self.pose.to_body_frame(sweep, exact)
 
     def columns_in_sensor(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
-        """Return the columns of points of a sweep, vectors in the frame of `in_sensor`."""
+        """Return the columns of a sweep with vectors in the same frame as `in_sensor`."""
         if self.coordinates == "sensor":
             return dict(points.columns)
         return _with_vectors(
             points,
             lambda normals: normals @ self.pose.rotations[sweep],
-            lambda origins: self.pose.inward(sweep, origins),
+            lambda origins: self.pose.to_body_frame(sweep, origins),
         )
 
     def columns_as_fired(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
-        """Return the columns of points of a sweep, vectors in the frame of `as_fired`."""
+        """Return the columns of a sweep with vectors in the same frame as `as_fired`."""
         if self.coordinates == "sensor":
             return dict(points.columns)
         poses = self.firing_poses(sweep, points)
-        return _with_vectors(points, poses.turned_inward, poses.inward)
+        return _with_vectors(points, poses.rotate_to_body_frame, poses.to_body_frame)
 
     def columns_compensated(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
-        """Return the columns of points of a sweep, vectors in the frame of `compensated`."""
+        """Return the columns of a sweep with vectors in the same frame as `compensated`."""
         if self.coordinates != "sensor":
             return self.columns_in_sensor(sweep, points)
         poses = self.firing_poses(sweep, points)
         return _with_vectors(
             points,
-            lambda normals: poses.turned_outward(normals) @ self.pose.rotations[sweep],
-            lambda origins: self.pose.inward(sweep, poses.outward(origins)),
+            lambda normals: poses.rotate_to_world(normals) @ self.pose.rotations[sweep],
+            lambda origins: self.pose.to_body_frame(sweep, poses.to_world(origins)),
         )
 
     def as_fired(self, sweep: int, points: Cloud) -> Floats:
-        """Return the points (k, 3) of a sweep in the sensor frame at the firing of each point."""
+        """Return the points of a sweep in the sensor frame at the firing time of each point."""
         exact = points.positions.astype(np.float64)
         if self.coordinates == "sensor":
             return exact
-        return self.firing_poses(sweep, points).inward(exact)
+        return self.firing_poses(sweep, points).to_body_frame(exact)
 
     def compensated(self, sweep: int, points: Cloud) -> Floats:
-        """Return the points (k, 3) of a sweep in the sensor frame at the start of the sweep."""
+        """Return the points of a sweep in the sensor frame at the start of the sweep.
+
+        Points that are stored in the sensor frame are compensated for motion.
+        """
         exact = points.positions.astype(np.float64)
         if self.coordinates == "sensor":
-            exact = self.firing_poses(sweep, points).outward(exact)
-        return self.pose.inward(sweep, exact)
+            exact = self.firing_poses(sweep, points).to_world(exact)
+        return self.pose.to_body_frame(sweep, exact)
 
     def firing_poses(self, sweep: int, points: Cloud) -> FiringPoses:
-        """Return the poses of the sensor at the firings of the points of a sweep.
+        """Return the sensor poses at the firing times of the points in a sweep.
 
-        Points without the column `time` count as fired in the middle of their scans.
+        If there is no `time` column, the points are assumed to be fired in the middle of their
+        scans.
         """
-        return self._sensor_within(sweep, self._shares(sweep, points))
+        return self._sensor_firing_poses(sweep, self._shares(sweep, points))
 
     def span_ns(self, sweep: int) -> float:
-        """Return the time from the start of a sweep to its last beam, nanoseconds."""
+        """Return the time in nanoseconds from the start of a sweep to its last beam."""
         firing_ns = self.lidars[self.sensor[sweep]].firing_ns if self.lidars else 0.0
         return float(self.ends_ns[sweep] - self.begins_ns[sweep]) + firing_ns
 
     def _shares(self, sweep: int, points: Cloud) -> Floats:
-        """Return the elapsed part of a sweep at the firing of each point: (k,), 0 to 1."""
+        """Return the fraction of the sweep that has elapsed when each point is fired."""
         return np.clip(self.since_ns(sweep, points) / max(self.span_ns(sweep), 1.0), 0, 1)
 
-    def _sensor_within(self, sweep: int, shares: Floats) -> FiringPoses:
-        """Return the poses of the sensor at elapsed parts (k,) of a sweep."""
+    def _sensor_firing_poses(self, sweep: int, shares: Floats) -> FiringPoses:
+        """Return the sensor poses at fractions of a sweep."""
         knots = self.knots[sweep] if len(self.knots) else _NO_KNOTS
-        return poses_at(knots, self.pose.positions[sweep], self.pose.rotations[sweep], shares)
+        return interpolate_poses(
+            knots, self.pose.positions[sweep], self.pose.rotations[sweep], shares
+        )
 
-    def _actor_within(self, actor: int, sweep: int, shares: Floats) -> FiringPoses:
-        """Return the poses of an actor at elapsed parts (k,) of a sweep."""
+    def _actor_firing_poses(self, actor: int, sweep: int, shares: Floats) -> FiringPoses:
+        """Return the poses of an actor at fractions of a sweep."""
         row = self.actor_rows[actor, sweep] if len(self.actor_rows) else -1
         knots = self.actor_knots[row] if row >= 0 else _NO_KNOTS
         (rotation,) = matrices(self.actor_poses.quaternions[actor, [sweep]])
-        return poses_at(knots, self.actor_poses.positions[actor, sweep], rotation, shares)
+        return interpolate_poses(knots, self.actor_poses.positions[actor, sweep], rotation, shares)
 
-    def carrier_within(self, sweep: int, shares: Floats) -> SweepPoses:
-        """Return the poses of the carrier at elapsed parts (k,) of a sweep, or just after it."""
-        positions, rotations = self._sensor_within(sweep, shares).frames(len(shares))
+    def platform_poses_at(self, sweep: int, shares: Floats) -> SweepPoses:
+        """Return the platform poses at fractions of a sweep.
+
+        `shares` has shape (k,). Values slightly greater than 1 are extrapolated.
+        """
+        positions, rotations = self._sensor_firing_poses(sweep, shares).frames(len(shares))
         number = self.sensor[sweep]
         (mount,) = matrices(self.mounts.quaternions[[number]])
         rotations = rotations @ mount.T
         return _poses_of(positions - rotations @ self.mounts.positions[number], rotations)
 
-    def actor_within(self, actor: int, sweep: int, shares: Floats) -> SweepPoses:
-        """Return the poses of an actor at elapsed parts (k,) of a sweep, or just after it."""
-        return _poses_of(*self._actor_within(actor, sweep, shares).frames(len(shares)))
+    def actor_poses_at(self, actor: int, sweep: int, shares: Floats) -> SweepPoses:
+        """Return the poses of an actor at fractions of a sweep.
+
+        `shares` has shape (k,). Values slightly greater than 1 are extrapolated.
+        """
+        return _poses_of(*self._actor_firing_poses(actor, sweep, shares).frames(len(shares)))
 
     def with_actors_at_start(self, sweep: int, points: Cloud) -> Cloud:
-        """Move the points of actors to where they were at the start of their sweep.
+        """Move the points on actors to their positions at the start of the sweep.
 
-        A point is moved by the actor's pose at the start of the sweep, times the inverse of its
-        pose at the firing of the point, so that all points of a rigid actor lie in its box. Points
-        that a frozen sensor repeats stay as they are.
+        Each point is transformed by the inverse of the actor pose at the firing time, followed by
+        the actor pose at the start of the sweep. All points on a rigid actor are then inside its
+        box. Points that a frozen sensor repeats are not moved.
         """
         frozen = any(fault.kind == "frozen" for fault in self.faults_in(sweep))
         actor = points["object"].astype(np.int64) - len(self.objects)
@@ -273,23 +299,24 @@ class Sweeps:
         moved = points[rows]
         owners = actor[rows]
         shares = self._shares(sweep, moved)
-        sensor = self._sensor_within(sweep, shares) if self.coordinates == "sensor" else None
+        sensor = self._sensor_firing_poses(sweep, shares) if self.coordinates == "sensor" else None
         masks = {owner: owners == owner for owner in np.unique(owners).tolist()}
         bodies = {
-            owner: self._actor_within(owner, sweep, shares[mask]) for owner, mask in masks.items()
+            owner: self._actor_firing_poses(owner, sweep, shares[mask])
+            for owner, mask in masks.items()
         }
 
         def at_start(positions: Floats) -> Floats:
-            in_world = positions if sensor is None else sensor.outward(positions)
+            in_world = positions if sensor is None else sensor.to_world(positions)
             for owner, mask in masks.items():
-                in_world[mask] = bodies[owner].to_start(in_world[mask])
-            return in_world if sensor is None else sensor.inward(in_world)
+                in_world[mask] = bodies[owner].move_to_start(in_world[mask])
+            return in_world if sensor is None else sensor.to_body_frame(in_world)
 
         def turned(normals: Floats) -> Floats:
-            in_world = normals if sensor is None else sensor.turned_outward(normals)
+            in_world = normals if sensor is None else sensor.rotate_to_world(normals)
             for owner, mask in masks.items():
-                in_world[mask] = bodies[owner].turned_to_start(in_world[mask])
-            return in_world if sensor is None else sensor.turned_inward(in_world)
+                in_world[mask] = bodies[owner].rotate_to_start(in_world[mask])
+            return in_world if sensor is None else sensor.rotate_to_body_frame(in_world)
 
         positions = points.positions.astype(np.float64)
         positions[rows] = at_start(positions[rows])
@@ -301,9 +328,9 @@ class Sweeps:
         return replace(points, positions=positions, columns=columns)
 
     def since_ns(self, sweep: int, points: Cloud) -> Floats:
-        """Return the firing times of points, nanoseconds since the start of their sweep: (k,).
+        """Return the firing times of points in nanoseconds since the start of their sweep.
 
-        Jumps of the sensor's clock are removed.
+        Jumps in the sensor clock are removed.
         """
         begin_ns = self.begins_ns[sweep]
         end_ns = self.ends_ns[sweep]
@@ -324,7 +351,8 @@ class Sweeps:
             for faults in combinations(jumps, count):
                 candidate = stamps - sum(round((fault.by_s or 0) * 1e9) for fault in faults)
                 stated_stamps = sum((fault.time_errors_ns(candidate) for fault in jumps), candidate)
-                # If several times give a stamp, the time closest to the point's scan counts.
+                # If several times are consistent with a timestamp, use the one that is closest to
+                # the scan of the point.
                 distance = np.abs(candidate - begin_ns - by_scan)
                 better = (stated_stamps == stamps) & (distance < smallest_distance)
                 since_begin = np.where(better, candidate - begin_ns, since_begin)
@@ -332,13 +360,13 @@ class Sweeps:
         return np.asarray(since_begin, np.float64)
 
     def frame_text(self, *, compensated: bool) -> str:
-        """Return the description of the frame of points for files."""
+        """Return the description of the coordinate frame of points that is written to files."""
         text = COMPENSATED if compensated else AS_FIRED
         return text + _ACTORS_AT_START if self.actors_at_start else text
 
     @cached_property
-    def carrier(self) -> SweepPoses:
-        """Poses of the carrier at the start of each sweep."""
+    def platform(self) -> SweepPoses:
+        """Platform poses at the start of each sweep."""
         mounts = matrices(self.mounts.quaternions)[self.sensor]
         rotations = matrices(self.pose.quaternions) @ mounts.transpose(0, 2, 1)
         lever_arms = np.einsum("nij,nj->ni", rotations, self.mounts.positions[self.sensor])
@@ -346,35 +374,38 @@ class Sweeps:
 
     @cached_property
     def object_names(self) -> tuple[str, ...]:
-        """Names that the column `object` counts: of objects, then of actors."""
+        """Names of the objects, followed by those of the actors.
+
+        The `object` column contains indices into this tuple.
+        """
         return (*self.objects, *self.actors)
 
     @cached_property
     def actor_types(self) -> list[str]:
         """Types of the actors."""
-        return [type_of(actor) for actor in self.actors]
+        return [actor_type(actor) for actor in self.actors]
 
     @cached_property
     def station_numbers(self) -> Ints:
-        """Station of each sweep, from 1, or 0 without several stations: int64 (n,).
+        """Station number of each sweep, starting at 1, or 0 if the survey has only one station.
 
-        A station that a sensor returns to keeps its first number.
+        If a sensor returns to a station, the station keeps its number. Shape (n,).
         """
         numbers = np.zeros(len(self), np.int64)
         if self.stations > 1:
             for sensor in np.unique(self.sensor):
                 of_sensor = self.sensor == sensor
-                numbers[of_sensor] = numbered_places(self.pose.positions[of_sensor])
+                numbers[of_sensor] = number_positions(self.pose.positions[of_sensor])
         return numbers
 
     @cached_property
     def numbers(self) -> Ints:
-        """Number of each sweep among the sweeps of its sensor, from 0: int64 (n,)."""
+        """Index of each sweep among the sweeps from its sensor, starting at 0. Shape (n,)."""
         return np.arange(len(self)) - np.searchsorted(self.sensor, self.sensor)
 
     @classmethod
     def unknown(cls) -> Sweeps:
-        """Return no sweeps, for points of an unknown survey, in steps of a millimeter."""
+        """Return an empty object for points from an unknown survey, with a precision of 1 mm."""
         none = SweepPoses(np.empty((0, 3)), np.empty((0, 4)))
         return cls(
             scans=np.zeros(1, np.int64),
@@ -398,7 +429,7 @@ class Sweeps:
 
     @classmethod
     def from_survey(cls, survey: Survey, scene: Scene) -> Sweeps:
-        """Return the sweeps of a survey of a scene."""
+        """Compute the sweeps of a survey in a scene."""
         by_sensor = [_sensor_sweeps(survey, number) for number in range(len(survey.carried))]
         begins_ns = np.concatenate([starts for _, starts, _ in survey.sweeps_each])
         ends_ns = np.concatenate([stops for _, _, stops in survey.sweeps_each])
@@ -451,13 +482,16 @@ class Sweeps:
             faults=tuple(survey.faults),
             materials=scene.material_names,
             lidars=traits,
-            knots=knots_of(survey, traits, rotations),
+            knots=compute_knots(survey, traits, rotations),
             stations=survey.path.stations,
             station_ns=survey.station_ns,
         )
 
     def faults_in(self, sweep: int) -> tuple[Fault, ...]:
-        """Return the faults of a sweep: present at any time, or, if frozen, at its start."""
+        """Return the faults that occur during a sweep.
+
+        A sweep is frozen only if the fault is present at its start.
+        """
         sensors = None, self.sensors[self.sensor[sweep]]
         begin = self.begins_ns[sweep]
         end = self.ends_ns[sweep]
@@ -469,21 +503,25 @@ class Sweeps:
         )
 
     def stamp_ns(self, sweep: int) -> int:
-        """Return the start of a sweep by the sensor's clock, ns since the survey's start."""
+        """Return the start of a sweep according to the sensor clock.
+
+        The time is in nanoseconds since the start of the survey.
+        """
         begin = self.begins_ns[sweep]
         return round(begin) + sum(
             int(fault.time_errors_ns(begin)) for fault in self.faults_in(sweep)
         )
 
     def points(self, cloud: CloudLike, first: int = 0, stop: int | None = None) -> Iterator[Cloud]:
-        """Yield the points of each sweep from `first` to `stop` in order, empty sweeps included.
+        """Yield the points of each sweep from `first` up to `stop`, including empty sweeps.
 
-        With `actors_at_start`, the points of actors are moved to the start of their sweep.
+        If `actors_at_start` is set, points on actors are moved to their positions at the start of
+        the sweep.
 
         Raises
         ------
         LidarError
-            If the points are not in the order of scans, or are of a different survey.
+            If the points are not in scan order, or if they belong to a different survey.
         """
         sweeps = self._points(cloud, first, len(self) if stop is None else stop)
         if not self.actors_at_start:
@@ -493,7 +531,7 @@ class Sweeps:
             yield self.with_actors_at_start(sweep, points)
 
     def _points(self, cloud: CloudLike, first: int, stop: int) -> Iterator[Cloud]:
-        """Yield the points of each sweep from `first` to `stop` as they were fired."""
+        """Yield the points of each sweep from `first` up to `stop` without moving any points."""
         sweep_parts: list[Cloud] = []
         empty = Cloud(np.empty((0, 3)), {c.name: np.empty(0, c.dtype) for c in cloud.table})
         current = first
@@ -505,26 +543,29 @@ class Sweeps:
             starts = np.flatnonzero(np.diff(sweep[:end], prepend=-1))
             for start, stop_row in pairwise([*starts, end]):
                 while current < sweep[start]:
-                    yield Cloud.joined(sweep_parts) if sweep_parts else empty
+                    yield Cloud.concatenate(sweep_parts) if sweep_parts else empty
                     sweep_parts = []
                     current = current + 1
                 sweep_parts.append(chunk[start:stop_row])
             if end < len(sweep):
                 break
         while current < stop:
-            yield Cloud.joined(sweep_parts) if sweep_parts else empty
+            yield Cloud.concatenate(sweep_parts) if sweep_parts else empty
             sweep_parts = []
             current = current + 1
 
     def save(self, path: Path) -> None:
-        """Write the sweeps as a NumPy archive.
+        """Write the sweeps to an NPZ file.
 
-        Raises OSError if the file cannot be written.
+        Raises
+        ------
+        OSError
+            If the file cannot be written.
         """
-        path.write_bytes(self.packed())
+        path.write_bytes(self.to_bytes())
 
-    def packed(self) -> bytes:
-        """Return the sweeps as a NumPy archive: equal sweeps have equal bytes."""
+    def to_bytes(self) -> bytes:
+        """Serialize the sweeps as an NPZ archive. Equal sweeps result in equal bytes."""
         values = {"format": _FORMAT, **{name: getattr(self, name) for name in _JSON_FIELDS}}
         values["lidars"] = [lidar.to_json() for lidar in self.lidars]
         if self.instruments is not None:
@@ -546,18 +587,18 @@ class Sweeps:
             }
             arrays["rays"] = np.frombuffer(json.dumps(rays).encode(), np.uint8)
             arrays["steps"] = self.fired.steps
-        return packed(arrays)
+        return pack_arrays(arrays)
 
     @classmethod
     def load(cls, path: Path | str, read: Callable[[], bytes] | None = None) -> Sweeps:
-        """Read sweeps that `save` has written, without running any code in the file.
+        """Read sweeps from a file that `save` has written, without unpickling objects.
 
-        `read` returns the bytes of the file, by default those at `path`.
+        `read` is a function that returns the content of the file (default: read `path`).
 
         Raises
         ------
         LidarError
-            If the file cannot be read, is damaged, or of a different version.
+            If the file cannot be read, is damaged, or was written by a different version.
         """
         with open_archive(path, read) as arrays:
             values = json.loads(arrays["words"].tobytes())
@@ -590,24 +631,26 @@ class Sweeps:
             )
 
 
-def type_of(name: str) -> str:
-    """Return the type of an actor for labels: its name without spaces and a number at the end.
+def actor_type(name: str) -> str:
+    """Return the type of an actor for labels, given its name.
+
+    The type is the name without a trailing number and with underscores in place of spaces.
 
     Examples
     --------
-    >>> [type_of(name) for name in ("Car 1", "Car (b.2)", "Delivery van", "7")]
+    >>> [actor_type(name) for name in ("Car 1", "Car (b.2)", "Delivery van", "7")]
     ['Car', 'Car', 'Delivery_van', '7']
     """
     plain = re.sub(r"(\s*\([^()]*\)|[\s._-]*\d+)$", "", name.strip())
     return re.sub(r"\s+", "_", plain or name.strip())
 
 
-def plain_names(names: Iterable[str]) -> list[str]:
-    """Return unique names for ROS and folders.
+def make_identifiers(names: Iterable[str]) -> list[str]:
+    """Convert names to unique identifiers that are valid as ROS names and folder names.
 
     Examples
     --------
-    >>> plain_names(["roof", "left/rear", "left rear", "2nd"])
+    >>> make_identifiers(["roof", "left/rear", "left rear", "2nd"])
     ['roof', 'left_rear', 'left_rear_2', '_2nd']
     """
     unique: list[str] = []
@@ -622,15 +665,15 @@ def plain_names(names: Iterable[str]) -> list[str]:
 
 
 class _SensorSweeps(NamedTuple):
-    """Sweeps of a sensor: arrays (n, …)."""
+    """Sensor poses and first time steps of the sweeps from a single sensor."""
 
-    positions: Floats  # (n, 3): of the sensor at the start of each sweep, scene frame, meters
+    positions: Floats  # (n, 3), sensor position at the start of each sweep, scene frame, meters
     rotations: Floats  # (n, 3, 3)
-    first_steps: Ints  # (n,): first time step of each sweep, counted from the start of its station
+    first_steps: Ints  # (n,), first time step of each sweep, counted from the start of its station
 
 
 def _sensor_sweeps(survey: Survey, number: int) -> _SensorSweeps:
-    """Return the sweeps of the sensor `number` of a survey."""
+    """Compute the sweeps of the sensor with index `number` in a survey."""
     path = survey.path
     mount = survey.carried[number].mount
     firsts, starts, _ = survey.sweeps_each[number]
@@ -638,17 +681,18 @@ def _sensor_sweeps(survey: Survey, number: int) -> _SensorSweeps:
     positions = []
     rotations = []
     for station in range(path.stations):
-        carrier_positions, carrier_rotations = full_poses(path, station, times)
-        positions.append(carrier_positions + carrier_rotations @ np.array(mount.position))
-        rotations.append(carrier_rotations @ mount.rotation_matrix)
+        platform_positions, platform_rotations = full_poses(path, station, times)
+        positions.append(platform_positions + platform_rotations @ np.array(mount.position))
+        rotations.append(platform_rotations @ mount.rotation_matrix)
     specs = [survey.sent_scan(scan) for scan in firsts.tolist()]
-    cast_scans = np.array([spec.scan + spec.random_offset for spec in specs])  # repeated if frozen
+    # While a sensor is frozen, it repeats scans that were simulated earlier.
+    cast_scans = np.array([spec.scan + spec.random_offset for spec in specs])
     first_steps = (cast_scans - firsts[0]) % survey.steps_each[number]
     return _SensorSweeps(np.concatenate(positions), np.concatenate(rotations), first_steps)
 
 
 def _fired_rays(survey: Survey, first_steps: list[Ints]) -> FiredRays | None:
-    """Return all rays of a survey, or None unless it keeps every return with its ray."""
+    """Describe all rays in a survey, or return None unless every return is stored with its ray."""
     if survey.keep_every != 1 or all(c.name != "ray" for c in survey.stored_columns):
         return None
     max_returns = tuple(2 if returns.mode in TWO_RETURNS else 1 for returns in survey.returns_each)
@@ -658,9 +702,9 @@ def _fired_rays(survey: Survey, first_steps: list[Ints]) -> FiredRays | None:
 
 
 def _poses_of(positions: Floats, rotations: Floats) -> SweepPoses:
-    """Return poses of positions (n, 3) and rotations (n, 3, 3), with w at or above 0."""
+    """Create poses from positions and rotation matrices, using quaternions with nonnegative w."""
     quaternions = quaternions_of(rotations)
-    quaternions[quaternions[:, 3] < 0] *= -1  # q and -q are the same rotation
+    quaternions[quaternions[:, 3] < 0] *= -1  # q and -q represent the same rotation
     return SweepPoses(np.array(positions), quaternions)
 
 
@@ -669,7 +713,7 @@ def _with_vectors(
     turn_normals: Callable[[Floats], Floats],
     move_origins: Callable[[Floats], Floats],
 ) -> dict[str, AnyArray]:
-    """Return the columns of points, with normals and origins of rays in a new frame."""
+    """Return the columns of points with normals and ray origins converted to a different frame."""
     columns = dict(points.columns)
     for names, convert in ((NORMAL, turn_normals), (ORIGIN, move_origins)):
         if not columns.keys() >= {*names}:

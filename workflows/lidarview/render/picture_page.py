@@ -25,7 +25,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from lidarsim.errors import explained
 from lidarsim.io.storage import Storage
 from lidarsim.numerics.arrays import AnyFloats, Floats
-from lidarsim.words import shortened
+from lidarsim.words import shorten_name
 
 from . import theme
 from .shot import SurfaceView
@@ -221,7 +221,7 @@ class Page:
             )
             ink = theme.INK if is_visible[k] else theme.MUTED
             style = {"va": "bottom", "path_effects": halo, "zorder": 7}
-            self._text(axes, position, shortened(name), 6.6, ink, **style)
+            self._text(axes, position, shorten_name(name), 6.6, ink, **style)
 
     def number_sensors(self, axes: Axes, shot: SurfaceView) -> None:
         """Write numbers on the markers of the sensors, starting from 1.
@@ -362,7 +362,7 @@ class Page:
                     color=color,
                     ms=0.85 * size * self.unit,
                     mec="none",
-                    label=shortened(name),
+                    label=shorten_name(name),
                 )
                 for marker, name, color in rows
             ],

@@ -12,7 +12,7 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import AXES, Column, Z
 from lidarsim.numerics.arrays import AnyArray, AnyFloats, Floats, Floats32, Ints, UInts32
 from lidarsim.scene.scene import Scene
-from lidarsim.words import plural, without_common_prefix
+from lidarsim.words import plural, remove_common_prefix
 
 from . import theme
 from .coloring import TURBO, column_values, make_coloring
@@ -53,7 +53,7 @@ def draw_scene(shot: SurfaceView, triangles: int) -> Page:
     _, firsts, counts = np.unique(kinds, return_index=True, return_counts=True)
     labels = [
         name if count == 1 else f"{name} ({count:,})"
-        for name, count in zip(without_common_prefix(names), counts, strict=True)
+        for name, count in zip(remove_common_prefix(names), counts, strict=True)
     ]
     first = len(names) - shot.actors  # the legend starts with the actors
     is_visible = np.bincount(kinds, has_faces) > 0

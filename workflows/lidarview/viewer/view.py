@@ -18,7 +18,17 @@ import numpy as np
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.ply_format import AXES
 from lidarsim.columns.table import AXES as POSITION
-from lidarsim.columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z, value_names
+from lidarsim.columns.table import (
+    CAUSES,
+    NO_SURFACE,
+    OBJECT,
+    TABLE,
+    Column,
+    X,
+    Y,
+    Z,
+    names_by_value,
+)
 from lidarsim.errors import LidarError
 from lidarsim.motion.trajectory import presence_ns
 from lidarsim.numerics.arrays import AnyArray, Floats, Floats32
@@ -232,7 +242,7 @@ class View:
             names: dict[str, Sequence[str]] = {
                 "sensor": sweeps.sensors,
                 "object": (*sweeps.objects, *sweeps.actors),
-                "class": value_names(sweeps.classes),
+                "class": names_by_value(sweeps.classes),
                 "material": sweeps.materials,
             }
             if column in names:

@@ -15,7 +15,7 @@ from lidarsim.columns.bags import POINT_FIELDS
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.numerics.arrays import Floats32, Ints, Records
 from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
-from lidarsim.sweeps.ray_image import Image
+from lidarsim.sweeps.ray_image import RayImage
 from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
 
 from ..boxes import Boxes
@@ -119,7 +119,7 @@ class SurveyMessages:
         self._actors = self._frames[len(sweeps.sensors) : -len(INSTRUMENTS)]
         poses = map(SweepPoses, sweeps.actor_poses.positions, sweeps.actor_poses.quaternions)
         # Frames of the vehicle and the actors, with their poses.
-        self._moving = [(VEHICLE, sweeps.carrier), *zip(self._actors, poses, strict=True)]
+        self._moving = [(VEHICLE, sweeps.platform), *zip(self._actors, poses, strict=True)]
         self._start_ns = survey_start_ns(sweeps)
         self._pose_rate_hz = pose_rate_hz
         sweeps_per_sensor = np.bincount(sweeps.sensor, minlength=1)[sweeps.sensor]
@@ -188,7 +188,7 @@ class SurveyMessages:
         if (rays := ScanRays.from_points(sweeps, sweep, points)) is not None:
             contents["scan"] = self._make.laser_scan(rays, header)
         if self._message_layout.name == "images":
-            ranges = Image.from_points(sweeps, sweep, points).filled(points["range"])
+            ranges = RayImage.from_points(sweeps, sweep, points).to_images(points["range"])
             ranges[np.isnan(ranges)] = np.inf  # REP 117: no detection
             for plane, image in enumerate(ranges):
                 contents[_numbered("range_image", plane)] = self._make.image(image[::-1], header)
@@ -217,10 +217,10 @@ class SurveyMessages:
         if not len(since_ns):
             return
         shares = since_ns / sweeps.span_ns(sweep)
-        frames = [(VEHICLE, sweeps.carrier_within(sweep, shares))]
+        frames = [(VEHICLE, sweeps.platform_poses_at(sweep, shares))]
         stays = sweeps.actor_there[:, sweep] & ~sweeps.actor_leaves[:, sweep]
         frames += [
-            (self._actors[actor], sweeps.actor_within(actor, sweep, shares))
+            (self._actors[actor], sweeps.actor_poses_at(actor, sweep, shares))
             for actor in np.flatnonzero(stays).tolist()
         ]
         for index, time_ns in enumerate((self.sweep_start_ns(sweep) + since_ns).tolist()):

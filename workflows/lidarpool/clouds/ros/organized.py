@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarsim.columns.cloud import Cloud
 from lidarsim.numerics.arrays import Records
-from lidarsim.sweeps.ray_image import Image
+from lidarsim.sweeps.ray_image import RayImage
 from lidarsim.sweeps.sweeps import Sweeps
 
 from .layouts import MessageLayout, message_stamp_ns, sensor_traits
@@ -44,7 +44,7 @@ def organized_rows(
     LidarError
         If the points are not in order, or if the rays of the survey are unknown.
     """
-    image = Image.from_points(sweeps, sweep, points)
+    image = RayImage.from_points(sweeps, sweep, points)
     # Points are copied as bytes, because NumPy does not copy the padding between fields.
     point = np.dtype((np.void, rows.dtype.itemsize))
     without_return = _rays(message_layout, image, rows.dtype, sweeps, sweep).view(point)
@@ -61,7 +61,11 @@ def organized_rows(
 
 
 def _rays(
-    message_layout: MessageLayout, image: Image, row: np.dtype[np.void], sweeps: Sweeps, sweep: int
+    message_layout: MessageLayout,
+    image: RayImage,
+    row: np.dtype[np.void],
+    sweeps: Sweeps,
+    sweep: int,
 ) -> Records:
     """Return points for all rays as if none had a return. Shape (channels, firings)."""
     layout = message_layout.layout
@@ -78,7 +82,7 @@ def _rays(
     return rays
 
 
-def _looking_ahead(image: Image) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:
+def _looking_ahead(image: RayImage) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:
     """Return the firing for each pixel such that all pixels in a column have the same direction.
 
     The shape is (channels, firings).

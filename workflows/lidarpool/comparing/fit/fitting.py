@@ -15,7 +15,7 @@ import yaml
 
 from lidarsim._version import __version__
 from lidarsim.columns.cloud import Cloud
-from lidarsim.environment.extras import need
+from lidarsim.environment.extras import require_package
 from lidarsim.errors import LidarError, explained
 from lidarsim.io.storage import Storage
 from lidarsim.motion.trajectory import Pose
@@ -127,7 +127,7 @@ def fit(
     """
     if white is not None:
         check_number("white", white, gt=0)
-    need("scipy", "fit", "Fitting sensor models")
+    require_package("scipy", "fit", "Fitting sensor models")
     named = None if model is None else read_model(model)  # before the recording, which takes long
     if not isinstance(recording, Recording):
         recording = open_recording(recording, sensor, intensity, name="the recording")

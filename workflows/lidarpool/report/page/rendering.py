@@ -28,9 +28,9 @@ from lidarsim.io.storage import Storage
 from lidarsim.media.weather import Weather
 from lidarsim.numerics.arrays import Ints
 from lidarsim.numerics.even_samples import even_indices
-from lidarsim.schema.declared import declared
+from lidarsim.schema.declared import declared_values
 from lidarsim.sensor import Noise, Returns
-from lidarsim.words import natural, plural, shortened, without_common_prefix
+from lidarsim.words import natural_sort_key, plural, remove_common_prefix, shorten_name
 from lidarview.render.stage import nice_step
 
 from ...clouds.format_table import data_set_title
@@ -268,10 +268,10 @@ def _template(name: str) -> Template:
     ):
         environment.filters[filter_.__name__] = filter_
     environment.filters["with_names"] = _with_names
-    environment.filters["shortened"] = lambda name, length=60: shortened(name, length)
+    environment.filters["shortened"] = lambda name, length=60: shorten_name(name, length)
     environment.filters["one_line"] = lambda text: type(text)(re.sub("[ \n]+", " ", text).strip())
     environment.filters["labels"] = lambda names: dict(
-        zip(names, without_common_prefix([*names]), strict=True)
+        zip(names, remove_common_prefix([*names]), strict=True)
     )
     return environment.get_template(name)
 
@@ -298,7 +298,7 @@ def _scenario_yaml(scenario: Scenario) -> str:
 
 def _changed_fields(values: Mapping[str, Any], kind: type) -> list[tuple[str, str]]:
     """Return the names and values of the fields that differ from the defaults of a dataclass."""
-    usual = declared(kind(), kind)
+    usual = declared_values(kind(), kind)
     return [(name, formatted(values[name])) for name in usual if values[name] != usual[name]]
 
 
@@ -387,7 +387,7 @@ def _worker_rows(tasks: WorkerTasks, axis: _TimeAxis) -> list[dict[str, str]]:
     rows = []
     for worker, stage in sorted(
         nlargest(MAX_ROWS, tasks, key=lambda key: busy_s[key]),
-        key=lambda key: (natural(key[0]), [*STAGES].index(key[1])),
+        key=lambda key: (natural_sort_key(key[0]), [*STAGES].index(key[1])),
     ):
         records = tasks[worker, stage]
         work = duration(busy_s[worker, stage])

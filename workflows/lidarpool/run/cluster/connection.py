@@ -24,7 +24,7 @@ from distributed.comm import connect
 from distributed.utils import LoopRunner
 
 import poolpart.deploy
-from lidarsim.environment.interrupts import children_spared, deferred_interrupts
+from lidarsim.environment.interrupts import block_child_signals, defer_interrupts
 from lidarsim.errors import LidarError
 from poolpart.deploy import forked_workers
 from poolpart.probe import visible_gpus
@@ -182,7 +182,7 @@ class BackgroundClient(AbstractContextManager[Client]):
         return self._client.result()
 
     def __exit__(self, *error: object) -> None:
-        with deferred_interrupts():
+        with defer_interrupts():
             if not self._left and self._client.exception() is None:
                 self._context.__exit__(None, None, None)
             self._left = True
@@ -224,12 +224,12 @@ def _client_of(cluster: AbstractContextManager[SpecCluster]) -> Iterator[Client]
     """
     stack = ExitStack()
     try:
-        with deferred_interrupts(), children_spared():
+        with defer_interrupts(), block_child_signals():
             client = Client(stack.enter_context(cluster), set_as_default=False)
             stack.enter_context(client)
         yield client
     finally:
-        with deferred_interrupts():
+        with defer_interrupts():
             stack.close()
 
 

@@ -150,7 +150,7 @@ def collect(
     cannot access this file, it keeps its parts in memory, from where the driver fetches them.
     """
     secede()
-    visible_storage = storage if storage.sees(*probe) else None
+    visible_storage = storage if storage.has_content(*probe) else None
     recorder = Recorder(start.stage, LIDAR)
     sender = _Sender(start, outlet)  # needs no limit, because the driver limits its orders
     start.trace("start")

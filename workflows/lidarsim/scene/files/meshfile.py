@@ -26,7 +26,7 @@ from ...numerics.arrays import Floats
 from ...numerics.elementary import cbrt
 from ...numerics.vectors import determinant, matmul, rotate
 from ...schema.vocabulary import UNITS_M
-from ...words import as_python, listed, plural, printable, rounded
+from ...words import format_as_python, listed, plural, printable, rounded
 from ..actors import Actor, join_meshes
 from ..colors import colors_summary
 from ..scene_instances import MAX_COORDINATE_M, SceneInstance
@@ -66,7 +66,7 @@ _log = logging.getLogger(__name__)
 
 def warn(note: str) -> None:
     """Log a note as a warning, with option names as in Python."""
-    _log.warning(as_python(note))
+    _log.warning(format_as_python(note))
 
 
 class Objects(NamedTuple):
@@ -319,7 +319,7 @@ def _report_axes(
     elif doubt:
         warn(note)
     else:
-        _log.info(as_python(note))
+        _log.info(format_as_python(note))
 
 
 def _doubt_about_rotation(content: Content, meshes: Sequence[SceneMesh | SceneInstance]) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from ...io.allowance import Allowance
 from ...io.input_files import InputFileError, read_input
 from ...numerics.arrays import Bytes, Floats, Ints
-from ...words import as_text
+from ...words import decode_name
 from ..colors import Colors, as_bytes
 from ..masks import (
     HALF_OPACITY,
@@ -55,7 +55,7 @@ class _Image:
             key, option_words = (part for part in match.groups() if part is not None)
             options[key.lower()] = option_words.split()
             offset = match.end()
-        return cls(as_text(words[offset:].strip()), options)
+        return cls(decode_name(words[offset:].strip()), options)
 
     @property
     def wrap(self) -> Wrap:
@@ -128,9 +128,9 @@ class MtlMaterials:
         """
         if not self._options.masks or name not in self._entries:
             return None
-        with self.notes.record_mask_error(as_text(name)):
+        with self.notes.record_mask_error(decode_name(name)):
             images = self._entries[name].images
-            if texture := self._texture(as_text(name), images):
+            if texture := self._texture(decode_name(name), images):
                 image = images.get(b"map_d") or images[b"map_kd"]
                 return texture.cutout(image.coordinates(vt), corners)
         return None
@@ -157,7 +157,7 @@ class MtlMaterials:
             return None
         colors = None
         if (image := entry.images.get(b"map_kd")) is not None:
-            with self.notes.record_color_error(as_text(name)):
+            with self.notes.record_color_error(decode_name(name)):
                 texture = self._image((image.name, image.wrap))
                 colors = texture.colors(image.coordinates(vt), corners)
         elif tints is not None:
@@ -172,7 +172,7 @@ class MtlMaterials:
         A statement names a single file, or several files that are separated by spaces.
         """
         read: set[Path | None] = set()
-        for names in map(as_text, libraries):
+        for names in map(decode_name, libraries):
             for name in [names] if self._file(names) else names.split():
                 try:
                     path = find_named_file(self._mesh, name, self._options)

@@ -22,7 +22,7 @@ import numpy as np
 
 from ...errors import CutShortError
 from ...numerics.arrays import AnyArray, Bytes, Floats, Ints
-from ...words import as_text
+from ...words import decode_name
 from ..colors import Colors, as_bytes
 from ..scene_mesh import SceneMesh
 from .mtl import MtlMaterials
@@ -164,7 +164,7 @@ def _parse_obj(text: bytes, stem: str, with_colors: bool, with_materials: bool) 
                 polygons.materials.append(material)
         elif key == divider:
             number = len(content.objects) if divider == b"o" else 0
-            name = as_text(value.strip()) or stem
+            name = decode_name(value.strip()) or stem
             polygons = content.objects.setdefault((name, number), _ObjPolygons())
         elif key == b"usemtl":
             material = materials.setdefault(value.strip(), len(materials))
@@ -191,7 +191,7 @@ def _obj_pieces(
         cutout = materials.cutout(material, uv, coordinates)
         corner_colors = None if tints is None else tints[faces]
         colors = materials.colors(material, uv, coordinates, corner_colors)
-        name = as_text(material) if options.materials else ""
+        name = decode_name(material) if options.materials else ""
         pieces.append(Piece(vertices, faces, cutout, colors, name))
     return pieces
 
@@ -296,7 +296,7 @@ def _is_real(word: bytes) -> bool:
 
 def _shown(line: bytes) -> str:
     """Return the start of a line for error messages."""
-    return as_text(line.strip()[:60])
+    return decode_name(line.strip()[:60])
 
 
 # -- .off ----------------------------------------------------------------------------------------
@@ -451,7 +451,7 @@ def read_stl(data: bytes, path: Path, options: ReadOptions) -> Content:
                 or f"a solid has {len(vertices):,} vertices, but {facets:,} facets of three "
                 "vertices each"
             )
-        meshes += _stl_mesh(as_text(head.strip()) or path.stem, vertices)
+        meshes += _stl_mesh(decode_name(head.strip()) or path.stem, vertices)
     return Content(meshes)
 
 

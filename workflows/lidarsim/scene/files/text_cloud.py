@@ -23,7 +23,7 @@ from ...io.input_files import check_input, open_input, read_input
 from ...io.tables import column_name
 from ...numerics.arrays import AnyArray, Floats
 from ...schema.vocabulary import UNITS_M
-from ...words import distinct, plural, printable
+from ...words import make_distinct, plural, printable
 from .text_rows import COMMENT_PREFIXES, RowReader, cells_of
 
 _SEPARATORS = (";", "\t", ",", None)
@@ -103,7 +103,7 @@ def read_text_cloud(path: Path) -> list[Sweep]:
         for position, index in enumerate(numeric)
     }
     positions = np.stack([arrays.pop(index) for index in axes], axis=1).astype(np.float64)
-    others = distinct(["x", "y", "z", *(names[index] for index in arrays)])[3:]
+    others = make_distinct(["x", "y", "z", *(names[index] for index in arrays)])[3:]
     columns = dict(zip(others, arrays.values(), strict=True))
     unread = tuple(name for index, name in enumerate(names) if index not in numeric)
     return [Sweep(positions, columns, units_m=units_m, skipped=unread)]

@@ -26,7 +26,7 @@ from raybeam.device import ExternalHits
 from raybeam.moving import body_hits, nearest_body_hits
 from raybeam.scan import Scan, check_scan
 
-from ...environment.interrupts import deferred_interrupts
+from ...environment.interrupts import defer_interrupts
 from ...errors import LidarError
 from ...numerics.arrays import Bools, Floats, Indices, Ints, Ints32
 from ...scene.actors import Actor, distinct_meshes
@@ -78,7 +78,7 @@ class CastBodies(NamedTuple):
 def check_backend_here(backend: str, advice: str = AUTO_ADVICE) -> None:
     """Raise LidarError, ending with `advice`, if a backend is not available on this machine."""
     # An interrupt during the import of an extension module would look like a missing module.
-    with deferred_interrupts():
+    with defer_interrupts():
         backends = {"auto": "", **available_backends()}
     if backend not in backends:
         hint = did_you_mean(backend, backends) or f" Available backends: {', '.join(backends)}."
