@@ -8,7 +8,7 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.sweeps.sweeps import Sweeps
 
 from .clouds.cloud_format import CloudFormat
-from .clouds.format_table import FormatRow
+from .clouds.format_row import FormatRow
 from .clouds.multi_file_format import MultiFileFormat
 from .clouds.recording import Recording, RecordingSource
 from .clouds.writing import ExportSpec

@@ -17,7 +17,7 @@ from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 
-from .format_table import FormatRow
+from .format_row import FormatRow
 from .recording import Recording, RecordingSource
 
 if TYPE_CHECKING:

@@ -51,7 +51,6 @@ _COLUMNS = {
 _FLAGS = {"isIntensityInvalid": ("intensity",), "isColorInvalid": COLORS}
 _MOVING = ", motion compensated"  # suffix of the scan name if the sensor moves
 _MIN_QUATERNION = 1e-6  # norm below which a quaternion is considered zero
-NORMAL_FIELDS = {f"nor:normal{name[-1].upper()}": name for name in NORMAL}  # {field: column}
 
 
 class E57(CloudFormat):
@@ -119,6 +118,8 @@ def _highest_intensity(cloud: CloudLike) -> float:
 def _write_scan(
     file: Any, sweeps: Sweeps, sweep: int, points: Cloud, highest_intensity: float
 ) -> None:
+    from .e57_writer import NORMAL_FIELDS
+
     positions = sweeps.compensated(sweep, points)
     x, y, z = positions.T.copy()
     data = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}

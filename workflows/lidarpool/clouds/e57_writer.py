@@ -13,10 +13,12 @@ from typing import Any
 import pye57
 from pye57 import libe57
 
+from lidarsim.columns.table import NORMAL
 from lidarsim.sweeps.sweeps import Sweeps
 
-from .e57 import NORMAL_FIELDS
 from .gps_time import gps_start_s
+
+NORMAL_FIELDS = {f"nor:normal{name[-1].upper()}": name for name in NORMAL}  # {field: column}
 
 
 class E57Writer(pye57.E57):

@@ -29,7 +29,8 @@ from lidarview.picture_file import PictureContent
 from ..columns.parts import StoredCloud
 from .cloud_format import CloudFormat
 from .folder import staging
-from .format_table import EXPORTS, FORMATS, LAYOUTS, FormatRow, format_row, load_format
+from .format_row import FormatRow
+from .format_table import EXPORTS, FORMATS, LAYOUTS, format_row, load_format
 from .multi_file_format import MultiFileFormat, RangeWorkers
 
 _ENDINGS = {Path(row.file).suffix: name for name, row in FORMATS.items() if "." in row.file}
