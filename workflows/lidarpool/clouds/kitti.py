@@ -222,9 +222,10 @@ def _row(rotation: Floats) -> str:
 
 def _camera(sweeps: Sweeps, sensor: int) -> Floats:
     """Return the rotation from the sensor frame to a level camera frame with the same heading."""
+    # The z axis of the world in the sensor frame, summed over all sweeps.
     up = matrices(sweeps.pose.quaternions[sweeps.sensor == sensor])[:, 2].sum(axis=0)
     leftward = np.cross(up, [1, 0, 0])
-    if not leftward.any():  # the sensor looks straight up or down, or is upside down
+    if not leftward.any():  # the sensor looks straight up or down
         return _CAMERA
     axes = np.stack([np.cross(leftward, up), leftward, up])
     return np.asarray(_CAMERA @ (axes / np.linalg.norm(axes, axis=1, keepdims=True)))

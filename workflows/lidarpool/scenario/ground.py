@@ -81,6 +81,7 @@ class SupportSurfaces:
         scene = self._scene
         shared = self._scene.instances
         if shared and (self._objects is None or np.isin(shared.owner, self._objects).any()):
+            # The triangles of instances are exact, unless there are millions of them.
             scene = SimplifiedScene.from_scene(scene).scene
         corners = scene.vertices[scene.faces]
         owner = scene.face_object

@@ -141,7 +141,9 @@ def scenario_template(data: Mapping[str, Any], note: str) -> str:
     Parameters
     ----------
     data
-        Content of the scenario, from `mesh_data`, which replaces the default values.
+        Sections of the scenario as {name: {field: value}}, for example from `mesh_data`, which
+        replace the default values. The section `sensor` can be the name of a model, and `poses` is
+        a list.
     note
         Note about the poses.
     """

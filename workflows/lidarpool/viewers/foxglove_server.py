@@ -223,6 +223,7 @@ def packed_points(shown: ShownSweep) -> Records:
 
 
 def _point_cloud(shown: ShownSweep) -> Any:
+    """Convert a sweep to a message, whose timestamp is from the clock of the sensor."""
     rows = packed_points(shown)
     fields = [
         messages.PackedElementField(name=name, offset=offset, type=_NUMBER_TYPES[kind.str[1:]])

@@ -37,7 +37,7 @@ class RayImage:
         Raises
         ------
         LidarError
-            If the points are not in order, or if the rays of the survey are unknown.
+            If the points are not sorted by scan and ray, or if the rays of the survey are unknown.
         """
         fired = require_fired_rays(sweeps)
         number = int(sweeps.sensor[sweep])
@@ -46,8 +46,10 @@ class RayImage:
         first_step = int(fired.steps[sweep])
         steps = range(first_step, first_step + stop_scan - first_scan)
         first_firing = np.array(sensor.firings(first_step)[:1])
-        lead_ns = float(sensor.begins_ns(first_firing)[0]) + sensor.lead_ns
-        begin_ns = round(sweeps.begins_ns[sweep] - lead_ns)
+        # A sweep begins with the earliest beam of its first firing. Stations begin at whole
+        # nanoseconds.
+        since_station_ns = float(sensor.begins_ns(first_firing)[0]) + sensor.lead_ns
+        begin_ns = round(sweeps.begins_ns[sweep] - since_station_ns)
         return cls.from_steps(
             sensor, steps, first_scan, begin_ns, fired.returns_per_pulse[number], points
         )
@@ -64,13 +66,14 @@ class RayImage:
     ) -> RayImage:
         """Locate the points from consecutive time steps of a sensor in an image.
 
-        `first_scan` is the scan of the first step, `begin_ns` is the start of the station, and
-        `returns_per_pulse` is the maximum number of returns of a pulse.
+        The points are sorted by scan and ray. Their column `ray` counts from the first ray of each
+        scan. `first_scan` is the scan of the first step, `begin_ns` is the start of the station,
+        and `returns_per_pulse` is the maximum number of returns of a pulse, or 1 if it is unknown.
 
         Raises
         ------
         LidarError
-            If the points are not in order or do not belong to these time steps.
+            If the points are not sorted or do not belong to these time steps.
         """
         from . import image_loops  # imported late because numba takes half a second to import
 

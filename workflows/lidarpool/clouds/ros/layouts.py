@@ -330,7 +330,11 @@ class MessageLayout:
 def encode_points(
     message_layout: MessageLayout, row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int
 ) -> Records:
-    """Convert the points of a sweep to the layout. `row` is the type of a point in it."""
+    """Convert the points of a sweep, in the frame of the survey, to records of the type `row`.
+
+    The positions in the records are in the sensor frame. The order of the points is kept, also if
+    the layout is organized.
+    """
     layout = message_layout.layout
     traits = sensor_traits(sweeps, sweep)
     if message_layout.compensated:
