@@ -99,8 +99,8 @@ class JobSource:
         """Prepare the scenario of a job. The arguments are those of `job`."""
         scenario = self.scenario(number)
         assert scenario is not None, "only jobs with a scenario can be prepared"
-        made_of = file_hashes(scenario.files)
-        fields |= {"values": self.values(number), "made_of": made_of}
+        hashes = file_hashes(scenario.files)
+        fields |= {"values": self.values(number), "input_files": hashes}
         return prepare(scenario, plans=False, cache=cache, columns=columns, **fields)
 
     def job(

@@ -49,7 +49,7 @@ class Job:
         Number of the job in its campaign, its name in file names, and the name of its split.
     outputs
         Formats of the cloud in addition to PLY.
-    made_of
+    input_files
         Names and SHA-256 hashes of the files that the job was created from.
 
     Raises

@@ -21,8 +21,10 @@ def install_command(*requirements: str) -> str:
 
     words: list[str] = []
     for name in requirements:
-        if name.partition("[")[0] == "lidarpool":
-            # The installation is editable so that changes to the checkout take effect.
+        # The installation is editable so that changes to the checkout take effect.
+        if name == "lidarpool":
+            words += [word for part in _PARTS for word in ("-e", part)]
+        elif name.startswith("lidarpool["):
             words += ["-e", f".{name.removeprefix('lidarpool')}"]
         else:
             words.append(name)
