@@ -1,1 +1,1 @@
-"""Materials of surfaces, leaves, and weather, which determine how light is scattered."""
+"""Materials of surfaces, leaves and weather, which determine how light is scattered."""

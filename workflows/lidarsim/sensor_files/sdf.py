@@ -32,7 +32,7 @@ class _Angles(NamedTuple):
 
 
 def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
-    """Write a model with a sensor.
+    """Write a model that contains a <gpu_lidar> sensor.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def _scan(name: str, angles: _Angles) -> list[str]:
 
 
 def _grid(rays: RayList) -> tuple[_Angles, _Angles]:
-    """Return the azimuths and elevations of a regular grid.
+    """Return the azimuths and elevations of the regular grid that the rays form.
 
     Raises
     ------
@@ -113,7 +113,7 @@ def _grid(rays: RayList) -> tuple[_Angles, _Angles]:
 
 
 class _Levels(NamedTuple):
-    """Distinct angles, and the index of each ray's angle."""
+    """Distinct angles, and the index of the angle of each ray."""
 
     angles_deg: Floats  # (k,), ascending
     of_ray: Ints  # (n,): index into `angles_deg` for each ray
@@ -129,7 +129,7 @@ def _levels(angles_deg: Floats) -> _Levels:
 
 
 def _even(name: str, words: str, angles_deg: Floats) -> _Angles:
-    """Return the ends and number of evenly spaced angles.
+    """Return the first, the last and the number of evenly spaced angles.
 
     Raises LidarError if the angles are not evenly spaced.
     """

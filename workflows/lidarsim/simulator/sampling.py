@@ -99,7 +99,7 @@ def sample_ranges(scene: Scene, survey: Survey, scans: range | None = None) -> F
 
 
 def _sampled_scans(survey: Survey, scans: range) -> tuple[Ints, Ints]:
-    """Return the first scans and the stops of evenly spaced sections of `scans`."""
+    """Return the start and stop of evenly spaced sections of `scans`."""
     # Limit the length so that a section spans at most two stations, which are cast separately.
     scans_per_section = max(1, min(*survey.steps_each, SECTION_SCANS))
     sections = even_indices(-(-len(scans) // scans_per_section), SAMPLE_SECTIONS)
@@ -108,7 +108,7 @@ def _sampled_scans(survey: Survey, scans: range) -> tuple[Ints, Ints]:
 
 
 def _with_few_rays(survey: Survey, every: int) -> list[Mounted]:
-    """Return the sensors of a survey, each replaced by a sample of one in `every` of its rays."""
+    """Return a survey's sensors, reduced to one in `every` of their rays."""
     return [
         replace(mounted, sensor=_FewRays.from_sensor(mounted.sensor, every), steps=steps)
         for mounted, steps in zip(survey.carried, survey.steps_each, strict=True)
@@ -116,13 +116,13 @@ def _with_few_rays(survey: Survey, every: int) -> list[Mounted]:
 
 
 def _batches(rig: Rig, firsts: Ints, stops: Ints) -> Iterator[Any]:
-    """Cast sections of a survey, given by first scans and stops, and yield their batches."""
+    """Cast sections of a survey, and yield their batches."""
     for first, stop in zip(firsts.tolist(), stops.tolist(), strict=True):
         yield from rig.cast(first, stop)
 
 
 class _SampledRays(NamedTuple):
-    """The k rays of a sensor that belong to a sample."""
+    """Sample of k rays of a sensor."""
 
     firings: Ints  # (f,): distinct firings of the rays
     row: Ints  # (k,): index into `firings` for each ray
@@ -156,7 +156,7 @@ class _FewRays(Sensor):
         )
 
     def firings(self, step: int) -> tuple[int, int]:
-        """Return the first sampled ray of a time step, and one past the last."""
+        """Return the range of sampled rays in a time step."""
         first, stop = self.sampled.firings(step)
         channels = self.sampled.channels
         return first * channels // self.every, stop * channels // self.every
@@ -180,6 +180,6 @@ class _FewRays(Sensor):
         return None if origins is None else origins[rays.row, rays.channel, None]
 
     def begins_ns(self, firings: Ints) -> Floats:
-        """Return the start times in nanoseconds of the firings that the sampled rays belong to."""
+        """Return the start time, in nanoseconds, of each sampled ray's firing."""
         rays = self._rays(firings)
         return self.sampled.begins_ns(rays.firings)[rays.row] + self.sampled.lead_ns

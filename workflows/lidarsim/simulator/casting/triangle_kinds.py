@@ -14,7 +14,7 @@ from .stored_triangles import StoredTriangles
 
 
 class TriangleKinds:
-    """Kinds of surfaces of the triangles in a scene, which are rows of the material table.
+    """Surface kinds of the triangles in a scene. Each kind is a row of the material table.
 
     A kind of surface is an object, or one material of an object whose files have several materials.
     """
@@ -32,7 +32,7 @@ class TriangleKinds:
         self.material_kinds = kinds
 
     def of_triangles(self, triangle: Integers) -> Ints32:
-        """Return the kinds of surfaces of triangles, or -1 for `NO_SURFACE`.
+        """Return the surface kind of each triangle, or -1 for `NO_SURFACE`.
 
         If several material names of an object match the same material of the survey, they are one
         kind.
@@ -43,7 +43,7 @@ class TriangleKinds:
         return self.of_rows(triangle_indices, objects)
 
     def of_rows(self, triangle_indices: Indices, objects: Ints32) -> Ints32:
-        """Return the kinds of surfaces from rows of the stored triangles and objects.
+        """Return the surface kinds for the given stored triangles and objects.
 
         Objects are required because instances of different objects can share stored triangles.
         """
@@ -74,7 +74,7 @@ class TriangleKinds:
         return np.concatenate(numbers)
 
     def material_numbers(self, triangle: Integers) -> Ints32:
-        """Return the materials of triangles as indices into `Scene.material_names`, or -1."""
+        """Return the material of each triangle as an index into `Scene.material_names`, or -1."""
         triangle_indices, objects, _ = self._triangles.locate(triangle)
         kinds = self.material_kinds.first[:-1][objects]
         if self._kind_in_object is not None:
@@ -89,7 +89,9 @@ class TriangleKinds:
 
     @cached_property
     def _material_kind(self) -> Ints32:
-        """For each kind, the first kind of the same object with the same material. Shape (kinds,).
+        """Number of the first kind that has the same object and material as each kind.
+
+        Shape (kinds,).
 
         Several material names in an object's files may match a single material of the survey. Their
         faces then form a single kind, so that a body of water or leaves is closed even if its faces
@@ -105,13 +107,13 @@ class TriangleKinds:
 
     @cached_property
     def _faces_by_object(self) -> tuple[Indices, Indices]:
-        """Rows of the scene's faces sorted by object, and where each object starts."""
+        """Rows of the scene's faces sorted by object, and the start of each object's rows."""
         owners = self._scene.face_object
         order = np.argsort(owners, kind="stable")
         return order, np.searchsorted(owners[order], np.arange(self._triangles.static_objects + 1))
 
     def faces_of(self, kind: int) -> Integers:
-        """Return the faces of the scene that have a kind of surface."""
+        """Return the scene's faces of the given surface kind."""
         order, starts = self._faces_by_object
         owner = int(self.material_kinds.object[kind])
         face_indices = order[starts[owner] : starts[owner + 1]]
@@ -121,7 +123,7 @@ class TriangleKinds:
         return self.select(kind, self._scene.faces[face_indices], materials)
 
     def select(self, kind: int, faces: Integers, materials: FaceMaterials | None) -> Integers:
-        """Select the faces that have a kind of surface from the faces of an object."""
+        """Select an object's faces of the given surface kind."""
         if self._kind_in_object is None:
             return faces
         kinds = self.material_kinds

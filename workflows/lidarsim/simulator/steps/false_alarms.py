@@ -29,7 +29,7 @@ class FalseAlarms(NamedTuple):
 
 
 class FalseAlarmStep(PulseStep):
-    """Adds false alarms to the returns of pulses."""
+    """Simulation step that adds false alarms to the returns of pulses."""
 
     role = Role.RECEIVES
     effects = ("False alarms",)
@@ -40,7 +40,7 @@ class FalseAlarmStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if the receiver has false alarms."""
+        """Return whether the receiver has false alarms."""
         return setup.noise.false_alarm_hz > 0
 
     @staticmethod
@@ -50,7 +50,7 @@ class FalseAlarmStep(PulseStep):
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the memory of the rays and of a cause for each return, in bytes."""
+        """Return the memory of the rays and of the return causes, in bytes."""
         return Memory(retained=10 * sizes.return_count, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
