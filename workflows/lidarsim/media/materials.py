@@ -257,7 +257,7 @@ class Material(FileSection):
             raise LidarError("scale is a factor of colors and requires reflectance: texture.")
 
     def _check_roughness(self) -> None:
-        """Check that only opaque surfaces without other specular reflection have a roughness."""
+        """Check that a roughness is only set for opaque surfaces without specular reflection."""
         if self.roughness is None and self.metalness:
             raise LidarError(
                 "metalness requires roughness. Set it to a value from 0.1 (polished) to 1 (matte)."
@@ -714,12 +714,18 @@ class MaterialTable:
 
     @property
     def leafy(self) -> Bools:
-        """Whether each kind of surface contains leaves. Shape (k,)."""
+        """Whether each kind of surface contains leaves.
+
+        The shape is (k,).
+        """
         return self.leaf_area > 0
 
     @property
     def refracts(self) -> Bools:
-        """Whether each kind of surface refracts light. Shape (k,)."""
+        """Whether each kind of surface refracts light.
+
+        The shape is (k,).
+        """
         return self.refractive_index > 0
 
     @property
@@ -830,7 +836,10 @@ def water_film_factor(mirrored: Any, reflectance: Any) -> Any:
 
 
 def normal_incidence_energy(distance: Any, extinction: float = 0.0) -> Any:
-    """Return the energy from perpendicular white surfaces at distances in meters."""
+    """Return the energies from white surfaces at normal incidence and the given distances.
+
+    The distances are in meters.
+    """
     distance = np.maximum(distance, NEAREST_M)
     nearer = np.square(REFERENCE_M / distance)
     return nearer * exp(-2 * extinction * distance) if extinction else nearer

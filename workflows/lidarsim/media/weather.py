@@ -150,7 +150,7 @@ class Weather(FileSection):
         return alpha
 
     def backscatter_at(self, wavelength_nm: float) -> float:
-        """Return the backscatter coefficient of fog and dust at a wavelength, in 1/(m sr)."""
+        """Return the backscatter coefficient of fog and dust at a given wavelength, in 1/(m sr)."""
         beta = dust_coefficients(self.dust_mg_m3)[1]
         if self.fog_lidar_ratio_sr is not None:
             beta += extinction(self.visibility_km, wavelength_nm) / self.fog_lidar_ratio_sr
@@ -291,7 +291,7 @@ class Air(NamedTuple):
         return np.asarray(hypot(self.exit_m, self.divergence * distance))
 
     def white_energy(self, distance: Any) -> Any:
-        """Return the energy from a white disc that fills the beam, at distances in meters."""
+        """Return the energy from a white disc that fills the beam at a given distance in meters."""
         effective_m = np.maximum(distance, max(self.overlap_m, 1e-3))
         transmission = exp(-2 * self.extinction * distance)
         return np.square(REFERENCE_M / effective_m) * np.maximum(transmission, MIN_TRANSMISSION)

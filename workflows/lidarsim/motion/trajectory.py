@@ -88,7 +88,10 @@ class Pose(FileSection):
         return np.eye(3) if self.rotation is None else self.rotation
 
     def compose(self, mount: Pose) -> Pose:
-        """Return the pose of an instrument mounted at `mount` on a platform with this pose."""
+        """Return the pose of an instrument that is mounted at `mount` on a platform.
+
+        This pose is the pose of the platform.
+        """
         if mount == CENTER:
             return self
         rotation = self.rotation_matrix

@@ -113,9 +113,7 @@ class RangeUnits(NamedTuple):
 class ReturnImages(NamedTuple):
     """Images of up to r returns per beam, nearest first.
 
-    There are n columns of c beams.
-
-    All arrays have shape (r, n, c).
+    All arrays have shape (r, n, c) for n columns of c beams.
     """
 
     range_m: AnyFloats  # range from the beam origin; 0 or NaN without a return

@@ -43,7 +43,10 @@ class Shots:
 
     @property
     def returned(self) -> Bools:
-        """Whether each shot has a return of each number. Shape (r, n, c)."""
+        """Whether each shot has a return of each number.
+
+        The shape is (r, n, c).
+        """
         return ~np.isnan(self.range_m)
 
     @classmethod

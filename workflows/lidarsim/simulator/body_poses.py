@@ -26,7 +26,10 @@ class BodyPoses(NamedTuple):
 
     @property
     def moves(self) -> Bools:
-        """Mask of the bodies that move during a sweep. Shape (k,)."""
+        """Mask of the bodies that move during a sweep.
+
+        The shape is (k,).
+        """
         return np.array([t is not None and t.moves for t in self.trajectories], np.bool_)
 
     def trajectory(self, number: int) -> Trajectory:

@@ -169,7 +169,10 @@ class _FewRays(Sensor):
         return _SampledRays(*np.unique(fired, return_inverse=True), channel)
 
     def directions(self, firings: Ints) -> Floats:
-        """Return the directions of sampled rays in the sensor frame. Shape (k, 1, 3)."""
+        """Return the directions of sampled rays in the sensor frame.
+
+        The shape is (k, 1, 3).
+        """
         rays = self._rays(firings)
         return self.sampled.directions(rays.firings)[rays.row, rays.channel, None]
 

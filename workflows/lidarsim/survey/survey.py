@@ -475,7 +475,7 @@ class Survey(CloudOptions, Weather):
             )
 
     def _check_duration(self, sensor: Sensor, steps: int) -> None:
-        """Check that the steps of a sensor fit into the trajectory and do not exceed any limit."""
+        """Check that the time steps of a sensor fit into the trajectory and exceed no limit."""
         needed_s = _last_firing_ns(sensor, steps) / 1e9
         available_s = self.path.duration_ns / 1e9
         if needed_s > available_s:

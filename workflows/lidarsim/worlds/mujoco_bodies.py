@@ -154,11 +154,11 @@ def create_bodies(model: Any, choice: BodySelection) -> ModelBodies:
 
 
 def _static_bodies(model: Any) -> Any:
-    """Return a mask of the static bodies."""
     return (np.asarray(model.body_weldid) == 0) & (np.asarray(model.body_mocapid) < 0)
 
 
 def visible_geoms(model: Any, choice: BodySelection) -> list[int]:
+    """Return the IDs of the geoms that are visible to a lidar."""
     colors = _colors(model)
     seen = np.isin(model.geom_group, choice.groups) & (colors[:, 3] > 0)
     seen &= ~np.isin(model.geom_bodyid, choice.excluded_bodies)

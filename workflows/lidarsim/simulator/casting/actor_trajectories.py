@@ -156,7 +156,10 @@ class ActorTrajectories(tuple[Trajectory, ...]):
 
     @cached_property
     def presence_ns(self) -> Floats:
-        """First and last time at which each actor is in the scene, in nanoseconds. Shape (w, 2)."""
+        """First and last time at which each actor is in the scene, in nanoseconds.
+
+        The shape is (w, 2).
+        """
         presence = [
             presence_ns(trajectory) if find_batch(trajectory) is None else ALWAYS
             for trajectory in self

@@ -56,7 +56,10 @@ class StoredTriangles:
 
     @cached_property
     def normal_matrices(self) -> Floats:
-        """Matrices that map part normals to unnormalized instance normals. Shape (n, 3, 3)."""
+        """Matrices that map part normals to unnormalized instance normals.
+
+        The shape is (n, 3, 3).
+        """
         instances = self._scene.instances
         if instances is None:
             return np.zeros((0, 3, 3))
@@ -155,7 +158,10 @@ class StoredTriangles:
         return np.where(instance >= 0, face_count + instance, face_or_actor)
 
     def count(self, triangle: Integers) -> Ints:
-        """Return the number of hits per hit counter. Shape (counters,)."""
+        """Return the number of hits per hit counter.
+
+        The shape is (counters,).
+        """
         return np.bincount(self.counter(triangle), minlength=self.counters)
 
     @property
@@ -173,7 +179,10 @@ class StoredTriangles:
 
     @cached_property
     def unit_normals(self) -> Floats32:
-        """Unit normals of the stored triangles. Shape (f, 3)."""
+        """Unit normals of the stored triangles.
+
+        The shape is (f, 3).
+        """
         bodies = self.stored_bodies
         normals = np.empty((sum(len(faces) for _, faces, _ in bodies), 3), np.float32)
         row = 0

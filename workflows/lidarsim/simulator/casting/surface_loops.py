@@ -89,7 +89,10 @@ class OnwardOptics(NamedTuple):
 
 
 class OnwardHits(NamedTuple):
-    """Hits at which light continues, as arrays of shape (n,)."""
+    """Hits at which light continues.
+
+    All arrays have shape (n,).
+    """
 
     kind: Ints32
     cosines: Floats  # cosines of incidence, of either sign

@@ -54,7 +54,9 @@ class TriangleKinds:
 
     @cached_property
     def _kind_in_object(self) -> Ints32 | None:
-        """Kind of each stored triangle, numbered within its object. Shape (f,).
+        """Kind of each stored triangle, numbered within its object.
+
+        The shape is (f,).
 
         None if each object has a single kind, whose number is then the number of the object.
         """

@@ -238,7 +238,9 @@ class Grids:
 
 
 def _border(rays: _GridRays, inside: Bools) -> Floats:
-    """Return the distances in meters from the start to the next voxel borders. Shape (3, k, n).
+    """Return the distances in meters from the start to the next voxel borders.
+
+    The shape is (3, k, n).
 
     For light that has left a grid for good, as determined from `inside` (k, n), there are no more
     borders, and `rays.shift` is set to inf.

@@ -93,7 +93,10 @@ class BatchPoints:
 
     @cached_property
     def counts(self) -> Ints:
-        """Number of returns in each scan. Shape (scans,)."""
+        """Number of returns in each scan.
+
+        The shape is (scans,).
+        """
         cuts = np.searchsorted(self.pulse_returns.ray, self._first_rays)
         return np.diff(np.append(cuts, len(self))).astype(np.int64)
 
@@ -168,12 +171,18 @@ class BatchPoints:
 
     @property
     def origins(self) -> Floats:
-        """Origins of the rays in the scene frame, in meters. Shape (n, 3)."""
+        """Origins of the rays in the scene frame, in meters.
+
+        The shape is (n, 3).
+        """
         return np.broadcast_to(self._rays[0], (len(self), 3))
 
     @property
     def directions(self) -> Floats:
-        """Unit directions in the scene frame. Shape (n, 3)."""
+        """Unit directions in the scene frame.
+
+        The shape is (n, 3).
+        """
         return self._rays[1]
 
     @property
@@ -183,7 +192,9 @@ class BatchPoints:
 
     @cached_property
     def positions(self) -> Floats:
-        """End points of the rays in the scene frame, in meters. Shape (n, 3).
+        """End points of the rays in the scene frame, in meters.
+
+        The shape is (n, 3).
 
         Points that a frozen sensor sends again stay fixed in the sensor frame, and so move with the
         sensor.
@@ -205,7 +216,10 @@ class BatchPoints:
 
     @cached_property
     def ray_origins(self) -> Floats:
-        """Origins of the rays in the survey's point coordinates, in meters. Shape (n, 3)."""
+        """Origins of the rays in the survey's point coordinates, in meters.
+
+        The shape is (n, 3).
+        """
         if self.survey.coordinates == "sensor":
             return self._in_sensor(np.zeros(len(self)))
         return self._moved_with_frozen_sensor(self.origins) + self.scene.origin
@@ -237,7 +251,10 @@ class BatchPoints:
 
     @cached_property
     def cells(self) -> Ints32:
-        """Positions as integer multiples of the survey's precision. Shape (3, n)."""
+        """Positions as integer multiples of the survey's precision.
+
+        The shape is (3, n).
+        """
         world = self.survey.coordinates == "world"
         scaled = (self.positions if world else self.sensor_positions) / self.survey.precision_m
         cells = np.empty((3, len(self)), np.int32)
@@ -275,7 +292,10 @@ class BatchPoints:
 
     @cached_property
     def _sensor_directions(self) -> Floats:
-        """Unit directions in the sensor frame. Shape (n, 3)."""
+        """Unit directions in the sensor frame.
+
+        The shape is (n, 3).
+        """
         return self._to_sensor(self._pattern.directions[self._pattern_rows])
 
     @cached_property
@@ -390,7 +410,9 @@ class BatchPoints:
 
     @cached_property
     def normals(self) -> Floats:
-        """Unit normals on the side that was hit, in the frame of the survey's points. Shape (n, 3).
+        """Unit normals on the side that was hit, in the frame of the survey's points.
+
+        The shape is (n, 3).
 
         Values are NaN for returns without a surface, for leaves within a crown, and for ghosts.
         """

@@ -77,7 +77,10 @@ class LightPaths:
 
 
 class CastLight(NamedTuple):
-    """Light that hits surfaces, and the triangles that it hits, as arrays of shape (n,)."""
+    """Light that hits surfaces, and the triangles that it hits.
+
+    All arrays have shape (n,).
+    """
 
     light: LightPaths
     # Distance in meters from which on the light can hit leaves: the sensor's minimum range or, for
@@ -136,7 +139,9 @@ class SurfaceCrossings(NamedTuple):
 
 
 class OnwardRows(NamedTuple):
-    """Rows of light that continues, as arrays of shape (k,).
+    """Rows of light that continues.
+
+    All arrays have shape (k,).
 
     Light that is divided has two rows.
     """

@@ -44,7 +44,10 @@ SLACK_NS = 10.0  # largest error of the estimated time at which a pulse reaches 
 
 
 class ReceivedPulses(NamedTuple):
-    """Pulses of other sensors that rays receive, as arrays of shape (k,)."""
+    """Pulses of other sensors that rays receive.
+
+    All arrays have shape (k,).
+    """
 
     row: Indices  # rows of the receiving rays
     distance: Floats  # apparent distance of the pulse, meters
@@ -65,7 +68,10 @@ class _WaitingRays(NamedTuple):
 
 
 class _Spots(NamedTuple):
-    """Points on surfaces that the pulses of a sensor illuminate, as arrays of shape (n,)."""
+    """Points on surfaces that the pulses of a sensor illuminate.
+
+    All arrays have shape (n,).
+    """
 
     time: Floats  # when the pulse illuminates the spot, nanoseconds since the start of the station
     position: Floats  # (n, 3), meters, scene frame

@@ -21,7 +21,10 @@ PEAK = Purpose(21, "energy of a false alarm")
 
 
 class FalseAlarms(NamedTuple):
-    """False alarms of rays, as arrays of shape (k,)."""
+    """False alarms of rays.
+
+    All arrays have shape (k,).
+    """
 
     row: Indices  # rows of the rays that have the alarms
     time_s: Floats  # time since the receiver opened, seconds

@@ -375,7 +375,10 @@ class Media:
 
 
 class LightInGrids(NamedTuple):
-    """Light that passes voxel grids, as arrays of shape (k,)."""
+    """Light that passes voxel grids.
+
+    All arrays have shape (k,).
+    """
 
     row_indices: Indices  # rows of the light
     meters: Floats  # distance to the leaf that the light hits, or inf
@@ -398,7 +401,10 @@ class Refraction(NamedTuple):
 
 
 class Leaves(NamedTuple):
-    """Leaves that light hits, as arrays of shape (k,)."""
+    """Leaves that light hits.
+
+    All arrays have shape (k,).
+    """
 
     row_indices: Indices  # rows of the light
     meters: Floats  # distance from the start of the span to the leaf

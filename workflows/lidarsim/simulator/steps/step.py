@@ -290,7 +290,9 @@ class PulseBatch:
 
     @cached_property
     def central_rays(self) -> tuple[Floats, Floats]:
-        """Origins in meters and directions of each beam's central sub-ray. Shape (n, 3).
+        """Origins in meters and directions of each beam's central sub-ray.
+
+        The shape is (n, 3).
 
         The central sub-ray is the first of each beam. Both arrays are in the scene frame.
         """
