@@ -369,7 +369,7 @@ class Material(FileSection):
 
 
 def _fits(name: str, patterns: str | Sequence[str] | None) -> bool:
-    """Return whether a name matches any of the patterns, or the patterns are None."""
+    """Return whether a name matches any of the patterns. None matches every name."""
     return patterns is None or any(
         name == pattern or fnmatchcase(name, pattern) for pattern in patterns
     )
@@ -807,10 +807,9 @@ def glossy_reflection(cosine: Floats, roughness: Floats) -> Floats:
 def fresnel(cosine: Any, index: Any = GLASS_INDEX) -> Any:
     """Return the fraction of unpolarized light that a surface reflects.
 
-    The fraction follows from Fresnel's equations.
-
-    `index` is the refractive index behind the surface divided by the index in front of it. If it is
-    less than 1, all light is reflected at grazing angles.
+    The fraction follows from Fresnel's equations. `index` is the refractive index behind the
+    surface divided by the index in front of it. If it is less than 1, all light is reflected at
+    grazing angles.
     """
     inside = np.sqrt(np.maximum(1 - (1 - cosine**2) / (index * index), 0.0))
     perpendicular = (cosine - index * inside) / (cosine + index * inside)

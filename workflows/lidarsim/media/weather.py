@@ -297,7 +297,7 @@ class Air(NamedTuple):
         return np.square(REFERENCE_M / effective_m) * np.maximum(transmission, MIN_TRANSMISSION)
 
     def min_diameter_mm(self, particles: Particles, energy: float, distance: Floats) -> Floats:
-        """Return the minimum diameter, in millimeters, of particles that return an energy.
+        """Return the minimum diameter of a particle that returns the given energy, in millimeters.
 
         `distance` is in meters, and has shape (n,) like the result. The diameter is infinite at
         distances at which no particle returns the energy.

@@ -107,7 +107,7 @@ def read_bag(path: Path, topic: str | None, origin: Origin) -> TimedPoses:
 
 
 def _choose_label(labels: Sequence[str], topic: str | None) -> str:
-    """Return the label to read if the requested topic is not the exact name of one.
+    """Choose a topic or frame to read if none was requested by its exact name.
 
     The result is the only label, or the only frame if the topic is /tf. Raise LidarError if there
     is no unique match.

@@ -1,4 +1,4 @@
-"""Headings of platforms whose poses have no angles, and that face their direction of travel.
+"""Headings along the direction of travel, for platforms whose poses contain no angles.
 
 The heading is the direction of the horizontal velocity. It is undefined while a platform is
 stationary or moves vertically. The platform then keeps its heading, and turns to the next heading
@@ -156,7 +156,7 @@ class _Stops(NamedTuple):
     def at(self, times_s: Floats) -> Heading:
         """Return the headings at the given times, at which the platform is stationary.
 
-        Shape (k,).
+        Times and headings have shape (k,).
         """
         row = np.clip(np.searchsorted(self.arrivals_s, times_s, "right") - 1, 0, None)
         stops_s = self.departures_s.take(row)

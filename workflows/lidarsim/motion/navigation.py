@@ -566,9 +566,7 @@ def _geocentric(
 ) -> tuple[Floats, Floats, Floats]:
     """Convert local positions to geocentric coordinates in meters.
 
-    Each coordinate has shape (k,).
-
-    The parameters are those of `to_geodetic`.
+    Each coordinate has shape (k,). The parameters are those of `to_geodetic`.
     """
     sp, cp = sin_cos_of(math.radians(origin[0]))
     sl, cl = sin_cos_of(math.radians(origin[1]))
@@ -603,7 +601,10 @@ def from_geodetic(coordinates: Floats, origin: tuple[float, float, float]) -> Fl
 
 
 def _cartesian(coordinates: Floats) -> Floats:
-    """Convert geodetic to geocentric coordinates in meters, both of shape (k, 3)."""
+    """Convert geodetic coordinates to geocentric coordinates in meters.
+
+    Both have shape (k, 3).
+    """
     latitude, longitude, height = coordinates.T
     sp, cp = sin_cos(np.radians(latitude))
     sl, cl = sin_cos(np.radians(longitude))

@@ -16,10 +16,8 @@ _ROUNDS = 8
 def rotations_of(angles_deg: Floats) -> Floats:
     """Convert yaw, pitch and roll in degrees to rotation matrices.
 
-    The rotations are applied in the aerospace order.
-
-    Angles of shape (k, 3) result in matrices of shape (k, 3, 3), and angles of shape (3,) in a
-    single matrix of shape (3, 3).
+    The angles are applied in the aerospace order. Angles of shape (k, 3) result in matrices of
+    shape (k, 3, 3), and angles of shape (3,) in a single matrix of shape (3, 3).
     """
     angles = np.radians(angles_deg.T)
     (sy, sp, sr), (cy, cp, cr) = sin_cos(angles)

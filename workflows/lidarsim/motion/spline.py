@@ -120,9 +120,8 @@ def _reduce(equations: Floats) -> None:
 class _Polynomials(NamedTuple):
     """Coefficients of polynomials of degree five.
 
-    Each has shape (d, m).
-
-    The argument of the polynomials is the fraction of the segment, from 0 to 1.
+    Each has shape (d, m). The argument of the polynomials is the fraction of the segment, from 0 to
+    1.
     """
 
     constant: Floats

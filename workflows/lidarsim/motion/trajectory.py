@@ -88,10 +88,7 @@ class Pose(FileSection):
         return np.eye(3) if self.rotation is None else self.rotation
 
     def compose(self, mount: Pose) -> Pose:
-        """Return the pose of an instrument that is mounted at `mount` on a platform.
-
-        This pose is the pose of the platform.
-        """
+        """Return the pose of an instrument mounted at `mount` on a platform with this pose."""
         if mount == CENTER:
             return self
         rotation = self.rotation_matrix
@@ -281,7 +278,7 @@ def velocities(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats
 
 @dataclass(frozen=True)
 class Stations:
-    """A trajectory of a sensor that is stationary at one pose after another."""
+    """A trajectory of a sensor that scans from one stationary pose after another."""
 
     at: tuple[Pose, ...]
     moves: ClassVar[bool] = False
@@ -312,7 +309,7 @@ class Stations:
 
 @dataclass(frozen=True, eq=False)
 class StaticPose:
-    """A trajectory that stays at a single pose, which a rotation matrix defines.
+    """A trajectory that stays at a single pose, given by a position and a rotation matrix.
 
     Attributes
     ----------

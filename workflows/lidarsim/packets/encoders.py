@@ -53,7 +53,7 @@ class Datagrams:
 
 @dataclass(frozen=True, eq=False)
 class PacketSource:
-    """Properties of a sensor and its survey that packets contain in addition to the shots."""
+    """Properties of a sensor and its survey that, besides the shots, determine the packets."""
 
     sensor: Sensor
     mode: str  # mode of the reported returns (`Returns`)

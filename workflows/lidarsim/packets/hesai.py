@@ -145,7 +145,7 @@ class HesaiEncoder(PacketEncoder):
         return clock == "ptp"
 
     def _packets(self, shots: Shots) -> Records:
-        """Return the data packets of shots, which fill whole packets, as records."""
+        """Encode shots as data packets, which the shots must fill completely."""
         layout = self._layout
         packets = np.zeros(len(shots) // self._firings, layout.packet)
         if layout.header:

@@ -211,7 +211,7 @@ class LivoxEncoder(PacketEncoder):
         self.data_type = data_type
 
     def _points(self, shots: Shots) -> Datagrams:
-        """Return the point packets of shots, which fill whole packets."""
+        """Encode shots as point packets, which the shots must fill completely."""
         data_type = int(self.data_type)  # a service thread may change it meanwhile
         kind = CARTESIAN[data_type]
         firings = np.arange(len(shots)).reshape(-1, self._firings)

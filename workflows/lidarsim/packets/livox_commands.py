@@ -137,9 +137,7 @@ def _checksum(data: bytes) -> int:
 def parse_values(data: bytes) -> dict[int, bytes]:
     """Parse the parameters in a set request.
 
-    Raises CommandRefusedError if they are truncated.
-
-    The result maps keys to values.
+    The result maps keys to values. Raises CommandRefusedError if the parameters are truncated.
     """
     values = {}
     offset = _COUNT.size

@@ -367,7 +367,7 @@ class OusterEncoder(PacketEncoder):
         return OusterApi(address, destination, send_to, self.metadata(), ports)
 
     def _rest_of_packets(self) -> list[Datagrams]:
-        """Encode the columns that wait for further columns as a packet, and discard them."""
+        """Encode the remaining columns as a packet, and discard them."""
         rest = self._rest
         self._rest = None
         return [] if rest is None else self._lidar(rest)
@@ -533,9 +533,8 @@ class OusterDecoder(PacketDecoder):
     def recognizes(payload: bytes) -> bool:
         """Return whether a datagram has the size and the type of a lidar packet.
 
-        The type is not checked for the profile LEGACY, which has none.
-
-        All profiles are recognized, including profiles that cannot be encoded here.
+        Packets of the profile LEGACY have no type, so only their size is checked. All profiles are
+        recognized, including profiles that cannot be encoded here.
         """
         size = len(payload)
         if size in _LEGACY_BYTES:

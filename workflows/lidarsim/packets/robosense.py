@@ -203,7 +203,7 @@ class RobosenseEncoder(PacketEncoder):
         return []
 
     def _msop(self, shots: Shots) -> Datagrams:
-        """Return the measurement packets of shots, which fill whole packets."""
+        """Encode shots as measurement packets, which the shots must fill completely."""
         firings = np.arange(len(shots)).reshape(-1, self._firings)
         packets = np.zeros(len(firings), self._model.msop)
         packets["id"] = np.frombuffer(self._model.header, np.uint8)
@@ -245,6 +245,8 @@ class RobosenseEncoder(PacketEncoder):
 
     def _difop(self, shots: Shots, until_ns: int) -> Datagrams:
         """Return the device data packets that are due by a given time.
+
+        The first packet of a survey is due at the start of its first shots.
 
         The first packet is due at the first of the first shots.
         """

@@ -42,7 +42,7 @@ _ENDS_WITHIN_S = 2.0  # time limit for the process to exit after SIGTERM
 
 @dataclass(frozen=True)
 class Lateness:
-    """Number of datagrams that were sent, and a histogram of their delays."""
+    """Number of datagrams that were sent, and a histogram of how late they were."""
 
     sent: int = 0
     limits_ms: tuple[float, ...] = ()  # upper limits of the bins

@@ -109,7 +109,7 @@ class VelodyneEncoder(PacketEncoder):
         return VelodyneApi(address, destination, send_to, state, ports)
 
     def _data(self, shots: Shots) -> Datagrams:
-        """Return the data packets of shots, which fill whole packets."""
+        """Encode shots as data packets, which the shots must fill completely."""
         firings = np.arange(len(shots)).reshape(-1, self._firings)
         packets = np.zeros(len(firings), _PACKET)
         packets["mode"] = self._mode
@@ -121,7 +121,7 @@ class VelodyneEncoder(PacketEncoder):
         return Datagrams(payloads, last_ns + self.firing_interval_ns, self._port)
 
     def _stamps_us(self, first_ns: Ints) -> Ints:
-        """Return packet timestamps in µs from the start times of the packets' first firings."""
+        """Return packet timestamps in µs past the hour, from the start times of first firings."""
         settings = self.source.settings
         offset_ns = 0.0
         if len(settings.lasers) > _BLOCKS * _BLOCK_LASERS // 4:
@@ -211,7 +211,9 @@ class VelodyneDecoder(PacketDecoder):
                 yield datagram
 
     def _is_hdl64e(self, sensor: int) -> bool:
-        """Return whether the last two bytes of packets vary, as only in packets of an HDL-64E.
+        """Return whether a sensor is an HDL-64E, whose packets end with two varying bytes.
+
+        The bytes transmit the state of the sensor.
 
         The bytes transmit the state of the sensor.
         """

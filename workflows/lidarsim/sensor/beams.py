@@ -23,7 +23,7 @@ MAX_CHANNELS = 65_535  # limit of the uint16 column `channel`
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """Beams of a sensor. Each of them is fired once per firing.
+    """Beams of a sensor, each of which is fired once per firing.
 
     Channel 0 is the first beam, which is usually the lowest.
 

@@ -38,7 +38,7 @@ class Prism:
 
 @dataclass(frozen=True)
 class TurningMirror:
-    """A plane mirror behind prisms that rotates about their axis."""
+    """A plane mirror behind the prisms, which rotates about their axis."""
 
     tilt_deg: Annotated[float, Field(gt=0, lt=90)]  # angle between the normal and the axis
     rpm: float  # revolutions per minute about the axis, from x to y of the sensor
@@ -172,7 +172,7 @@ def _refract(rays: Floats, normals: Floats, ratio: float) -> Floats:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ListedSensor(Sensor):
-    """A sensor that fires the rays of a list one by one, for example of a manufacturer's ray list.
+    """A sensor that fires the rays of a list, such as a manufacturer's ray list, one by one.
 
     The list is repeated indefinitely. The head divides the list into time steps, but the times and
     azimuths of the head are not used.

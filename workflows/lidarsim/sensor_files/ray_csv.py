@@ -45,7 +45,7 @@ def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
 
 
 def is_ray_table(text: str) -> bool:
-    """Return whether a text is a ray table, which the name of its time column identifies."""
+    """Return whether a text is a ray table, which is recognized by its time column."""
     lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
     return TIME_COLUMN in next(lines, "").split(",")
 

@@ -70,7 +70,7 @@ def parsed_header(text: str | bytes) -> dict[str, Any]:
 
 
 def columns_of(rays: RayList) -> dict[str, Floats | Ints]:
-    """Return the columns of `COLUMNS` for a list of rays."""
+    """Return the values of the columns in `COLUMNS` for a list of rays."""
     timed = rays.with_times()
     assert timed.times_ns is not None  # `with_times` sets the times
     angles = (rays.azimuths_deg, rays.elevations_deg)

@@ -113,7 +113,7 @@ def _grid(rays: RayList) -> tuple[_Angles, _Angles]:
 
 
 class _Levels(NamedTuple):
-    """Distinct angles, and the index of the angle of each ray."""
+    """Distinct angles, and the index of each ray's angle."""
 
     angles_deg: Floats  # (k,), ascending
     of_ray: Ints  # (n,): index into `angles_deg` for each ray

@@ -58,7 +58,7 @@ _ON_SENSORS = " To load a sensor model, use load_sensor('velodyne/vlp16')."
 
 
 def nanoseconds(moment: datetime) -> int:
-    """Return the nanoseconds since 1970-01-01 UTC for a timezone-aware datetime."""
+    """Convert a timezone-aware datetime to nanoseconds since 1970-01-01 UTC."""
     return (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
 
 
@@ -144,7 +144,7 @@ class ScanSpec:
         return (self.firings[1] - self.firings[0]) * self.channels
 
     def shifted(self, start_ns: int, random_offset: int) -> ScanSpec:
-        """Return a copy with a new start of the station and a new offset of the random numbers."""
+        """Return a copy with a new station start and a new offset for random numbers."""
         spec = object.__new__(type(self))  # five times as fast as `replace`
         vars(spec).update(vars(self), start_ns=start_ns, random_offset=random_offset)
         return spec
@@ -345,7 +345,7 @@ class Survey(CloudOptions, Weather):
         return html_table(rows.items()) + html_picture(self)
 
     def _fill_in(self, name: str, default: Returns | Noise) -> None:
-        """Set the returns or the noise, if unset, from the sensors or the default."""
+        """Fill in unset returns or noise with those of the sensors or with the default."""
         if getattr(self, name) is not None:
             return
         if self.sensors:

@@ -265,7 +265,7 @@ def _rest_pose(model: Any, body: int) -> tuple[Floats, Floats]:
 
 
 def describe_soft_bodies(model: Any) -> str:
-    """Describe the number of flexes and skins in a model, which are invisible to a lidar.
+    """Describe the number of flexes and skins in a model. A lidar cannot see them.
 
     The result is an empty string if the model has none.
     """

@@ -256,5 +256,5 @@ class ActorTrajectories(tuple[Trajectory, ...]):
 
 
 def _no_tracks() -> _StraightTracks:
-    """Return an empty set of tracks, which fixes the shapes of concatenated arrays."""
+    """Return an empty set of tracks, so that concatenation always has an operand."""
     return _static_tracks([], [])

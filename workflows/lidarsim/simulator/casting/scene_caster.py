@@ -57,10 +57,9 @@ class _NearestHits(NamedTuple):
 class _ActorShapes(NamedTuple):
     """Distinct shapes of the actors in a scene.
 
-    There are s shapes and a actors.
-
-    Actors with the same mesh share a shape. A mesh has a part for its opaque triangles and a part
-    for each mask (`split_by_masks`). Each part is an instance in the shape's caster.
+    There are s shapes of a actors, because actors with the same mesh share a shape. A mesh has a
+    part for its opaque triangles and a part for each mask (`split_by_masks`). Each part is an
+    instance in the shape's caster.
     """
 
     casters: tuple[RayCaster | DeformingMesh, ...]  # (s,): in the mesh frame

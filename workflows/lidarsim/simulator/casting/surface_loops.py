@@ -444,7 +444,7 @@ def find_runs(trajectory, times, first_rows, run_numbers):
 
 @inlined
 def _segment_at(tracks, track, time_s):
-    """Find the last segment of a track that has started by a given time, using binary search."""
+    """Find a track's last segment that starts no later than `time_s`, by binary search."""
     segment = tracks.first[track]
     later_segments = tracks.segments[track] - 1
     while later_segments:

@@ -56,9 +56,8 @@ class TriangleKinds:
     def _kind_in_object(self) -> Ints32 | None:
         """Kind of each stored triangle, numbered within its object.
 
-        The shape is (f,).
-
-        None if each object has a single kind, whose number is then the number of the object.
+        The shape is (f,). The value is None if each object has a single kind, whose number is then
+        the number of the object.
         """
         if len(self.material_kinds.object) == len(self.material_kinds.names):
             return None
@@ -93,11 +92,9 @@ class TriangleKinds:
     def _material_kind(self) -> Ints32:
         """Number of the first kind that has the same object and material as each kind.
 
-        Shape (kinds,).
-
-        Several material names in an object's files may match a single material of the survey. Their
-        faces then form a single kind, so that a body of water or leaves is closed even if its faces
-        have several names.
+        The shape is (kinds,). Several material names in an object's files may match a single
+        material of the survey. Their faces then form a single kind, so that a body of water or
+        leaves is closed even if its faces have several names.
         """
         kinds = self.material_kinds
         first = first_matches(self._materials, self.material_kinds)

@@ -194,15 +194,13 @@ class BatchPoints:
     def positions(self) -> Floats:
         """End points of the rays in the scene frame, in meters.
 
-        The shape is (n, 3).
-
-        Points that a frozen sensor sends again stay fixed in the sensor frame, and so move with the
-        sensor.
+        The shape is (n, 3). Points that a frozen sensor sends again stay fixed in the sensor frame,
+        and so move with the sensor.
         """
         return self._moved_with_frozen_sensor(self._scene_positions)
 
     def _moved_with_frozen_sensor(self, points: Floats) -> Floats:
-        """Move points with a frozen sensor to its pose in the sweep that the old sweep replaces.
+        """Move points along with a frozen sensor, from its old pose to its current pose.
 
         Points are in the scene frame. If the sensor is not frozen, they are returned unchanged.
         """
@@ -243,7 +241,7 @@ class BatchPoints:
     def _scene_positions(self) -> Floats:
         """End points of the rays at their firing times, in the scene frame, in meters.
 
-        Shape (n, 3).
+        The shape is (n, 3).
         """
         origins, directions = self._rays
         positions = directions * self.range[:, None]
@@ -302,7 +300,7 @@ class BatchPoints:
     def sensor_positions(self) -> Floats:
         """End points of the rays in the sensor frame at the firing time, in meters.
 
-        Shape (n, 3).
+        The shape is (n, 3).
         """
         return self._in_sensor(self.range)
 
@@ -357,12 +355,12 @@ class BatchPoints:
 
     @property
     def triangle(self) -> Ints32:
-        """Triangle number of each return in the scene."""
+        """Number of the scene triangle that each return comes from."""
         return self.pulse_returns.triangle
 
     @cached_property
     def object(self) -> Ints32:
-        """Object number of each return in the scene."""
+        """Number of the scene object that each return comes from."""
         return self._surfaces.triangles.objects(self.pulse_returns.triangle)
 
     @cached_property
@@ -412,9 +410,8 @@ class BatchPoints:
     def normals(self) -> Floats:
         """Unit normals on the side that was hit, in the frame of the survey's points.
 
-        The shape is (n, 3).
-
-        Values are NaN for returns without a surface, for leaves within a crown, and for ghosts.
+        The shape is (n, 3). Values are NaN for returns without a surface, for leaves within a
+        crown, and for ghosts.
         """
         normals, _ = self._facing_normals
         if self.survey.coordinates == "sensor":

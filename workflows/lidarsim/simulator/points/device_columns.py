@@ -418,7 +418,10 @@ class _ColumnTransfer:
         return _TransferBuffers(kernel, kernel_arguments, outbox, columns, hits)
 
     def _kernel_arguments(self, cupy: Any) -> tuple[Any, ...]:
-        """Return the kernel arguments between the hits and the columns, as device arrays."""
+        """Return the kernel arguments that follow the hits and precede the columns.
+
+        They are device arrays and scalars.
+        """
         maker = self._maker
         specs = self._specs
         sensor = maker.survey.carried[specs[0].sensor].sensor
@@ -460,7 +463,10 @@ class _TransferBuffers:
 
 @lru_cache(maxsize=16)
 def _kernel(cupy: Any, device: int) -> Any:
-    """Compile columns.cu for the current device, which has the number `device`."""
+    """Compile columns.cu for the current device, which has the number `device`.
+
+    The compiled kernel is cached for each device.
+    """
     code = importlib.resources.files(__package__).joinpath("columns.cu").read_text("utf-8")
     module = cupy.RawModule(code=f'#line 1 "columns.cu"\n{code}', options=OPTIONS)
     return module.get_function("columns")

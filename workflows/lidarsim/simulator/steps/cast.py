@@ -141,9 +141,7 @@ class SurfaceCrossings(NamedTuple):
 class OnwardRows(NamedTuple):
     """Rows of light that continues.
 
-    All arrays have shape (k,).
-
-    Light that is divided has two rows.
+    All arrays have shape (k,). Light that is divided has two rows.
     """
 
     row_indices: Indices
@@ -238,9 +236,8 @@ class CastStep(PulseStep):
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """Return the memory of sub-rays and hits in bytes.
 
-        More memory is required if light continues beyond hits.
-
-        It consists of the memory used while rays are cast and while returns are counted (`Memory`).
+        The memory is larger if light continues beyond hits. It consists of the memory used while
+        rays are cast and while returns are counted (`Memory`).
         """
         subray = 200 if not setup.has_onward_light else 1350 if setup.refracts else 650
         casting = (subray + 200 * setup.has_velocities) * sizes.subrays + 30 * sizes.return_count
@@ -333,7 +330,7 @@ class CastStep(PulseStep):
         return CastLight(light, start_m, hits.distance, hits.triangle), rays
 
     def _light_of_rays(self, ray: Ints, rays: Floats, batch: PulseBatch) -> LightPaths:
-        """Return the light of the sub-rays that hit a surface, as it leaves the sensor.
+        """Return the light at the sensor for the sub-rays that hit a surface.
 
         `rays` has all sub-rays of the batch (`_cast_first`).
         """
@@ -410,7 +407,7 @@ class CastStep(PulseStep):
         )
 
     def _meet_leaves(self, cast: CastLight, batch: PulseBatch) -> tuple[CastLight, Leaves | None]:
-        """Shorten light where it hits leaves, and return it together with the leaves.
+        """Shorten light paths at the leaves that they hit. Return the paths and the leaves.
 
         The leaves are None without media.
         """

@@ -437,7 +437,7 @@ class LightInMedia:
         return 1.0 if self.differentials is None else self.differentials.index
 
     def optical_length(self, step: Floats) -> Floats:
-        """Return the optical lengths of steps, both in meters."""
+        """Convert the lengths of steps to optical path lengths, both in meters."""
         return step if self.differentials is None else step * self.differentials.index
 
     def meet_leaves(

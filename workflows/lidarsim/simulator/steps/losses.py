@@ -26,7 +26,7 @@ class DirtStep(PulseStep):
         return bool(setup.faults("dirt"))
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Reduce the energies of the hits by dirt, and replace the hits of the batch."""
+        """Return the hits with their energies reduced by dirt, and store them in the batch."""
         sensor = self.setup.sensor
         beams = np.arange(batch.start, batch.stop)
         transmission = np.ones(len(beams))

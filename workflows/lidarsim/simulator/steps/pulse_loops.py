@@ -83,7 +83,7 @@ def scan_row(scan_starts, beam, row):
 
 @compiled()
 def thin_out(ray, scan_starts, keep_every, hit_counts, row_indices, number, return_counts):
-    """Count the returns of each scan, and select every `keep_every`-th of them.
+    """Count the returns of each scan, and select every `keep_every`-th return.
 
     Scans begin at the rays `scan_starts`, and their counts are added to `hit_counts`. For each kept
     return, the function writes the row to `row_indices`, the number in the pulse (from 1) to
@@ -111,7 +111,7 @@ def thin_out(ray, scan_starts, keep_every, hit_counts, row_indices, number, retu
 
 @inlined
 def _half_way(hit, neighbor, inverse_distance, neighbors):
-    """Return the range, in meters, of a hit's plane half-way to the direction of a neighboring hit.
+    """Return the range of a hit's plane, in meters, midway to the ray of a neighboring hit.
 
     `hit` and `neighbor` are rows in `SubrayNeighbors`, and `inverse_distance` is that of `hit`, in
     1/m.

@@ -82,7 +82,10 @@ def range_walk(noise: Noise, energy: Floats) -> Floats:
 
 
 def lasting_errors(noise: Noise, channel: Integers, times_ns: Ints) -> Floats:
-    """Return the lasting range errors, in meters, of channels at times since the survey start."""
+    """Return the lasting range errors, in meters, for the given channels and times.
+
+    `times_ns` are nanoseconds since the start of the survey.
+    """
     biases = np.asarray(noise.channel_bias_m, np.float64)
     if not biases.ndim:
         channels = np.arange(channel.max(initial=0) + 1)

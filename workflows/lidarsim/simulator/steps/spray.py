@@ -118,7 +118,7 @@ class SprayStep(PulseStep):
         return Memory(casting=300 * sizes.beams + 30 * sizes.subrays)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Add hits on spray to the hits of a batch, and attenuate the light that spray absorbs."""
+        """Add hits on spray to the hits of a batch, and attenuate light that crosses spray."""
         if self._clump_distribution is None:
             return returns
         from . import pulse_loops, spray_loops  # imported here: numba takes half a second to import

@@ -292,9 +292,8 @@ class PulseBatch:
     def central_rays(self) -> tuple[Floats, Floats]:
         """Origins in meters and directions of each beam's central sub-ray.
 
-        The shape is (n, 3).
-
-        The central sub-ray is the first of each beam. Both arrays are in the scene frame.
+        The shape is (n, 3). The central sub-ray is the first of each beam. Both arrays are in the
+        scene frame.
         """
         subray_indices = np.arange(self.stop - self.start) * self.subrays_per_beam
         origins, directions = self.subray_poses.rays(self.beams, subray_indices, self.window[0])

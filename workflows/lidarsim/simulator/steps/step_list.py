@@ -59,7 +59,7 @@ def steps_of(setup: Setup) -> list[type[PulseStep]]:
 
 
 def received_causes() -> list[int]:
-    """Return the indices in `CAUSES` of the causes of returns that the receiver adds.
+    """Return the causes of returns that the receiver adds, as indices into `CAUSES`.
 
     Such returns do not come from a point that reflects light, so they have no velocity.
     """

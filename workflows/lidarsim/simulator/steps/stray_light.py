@@ -130,7 +130,7 @@ class StrayLightStep(PulseStep):
         return light
 
     def _triangles(self, cluster: _RetroCluster, table: MaterialTable) -> RetroTriangles:
-        """Return a cluster's triangles and their energies at normal incidence, for loops."""
+        """Return a cluster's triangles together with their energies at normal incidence."""
         from .stray_loops import RetroTriangles
 
         white = np.ones(len(cluster.triangles))

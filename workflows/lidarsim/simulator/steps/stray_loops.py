@@ -260,7 +260,7 @@ def _choose_triangles(middles, ray, chosen):
 
 @inlined
 def _add_light(k, t, ray, triangles, limits, strongest):
-    """Replace row `k` of `strongest` by the light of triangle `t` if that is stronger."""
+    """Replace row `k` of `strongest` with the light of triangle `t` if that is stronger."""
     middles = triangles.middles
     tangent, nearest = _nearest_point(triangles.corners, t, ray)
     angle = math.degrees(arctan2(tangent, 1.0))
@@ -281,7 +281,7 @@ def _add_light(k, t, ray, triangles, limits, strongest):
 
 @compiled()
 def find_stray_light(rays, triangles, limits, chosen, strongest):  # noqa: PLR0914 - a compiled loop
-    """Replace rows of `strongest` by the light of `triangles` where that is stronger.
+    """Replace rows of `strongest` with the light of `triangles` where that is stronger.
 
     `rays` is a `RayCells`, `triangles` a `RetroTriangles` in the frame of the rays, `limits` a
     `StrayLimits`, and `strongest` a `StrayLight`. The light comes from the point on the triangles
