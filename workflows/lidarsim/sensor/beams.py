@@ -227,7 +227,7 @@ class Spin:
     def restrict_to(self, start: float, share: float) -> Mirror:
         """Return a head that only fires during part of each revolution.
 
-        Time 0 and firing 0 are at the start of this part. A time step contains the same share of
+        Time 0 and firing 0 are at the start of this part. A time step contains the same fraction of
         the firings as before, but at least one firing.
 
         Parameters

@@ -170,7 +170,7 @@ def _returns_per_pulse(setup: Setup) -> float:
     if mode == "all":
         added = sum(added_by_step)
     elif reports_two:
-        # The share of pulses to which a step adds a return, if returns are added independently.
+        # The fraction of pulses to which a step adds a return, if returns are added independently.
         added = sum(1 - float(exp(-count)) for count in added_by_step)
     if not (mode == "all" or reports_two) or not (subrays > 1 or setup.has_onward_light):
         return 1 + added

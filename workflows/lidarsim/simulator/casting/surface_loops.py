@@ -74,14 +74,14 @@ class WaterFilm(NamedTuple):
     """Film of water on surfaces."""
 
     level: float  # smallest z of a normal, on the visible side, for surfaces that hold water
-    wet: float  # share of these surfaces that is covered by water
+    wet: float  # fraction of these surfaces that is covered by water
     dry: Bools  # (kinds,): whether a kind of surface stays dry
 
 
 class OnwardOptics(NamedTuple):
     """Optical properties of n surface kinds that determine how light continues beyond a hit."""
 
-    specular: Floats  # share of light that is reflected specularly at normal incidence
+    specular: Floats  # fraction of light that is reflected specularly at normal incidence
     passes: Bools  # whether light passes through, as through glass
     # Whether light is not refracted because the surface bounds no refracting medium.
     straight: Bools
@@ -97,14 +97,14 @@ class OnwardHits(NamedTuple):
     kind: Ints32
     cosines: Floats  # cosines of incidence, of either sign
     film: Bools  # whether there may be water; empty without water
-    share: Floats  # share of the energy that is left, because light crosses each surface twice
+    share: Floats  # fraction of the energy that is left, because light crosses each surface twice
     distance: Floats  # optical path length from the sensor, meters
 
 
 class OnwardLimits(NamedTuple):
     """Thresholds for light that continues beyond a hit."""
 
-    wet: float  # share of surfaces with a film that is covered by water
+    wet: float  # fraction of surfaces with a film that is covered by water
     brightest: float  # largest energy that any surface returns from a distance of 10 m
     extinction: float  # 1/m
     faintest: float  # light is dropped if it cannot return more energy than this
@@ -291,10 +291,10 @@ def attenuate_energies(distance, extinction, energy):
 def apply_water_film(normals_z, cosines, kinds, shares, water, film, back):
     """Reduce the energies of hits on wet surfaces, and mark these hits in `film`.
 
-    `normals_z` are the z components of the normals, `shares` are the shares of light that surfaces
-    scatter, and `back` are the received energies, each of shape (n,). `water` is a `WaterFilm`. The
-    share `WaterFilm.wet` of each marked surface scatters light through water, whose surface
-    reflects a part of the light on the way in and on the way out.
+    `normals_z` are the z components of the normals, `shares` are the fractions of light that
+    surfaces scatter, and `back` are the received energies, each of shape (n,). `water` is a
+    `WaterFilm`. The fraction `WaterFilm.wet` of each marked surface scatters light through water,
+    whose surface reflects part of the light on the way in and on the way out.
     """
     level = water.level
     wet = water.wet
@@ -312,14 +312,14 @@ def divide_light(row_indices, reflected, hits, shares, optics, limits, onward_sh
     """Compute the transmitted and reflected fractions of light at hits, and drop faint light.
 
     `row_indices` (k,) are rows of the hits, `reflected` (k,) is True for light that the surface
-    reflects and False for light that it transmits, and `shares` (k,) are the shares of light that
-    the surfaces scatter. `hits` is an `OnwardHits`, `optics` an `OnwardOptics`, and `limits` an
-    `OnwardLimits`. Surfaces of refracting media do not divide light here, because
+    reflects and False for light that it transmits, and `shares` (k,) are the fractions of light
+    that the surfaces scatter. `hits` is an `OnwardHits`, `optics` an `OnwardOptics`, and `limits`
+    an `OnwardLimits`. Surfaces of refracting media do not divide light here, because
     `LightInMedia.cross` does that.
 
     The function overwrites `row_indices` and `reflected` with the light that is bright enough,
-    writes its share of the energy to `onward_share`, and returns the number of remaining rows. The
-    share counts each surface twice, because light crosses it on the way out and back.
+    writes its fraction of the energy to `onward_share`, and returns the number of remaining rows.
+    The fraction counts each surface twice, because light crosses it on the way out and back.
     """
     count = 0
     for j in range(len(row_indices)):

@@ -40,7 +40,7 @@ class SensorLight(NamedTuple):
 
     wavelength_nm: float
     extinction: float  # 1/m
-    wet: float = 0.0  # share of upward-facing surfaces that is covered by water
+    wet: float = 0.0  # fraction of upward-facing surfaces that is covered by water
 
 
 class IlluminatedHits(NamedTuple):

@@ -31,7 +31,9 @@ from ..steps.doppler import VELOCITY, radial_velocities
 from ..steps.step_list import received_causes
 
 BLOCK_HITS = 1 << 16  # number of hits whose normals are computed at a time
-MIN_REMAINING = 1e-30  # smallest share of light, which keeps quotients finite in single precision
+MIN_REMAINING = (
+    1e-30  # smallest fraction of light, which keeps quotients finite in single precision
+)
 
 
 class BatchPoints:

@@ -146,7 +146,7 @@ class OnwardRows(NamedTuple):
 
     row_indices: Indices
     reflected: Bools  # True if the light of the row is reflected, False if it is transmitted
-    share: Floats  # share behind the surface, as in `LightPaths.share`
+    share: Floats  # fraction of the energy behind the surface, as in `LightPaths.share`
 
 
 class Deflection(NamedTuple):
@@ -156,7 +156,7 @@ class Deflection(NamedTuple):
     """
 
     directions: Floats
-    share: Floats  # share behind the surface, as in `LightPaths.share`
+    share: Floats  # fraction of the energy behind the surface, as in `LightPaths.share`
     mirrored: Bools  # whether light is reflected, including total internal reflection
     twice_normals: Floats  # twice the normal where light is reflected, otherwise 0
 

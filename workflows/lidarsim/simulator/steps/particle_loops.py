@@ -20,7 +20,7 @@ class ParticleTables(NamedTuple):
 
     counts: Floats  # (k,): cumulative probabilities of 0, 1, … particles in a beam; the last is 1
     by_range: Floats  # (5, shares): rows as in `particles.DetectableParticles.by_range`
-    step_mm: float  # diameter that a share exp(-1) of the particles exceeds
+    step_mm: float  # diameter that a fraction exp(-1) of the particles exceeds
     exponential: Floats  # quantiles of the exponential distribution
 
 

@@ -48,7 +48,7 @@ PARTICLE_RANGE = Purpose(13, "range of a particle")
 PARTICLE_DIAMETER = Purpose(14, "diameter of a particle")
 PARTICLE_SUBRAY = Purpose(15, "sub-ray that hits a particle")
 AIR = CAUSES.index("air")
-QUANTILES = 1 << 16  # number of equal shares of a distribution in tables
+QUANTILES = 1 << 16  # number of equal parts of a distribution in tables
 CACHED_TABLES = 32  # cached because a scanner rebuilds its casters whenever an object is moved
 MAX_FOG_CELLS = 255  # cells of half a pulse length
 # Probabilities are summed up to this many standard deviations below and above the highest signal.
@@ -59,11 +59,11 @@ class DetectableParticles(NamedTuple):
     """Distribution of the detectable particles of one kind."""
 
     counts: Floats  # (k,): cumulative probabilities of 0, 1, … particles in a beam
-    # (5, QUANTILES), with a column for each equal share of the particles by range: ascending
+    # (5, QUANTILES), with a column for each equal fraction of the particles by range: ascending
     # distances in meters, smallest detectable diameters in mm, 1 - exp(-slope * (largest -
     # smallest)), energies of a particle of 1 mm, and energies of a particle that fills the beam.
     by_range: Floats
-    step_mm: float  # 1 / slope, the diameter that a share exp(-1) of the particles exceeds
+    step_mm: float  # 1 / slope, the diameter that a fraction exp(-1) of the particles exceeds
 
 
 class FogCells(NamedTuple):

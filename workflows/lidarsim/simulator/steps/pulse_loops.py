@@ -137,7 +137,7 @@ def continue_surfaces(begin, stop, marks, hits, gap_m, neighbors):  # noqa: C901
 
     The hits of the beam are rows `begin` to `stop` of `hits`, a `PulseHits`, and of `marks`, a
     `SurfaceMarks`. Only `solid` hits are considered. Two neighboring sub-rays hit the same surface
-    if the planes through their hits meet half-way between the hits, within `gap_m` or within half
+    if the planes through their hits meet halfway between the hits, within `gap_m` or within half
     of the distance between the hits. The inverse range of a plane is linear in the ray's direction,
     so two hits on one plane always meet, whatever the angle. The tolerance of half the distance
     allows for rough ground.

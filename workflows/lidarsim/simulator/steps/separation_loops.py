@@ -39,7 +39,7 @@ class Receiver(NamedTuple):
     gap_m: float  # half of the pulse length; closer hits form one return
     mode: int  # which returns are reported
     with_velocity: bool  # whether returns have velocities
-    dropout: float  # share of returns that are lost
+    dropout: float  # fraction of returns that are lost
     threshold: float  # energy at which half of the returns are detected; 0 without detection
     threshold_sigmas: float  # threshold in standard deviations of the noise
     quantiles: Floats  # quantiles of the normal distribution; empty without detection
@@ -48,7 +48,7 @@ class Receiver(NamedTuple):
 class _Detection(NamedTuple):
     """Detection settings of a `Receiver`, and the hash starts of its random numbers."""
 
-    dropout: float  # share of returns that are lost
+    dropout: float  # fraction of returns that are lost
     threshold: float  # energy at which half of the returns are detected; 0 without detection
     threshold_sigmas: float  # threshold in standard deviations of the noise
     quantiles: Floats  # pointer to the quantiles of the normal distribution

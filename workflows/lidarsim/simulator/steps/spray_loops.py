@@ -60,8 +60,8 @@ class ClumpTables(NamedTuple):
     """Tables of detectable clumps of spray (`particles.DetectableParticles`)."""
 
     mean: float  # detectable clumps per beam in air of density `Survey.spray_g_m3`
-    by_range: Floats  # (5, shares): columns of ascending range that hold equal shares of `mean`
-    step_mm: float  # diameter that a share exp(-1) of the drops exceeds
+    by_range: Floats  # (5, shares): columns of ascending range that hold equal fractions of `mean`
+    step_mm: float  # diameter that a fraction exp(-1) of the drops exceeds
     exponential: Floats  # quantiles of the exponential distribution
 
 

@@ -29,7 +29,7 @@ STRAY = Purpose(22, "energy noise of stray light")
 BLOOMING = CAUSES.index("blooming")
 NEAREST_TRIANGLES = 4  # number of a cluster's triangles, nearest by angle, compared with a ray
 CLUSTER_M = 1.0  # size of a cluster of triangles that are compared with rays together
-FAINTEST = 0.1  # fainter light, as a share of the detection threshold, is never detected
+FAINTEST = 0.1  # fainter light, as a fraction of the detection threshold, is never detected
 
 
 class StrayLightStep(PulseStep):

@@ -19,8 +19,8 @@ from ..casting.surface_loops import normal_incidence_energy
 
 CELL_RAYS = 1 << 8  # number of consecutive rays that are compared with retroreflectors at a time
 MAX_STRAY = math.radians(30.0)  # largest angle between a ray and stray light
-# Rays to an edge of a triangle are moved towards its center by this share of the distance, so that
-# they hit the triangle.
+# Rays to an edge of a triangle are moved towards its center by this fraction of the distance, so
+# that they hit the triangle.
 INWARDS = 0.02
 
 
@@ -48,7 +48,9 @@ class StrayLimits(NamedTuple):
     """Detection limits of stray light."""
 
     min_range_m: float
-    share_at_degree: float  # energy at an angle of 1 degree, as a share of the energy in the beam
+    share_at_degree: (
+        float  # energy at an angle of 1 degree, as a fraction of the energy in the beam
+    )
     faintest: float  # smallest energy that may be detected
     extinction: float  # 1/m
 
@@ -192,7 +194,7 @@ def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
         step = min(max(-(x * u + y * v) / max(u * u + v * v, 1e-300), 0.0), 1.0)
         tangent = math.sqrt((x + step * u) * (x + step * u) + (y + step * v) * (y + step * v))
         if tangent < min_tangent:
-            # A step on the plane corresponds to a different share of the edge in space.
+            # A step on the plane corresponds to a different fraction of the edge in space.
             share = step * p_depth / (step * p_depth + (1 - step) * q_depth)
             nearest = px + share * (qx - px), py + share * (qy - py), pz + share * (qz - pz)
             min_tangent = tangent

@@ -29,13 +29,13 @@ CLOSE = 1.0
 # Largest distance that a fit may move a Gaussian from its initial position.
 MOVES = 2.0
 
-FAINT = 0.01  # lowest peak that is found, as a share of the waveform's highest sample
-CURVED = 0.005  # smallest curvature times variance of a detectable Gaussian, as such a share
+FAINT = 0.01  # lowest peak that is found, as a fraction of the waveform's highest sample
+CURVED = 0.005  # smallest curvature times variance of a detectable Gaussian, as such a fraction
 TOGETHER = 4  # largest number of Gaussians that are fitted together
 STEPS = 30  # largest number of Levenberg-Marquardt steps
 GAIN = 1e-3  # smallest relative reduction of the sum of squares for which a fit continues
 ENOUGH = 1e-9  # sum of squares at which a fit stops
-HIGHEST = 1.2  # largest height of a Gaussian, as a share of the highest sample
+HIGHEST = 1.2  # largest height of a Gaussian, as a fraction of the highest sample
 _AREA = math.sqrt(2 * math.pi)  # area of a Gaussian of height and standard deviation 1
 _KEY_STEPS = 1024  # subdivisions of a sample for comparing the times of hits and peaks
 
@@ -121,8 +121,8 @@ class WaveReturnArrays(NamedTuple):
 class FitScratch(NamedTuple):
     """Scratch memory for fitting up to `TOGETHER` Gaussians to up to `length` samples.
 
-    Heights are shares of the highest sample. Positions and widths are in standard deviations of the
-    system waveform.
+    Heights are fractions of the highest sample. Positions and widths are in standard deviations of
+    the system waveform.
     """
 
     # (3, TOGETHER): heights, positions and widths, initially of the guess and finally of the fit.
@@ -146,7 +146,7 @@ class GaussianScratch(NamedTuple):
     curvature: Floats  # second differences of the samples
     minima: Ints  # samples at which the curvature has a minimum
     x: Floats  # samples of a piece, in standard deviations of the system waveform
-    y: Floats  # samples of a piece, as shares of the highest sample
+    y: Floats  # samples of a piece, as fractions of the highest sample
     time: Floats  # times of the Gaussians, in samples from range 0
     height: Floats  # heights in units of the samples
     width: Floats  # widths in standard deviations of the system waveform
@@ -477,7 +477,7 @@ def _join_gaussians(wave, scratch, count, stops, peaks):
     Return their number.
 
     The arguments are described in `SearchScratch`. A peak has the sum, mean and variance of its
-    Gaussians, and ends half-way to the next peak.
+    Gaussians, and ends halfway to the next peak.
     """
     sigma = wave.sigma
     time = scratch.time
