@@ -20,10 +20,10 @@ from ..sensor.beams import Beams
 from ..survey.survey import Mounted, Survey
 from .rig import Rig
 
-SAMPLE_RAYS = 500_000  # largest number of rays that `sample_survey` casts
-SAMPLE_SECTIONS = 500  # largest number of sections of consecutive scans that are sampled
-SECTION_SCANS = 40  # largest number of consecutive scans in a section
-RANGE_RAYS = 20_000  # largest number of rays that `sample_ranges` casts
+SAMPLE_RAYS = 500_000  # maximum number of rays that `sample_survey` casts
+SAMPLE_SECTIONS = 500  # maximum number of sections of consecutive scans that are sampled
+SECTION_SCANS = 40  # maximum number of consecutive scans in a section
+RANGE_RAYS = 20_000  # maximum number of rays that `sample_ranges` casts
 GOLDEN = 0.6180339887498949  # golden ratio minus 1
 
 

@@ -23,7 +23,7 @@ class ClippedMesh(NamedTuple):
 
     vertices: Floats  # (v, 3)
     faces: Ints  # (f, 3)
-    origin: Indices  # (f,): original triangle that each triangle is a part of, ascending
+    origin: Indices  # (f,): original triangle of which each triangle is part, ascending
 
 
 def box_planes(region: Floats, transform: Floats | None = None) -> Floats:

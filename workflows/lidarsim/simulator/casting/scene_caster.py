@@ -41,7 +41,7 @@ from .surfaces import SceneSurfaces
 from .visibility import static_key, unseen_objects
 
 AUTO_ADVICE = "The backend 'auto' selects one that is available."
-_MAX_ROOM_RAYS = 1 << 18  # largest number of rays that are stored for both casts: 13 MB
+_MAX_ROOM_RAYS = 1 << 18  # maximum number of rays that are stored for both casts: 13 MB
 _NEVER_NS = np.array([np.inf, -np.inf])  # presence of an actor that is never in the scene
 REACHED = 1e-3  # a ray reaches a point if it gets this close, as a fraction of the distance
 

@@ -72,7 +72,7 @@ class _Trees(NamedTuple):
     first_triangles: Ints32 | None
     # (r,): rows of the scene's instances that are the last r instances of the caster, ascending
     instance_indices: Ints
-    # {instance of the caster: original triangle that each clipped triangle is a part of}
+    # {instance of the caster: original triangle of which each clipped triangle is part}
     origins: dict[int, Indices]
 
     @property

@@ -30,7 +30,7 @@ from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 GHOST = CAUSES.index("ghost")
 MAX_PASSES = 16  # number of surfaces that light can pass before it is dropped
-MAX_LEAFY_PASSES = 64  # limit with crowns, because light passes the surface of a crown twice
+MAX_LEAFY_PASSES = 64  # limit with crowns, whose surface light passes twice
 MAX_REFLECTIONS = 2  # number of times that light can be reflected; each may divide the light
 
 
@@ -47,7 +47,7 @@ class LightPaths:
     times: Floats  # firing times, nanoseconds since the start of the survey; 0 without actors
     origins: Floats  # start points of the segments, meters
     directions: Floats  # unit vectors
-    # Share of the energy left by the earlier surfaces, on the way out and back; 1 at the sensor.
+    # Fraction of the energy left by the earlier surfaces, on the way out and back; 1 at the sensor.
     share: Floats
     optical_start: Floats  # optical path length from the sensor to the origins, meters
     # (n, 3, 3): product of the reflections so far, which maps fired directions to the directions of
@@ -118,7 +118,7 @@ class VisibleHits(NamedTuple):
     hits: PulseReturns  # k rows; these are all hits if there are no media
     normals: Floats  # (k, 3): normals of the hits, reflected back to match the fired directions
     transmits: Bools  # (n,): whether light continues through the surface
-    mirrors: Bools  # (n,): whether the surface reflects a part of the light specularly
+    mirrors: Bools  # (n,): whether the surface reflects part of the light specularly
 
 
 class SurfaceCrossings(NamedTuple):

@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 FOREIGN_PULSE = Purpose(23, "energy noise of a pulse from another sensor")
 CROSSTALK = CAUSES.index("crosstalk")
 CELL_RAYS = 1 << 6  # number of rays that are compared with a spot at a time
-FILTER_NM = 20.0  # largest difference of wavelengths that passes a receiver's filter
-SLACK_NS = 10.0  # largest error of the estimated time at which a pulse reaches the receiver
+FILTER_NM = 20.0  # maximum difference of wavelengths that passes a receiver's filter
+SLACK_NS = 10.0  # maximum error of the estimated time at which a pulse reaches the receiver
 
 
 class ReceivedPulses(NamedTuple):

@@ -395,7 +395,7 @@ class Refraction(NamedTuple):
     """
 
     directions: Floats
-    # Share of the light, one way: transmitted light, or reflected light where light is reflected.
+    # Fraction of the light, one way: transmitted, or reflected where the light is reflected.
     shares: Floats | float
     totally_reflected: Bools  # whether light is totally reflected; its direction is then unchanged
 

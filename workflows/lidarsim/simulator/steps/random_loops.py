@@ -21,7 +21,7 @@ _11 = np.uint64(11)
 _FIRST_FACTOR = np.uint64(0xBF58476D1CE4E5B9)
 _SECOND_FACTOR = np.uint64(0x94D049BB133111EB)
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)
-_NUMBERS = np.uint64(256)  # largest number of random numbers of a ray for one purpose
+_NUMBERS = np.uint64(256)  # maximum number of random numbers of a ray for one purpose
 _NEXT = np.uint64(1)
 
 

@@ -16,7 +16,7 @@ from .particle_loops import write_particle
 from .pulse_loops import beam_of, scan_row
 from .random_loops import SHIFT_TO_INDEX, bits, uniform
 
-MAX_CLUMPS = 255  # largest number of clumps that a beam can meet, limited by its random numbers
+MAX_CLUMPS = 255  # maximum number of clumps that a beam can meet, limited by its random numbers
 _GUIDE_PARTS = 1024  # number of parts of a lookup table for columns
 
 

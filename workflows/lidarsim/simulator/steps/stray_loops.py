@@ -18,7 +18,7 @@ from ...sensor.optics import LIGHT_M_NS
 from ..casting.surface_loops import normal_incidence_energy
 
 CELL_RAYS = 1 << 8  # number of consecutive rays that are compared with retroreflectors at a time
-MAX_STRAY = math.radians(30.0)  # largest angle between a ray and stray light
+MAX_STRAY = math.radians(30.0)  # maximum angle between a ray and stray light
 # Rays to an edge of a triangle are moved towards its center by this fraction of the distance, so
 # that they hit the triangle.
 INWARDS = 0.02
@@ -51,7 +51,7 @@ class StrayLimits(NamedTuple):
     share_at_degree: (
         float  # energy at an angle of 1 degree, as a fraction of the energy in the beam
     )
-    faintest: float  # smallest energy that may be detected
+    faintest: float  # minimum energy that may be detected
     extinction: float  # 1/m
 
 
@@ -96,7 +96,7 @@ class ReceptionLimits(NamedTuple):
     """Limits within which a receiver detects pulses of other sensors."""
 
     cosine: float  # cosine of the largest angle between a ray and a spot
-    min_range_m: float  # smallest apparent distance of a spot
+    min_range_m: float  # minimum apparent distance of a spot
     max_range_m: float
 
 

@@ -26,16 +26,16 @@ MEET = 1.0
 APART = 6.0
 # Gaussians that are closer form one return.
 CLOSE = 1.0
-# Largest distance that a fit may move a Gaussian from its initial position.
+# Maximum distance that a fit may move a Gaussian from its initial position.
 MOVES = 2.0
 
 FAINT = 0.01  # lowest peak that is found, as a fraction of the waveform's highest sample
-CURVED = 0.005  # smallest curvature times variance of a detectable Gaussian, as such a fraction
-TOGETHER = 4  # largest number of Gaussians that are fitted together
-STEPS = 30  # largest number of Levenberg-Marquardt steps
-GAIN = 1e-3  # smallest relative reduction of the sum of squares for which a fit continues
+CURVED = 0.005  # minimum curvature times variance of a detectable Gaussian, as such a fraction
+TOGETHER = 4  # maximum number of Gaussians that are fitted together
+STEPS = 30  # maximum number of Levenberg-Marquardt steps
+GAIN = 1e-3  # minimum relative reduction of the sum of squares for which a fit continues
 ENOUGH = 1e-9  # sum of squares at which a fit stops
-HIGHEST = 1.2  # largest height of a Gaussian, as a fraction of the highest sample
+HIGHEST = 1.2  # maximum height of a Gaussian, as a fraction of the highest sample
 _AREA = math.sqrt(2 * math.pi)  # area of a Gaussian of height and standard deviation 1
 _KEY_STEPS = 1024  # subdivisions of a sample for comparing the times of hits and peaks
 
@@ -544,7 +544,7 @@ def order_hits(subrays, ray, distance, energy, row):
 
     Hits are in the order of rays, which are sub-rays, with `subrays` per beam. `row` is
     `PulseHits.row`, whose other column is scratch memory of `continue_surfaces`. Returns the number
-    of hits that have energy, and the largest number of hits of a beam.
+    of hits that have energy, and the maximum number of hits in a beam.
     """
     count = 0
     begin = 0
