@@ -75,7 +75,7 @@ def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Flo
 
 
 def parse_dates(text: str) -> Floats | None:
-    """Parse text with one date per line to seconds since 1970.
+    """Convert text with one date per line to seconds since 1970.
 
     The result is None if any line is not a date.
     """

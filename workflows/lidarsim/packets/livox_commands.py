@@ -42,7 +42,7 @@ class Command(IntEnum):
 
 
 class Code(IntEnum):
-    """Return codes in responses."""
+    """Result codes in responses."""
 
     SUCCESS = 0x00
     FAILURE = 0x01
@@ -54,7 +54,7 @@ class Code(IntEnum):
 
 
 class Key(IntEnum):
-    """Keys of parameters that this module or the service refers to by name."""
+    """Keys of the parameters that the code refers to by name."""
 
     DATA_TYPE = 0x0000
     PATTERN = 0x0001

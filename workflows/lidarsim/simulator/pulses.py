@@ -185,7 +185,7 @@ class PulseCaster:
         return ScannedReturns(renumbered.take(in_range), hit_counts, tally)
 
     def _pulses(self, batch: PulseBatch) -> PulseReturns:
-        """Apply all steps that act before thinning to a batch, and return its returns."""
+        """Return the returns of a batch after all steps that act before thinning."""
         returns = PulseReturns.empty()
         for step in self.steps:
             if Role.ON_REPORTED not in step.role:

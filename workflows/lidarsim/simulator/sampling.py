@@ -64,7 +64,7 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
 
 
 def sample_ranges(scene: Scene, survey: Survey, scans: range | None = None) -> Floats:
-    """Return the distances in meters from sampled rays of a survey to the nearest surfaces.
+    """Return the distances, in meters, at which sampled rays of a survey hit surfaces.
 
     The sensors are simulated without range limits, noise, faults and weather. Rays that hit no
     surface are omitted. Rays are sampled from `scans`, by default from all scans of the survey.
@@ -162,7 +162,7 @@ class _FewRays(Sensor):
         return first * channels // self.every, stop * channels // self.every
 
     def _rays(self, firings: Ints) -> _SampledRays:
-        """Return the sensor's ray for each firing of this sample."""
+        """Return the sampled ray of the original sensor for each firing."""
         # Multiples of the golden ratio spread the rays evenly over firings and channels.
         ray = firings * self.every + (firings * GOLDEN % 1 * self.every).astype(np.int64)
         fired, channel = np.divmod(ray, self.sampled.channels)

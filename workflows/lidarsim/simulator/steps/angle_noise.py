@@ -33,7 +33,7 @@ class AngleNoiseStep(PulseStep):
         return beam_memory(setup, sizes)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Add random angles to the beams of a batch, and return the returns unchanged."""
+        """Add random angles to the beams of a batch. The returns do not change."""
         beams = np.arange(batch.start, batch.stop)
         scan, ray = batch.keys.scan_and_number(beams)
         across, up = angle_errors(self.setup.noise, scan, ray)
@@ -58,7 +58,7 @@ class RippleStep(PulseStep):
         return Memory() if setup.noise.angle_deg else beam_memory(setup, sizes)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Add the azimuth errors to the beams of a batch, and return the returns unchanged."""
+        """Add azimuth errors to the beams of a batch. The returns do not change."""
         noise = self.setup.noise
         sensor = self.setup.sensor
         azimuth = sensor.head.azimuths(batch.firings.numbers[batch.row_range])

@@ -137,7 +137,7 @@ class CrosstalkStep(PulseStep):
         )
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns of a batch together with received foreign pulses."""
+        """Add the received foreign pulses to the returns of a batch."""
         rays = np.arange(batch.start, batch.stop)
         row, distance, energy = self.receive(
             batch.keys.scan, rays, *batch.central_rays, batch.subray_poses

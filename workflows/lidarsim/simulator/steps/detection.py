@@ -33,7 +33,7 @@ class DetectionStep(PulseStep):
         return setup.noise.loses_returns and setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the detected returns."""
+        """Keep the detected returns of a batch."""
         scan, ray = batch.keys.scan_and_number(returns.ray)
         detected_mask = detected(
             self.setup.noise, returns.height, scan, ray, number_within_ray(returns.ray)

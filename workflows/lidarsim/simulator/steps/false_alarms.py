@@ -57,7 +57,7 @@ class FalseAlarmStep(PulseStep):
         return Memory(retained=10 * sizes.return_count, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns of a batch together with the false alarms of its rays."""
+        """Add the false alarms of rays to the returns of a batch."""
         sensor = self.setup.sensor
         rays = np.arange(batch.start, batch.stop)
         scan, ray = batch.keys.scan_and_number(rays)

@@ -223,7 +223,7 @@ class Media:
                 mean_projection(angle, np.ones(1))  # computes and caches the table for this angle
 
     def enters(self, kinds: Ints32, cosines: Floats) -> Bools:
-        """Return whether light that crosses surfaces enters their bodies.
+        """Return whether light that crosses surfaces enters the bodies that they enclose.
 
         `cosines` are those between normals and light.
         """

@@ -71,7 +71,7 @@ class LossStep(PulseStep):
         return bool(setup.faults("dead_channels", "dropped_packets", "frozen"))
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns that are not lost."""
+        """Drop the lost returns of a batch."""
         from . import fault_loops  # imported here because numba takes half a second to import
 
         firings = batch.firings

@@ -33,7 +33,7 @@ class RangeNoiseStep(PulseStep):
         return setup.noise.has_range_errors
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns with their reported ranges."""
+        """Add reported ranges to the returns of a batch."""
         # The leading edge of a clipped pulse is the same as that of the whole pulse.
         height = returns.height if self.setup.in_waveforms else returns.energy
         scan, ray = batch.keys.scan_and_number(returns.ray)

@@ -33,7 +33,7 @@ class SaturationStep(PulseStep):
         return Memory(retained=16 * sizes.return_count, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns of a batch after saturation."""
+        """Apply saturation to the returns of a batch."""
         setup = self.setup
         optics = self.setup.sensor.optics
         pulse_ns = setup.reporting.length_ns(optics)

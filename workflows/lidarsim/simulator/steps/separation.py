@@ -213,7 +213,7 @@ class SeparationStep(PulseStep):
         return setup.return_count_varies and not setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns that the hits of a batch form."""
+        """Combine the hits of a batch into returns."""
         setup = self.setup
         # If the receiver adds or merges returns, `SelectionStep` selects the reported returns.
         mode: Mode = "all" if setup.has_received_returns else setup.reporting.mode
@@ -240,7 +240,7 @@ class SelectionStep(PulseStep):
         return setup.has_received_returns
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the reported returns of a batch."""
+        """Keep the reported returns of a batch."""
         return returns.take(reported_mask(returns, self.setup.reporting.mode))
 
 

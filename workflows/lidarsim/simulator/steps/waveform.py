@@ -39,7 +39,7 @@ class WaveformStep(PulseStep):
         return setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns found in the waveforms of a batch. Their `ray` is the beam number."""
+        """Find the returns in the waveforms of a batch. Their `ray` is the beam number."""
         digitizer = Digitizer.for_sensor(self.setup)
         in_waveforms = returns_in(returns, digitizer, batch.subrays_per_beam, batch.planes)
         return in_waveforms._replace(ray=batch.start + in_waveforms.ray)
@@ -94,7 +94,7 @@ class Digitizer:
 def returns_in(
     hits: PulseReturns, digitizer: Digitizer, subrays: int = 1, planes: Planes | None = None
 ) -> PulseReturns:
-    """Return the returns found in the waveforms of beams, sorted by beam and distance.
+    """Find the returns in the waveforms of beams, and sort them by beam and distance.
 
     Hits that are close together, or on one surface (`pulse_loops.continue_surfaces`), form one
     Gaussian with their mean and variance. Other waveforms are sampled and searched. The triangle

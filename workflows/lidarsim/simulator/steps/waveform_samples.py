@@ -60,7 +60,7 @@ class RecordingStep(PulseStep):
         return Memory(casting=sampled + recorded, counting=2.3 * recorded)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns of a batch together with their recorded waveforms.
+        """Add recorded waveforms to the returns of a batch.
 
         A window starts where the signal of its first return starts. Later returns of the pulse
         share the window if their signals end within it. Overlapping windows of a pulse contain
