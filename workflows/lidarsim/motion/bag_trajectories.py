@@ -145,7 +145,6 @@ def _row_of(pose: Any) -> list[float]:
 
 
 def _stamp_ns(header: Any) -> int:
-    """Return the timestamp of a message header in nanoseconds."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
@@ -215,7 +214,7 @@ def _gnss_poses(
 
 
 def _orientations(bag: Reader, kinds: Mapping[str, str], imu: str) -> tuple[Ints, Floats] | None:
-    """Return the orientations of an IMU and their times in nanoseconds, or None without an IMU.
+    """Return the times (in nanoseconds) and orientations of an IMU, or None without an IMU.
 
     The times have shape (k,). The rows have shape (k, 7) and contain zero positions.
     """
@@ -242,7 +241,7 @@ def _orientations(bag: Reader, kinds: Mapping[str, str], imu: str) -> tuple[Ints
 
 
 def _edges_of(bag: Reader, kinds: Mapping[str, str]) -> dict[str, _Edge]:
-    """Read the poses of each frame relative to its parent frame from all tf topics."""
+    """Read the poses of all frames relative to their parent frames from the tf topics."""
     edges: dict[str, _Edge] = {}
     topics = [topic for topic, kind in kinds.items() if kind == _FRAMES]
     for topic, _, message in read_messages(bag, topics):

@@ -175,7 +175,7 @@ class _Stops(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CurveHeadings:
-    """Headings of a platform that follow the horizontal tangent of a smooth curve.
+    """Headings along the horizontal tangent of a smooth curve.
 
     Attributes
     ----------

@@ -56,7 +56,7 @@ class StraightLines(NamedTuple):
         return float((speeds_m_s * within_s).sum() / within_s.sum())
 
     def seconds_within(self, spans_s: Sequence[tuple[float, float]]) -> Floats:
-        """Return for how many seconds each line overlaps any of the given time spans.
+        """Return the time, in seconds, for which each line overlaps any of the given time spans.
 
         Overlaps of 0.1 s or less are ignored, because the ends of a line are not known more
         precisely. The result has shape (n,).

@@ -864,7 +864,6 @@ class _SegmentTimes(NamedTuple):
 
 
 def _level_rotations(heading: Heading) -> Floats:
-    """Return the rotation matrices of a level platform with the given heading."""
     rotations = np.zeros((3, 3, len(heading.cosines)))
     rotations[0, 0] = rotations[1, 1] = heading.cosines
     rotations[1, 0] = heading.sines

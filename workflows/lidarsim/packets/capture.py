@@ -254,7 +254,6 @@ class Capture:
         self.ends_early = file.tell() > os.fstat(file.fileno()).st_size
 
     def _check_size(self, size: int, file: BinaryIO) -> None:
-        """Raise LidarError if a frame size is impossibly large."""
         if size > _MAX_FRAME_BYTES:
             raise self._damaged(file)
 

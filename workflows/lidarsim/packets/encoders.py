@@ -158,7 +158,7 @@ class PacketEncoder(ABC):
         return int(np.rint(np.diff(self.source.sensor.begins_ns(firings))[0]))
 
     def port(self, kind: str, default: int) -> int:
-        """Return the port of a kind of packets, from the sensor's data file or `default`."""
+        """Return the port for one kind of packet from the sensor's data file, or `default`."""
         return self.source.settings.ports.get(kind, default)
 
     def unusable(self, reason: str) -> LidarError:
@@ -288,7 +288,6 @@ def _decoder(decoder: type[PacketDecoder], path: Path, name: str) -> PacketDecod
 
 
 def _imported(value: str) -> Any:
-    """Import the class that "module:class" refers to."""
     module, _, attribute = value.partition(":")
     return getattr(import_module(module), attribute)
 

@@ -106,7 +106,6 @@ class HesaiEncoder(PacketEncoder):
 
     @property
     def _rate_rpm(self) -> int:
-        """Rotation rate in revolutions per minute."""
         return round(self.source.sensor.head.rate_hz * 60)  # type: ignore[attr-defined]
 
     def _layout_of_model(self) -> HesaiPacketLayout:

@@ -76,5 +76,4 @@ def _table(heads: list[list[Any]], times: list[str], columns: int) -> str:
 
 
 def _decimal(number: float) -> str:
-    """Format a number with at most six decimal places."""
     return f"{round(number, 6) + 0.0:.6f}".rstrip("0").rstrip(".")  # + 0.0 avoids -0

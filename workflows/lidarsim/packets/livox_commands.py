@@ -130,7 +130,6 @@ def _frame(command: int, number: int, data: bytes, kind: int) -> bytes:
 
 
 def _checksum(data: bytes) -> int:
-    """Return the checksum of data, which is 0 if the data are empty."""
     return crc32(data) if data else 0
 
 

@@ -83,14 +83,12 @@ class PcapWriter:
         return frames
 
     def _ip_header(self, size: int) -> bytes:
-        """Return the IPv4 header of an unfragmented datagram of `size` bytes."""
         head = pack(">BBHHHBB", 0x45, 0, 28 + size, 0, 0x4000, _TIME_TO_LIVE, _UDP)
         words = np.frombuffer(head + self._addresses, ">u2").astype(np.int64)
         checksum = int(_complement(words.sum(keepdims=True))[0])
         return head + pack(">H", checksum) + self._addresses
 
     def _udp_header(self, group: Datagrams, size: int) -> bytes:
-        """Return the UDP header of a datagram without its checksum."""
         return pack(">HHHH", group.source_port or group.port, group.port, 8 + size, 0)
 
     def _udp_checksums(self, segments: Bytes) -> Bytes:

@@ -293,7 +293,6 @@ class RobosenseEncoder(PacketEncoder):
         return packets
 
     def _elevations_deg(self) -> Floats:
-        """Return the elevations of the lasers in degrees."""
         return np.degrees(self.source.sensor.beams.elevation[self.source.settings.channels])
 
     def _azimuths_deg(self) -> Floats:

@@ -154,7 +154,9 @@ class VelodyneEncoder(PacketEncoder):
 
 
 class VelodyneDecoder(PacketDecoder):
-    """Decoder that reads Velodyne packets, which identify the sensor model, with velodyne_decoder.
+    """Decoder that reads Velodyne packets with velodyne_decoder.
+
+    Data packets identify the sensor model.
 
     If a file contains several units, each is a sensor named `ADDRESS:PORT` after the address of the
     unit and the port of the receiver.

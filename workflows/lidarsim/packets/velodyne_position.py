@@ -79,7 +79,6 @@ class PositionPackets:
         return Datagrams(_as_bytes(packets), due_ns[follows], self._port)
 
     def _sentence(self, second: int) -> bytes:
-        """Return the GPRMC sentence for a second since 1970."""
         if second not in self._sentences:
             since_start_ns = second * _SECOND_NS - self._source.start_ns
             fix = None if self._fixes is None else self._fixes.at(since_start_ns)

@@ -307,7 +307,6 @@ _HESAI_CHECKSUM = re.compile(r"^[0-9a-f]{64}[,\s]*\Z", re.IGNORECASE | re.MULTIL
 
 
 def _split_cells(line: str) -> list[str]:
-    """Split a line at its commas into lower-case cells."""
     return [word.strip().lower() for word in line.split(",")]
 
 

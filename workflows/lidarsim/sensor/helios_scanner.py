@@ -122,7 +122,6 @@ def write(path: Path, sensor: Sensor, duration_s: float, left_out: Sequence[str]
 
 
 def _scanner_lines(name: str, sensor: Sensor, scanner: _Scanner) -> list[str]:
-    """Return the lines of the <scanner> element."""
     optics = sensor.optics
     numbers: dict[str, float] = {
         "pulseFreqs_Hz": scanner.pulse_hz,

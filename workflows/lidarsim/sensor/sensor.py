@@ -309,7 +309,6 @@ class Sensor:
 
     @cached_property
     def _steps_in_revolution(self) -> int:
-        """Number of time steps in the first revolution."""
         return self._first_step(1, 1)
 
     def _first_step(self, number: int, steps_per_revolution: int) -> int:

@@ -63,5 +63,4 @@ def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
 
 
 def _numbers(vector: Floats) -> str:
-    """Format a vector as the value of an XML attribute."""
     return " ".join(map(repr, vector.tolist()))

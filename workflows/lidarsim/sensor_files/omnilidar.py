@@ -69,7 +69,6 @@ def _remark(rays: RayList, left_out: Sequence[str]) -> str:
 
 
 def _schemas(states: int) -> Iterator[str]:
-    """Yield the API schemas for the given number of emitter states."""
     yield '"OmniSensorGenericLidarCoreAPI"'
     for number in range(1, states + 1):
         yield f'"OmniSensorGenericLidarCoreEmitterStateAPI:{_state_name(number)}"'
@@ -166,5 +165,4 @@ def _array(number: int, kind: str, name: str, values: AnyArray) -> Iterator[str]
 
 
 def _text(text: str) -> str:
-    """Escape text for a quoted USD string."""
     return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")

@@ -207,7 +207,6 @@ def _number(header: Mapping[str, Any], name: str) -> float:
 
 
 def _shown(value: Any) -> str:
-    """Format a header value so that it fits on one line."""
     return printable(repr(value), 60)
 
 

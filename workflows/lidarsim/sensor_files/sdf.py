@@ -69,7 +69,6 @@ def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
 
 
 def _scan(name: str, angles: _Angles) -> list[str]:
-    """Return the lines of a <horizontal> or <vertical> element."""
     limits = np.radians([angles.first_deg, angles.last_deg]).tolist()
     return [
         f"            <{name}>",
@@ -120,7 +119,6 @@ class _Levels(NamedTuple):
 
 
 def _levels(angles_deg: Floats) -> _Levels:
-    """Return the distinct angles of rays."""
     order = np.argsort(angles_deg, kind="stable")
     is_new = np.diff(angles_deg[order], prepend=-np.inf) > _SAME_DEG
     of_ray = np.empty(len(order), np.int64)

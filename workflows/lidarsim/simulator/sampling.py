@@ -116,7 +116,6 @@ def _with_few_rays(survey: Survey, every: int) -> list[Mounted]:
 
 
 def _batches(rig: Rig, firsts: Ints, stops: Ints) -> Iterator[Any]:
-    """Cast sections of a survey, and yield their batches."""
     for first, stop in zip(firsts.tolist(), stops.tolist(), strict=True):
         yield from rig.cast(first, stop)
 

@@ -137,7 +137,6 @@ def _field_vertices(model: Any, field: int) -> Floats:
 
 
 def _cells(grid: Ints) -> Ints:
-    """Return two triangles for each cell of a two-dimensional grid of vertex indices."""
     first = grid[:-1, :-1]
     right = grid[:-1, 1:]
     above = grid[1:, :-1]

@@ -64,7 +64,6 @@ def _straight_tracks(trajectories: Sequence[Trajectory]) -> Iterator[_StraightTr
 
 
 def _limits_of(track: Track) -> tuple[float, float, float, float]:
-    """Return a row of `TrackTable.limits` for a track."""
     first_s, last_s = track.times_s[[0, -1]].tolist()
     return float(track.start_s or 0), first_s, last_s, track.slack_s
 

@@ -72,7 +72,6 @@ class _Part(NamedTuple):
 
 
 def _outside(vertices: Floats, planes: Floats) -> Bools:
-    """Return whether each vertex is outside each plane."""
     x, y, z = vertices.T[:, :, None]
     a, b, c, offset = planes.T
     return np.asarray(a * x + b * y + c * z > offset)

@@ -62,7 +62,7 @@ class MediaBodies:
         return tuple(np.flatnonzero(holds_medium).tolist())
 
     def offset_vertices(self, by_m: float) -> Floats:
-        """Return the scene's vertices, with the surfaces of media moved outwards by `by_m` meters.
+        """Return the scene's vertices, with the surfaces of media moved outward by `by_m` meters.
 
         Water that touches its basin, or leaves that touch other leaves, would otherwise coincide
         with the other surface, and light that hits one of the two surfaces would miss the other.

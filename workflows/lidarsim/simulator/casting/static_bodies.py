@@ -338,13 +338,11 @@ def _parts_in(
 
 
 def _have_area(vertices: Floats, faces: Integers) -> bool:
-    """Return whether any triangle has a nonzero area."""
     a, b, c = vertices[faces[(faces != faces[:, :1]).any(axis=1)]].transpose(1, 0, 2)
     return bool(np.cross(b - a, c - a).any())
 
 
 def _is_near(instances: Instances, region: Floats) -> Bools:
-    """Return whether the bounding box of each instance intersects a region."""
     lower, upper = instances.bounds.transpose(1, 0, 2)
     return np.asarray(((lower <= region[1]) & (region[0] <= upper)).all(axis=1))
 

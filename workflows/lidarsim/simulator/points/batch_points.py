@@ -37,7 +37,7 @@ MIN_REMAINING = (
 
 
 class BatchPoints:
-    """Reported returns of consecutive scans of one station, sorted by scan and ray.
+    """Reported returns of consecutive scans at one station, sorted by scan and ray.
 
     The properties are the sources of columns (`lidarsim.columns.table`). Each is an array with one
     value per return (n,), and expensive ones are computed on first use.
@@ -586,7 +586,7 @@ class BatchPoints:
 
     @property
     def return_number(self) -> Bytes:
-        """Return number within the pulse, starting at 1."""
+        """Number of the return within its pulse, starting at 1."""
         return required(self.pulse_returns.number)
 
     @property

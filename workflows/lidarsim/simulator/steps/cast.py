@@ -283,7 +283,6 @@ class CastStep(PulseStep):
 
     @property
     def _leafy(self) -> bool:
-        """Whether the scene has crowns."""
         return self._media is not None and self._media.leafy
 
     @property

@@ -354,7 +354,7 @@ def _firings_in(sensor: Sensor, steps: int, span: tuple[float, float]) -> tuple[
 
 
 def _foreign_pulses(survey: Survey, sensor: Sensor) -> float:
-    """Return the number of foreign pulses per pulse of a sensor."""
+    """Return the number of pulses that other sensors fire per pulse of a sensor."""
 
     def rate(lidar: Sensor) -> float:
         first, stop = lidar.firings(0)

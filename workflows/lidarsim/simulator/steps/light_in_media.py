@@ -263,7 +263,7 @@ class Media:
         times: Floats,
         actor_trajectories: ActorTrajectories,
     ) -> MediaStack:
-        """Find the media around origins by casting rays upwards.
+        """Find the media around origins by casting rays upward.
 
         If a ray leaves a medium that it has not entered, its origin is inside this medium.
         """
@@ -375,7 +375,7 @@ class Media:
 
 
 class LightInGrids(NamedTuple):
-    """Light that passes voxel grids.
+    """Light that passes through voxel grids.
 
     All arrays have shape (k,).
     """

@@ -1,4 +1,4 @@
-"""Combine hits that a receiver cannot separate into one return, and select reported returns."""
+"""Combine inseparable hits into returns, and select the returns to report."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def separate_hits(
     air: PulseReturns | None = None,
     reporting: Reporting | None = None,
 ) -> PulseReturns:
-    """Combine the hits of a beam that a receiver cannot separate into one return.
+    """Combine hits of a beam into one return where the receiver cannot separate them.
 
     Hits of a beam form a single return if each is within `gap_m` of the next. Hits of neighboring
     sub-rays on one surface also form a single return, however far apart they are: a beam that

@@ -290,7 +290,7 @@ class PulseBatch:
 
     @cached_property
     def central_rays(self) -> tuple[Floats, Floats]:
-        """Origins in meters and directions of each beam's central sub-ray.
+        """Origins (in meters) and directions of the beams' central sub-rays.
 
         The shape is (n, 3). The central sub-ray is the first of each beam. Both arrays are in the
         scene frame.

@@ -85,7 +85,7 @@ class WaveSampling(NamedTuple):
 
 
 class WavePeaks(NamedTuple):
-    """Peaks that hits belong to in the searched waveforms."""
+    """Peaks to which the hits in searched waveforms belong."""
 
     number: Ints  # (n,): number of the peak, counted over all waveforms; -1 without a peak
     # (3, n): time of the peak in samples from range 0, energy, and width as a multiple of the
