@@ -167,7 +167,10 @@ class HesaiEncoder(PacketEncoder):
         return packets
 
     def _stamps_us(self, firings_ns: Ints) -> Ints:
-        """Return packet timestamps in µs since 1970, from the firing times of reference blocks."""
+        """Return packet timestamps in µs since 1970.
+
+        `firings_ns` are the firing times of the blocks to which the timestamps belong.
+        """
         offset_us = self._layout.first_laser_us + self._layout.reference_us
         stamps_ns = self.source.start_ns + firings_ns - round(offset_us * 1000)
         return (stamps_ns + 500) // 1000

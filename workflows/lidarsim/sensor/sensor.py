@@ -178,7 +178,7 @@ class Sensor:
 
     @property
     def model(self) -> str:
-        """Name of the sensor in reports."""
+        """Name of the sensor model, for use in reports."""
         return self.name or f"{type(self).__name__} with {self.channels} channels"
 
     @classmethod

@@ -385,7 +385,7 @@ def casters_of_sensors(
 
     @cache
     def vertices() -> Floats:
-        # Surfaces of media are moved outwards so that light hits both of two touching surfaces.
+        # Surfaces of media are moved outward so that light hits both of two touching surfaces.
         return surfaces.media_bodies.offset_vertices(1.5 * _clearance_m(scene))
 
     def bodies_without(unseen: Bools | None) -> CastBodies:
