@@ -1,1 +1,1 @@
-"""Materials of surfaces, leaves, and weather, which determine how light is scattered."""
+"""Materials, leaves and weather, which determine how light is scattered."""

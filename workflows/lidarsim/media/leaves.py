@@ -79,7 +79,7 @@ def leaf_angle_density(leaf_angle: str | float, angle: Floats) -> Floats:
 
 
 class _LightTable(NamedTuple):
-    """Projection and brightness of leaves for several light directions."""
+    """Projection and brightness of leaves, tabulated by the direction of the light."""
 
     cosine: Floats  # (361,), cosine of the angle between the light and the vertical, ascending
     projection: Floats  # (361,), as returned by `mean_projection`
@@ -88,7 +88,7 @@ class _LightTable(NamedTuple):
 
 @cache
 def _light_table(leaf_angle: str | float) -> _LightTable:
-    """Integrate the projection and brightness of leaves over the leaf angles."""
+    """Integrate the projection and the brightness of leaves over all leaf angles."""
     cosine = sin(np.linspace(0, np.pi / 2, _NODES))[:, None]
     angle = (np.arange(_ANGLES, dtype=np.float64) + 0.5) * (np.pi / 2 / _ANGLES)
     share = leaf_angle_density(leaf_angle, angle)
@@ -124,7 +124,7 @@ def mean_projection(leaf_angle: str | float, cosine: Floats) -> Floats:
 
 
 def mean_brightness(leaf_angle: str | float, cosine: Floats) -> Floats:
-    """Return the mean cosine of the incidence angle of light on leaves.
+    """Return the mean cosine of the incidence angle at which light hits leaves.
 
     The probability that a leaf is hit is proportional to its projected area, so leaves that face
     the light have a larger weight. The mean for a "spherical" distribution is two thirds in every

@@ -51,7 +51,7 @@ Transparent = Literal["none", "pass"]
 
 
 def find_class_names_error(names: Mapping[Any, Any]) -> str:
-    """Return an error message if a mapping from numbers to class names cannot be stored in files.
+    """Return an error message if a mapping from numbers to class names cannot be stored.
 
     The result is an empty string if the names are valid. Two classes must not have the same name.
     """
@@ -85,7 +85,7 @@ class MeasuredReflectance(NamedTuple):
 
 @cache
 def reflectances() -> dict[str, MeasuredReflectance]:
-    """Return the table of measured reflectances by material name."""
+    """Return the table of measured reflectances, keyed by material name."""
     text = (files("lidarsim.media") / "reflectances.csv").read_text("utf-8")
     return {
         row["name"]: MeasuredReflectance(
@@ -231,7 +231,7 @@ class Material(FileSection):
         self._check_medium()
 
     def _set_names(self, field_name: str) -> None:
-        """Convert one or more names in a field to a tuple, and raise LidarError for empty names."""
+        """Convert a name or names in a field to a tuple. Raises LidarError for empty names."""
         value = getattr(self, field_name)
         if value is None:
             return
@@ -257,7 +257,7 @@ class Material(FileSection):
             raise LidarError("scale is a factor of colors and requires reflectance: texture.")
 
     def _check_roughness(self) -> None:
-        """Check that only opaque surfaces without other specular reflection have a roughness."""
+        """Check that a roughness is only set for opaque surfaces without specular reflection."""
         if self.roughness is None and self.metalness:
             raise LidarError(
                 "metalness requires roughness. Set it to a value from 0.1 (polished) to 1 (matte)."
@@ -329,7 +329,7 @@ class Material(FileSection):
             )
 
     def diffuse_reflectance(self, wavelength_nm: float) -> float:
-        """Return the fraction of the light that is scattered at a wavelength.
+        """Return the fraction of light that the material scatters at the given wavelength.
 
         If `reflectance` is "texture", the result applies to faces without a color.
         """
@@ -355,7 +355,7 @@ class Material(FileSection):
         return float(self.specular_reflectance == "fresnel" or self.specular_reflectance or 0)
 
     def applies_to(self, name: str, materials: Collection[str] = ("",)) -> bool:
-        """Return True if this material applies to an object.
+        """Return whether this material applies to an object.
 
         `name` is the name of the object, and `materials` are the names that the materials of its
         faces have in the scene file.
@@ -369,14 +369,14 @@ class Material(FileSection):
 
 
 def _fits(name: str, patterns: str | Sequence[str] | None) -> bool:
-    """Return True if a name matches any of the patterns, or if the patterns are None."""
+    """Return whether a name matches any of the patterns. None matches every name."""
     return patterns is None or any(
         name == pattern or fnmatchcase(name, pattern) for pattern in patterns
     )
 
 
 def _materials_like(name: str, materials: Sequence[str]) -> str:
-    """Return a hint for a misspelled spectrum.
+    """Return a hint for a misspelled spectrum name.
 
     The hint lists the spectra that contain the name, the most similar spectrum, or all spectra.
     """
@@ -390,7 +390,10 @@ def _materials_like(name: str, materials: Sequence[str]) -> str:
 
 
 def match_names(pattern: str, names: Sequence[str]) -> Indices:
-    """Return the indices of the names that are equal to or match a pattern with * and ?."""
+    """Return the indices of the names that are equal to a pattern or match it.
+
+    The pattern may contain * and ?.
+    """
     if not any(sign in pattern for sign in "*?["):
         return np.array([row for row, name in enumerate(names) if name == pattern], np.intp)
     fits = re.compile(translate(pattern)).match
@@ -399,7 +402,7 @@ def match_names(pattern: str, names: Sequence[str]) -> Indices:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceKinds:
-    """Kinds of surfaces in a scene, one for each material of each object.
+    """Surface kinds of a scene, one for each material of each object.
 
     Parameters
     ----------
@@ -418,7 +421,7 @@ class SurfaceKinds:
 
     @classmethod
     def from_objects(cls, names: Sequence[str]) -> SurfaceKinds:
-        """Create one kind for each object, without materials from scene files."""
+        """Create one kind for each object, ignoring materials in scene files."""
         return cls(names, np.arange(len(names)), ("",) * len(names))
 
     @cached_property
@@ -430,7 +433,7 @@ class SurfaceKinds:
         return np.searchsorted(self.object, np.arange(len(self.names) + 1))
 
     def kinds_of_objects(self, object_indices: Indices) -> Indices:
-        """Return the kinds of several objects, which are selected by index."""
+        """Return the kinds of the objects with the given indices."""
         if len(self.object) == len(self.names):
             return object_indices
         starts = self.first[object_indices]
@@ -439,13 +442,13 @@ class SurfaceKinds:
         return np.concatenate([np.zeros(0, np.intp), *ranges])
 
     def describe(self, kind: int) -> str:
-        """Return the object and material of a kind for error messages."""
+        """Format the object and the material of a kind for error messages."""
         name = repr(self.names[self.object[kind]])
         return f"{name}, material {self.material[kind]!r}" if self.material[kind] else name
 
 
 def first_matches(materials: Sequence[Material], kinds: SurfaceKinds) -> Indices:
-    """Return the index of the first material that applies to each kind, or -1 if none applies.
+    """Return the index of the first material that applies to each kind, or -1 if none does.
 
     The result has shape (k,).
 
@@ -525,7 +528,7 @@ def _matching_kinds(
 def match_object_names(
     pattern: str, names: Sequence[str], object_rows: Mapping[str, int], subject: str
 ) -> Indices:
-    """Return the indices of the objects that match a pattern.
+    """Return the indices of the objects whose names match a pattern.
 
     Parameters
     ----------
@@ -557,7 +560,7 @@ def match_object_names(
 def assign_classes(
     materials: Sequence[Material], classes: Mapping[int, Sequence[str]], kinds: SurfaceKinds
 ) -> list[Material]:
-    """Assign semantic classes to objects by name, unless their materials already have a class.
+    """Assign semantic classes to objects by name, except where a material sets a class.
 
     Parameters
     ----------
@@ -629,7 +632,7 @@ def assign_class(
 
 @dataclass(frozen=True, eq=False)
 class MaterialTable:
-    """Material properties of surfaces, as arrays with one value per kind of surface."""
+    """Material properties of surfaces, with one value per kind of surface."""
 
     reflectance: Floats
     scale: Floats  # factor for the luminance of colors, or 0 if the reflectance is a number
@@ -711,12 +714,18 @@ class MaterialTable:
 
     @property
     def leafy(self) -> Bools:
-        """Whether each kind of surface contains leaves. Shape (k,)."""
+        """Whether each kind of surface contains leaves.
+
+        The shape is (k,).
+        """
         return self.leaf_area > 0
 
     @property
     def refracts(self) -> Bools:
-        """Whether each kind of surface refracts light. Shape (k,)."""
+        """Whether each kind of surface refracts light.
+
+        The shape is (k,).
+        """
         return self.refractive_index > 0
 
     @property
@@ -725,7 +734,7 @@ class MaterialTable:
         return bool(self.scale.any())
 
     def diffuse_reflectances(self, kind_indices: Integers, luminance: Floats | None) -> Floats:
-        """Return the fraction of the light that surfaces scatter.
+        """Return the fractions of light that surfaces scatter.
 
         Parameters
         ----------
@@ -750,7 +759,7 @@ class MaterialTable:
     def relative_energy(
         self, kind_indices: Integers, cosine: Floats, luminance: Floats | None = None
     ) -> Floats:
-        """Return the light that surfaces return, relative to a perpendicular white surface.
+        """Return the energy from surfaces relative to a white surface at normal incidence.
 
         Parameters
         ----------
@@ -782,7 +791,7 @@ class MaterialTable:
 
 
 def glossy_reflection(cosine: Floats, roughness: Floats) -> Floats:
-    """Return the light that a rough surface reflects specularly, relative to a white diffuser.
+    """Return the specular reflection of rough surfaces, relative to a white diffuser.
 
     The microfacets have the GGX distribution of Walter et al. (2007) with Smith shadowing. As in
     glTF 2.0, the width of the distribution is the square of the roughness. Because the light source
@@ -796,10 +805,11 @@ def glossy_reflection(cosine: Floats, roughness: Floats) -> Floats:
 
 
 def fresnel(cosine: Any, index: Any = GLASS_INDEX) -> Any:
-    """Return the fraction of unpolarized light that a surface reflects, from Fresnel's equations.
+    """Return the fraction of unpolarized light that a surface reflects.
 
-    `index` is the refractive index behind the surface divided by the index in front of it. If it is
-    less than 1, all light is reflected at grazing angles.
+    The fraction follows from Fresnel's equations. `index` is the refractive index behind the
+    surface divided by the index in front of it. If it is less than 1, all light is reflected at
+    grazing angles.
     """
     inside = np.sqrt(np.maximum(1 - (1 - cosine**2) / (index * index), 0.0))
     perpendicular = (cosine - index * inside) / (cosine + index * inside)
@@ -819,20 +829,23 @@ def wet_surface_factor(cosine: Any, reflectance: Any) -> Any:
 
 
 def water_film_factor(mirrored: Any, reflectance: Any) -> Any:
-    """Return the result of `wet_surface_factor` for a known reflectance of the film of water."""
+    """Return the result of `wet_surface_factor`, given the reflectance of the film of water."""
     through = (1 - mirrored) / WATER_INDEX
     return through * through / (1 - WATER_INWARDS * reflectance)
 
 
 def normal_incidence_energy(distance: Any, extinction: float = 0.0) -> Any:
-    """Return the energy from perpendicular white surfaces at distances in meters."""
+    """Return the energies from white surfaces at normal incidence and the given distances.
+
+    The distances are in meters.
+    """
     distance = np.maximum(distance, NEAREST_M)
     nearer = np.square(REFERENCE_M / distance)
     return nearer * exp(-2 * extinction * distance) if extinction else nearer
 
 
 def extinction(visibility_km: float | None, wavelength_nm: float) -> float:
-    """Return the extinction of fog and haze at a wavelength, in 1/m.
+    """Return the extinction coefficient of fog and haze at the given wavelength, in 1/m.
 
     Parameters
     ----------

@@ -132,7 +132,7 @@ class Weather(FileSection):
 
     @property
     def particles(self) -> tuple[Particles, ...]:
-        """Raindrops and snowflakes in the air, if there are any."""
+        """Kinds of particles in the air: raindrops, snowflakes, both or none."""
         kinds = []
         if self.rain_mm_h:
             kinds.append(raindrops(self.rain_mm_h))
@@ -141,7 +141,7 @@ class Weather(FileSection):
         return tuple(kinds)
 
     def extinction_at(self, wavelength_nm: float) -> float:
-        """Return the extinction coefficient of the air at a wavelength, in 1/m."""
+        """Return the extinction coefficient of the air at the given wavelength, in 1/m."""
         alpha = extinction(self.visibility_km, wavelength_nm)
         for kind in self.particles:
             alpha += kind.extinction
@@ -150,7 +150,7 @@ class Weather(FileSection):
         return alpha
 
     def backscatter_at(self, wavelength_nm: float) -> float:
-        """Return the backscatter coefficient of fog and dust at a wavelength, in 1/(m sr)."""
+        """Return the backscatter coefficient of fog and dust at a given wavelength, in 1/(m sr)."""
         beta = dust_coefficients(self.dust_mg_m3)[1]
         if self.fog_lidar_ratio_sr is not None:
             beta += extinction(self.visibility_km, wavelength_nm) / self.fog_lidar_ratio_sr
@@ -179,7 +179,7 @@ class Particles(NamedTuple):
         return LARGE * math.pi / 4 * self.number * squares * 1e-6
 
     def number_above(self, diameter_mm: Floats) -> Floats:
-        """Return the number of particles above each diameter, per m³.
+        """Return the number of particles per m³ that are larger than each diameter.
 
         `diameter_mm` and the result have shape (n,).
         """
@@ -188,7 +188,7 @@ class Particles(NamedTuple):
 
 
 def raindrops(mm_h: float) -> Particles:
-    """Return the raindrops at a rain rate in mm/h (Marshall and Palmer 1948).
+    """Return the distribution of raindrops for a rain rate in mm/h (Marshall and Palmer 1948).
 
     According to geometrical optics, a drop reflects light at its front and, on the axis, at its
     back. With Fresnel's r = ((n-1)/(n+1))², its reflectance is (r + r (1-r)² (n/(2-n))²) / 4.
@@ -206,7 +206,7 @@ def raindrops(mm_h: float) -> Particles:
 
 
 def snowflakes(mm_h: float) -> Particles:
-    """Return the flakes of dry snow at a snowfall rate (Gunn and Marshall 1958).
+    """Return the distribution of dry snowflakes for a snowfall rate (Gunn and Marshall 1958).
 
     The snowfall rate is that of the melted water, in mm/h. The size distribution refers to the
     drops into which the flakes melt. A flake with a relative density of 0.1 is 2.15 times as wide
@@ -225,7 +225,7 @@ def snowflakes(mm_h: float) -> Particles:
 
 
 def spray_clumps(g_m3: float) -> Particles:
-    """Return the clumps of drops in the spray behind a vehicle.
+    """Return the distribution of clumps of drops in the spray behind a vehicle.
 
     `g_m3` is the mass of water in the air in g/m³. The extinction of the drops is twice their cross
     section. The drops form clumps, which are assumed to be opaque. The backscatter from an opaque
@@ -252,12 +252,12 @@ def dust_coefficients(mg_m3: float) -> tuple[float, float]:
 
 
 def particle_range(min_range_m: float, max_range_m: float) -> tuple[float, float]:
-    """Limit the range interval of a sensor to the ranges at which particles are simulated."""
+    """Limit a sensor's range interval to the ranges at which particles are simulated."""
     return max(min_range_m, NEAREST_M), min(max_range_m, FARTHEST_M)
 
 
 class Air(NamedTuple):
-    """Air along the beams of a sensor.
+    """Properties of the air and of a sensor's beam that determine the energy of returns.
 
     Energies are relative to the energy from a white surface at a distance of 10 m. The beam is
     round and uniformly bright.
@@ -284,20 +284,20 @@ class Air(NamedTuple):
     overlap_m: float
 
     def beam_diameter(self, distance: Floats) -> Floats:
-        """Return the beam diameter at each distance, in meters.
+        """Return the diameter of the beam at each distance, in meters.
 
         `distance` and the result have shape (n,).
         """
         return np.asarray(hypot(self.exit_m, self.divergence * distance))
 
     def white_energy(self, distance: Any) -> Any:
-        """Return the energy from a white disc that fills the beam, at distances in meters."""
+        """Return the energy from a white disc that fills the beam at a given distance in meters."""
         effective_m = np.maximum(distance, max(self.overlap_m, 1e-3))
         transmission = exp(-2 * self.extinction * distance)
         return np.square(REFERENCE_M / effective_m) * np.maximum(transmission, MIN_TRANSMISSION)
 
     def min_diameter_mm(self, particles: Particles, energy: float, distance: Floats) -> Floats:
-        """Return the diameter in millimeters of the smallest particle that returns an energy.
+        """Return the minimum diameter of a particle that returns the given energy, in millimeters.
 
         `distance` is in meters, and has shape (n,) like the result. The diameter is infinite at
         distances at which no particle returns the energy.
@@ -307,7 +307,7 @@ class Air(NamedTuple):
         return np.where(share <= 1, diameter_mm, np.inf)
 
     def particle_rate(self, particles: Particles, energy: float, distance: Floats) -> Floats:
-        """Return the number of particles per meter of the beam that return at least an energy.
+        """Return the number of particles per meter of beam that return at least the given energy.
 
         `distance` is in meters, and has shape (n,) like the result.
         """
@@ -317,7 +317,7 @@ class Air(NamedTuple):
     def mean_particles(
         self, particles: Particles, energy: float, start_m: float, stop_m: float
     ) -> float:
-        """Return the mean number of particles in a beam that return at least an energy.
+        """Return the mean number of particles in a beam that return at least the given energy.
 
         Only particles between the ranges `start_m` and `stop_m` are counted.
         """
@@ -325,7 +325,7 @@ class Air(NamedTuple):
         return float(np.trapezoid(self.particle_rate(particles, energy, distance), distance))
 
     def backscatter_energy(self, backscatter: float, starts: Floats, stops: Floats) -> Floats:
-        """Return the energies that fog or dust returns from slabs that fill the beam.
+        """Return the energies that fog or dust returns from slabs across the beam.
 
         `starts` and `stops` are ranges in meters, and have shape (n,) like the result. The energies
         are integrated with Simpson's rule.

@@ -1,4 +1,4 @@
-"""Poses and trajectories, their files, and the IMU and GNSS receiver of a platform."""
+"""Poses and trajectories, their files, and the platform's IMU and GNSS receiver."""
 
 from .navigation import Gnss, Imu, Navigation
 from .trajectory import Pose, StaticPose, Stations, Track, Trajectory

@@ -57,7 +57,7 @@ class TimedPoses(NamedTuple):
 
 @dataclass
 class _Edge:
-    """Poses of a frame in its parent frame."""
+    """Timed poses of a frame relative to its parent frame."""
 
     parent: str
     times_ns: list[int] = field(default_factory=list)
@@ -65,7 +65,7 @@ class _Edge:
 
 
 def read_bag(path: Path, topic: str | None, origin: Origin) -> TimedPoses:
-    """Read a trajectory from a bag.
+    """Read a trajectory from a ROS 2 bag.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def read_bag(path: Path, topic: str | None, origin: Origin) -> TimedPoses:
 
 
 def _choose_label(labels: Sequence[str], topic: str | None) -> str:
-    """Return the label to read if no topic was requested by its exact name.
+    """Choose a topic or frame to read if none was requested by its exact name.
 
     The result is the only label, or the only frame if the topic is /tf. Raise LidarError if there
     is no unique match.
@@ -130,7 +130,7 @@ def _choose_label(labels: Sequence[str], topic: str | None) -> str:
 
 
 def _row_of(pose: Any) -> list[float]:
-    """Return x, y and z and the quaternion (x, y, z, w) of a Pose or Transform message."""
+    """Return the position and the quaternion (x, y, z, w) in a Pose or Transform message."""
     position = pose.position if hasattr(pose, "position") else pose.translation
     orientation = pose.orientation if hasattr(pose, "orientation") else pose.rotation
     return [
@@ -145,12 +145,11 @@ def _row_of(pose: Any) -> list[float]:
 
 
 def _stamp_ns(header: Any) -> int:
-    """Return the timestamp of a message header in nanoseconds."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
 def _in_order(times_ns: Sequence[int], rows: Sequence[Sequence[float]]) -> tuple[Ints, Floats]:
-    """Return times and rows sorted by time, without duplicates of rows that were sent twice.
+    """Sort rows by time, and drop rows that were sent twice.
 
     The times have shape (k,), and the rows have shape (k, n).
     """
@@ -165,7 +164,7 @@ def _in_order(times_ns: Sequence[int], rows: Sequence[Sequence[float]]) -> tuple
 
 
 def _topic_poses(bag: Reader, topic: str, get_pose: Callable[[Any], Any]) -> TimedPoses:
-    """Return the poses of a topic with the timestamps of their headers."""
+    """Return the poses on a topic, with the timestamps in their message headers."""
     stamps = []
     times = []
     rows = []
@@ -187,7 +186,7 @@ def _topic_poses(bag: Reader, topic: str, get_pose: Callable[[Any], Any]) -> Tim
 def _gnss_poses(
     bag: Reader, kinds: Mapping[str, str], topic: str, imu: str, origin: Origin
 ) -> TimedPoses:
-    """Return the positions of a GNSS receiver, with orientations of an IMU if the bag has any."""
+    """Return the positions of a GNSS receiver, with an IMU's orientations if the bag has any."""
     times_ns = []
     fixes = []
     for _, _, fix in read_messages(bag, [topic]):
@@ -215,7 +214,7 @@ def _gnss_poses(
 
 
 def _orientations(bag: Reader, kinds: Mapping[str, str], imu: str) -> tuple[Ints, Floats] | None:
-    """Return the times in nanoseconds and the orientations of an IMU, or None without any.
+    """Return the times (in nanoseconds) and orientations of an IMU, or None without an IMU.
 
     The times have shape (k,). The rows have shape (k, 7) and contain zero positions.
     """
@@ -242,7 +241,7 @@ def _orientations(bag: Reader, kinds: Mapping[str, str], imu: str) -> tuple[Ints
 
 
 def _edges_of(bag: Reader, kinds: Mapping[str, str]) -> dict[str, _Edge]:
-    """Return the poses of each frame in its parent frame, from all tf topics."""
+    """Read the poses of all frames relative to their parent frames from the tf topics."""
     edges: dict[str, _Edge] = {}
     topics = [topic for topic, kind in kinds.items() if kind == _FRAMES]
     for topic, _, message in read_messages(bag, topics):
@@ -264,7 +263,7 @@ def _edges_of(bag: Reader, kinds: Mapping[str, str]) -> dict[str, _Edge]:
 
 
 def _chain(edges: Mapping[str, _Edge], frame: str) -> list[_Edge]:
-    """Return the edges from a frame up to the root."""
+    """Return the edges on the way from a frame to the root."""
     chain = []
     visited = set[str]()
     while frame in edges:
@@ -316,7 +315,7 @@ def _frame_poses(edges: Mapping[str, _Edge], frame: str) -> TimedPoses:
 
 
 def _edge_poses(edge_times: Ints, rows: Floats, times: Ints) -> tuple[Floats, Floats]:
-    """Interpolate the poses of an edge at times within its own times.
+    """Interpolate the poses of an edge at the requested times.
 
     Parameters
     ----------

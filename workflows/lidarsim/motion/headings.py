@@ -1,4 +1,4 @@
-"""Headings of platforms that face their direction of travel, because their poses have no angles.
+"""Headings along the direction of travel, for platforms whose poses contain no angles.
 
 The heading is the direction of the horizontal velocity. It is undefined while a platform is
 stationary or moves vertically. The platform then keeps its heading, and turns to the next heading
@@ -28,7 +28,7 @@ _NEAR_END = 2.0**-10  # fraction of a step near a stop in which rounding errors 
 
 
 class _Turns(NamedTuple):
-    """Consecutive changes of the heading."""
+    """Consecutive changes of heading."""
 
     starts_s: Floats  # (n,), ascending
     stops_s: Floats  # (n,), not after the next start
@@ -36,7 +36,7 @@ class _Turns(NamedTuple):
 
 
 class HeadedPoses(NamedTuple):
-    """Poses of a platform on straight legs, including the start and the end of each turn."""
+    """Poses of a platform on straight legs, including the poses where turns start and end."""
 
     times_s: Floats  # (n,)
     positions: Floats  # (n, 3), meters
@@ -44,7 +44,7 @@ class HeadedPoses(NamedTuple):
 
 
 def headed_poses(times_s: Floats, positions: Floats) -> HeadedPoses:
-    """Return the poses of a level platform that travels on straight legs between positions.
+    """Return the poses of a level platform that travels along straight legs.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def _turns_between_legs(times_s: Floats, positions: Floats) -> _Turns:
 
 
 def _nonzero_turns(starts: Floats, stops: Floats, yaws: Floats) -> _Turns:
-    """Return the turns that change the heading, each in the shorter direction."""
+    """Return the turns that change the heading, taking the shorter direction for each."""
     changes = np.diff(yaws)
     changes -= 2 * np.pi * np.round(changes / (2 * np.pi))
     turning = np.abs(changes) > 1e-12
@@ -102,7 +102,7 @@ def _nonzero_turns(starts: Floats, stops: Floats, yaws: Floats) -> _Turns:
 
 
 class Heading(NamedTuple):
-    """Headings at k times."""
+    """Headings at k times, and their rates of change."""
 
     cosines: Floats  # (k,)
     sines: Floats  # (k,)
@@ -110,7 +110,7 @@ class Heading(NamedTuple):
 
 
 class _Stops(NamedTuple):
-    """Intervals in which a platform is stationary, with its headings on arrival and departure.
+    """Intervals in which a platform is stationary, with the headings before and after.
 
     The first interval ends when the platform starts to travel, and the last interval starts when it
     stops for the last time. Both intervals exist even if they have no duration.
@@ -122,7 +122,7 @@ class _Stops(NamedTuple):
 
     @classmethod
     def between(cls, times_s: Floats, travels: Bools, first: Floats, last: Floats) -> _Stops:
-        """Create the stationary intervals between the segments in which a platform travels.
+        """Create the intervals between the segments on which the platform travels.
 
         Parameters
         ----------
@@ -154,7 +154,10 @@ class _Stops(NamedTuple):
         )
 
     def at(self, times_s: Floats) -> Heading:
-        """Return the headings at times at which the platform is stationary. Shape (k,)."""
+        """Return the headings at the given times, at which the platform is stationary.
+
+        Times and headings have shape (k,).
+        """
         row = np.clip(np.searchsorted(self.arrivals_s, times_s, "right") - 1, 0, None)
         stops_s = self.departures_s.take(row)
         duration = np.minimum(stops_s - self.arrivals_s.take(row), STATIONARY_TURN_S)
@@ -172,7 +175,7 @@ class _Stops(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CurveHeadings:
-    """Headings of a platform on a smooth curve, which follow the horizontal tangent of the curve.
+    """Headings along the horizontal tangent of a smooth curve.
 
     Attributes
     ----------
@@ -200,7 +203,7 @@ class CurveHeadings:
 
     @classmethod
     def from_knots(cls, times_s: Floats, knots: Floats) -> CurveHeadings:
-        """Create the headings of a curve from its knots and their times.
+        """Create the headings of a curve, given its knots and their times.
 
         The knots have shape (3, 3, n), and the times have shape (n,).
         """
@@ -222,7 +225,7 @@ class CurveHeadings:
         return cls(times_s, knots, still, travels, first, stops)
 
     def at(self, segment: Indices, since: Floats) -> Heading:
-        """Return the headings at `since` seconds after the knots with the indices `segment`.
+        """Return the headings `since` seconds after the knots with the indices `segment`.
 
         Both arrays have shape (k,).
         """
@@ -235,7 +238,7 @@ class CurveHeadings:
         return Heading(*(np.where(travels, one, other) for one, other in pairs))
 
     def _tangent(self, segment: Indices, since: Floats) -> Heading:
-        """Return the headings on segments in which the platform travels."""
+        """Return the headings on the segments on which the platform travels."""
         steps = np.diff(self.times_s)
         step = steps.take(segment)
         near_start = np.where(self.still.take(segment), _NEAR_END * step, 0.0)

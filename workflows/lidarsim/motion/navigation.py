@@ -1,4 +1,4 @@
-"""Simulation of the IMU and the GNSS receiver of a platform, including drift.
+"""Simulation of a platform's IMU and GNSS receiver, including drift.
 
 True values are computed from the trajectory of the platform. The samples of an inertial measurement
 unit (IMU) are means over the sampling interval. Their sums are therefore exactly the rotations and
@@ -244,7 +244,7 @@ class ImuSamples(NamedTuple):
 
 
 class GnssFixes(NamedTuple):
-    """Consecutive positions of the antenna of a GNSS receiver."""
+    """Consecutive antenna positions measured by a GNSS receiver."""
 
     times_ns: Ints  # (k,), since the start of the survey
     positions: Floats  # (k, 3), meters, scene coordinates
@@ -255,7 +255,7 @@ class InstrumentedDrive(Protocol):
 
     @property
     def navigation(self) -> Navigation | None:
-        """Instruments on the platform, or None."""
+        """Instruments on the platform, or None if it has none."""
 
     @property
     def path(self) -> Trajectory:
@@ -263,7 +263,7 @@ class InstrumentedDrive(Protocol):
 
     @property
     def duration_ns(self) -> float:
-        """Duration in nanoseconds."""
+        """Duration of the survey in nanoseconds."""
 
     @property
     def platform_name(self) -> str:
@@ -293,7 +293,7 @@ def check_navigation(navigation: Navigation, path: Trajectory, epsg: int | None)
 
 
 def imu_samples(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[ImuSamples]:
-    """Yield the samples of the IMU on a drive in blocks of `block` samples.
+    """Yield the IMU samples of a drive in blocks of `block` samples.
 
     A sample ends at each multiple of the sampling interval within the drive. Samples do not depend
     on `block`.
@@ -317,7 +317,7 @@ def imu_samples(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[ImuSam
 
 
 def _true_samples(path: Trajectory, imu: Imu, gravity_m_s2: float, samples: Ints) -> ImuSamples:
-    """Return the samples with the indices `samples` of an ideal IMU on a trajectory."""
+    """Return the samples with the given indices that an ideal IMU takes on a trajectory."""
     ends_ns: Floats = np.append(samples, samples[-1] + 1) * 1e9 / imu.rate_hz
     motion = _mounted_motion(path, imu.mount, ends_ns)
     middles = (ends_ns[1:] + ends_ns[:-1]) / 2
@@ -337,7 +337,7 @@ class _Triad(NamedTuple):
 
     @classmethod
     def from_imu(cls, imu: Imu, name: str, seed: int) -> _Triad:
-        """Create the gyroscopes or accelerometers of an IMU.
+        """Create the gyroscopes or the accelerometers of an IMU.
 
         `name` is either "gyroscope" or "accelerometer".
         """
@@ -354,7 +354,7 @@ class _Triad(NamedTuple):
         return cls(errors, np.eye(3) + sigma * skews)
 
     def measure(self, truth: Floats, samples: Ints) -> Floats:
-        """Return true values with the errors of the next samples.
+        """Add the errors of the next samples to the true values.
 
         For `samples` of shape (k,), `truth` and the result have shape (k, 3).
         """
@@ -362,7 +362,7 @@ class _Triad(NamedTuple):
 
 
 def gnss_fixes(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[GnssFixes]:
-    """Yield the positions of the GNSS receiver on a drive in blocks of `block` positions."""
+    """Yield the GNSS positions of a drive in blocks of `block` positions."""
     navigation = drive.navigation
     path = drive.path
     if navigation is None or navigation.gnss is None:
@@ -398,7 +398,7 @@ def gnss_fixes(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[GnssFix
 def _bridging_errors(
     imu: Imu, seed: int, number: int, since_s: Floats, duration_s: float
 ) -> Floats:
-    """Return the position errors during and after an outage that is bridged by an IMU.
+    """Return the position errors during and after an outage that an IMU bridges.
 
     After the time t, the error is b t^2 / 2 for a bias b, and N sqrt(t^3 / 3) for a velocity random
     walk N (Groves 2013).
@@ -430,7 +430,7 @@ def _bridging_errors(
 
 
 class _Motion(NamedTuple):
-    """Motion of an instrument, in the scene frame."""
+    """Motion of an instrument in the scene frame."""
 
     positions: Floats  # (k, 3), meters
     rotations: Floats  # (k, 3, 3)
@@ -438,7 +438,7 @@ class _Motion(NamedTuple):
 
 
 def _mounted_motion(path: Trajectory, mount: Pose, times_ns: Floats) -> _Motion:
-    """Return the motion of an instrument on a platform at several times."""
+    """Return the motion of an instrument on a platform at the given times."""
     times_ns = np.minimum(times_ns, path.duration_ns)
     positions, rotations = full_poses(path, 0, times_ns)
     speeds, rates = velocities(path, 0, times_ns)
@@ -564,9 +564,9 @@ def to_geodetic(positions: Floats, origin: tuple[float, float, float]) -> Floats
 def _geocentric(
     positions: Floats, origin: tuple[float, float, float]
 ) -> tuple[Floats, Floats, Floats]:
-    """Convert local positions to geocentric coordinates in meters, each of shape (k,).
+    """Convert local positions to geocentric coordinates in meters.
 
-    The parameters are those of `to_geodetic`.
+    Each coordinate has shape (k,). The parameters are those of `to_geodetic`.
     """
     sp, cp = sin_cos_of(math.radians(origin[0]))
     sl, cl = sin_cos_of(math.radians(origin[1]))
@@ -579,7 +579,7 @@ def _geocentric(
 
 
 def from_geodetic(coordinates: Floats, origin: tuple[float, float, float]) -> Floats:
-    """Convert geodetic coordinates to local positions, which is the inverse of `to_geodetic`.
+    """Convert geodetic coordinates to local positions. This is the inverse of `to_geodetic`.
 
     Parameters
     ----------
@@ -601,7 +601,10 @@ def from_geodetic(coordinates: Floats, origin: tuple[float, float, float]) -> Fl
 
 
 def _cartesian(coordinates: Floats) -> Floats:
-    """Convert geodetic to geocentric coordinates in meters, both of shape (k, 3)."""
+    """Convert geodetic coordinates to geocentric coordinates in meters.
+
+    Both have shape (k, 3).
+    """
     latitude, longitude, height = coordinates.T
     sp, cp = sin_cos(np.radians(latitude))
     sl, cl = sin_cos(np.radians(longitude))

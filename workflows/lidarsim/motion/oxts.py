@@ -1,4 +1,4 @@
-"""Reader for the oxts folders of the KITTI data set, recorded by an inertial navigation system.
+"""Reader for the oxts folders of the KITTI data set, from an inertial navigation system.
 
 Each file contains a row of 30 numbers. The row starts with latitude and longitude in degrees,
 altitude in meters, and roll, pitch and yaw in radians, as described in dataformat.txt of KITTI's
@@ -29,7 +29,7 @@ _DATE = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d*)?")
 
 
 def find_oxts(path: Path) -> Path | None:
-    """Return the oxts folder at or inside a path, or None."""
+    """Find the oxts folder at or inside a path. Return None if there is none."""
     for folder in (path, path / "oxts", path.parent if path.name == "data" else path):
         if (folder / "data").is_dir() and (folder / OXTS_TIMES).is_file():
             return folder
@@ -37,12 +37,12 @@ def find_oxts(path: Path) -> Path | None:
 
 
 def oxts_files(folder: Path) -> list[Path]:
-    """Return the data files of an oxts folder in the order of their numbers."""
+    """Return the data files of an oxts folder, sorted by their numbers."""
     return sort_by_number((folder / "data").glob("*.txt"))
 
 
 def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Floats, Floats]:
-    """Read an oxts folder, which contains timestamps.txt and the folder data.
+    """Read an oxts folder, which contains timestamps.txt and a folder `data`.
 
     Returns
     -------
@@ -75,7 +75,7 @@ def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Flo
 
 
 def parse_dates(text: str) -> Floats | None:
-    """Return the times in seconds since 1970 of a text with one date per line.
+    """Convert text with one date per line to seconds since 1970.
 
     The result is None if any line is not a date.
     """
@@ -86,7 +86,7 @@ def parse_dates(text: str) -> Floats | None:
 
 
 def oxts_poses(rows: Floats, origin: Sequence[float] | None) -> tuple[Floats, Floats]:
-    """Convert rows of oxts files to positions and quaternions.
+    """Convert the rows of oxts files to positions and quaternions.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def oxts_poses(rows: Floats, origin: Sequence[float] | None) -> tuple[Floats, Fl
     scale = sin_cos_of(np.radians(float(origin_row[0])))[1]
 
     def project(latitude: Floats, longitude: Floats) -> Floats:
-        """Convert degrees of shape (k,) to meters to the east and north, with shape (k, 2)."""
+        """Project latitudes and longitudes in degrees to meters to the east and north."""
         sine, cosine = sin_cos((90.0 + latitude) * (np.pi / 360.0))
         north = log(sine / cosine)
         return scale * _RADIUS_M * np.stack([np.radians(longitude), north], axis=-1)

@@ -22,7 +22,7 @@ _QUATERNIONS = (
 
 
 def _spelled(prefixes: tuple[str, ...], axis: str, *spellings: str) -> tuple[str, ...]:
-    """Return the spellings of an axis with each prefix, followed by `spellings`."""
+    """Return the spellings of an axis: each prefix with the axis, followed by `spellings`."""
     return *(f"{prefix}_{axis}" for prefix in prefixes), *spellings
 
 
@@ -74,7 +74,7 @@ REFUSED_COLUMNS = {
 
 
 def convert_heading(columns: Mapping[str, Floats]) -> dict[str, Floats]:
-    """Return the columns of a table with the heading converted to yaw, in degrees.
+    """Return the columns of a table, with a heading converted to yaw in degrees.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def convert_heading(columns: Mapping[str, Floats]) -> dict[str, Floats]:
 
 
 def stack_angles(columns: Mapping[str, Floats], count: int) -> Floats:
-    """Return yaw, pitch and roll in degrees, with zeros for missing columns.
+    """Return yaw, pitch and roll in degrees. Missing columns are filled with zeros.
 
     The result has shape (count, 3).
     """

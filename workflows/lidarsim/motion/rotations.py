@@ -14,10 +14,10 @@ _ROUNDS = 8
 
 
 def rotations_of(angles_deg: Floats) -> Floats:
-    """Convert yaw, pitch and roll in degrees, in aerospace order, to rotation matrices.
+    """Convert yaw, pitch and roll in degrees to rotation matrices.
 
-    Angles of shape (k, 3) result in matrices of shape (k, 3, 3), and angles of shape (3,) in a
-    single matrix of shape (3, 3).
+    The angles are applied in the aerospace order. Angles of shape (k, 3) result in matrices of
+    shape (k, 3, 3), and angles of shape (3,) in a single matrix of shape (3, 3).
     """
     angles = np.radians(angles_deg.T)
     (sy, sp, sr), (cy, cp, cr) = sin_cos(angles)
@@ -34,7 +34,7 @@ def rotations_of(angles_deg: Floats) -> Floats:
 
 
 def check_rotations(rotations: Floats, slack: float = 1e-6) -> None:
-    """Check that the matrices of poses are rotation matrices.
+    """Check that matrices are rotation matrices.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def check_rotations(rotations: Floats, slack: float = 1e-6) -> None:
 
 
 def rotation_sines(rotations: Floats) -> Floats:
-    """Return the unit rotation axes, multiplied by twice the sine of the rotation angle.
+    """Return the unit rotation axes multiplied by twice the sine of the rotation angle.
 
     For rotations of shape (k, 3, 3), the result has shape (k, 3).
     """
@@ -74,7 +74,7 @@ def rotation_sines(rotations: Floats) -> Floats:
 
 
 def rotation_terms(rotations: Floats, axes: Floats) -> Floats:
-    """Return the coefficients of Rodrigues' formula for rotations that continue about an axis.
+    """Return the coefficients of Rodrigues' formula for continuing rotations about the given axes.
 
     For rotations of shape (3, 3, s) and unit axes of shape (3, s), the result `terms` has shape
     (3, 9, s). After a further rotation by the angle a, the matrix is
@@ -89,7 +89,7 @@ def rotation_terms(rotations: Floats, axes: Floats) -> Floats:
 
 
 def rotations_between(first: Floats, last: Floats, durations_s: Floats) -> tuple[Floats, Floats]:
-    """Return the axes and rates of constant rotations between pairs of quaternions.
+    """Return the axes and rates of the constant rotations between pairs of quaternions.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def matrices(quaternions: Floats) -> Floats:
 
 
 def matrices_by_component(quaternions: Floats) -> Floats:
-    """Convert unit quaternions to rotation matrices, with the components along the first axes.
+    """Convert unit quaternions to rotation matrices, both with the components first.
 
     The quaternions (x, y, z, w) have shape (4, k), and the matrices have shape (3, 3, k).
     """
@@ -138,7 +138,7 @@ def matrices_by_component(quaternions: Floats) -> Floats:
 
 
 def quaternions_of(rotations: Floats) -> Floats:
-    """Convert rotation matrices, which may have rounding errors, to unit quaternions.
+    """Convert rotation matrices, which may contain rounding errors, to unit quaternions.
 
     The matrices have shape (k, 3, 3), and the quaternions (x, y, z, w) have shape (k, 4).
 

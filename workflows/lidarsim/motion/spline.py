@@ -1,4 +1,4 @@
-"""Twice continuously differentiable curves that interpolate values and are stationary at stops.
+"""Twice continuously differentiable curves that interpolate values and rest at stops.
 
 Between two knots, a curve is a polynomial of degree five. The first and second derivatives at its
 ends are zero at stops and those of the cubic spline elsewhere, so that the curve is identical to
@@ -20,7 +20,7 @@ _PAD = 32
 
 
 def fit_knots(times: Floats, values: Floats) -> Floats:
-    """Return the values at the knots of a curve, and their first two derivatives.
+    """Return the values and the first two derivatives of a curve at its knots.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def fit_knots(times: Floats, values: Floats) -> Floats:
 
 
 def is_stationary(steps: Floats, slopes: Floats) -> Bools:
-    """Return whether the curve is stationary between each pair of adjacent knots.
+    """Return whether a curve is stationary between each pair of adjacent knots.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def is_stationary(steps: Floats, slopes: Floats) -> Bools:
 
 
 def _end_slopes(times: Floats, values: Floats) -> Floats:
-    """Return the slopes at the first time of cubic polynomials through four values.
+    """Return the slopes of cubic polynomials through four values at the first of their times.
 
     The polynomials are in Newton form. `values` has shape (d, 4), or fewer columns for a short
     curve, and the result has shape (d,).
@@ -96,7 +96,7 @@ def _end_slopes(times: Floats, values: Floats) -> Floats:
 
 
 def _reduce(equations: Floats) -> None:
-    """Solve padded tridiagonal equations in place by cyclic reduction (Hockney, 1965).
+    """Solve padded tridiagonal equations in place by cyclic reduction (Hockney 1965).
 
     `equations` has shape (2 + d, n). Rows 0 and 1 contain the coefficients of the previous and the
     next unknown. The other rows contain the right-hand sides, which are replaced by the solutions.
@@ -118,9 +118,10 @@ def _reduce(equations: Floats) -> None:
 
 
 class _Polynomials(NamedTuple):
-    """Coefficients of polynomials of degree five, each with shape (d, m).
+    """Coefficients of polynomials of degree five.
 
-    The argument of the polynomials is the fraction of the segment, from 0 to 1.
+    Each has shape (d, m). The argument of the polynomials is the fraction of the segment, from 0 to
+    1.
     """
 
     constant: Floats
@@ -134,7 +135,7 @@ class _Polynomials(NamedTuple):
 def evaluate_curve(
     knots: Floats, steps: Floats, segment: Indices, since: Floats, order: int = 0
 ) -> list[Floats]:
-    """Evaluate a curve and its derivatives at several points.
+    """Evaluate a curve and its derivatives at the given points.
 
     Parameters
     ----------
@@ -176,7 +177,7 @@ def evaluate_curve(
 
 
 def _polynomials(knots: Floats, segments: Indices, step: Floats) -> _Polynomials:
-    """Return the polynomials of segments with durations `step`, both of shape (m,)."""
+    """Return the polynomials on segments of the given durations."""
     powers = np.stack([step / step, step, step * step / 2])[:, None]
     # p, v and a are the value and the scaled derivatives at the start, and q, w and b at the end.
     (p, v, a), (q, w, b) = (knots.take(segments + k, axis=2) * powers for k in (0, 1))

@@ -31,7 +31,7 @@ class StraightLines(NamedTuple):
 
     @property
     def seconds(self) -> float:
-        """Total duration of the lines."""
+        """Total duration of the lines in seconds."""
         return float((self.stops_s - self.starts_s).sum())
 
     @property
@@ -40,7 +40,7 @@ class StraightLines(NamedTuple):
         return float(self.lengths_m.sum())
 
     def mean_speed(self, start_s: float, stop_s: float) -> float | None:
-        """Return the mean speed in m/s on the lines within a time interval, or None without lines.
+        """Return the mean speed in m/s on the lines in a time interval, or None if it has no lines.
 
         Examples
         --------
@@ -56,7 +56,7 @@ class StraightLines(NamedTuple):
         return float((speeds_m_s * within_s).sum() / within_s.sum())
 
     def seconds_within(self, spans_s: Sequence[tuple[float, float]]) -> Floats:
-        """Return the time in seconds for which each line overlaps any of several time spans.
+        """Return the time, in seconds, for which each line overlaps any of the given time spans.
 
         Overlaps of 0.1 s or less are ignored, because the ends of a line are not known more
         precisely. The result has shape (n,).
@@ -77,7 +77,7 @@ class StraightLines(NamedTuple):
 
     @classmethod
     def find(cls, times_s: Floats, positions: Floats) -> StraightLines:
-        """Find the lines of a trajectory that last at least a second.
+        """Find the straight lines of a trajectory that last at least a second.
 
         Only the horizontal direction of travel is considered.
 
@@ -144,7 +144,7 @@ def _steady_runs(headings: Floats, moves: Bools, reach: int) -> list[tuple[int, 
 
 
 def _merge_runs(headings: Floats, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Merge runs if the direction of travel changes by less than `_TURN_DEG` between them."""
+    """Merge runs between which the direction of travel changes by less than `_TURN_DEG`."""
     lines: list[tuple[int, int]] = []
     for start, stop in runs:
         if lines:

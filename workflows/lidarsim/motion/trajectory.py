@@ -71,7 +71,7 @@ class Pose(FileSection):
 
     @property
     def rotation(self) -> Floats | None:
-        """Rotation matrix from the sensor frame to the scene frame, or None without rotation.
+        """Rotation matrix from the sensor frame to the scene frame, or None without a rotation.
 
         The shape is (3, 3).
         """
@@ -127,7 +127,7 @@ class Pose(FileSection):
 
 
 def as_pose(name: str, value: Any) -> Pose:
-    """Convert a position to a pose, and return a pose unchanged.
+    """Convert a position to a pose. A pose is returned unchanged.
 
     Parameters
     ----------
@@ -191,10 +191,10 @@ class Trajectory(Protocol):
         """Maximum duration of a station in nanoseconds, which may be infinite."""
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
-        """Return the pose at a time in nanoseconds since the start of a station."""
+        """Return the pose at a given time in nanoseconds since the start of a station."""
 
     def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats | None]:
-        """Return the positions and rotations at several times.
+        """Return the positions and rotations at the given times.
 
         Ray casting is fastest if each component is contiguous over the poses.
 
@@ -223,7 +223,7 @@ def presence_ns(path: Trajectory) -> tuple[float, float]:
 
 
 def full_poses(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-    """Return positions and rotations as `path.poses`, with identity matrices instead of None."""
+    """Return the result of `path.poses`, with identity matrices for missing rotations."""
     positions, rotations = path.poses(station, times_ns)
     if rotations is None:
         rotations = np.broadcast_to(np.eye(3), (len(times_ns), 3, 3))
@@ -231,7 +231,7 @@ def full_poses(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats
 
 
 def check_trajectory_type(name: str, value: object) -> None:
-    """Check that an argument is a trajectory instead of, for example, the path of its file.
+    """Check that an argument is a trajectory and not, for example, the path of a file.
 
     Raises
     ------
@@ -246,7 +246,7 @@ def check_trajectory_type(name: str, value: object) -> None:
 
 
 def velocities(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-    """Return the linear and angular velocities on a trajectory.
+    """Return the linear and angular velocities along a trajectory.
 
     If the class of the trajectory has a method `velocities(station, times_ns)`, as in this package,
     that method is called. Otherwise, the velocities are difference quotients over 1 ms.
@@ -278,7 +278,7 @@ def velocities(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats
 
 @dataclass(frozen=True)
 class Stations:
-    """A trajectory of a sensor that is stationary at one pose after another."""
+    """A trajectory of a sensor that scans from one stationary pose after another."""
 
     at: tuple[Pose, ...]
     moves: ClassVar[bool] = False
@@ -287,7 +287,7 @@ class Stations:
 
     @property
     def stations(self) -> int:
-        """Number of stations, which is the number of poses."""
+        """Number of stations, which equals the number of poses."""
         return len(self.at)
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
@@ -309,7 +309,7 @@ class Stations:
 
 @dataclass(frozen=True, eq=False)
 class StaticPose:
-    """A trajectory that stays at a single pose, which is defined by a rotation matrix.
+    """A trajectory that stays at a single pose, given by a position and a rotation matrix.
 
     Attributes
     ----------
@@ -456,7 +456,7 @@ class Track:
         return [_BatchTrack.from_batch(batch, number) for number in range(len(matrices))]
 
     def _set_quaternions(self, angles: Mapping[str, ArrayLike]) -> None:
-        """Set the quaternions from angles in degrees, which are mapped by parameter name.
+        """Compute the quaternions from angles in degrees, keyed by parameter name.
 
         Each entry is either one angle for all poses or an array of shape (k,).
         """
@@ -483,7 +483,7 @@ class Track:
         object.__setattr__(self, "quaternions", quaternions_of(rotations_of(table)))
 
     def _set_poses(self) -> None:
-        """Validate the times, positions and quaternions, and replace them by read-only copies."""
+        """Validate the times, positions and quaternions, and replace them with read-only copies."""
         times = as_array("times_s", self.times_s).copy()
         positions = as_array("positions", self.positions).copy()
         if times.ndim != 1 or len(times) < 2 or positions.shape != (len(times), 3):
@@ -513,7 +513,7 @@ class Track:
             object.__setattr__(self, name, array)
 
     def _set_span(self) -> None:
-        """Check that the station is within the times, and set its start and duration."""
+        """Set the start and duration of the station, and check that both are within the times."""
         times = self.times_s
         start = times[0] if self.start_s is None else self.start_s
         last = times[-1] if self.duration_s is None else start + self.duration_s
@@ -541,7 +541,7 @@ class Track:
 
     @property
     def presence_ns(self) -> tuple[float, float]:
-        """Times at which an actor enters and leaves the scene.
+        """Times at which an actor on this track enters and leaves the scene.
 
         The times are in nanoseconds since the start of the station. They are infinite unless
         `beyond` is "absent".
@@ -554,16 +554,16 @@ class Track:
 
     @property
     def slack_s(self) -> float:
-        """Maximum time in seconds by which a requested pose may lie outside the trajectory."""
+        """Maximum time in seconds by which a pose may be requested before or after the track."""
         return _FIRING_S if self.beyond == "refuse" else np.inf
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
-        """Return the pose at a time in nanoseconds since the start of the station."""
+        """Return the pose at a given time in nanoseconds since the start of the station."""
         positions, rotations = self.poses(station, np.array([time_ns], np.float64))
         return Pose.from_rotation(positions[0], rotations[0])
 
     def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return the positions and rotations at several times.
+        """Return the positions and rotations at the given times.
 
         Parameters
         ----------
@@ -603,7 +603,7 @@ class Track:
         return positions.T, rotations.reshape(3, 3, -1).transpose(2, 0, 1)
 
     def velocities(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return the linear and angular velocities at several times.
+        """Return the linear and angular velocities at the given times.
 
         Both velocities are in the scene frame and are exact derivatives of the path. At a pose of
         the track, they are the derivatives of the next segment.
@@ -642,7 +642,7 @@ class Track:
         return (speeds * within).T, (rates * within).T
 
     def _segments_at(self, times_ns: Floats) -> _SegmentTimes:
-        """Return the segments that contain times in nanoseconds since the start of the station."""
+        """Return the segments for the given times in nanoseconds since the start of the station."""
         assert self.start_s is not None  # set in __post_init__
         times = self.times_s
         moments_s = times_ns / 1e9 + self.start_s
@@ -675,14 +675,14 @@ class Track:
 
     @cached_property
     def _headings(self) -> CurveHeadings | None:
-        """Headings of a smooth track without quaternions, or None for other tracks."""
+        """Headings of a smooth track without quaternions, or None for any other track."""
         if not self.smooth or self.quaternions is not None:
             return None
         return CurveHeadings.from_knots(self.times_s, self._spline[0])
 
     @cached_property
     def _spline(self) -> tuple[Floats, Floats]:
-        """Knots of positions and quaternions, and steps in seconds, for `evaluate_curve`.
+        """Knots of positions and quaternions, and time steps in seconds, for `evaluate_curve`.
 
         The knots have shape (3, d, k), where d is 7, or 3 without quaternions. The steps have shape
         (k - 1,). The sign of each quaternion is chosen so that it is close to the previous one.
@@ -711,7 +711,9 @@ class Track:
 
 
 class Segments(NamedTuple):
-    """Coefficients for the poses on the segments of a track, with one column per segment.
+    """Coefficients from which the poses on segments of a track are computed.
+
+    The arrays have one column per segment.
 
     Attributes
     ----------
@@ -763,7 +765,7 @@ def _segments(
 
 @dataclass(frozen=True, eq=False)
 class TrackBatch:
-    """Linear tracks of several bodies with common times, whose segments are computed together.
+    """Linear tracks of several bodies with common times. Their segments are computed together.
 
     Attributes
     ----------
@@ -787,7 +789,10 @@ class TrackBatch:
 
     @classmethod
     def from_matrices(cls, times_s: Floats, matrices: Floats, beyond: Beyond) -> TrackBatch:
-        """Create tracks from rigid transforms of shape (k, s, 4, 4) at times of shape (s,)."""
+        """Create tracks from rigid transforms at the given times.
+
+        The transforms have shape (k, s, 4, 4), and the times have shape (s,).
+        """
         count, samples = matrices.shape[:2]
         quaternions = quaternions_of(matrices[..., :3, :3].reshape(-1, 3, 3))
         rows = quaternions.reshape(count, samples, 4)
@@ -804,7 +809,7 @@ class TrackBatch:
         return cls(times_s, positions, rows, beyond, segments)
 
     def select_segments(self, numbers: ArrayLike) -> Segments:
-        """Return the segments of several tracks, in the order of their indices in `numbers`."""
+        """Return the segments of the tracks with the given indices, in that order."""
         steps = len(self.times_s) - 1
         columns = (np.asarray(numbers)[:, None] * steps + np.arange(steps)).reshape(-1)
         return Segments(*(np.ascontiguousarray(part[..., columns]) for part in self.segments))
@@ -821,7 +826,7 @@ class _BatchTrack(Track):
 
     @classmethod
     def from_batch(cls, batch: TrackBatch, number: int) -> _BatchTrack:
-        """Create a track without the validation of `Track`."""
+        """Create a track without the validation that `Track` performs."""
         track = object.__new__(cls)
         vars(track).update(
             times_s=batch.times_s,
@@ -851,7 +856,7 @@ def find_batch(trajectory: Trajectory) -> TrackBatch | None:
 
 
 class _SegmentTimes(NamedTuple):
-    """Times on a track, relative to the segments that contain them."""
+    """Times on a track, relative to the segments in which they lie."""
 
     segment: Indices  # (k,), indices of the segments
     since: Floats  # (k,), seconds since the start of each segment
@@ -859,7 +864,6 @@ class _SegmentTimes(NamedTuple):
 
 
 def _level_rotations(heading: Heading) -> Floats:
-    """Return the rotation matrices of a level platform."""
     rotations = np.zeros((3, 3, len(heading.cosines)))
     rotations[0, 0] = rotations[1, 1] = heading.cosines
     rotations[1, 0] = heading.sines

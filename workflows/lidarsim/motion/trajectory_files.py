@@ -1,4 +1,4 @@
-"""Reader for trajectory files, such as TUM and KITTI poses, tables, oxts folders and ROS 2 bags."""
+"""Reader for trajectory files: TUM, KITTI, tables, oxts folders and ROS 2 bags."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _HELIOS = " To read a HELIOS++ .trj with its survey, run `lidarpool import`."
 
 
 class PoseTable(NamedTuple):
-    """Poses that were read from a file."""
+    """Poses read from a file."""
 
     seconds: Floats  # (k,)
     positions: Floats  # (k, 3), meters
@@ -56,7 +56,7 @@ class PoseTable(NamedTuple):
 
 
 class TimeOptions(NamedTuple):
-    """Options for the times of a pose file."""
+    """Options that define the times of a pose file."""
 
     file: str | Path | None  # file that contains the times of KITTI poses
     unit: TimeUnit | None
@@ -173,7 +173,7 @@ def load_trajectory(
 
 
 def read_kitti_poses(path: Path) -> Floats | None:
-    """Read the matrices in a file of KITTI poses, which has no times.
+    """Read the matrices in a file of KITTI poses, which contains no times.
 
     Returns
     -------
@@ -204,7 +204,7 @@ def read_kitti_poses(path: Path) -> Floats | None:
 
 
 def list_trajectory_files(path: Path) -> list[Path]:
-    """Return the files of a trajectory, which are the path itself or the files in its folder."""
+    """Return the files of a trajectory: the path itself, or the files in its folder."""
     if not path.is_dir():
         return [path]
     if is_bag(path):
@@ -226,7 +226,7 @@ def _read_container(
     topic: str | None,
     origin: Sequence[float] | None,
 ) -> tuple[str, PoseTable]:
-    """Read a folder or bag, and return its format and poses."""
+    """Read a folder or a bag. Return its format and its poses."""
     if not path.exists():
         raise FileNotFoundError(2, "No such file or directory")
     if is_bag(path) and kind in (None, "bag"):
@@ -257,7 +257,7 @@ def _parse_text(
     ignore: Sequence[str],
     origin: Sequence[float] | None,
 ) -> tuple[str, PoseTable]:
-    """Return the format and the poses of the content of a text file."""
+    """Parse the content of a text file. Return its format and its poses."""
     lines = text.splitlines()
     if timing.file is not None and kind not in (None, "kitti", "oxts"):
         raise ValueError(f"times can only be combined with KITTI poses, but format is {kind}")
@@ -276,7 +276,7 @@ def _parse_rows(
     timing: TimeOptions,
     origin: Sequence[float] | None,
 ) -> tuple[str, PoseTable]:
-    """Return the format and the poses of rows of numbers without a header."""
+    """Parse rows of numbers without a header. Return their format and poses."""
     width = rows.shape[1]
     if kind is None:
         kind = (
@@ -305,7 +305,7 @@ def _parse_rows(
 
 
 def _seconds_in_file(path: Path, unit: TimeUnit | None) -> Floats:
-    """Return the times in seconds from a file with a number or a date in each row."""
+    """Read times in seconds from a file with a number or a date in each row."""
     try:
         text = read_text(path)
         dates = parse_dates(text)
@@ -321,14 +321,14 @@ def _seconds_in_file(path: Path, unit: TimeUnit | None) -> Floats:
 
 
 def _seconds_of_dates(seconds: Floats, unit: TimeUnit | None) -> Floats:
-    """Validate the times of dates, and raise ValueError if a time unit is set."""
+    """Validate times that were parsed from dates. Raises ValueError if a time unit is set."""
     if unit is not None:
         raise ValueError("its times are dates, so time_unit cannot be set")
     return seconds_of(seconds, None, advice="Correct them")
 
 
 def _is_pose_column(cell: str) -> bool:
-    """Return True if a header cell names a component of a pose."""
+    """Return whether a header cell names a component of a pose."""
     words = column_name(cell).words
     return any(
         words in {column_name(name).words for name in quantity.spellings}
@@ -337,7 +337,7 @@ def _is_pose_column(cell: str) -> bool:
 
 
 def _parse_numbers(text: str, columns: int | None = None) -> Floats:
-    """Return the rows of numbers in a text, and skip comments that start with #.
+    """Parse the rows of numbers in a text, skipping comments that start with #.
 
     The rows must have `columns` numbers, if it is set.
     """
@@ -365,14 +365,13 @@ def _parse_table(
     bare: Mapping[str, str],
     time_unit: TimeUnit | None,
 ) -> PoseTable:
-    """Return the poses of a table with a header.
+    """Parse the poses in a table with a header.
 
     Columns whose header has no unit have the unit in `bare`.
     """
     quaternion = [quantity.name for quantity in QUATERNION]
 
     def required_columns(columns: Mapping[str, Floats]) -> tuple[str, ...]:
-        """Return the columns that are required in a table with `columns`."""
         rotation_columns = quaternion if any(name in columns for name in quaternion) else ()
         return ("time_s", "x", "y", "z", *rotation_columns)
 
@@ -410,7 +409,7 @@ def _parse_table(
 
 
 def _convert_from_camera(track: Track) -> Track:
-    """Convert poses from a camera frame to a platform frame."""
+    """Convert poses of a camera frame to poses of the platform frame."""
     positions = rotate(track.positions, _CAMERA)
     if track.quaternions is None:
         return replace(track, positions=positions)

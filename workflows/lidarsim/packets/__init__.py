@@ -1,1 +1,1 @@
-"""Encode sweeps as sensor packets in the manufacturers' protocols, and decode such packets."""
+"""Encode sweeps as sensor packets in the manufacturers' protocols, and decode these packets."""

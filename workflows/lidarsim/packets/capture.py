@@ -1,4 +1,4 @@
-"""Read the UDP datagrams in a network capture, which is a pcap or pcapng file.
+"""Read the UDP datagrams in a network capture, in the pcap or pcapng format.
 
 The format is detected from the content, not from the file name. Frames may have any of the link
 types in `_LINKS`, VLAN tags, padding and a frame check sequence. Frames of other protocols are
@@ -48,7 +48,7 @@ _OFFSET = 14
 
 
 class _Link(NamedTuple):
-    """Header of a link layer protocol."""
+    """Header layout of a link layer protocol."""
 
     size: int  # bytes
     protocol: int | None = None  # offset of the EtherType; None if the payload is always IP
@@ -114,7 +114,7 @@ class Capture:
 
     @property
     def notes(self) -> list[str]:
-        """Messages about data missing from the file, available once `datagrams` has ended."""
+        """Messages about missing data in the file, available after `datagrams` has ended."""
         notes = []
         if self.ends_early:
             notes.append("ends inside a frame. The rest of the recording is missing")
@@ -126,7 +126,7 @@ class Capture:
         return notes
 
     def is_classic(self, links: Collection[int]) -> bool:
-        """Return whether the file is a pcap file whose frames have one of the link types.
+        """Return whether this is a classic pcap file whose link type is one of the given types.
 
         Raises LidarError if the file cannot be read.
         """
@@ -166,7 +166,7 @@ class Capture:
             raise LidarError(f"{self.name} {self._why_empty(unknown_links)}")
 
     def _why_empty(self, unknown_links: set[int]) -> str:
-        """Return the predicate of an error message for a file without datagrams, with advice."""
+        """Return the end of the error message for a file without datagrams, with advice."""
         if self.cut_datagrams:
             return (
                 "contains only truncated datagrams. Capture whole frames, for example "
@@ -181,7 +181,6 @@ class Capture:
         return "has no UDP datagrams over IPv4. Expected a recording of a sensor."
 
     def _frames(self, file: BinaryIO) -> Iterator[_Frame]:
-        """Yield the frames of a pcap or pcapng file."""
         magic = file.read(4)
         if magic == _PCAPNG_MAGIC:
             file.seek(0)
@@ -196,7 +195,7 @@ class Capture:
     def _pcap_frames(
         self, file: BinaryIO, order: str, unit_ns: int, header_bytes: int
     ) -> Iterator[_Frame]:
-        """Yield the frames of a pcap file that follow its magic number."""
+        """Yield the frames in the rest of a pcap file, after its magic number."""
         head = file.read(20)
         if len(head) < 20:
             raise LidarError(f"{self.name} ends inside its header. Copy or record it again.")
@@ -250,17 +249,15 @@ class Capture:
                 raise self._damaged(file) from reason
 
     def _skip(self, file: BinaryIO, size: int) -> None:
-        """Skip bytes of the file, and record whether it ends too early."""
+        """Skip bytes of the file, and record whether they extend beyond its end."""
         file.seek(size, os.SEEK_CUR)
         self.ends_early = file.tell() > os.fstat(file.fileno()).st_size
 
     def _check_size(self, size: int, file: BinaryIO) -> None:
-        """Raise LidarError if a frame size is impossibly large."""
         if size > _MAX_FRAME_BYTES:
             raise self._damaged(file)
 
     def _damaged(self, file: BinaryIO) -> LidarError:
-        """Return the error for a damaged file."""
         return LidarError(
             f"{self.name} is damaged before byte {file.tell():,}. Copy or record it again."
         )
@@ -268,7 +265,7 @@ class Capture:
     def _datagram(
         self, frame: _Frame, start: int, fragments: _Fragments
     ) -> CapturedDatagram | None:
-        """Return the UDP datagram that an IPv4 packet completes, or None if there is none."""
+        """Return the UDP datagram that an IPv4 packet completes, or None if it completes none."""
         packet = frame.content[start:]
         if len(packet) < 20 or packet[0] >> 4 != 4 or packet[9] != _UDP:
             return None
@@ -298,13 +295,13 @@ class Capture:
 
 
 def _link_of(head: bytes, order: str) -> int:
-    """Return the link type from the header of a pcap file, without its magic number."""
+    """Return the link type in a pcap file header, given without its magic number."""
     (link,) = unpack_from(f"{order}I", head, 16)
     return int(link) & 0xFFFF  # the other bits describe the frame check sequence
 
 
 class _Interface(NamedTuple):
-    """An interface description in a pcapng section."""
+    """Description of an interface in a pcapng section."""
 
     link: int
     snap_bytes: int  # length to which frames are truncated; 0 if they are not
@@ -313,7 +310,7 @@ class _Interface(NamedTuple):
 
     @classmethod
     def from_block(cls, body: bytes, order: str) -> _Interface:
-        """Read the description of an interface and its options."""
+        """Parse an interface description and its options."""
         link, _, snap_bytes = unpack_from(f"{order}HHI", body)
         units_per_s = 1_000_000
         offset_s = 0
@@ -335,7 +332,7 @@ class _Interface(NamedTuple):
 def _frame_of_block(
     kind: int, body: bytes, order: str, interfaces: list[_Interface], last_ns: int
 ) -> _Frame:
-    """Return the frame of a pcapng block. Simple blocks get the time of the previous frame."""
+    """Return the frame in a pcapng block. Simple blocks get the time of the previous frame."""
     if kind == _SIMPLE_PACKET:
         interface = interfaces[0]
         (size,) = unpack_from(f"{order}I", body)
@@ -353,14 +350,14 @@ def _frame_of_block(
 
 
 def _part(body: bytes, start: int, size: int) -> bytes:
-    """Return bytes of a block, or raise IndexError if the block is shorter."""
+    """Return part of a block. Raises IndexError if the block is too short."""
     if start + size > len(body):
         raise IndexError("the frame is longer than its block")
     return body[start : start + size]
 
 
 def _ipv4_start(frame: _Frame) -> int | None:
-    """Return the offset of the IPv4 header in a frame, or None for other protocols."""
+    """Return the offset of a frame's IPv4 header, or None for other protocols."""
     content = frame.content
     link = _LINKS[frame.link]
     if link.protocol is None:
@@ -376,13 +373,13 @@ def _ipv4_start(frame: _Frame) -> int | None:
 
 
 class _Fragments:
-    """Fragments of incomplete datagrams."""
+    """Fragments of datagrams that are still incomplete."""
 
     def __init__(self) -> None:
         self._parts: dict[bytes, dict[int, bytes]] = {}  # {datagram: {offset: fragment}}
 
     def join(self, key: bytes, flags: int, content: bytes) -> bytes | None:
-        """Add a fragment, and return its datagram if it is now complete, or None."""
+        """Add a fragment. Return its datagram if that is now complete, otherwise None."""
         parts = self._parts.setdefault(key, {})
         parts[(flags & 0x1FFF) * 8] = content
         if not flags & 0x2000:

@@ -31,7 +31,7 @@ START_NS = 1_000_000_000_000_000_000
 
 @dataclass(frozen=True, eq=False)
 class Datagrams:
-    """UDP datagrams of the same size and destination port."""
+    """UDP datagrams with the same size and destination port."""
 
     payloads: Bytes  # (n, size)
     due_ns: Ints  # (n,): send times, nanoseconds since the start of the survey
@@ -42,7 +42,7 @@ class Datagrams:
         return len(self.payloads)
 
     def without(self, dropped: Bools) -> Datagrams:
-        """Return the datagrams that are not lost.
+        """Return only the datagrams that are not lost.
 
         `dropped` (n,) is True for lost datagrams.
         """
@@ -53,7 +53,7 @@ class Datagrams:
 
 @dataclass(frozen=True, eq=False)
 class PacketSource:
-    """Properties of a sensor and its survey that packets depend on in addition to the shots."""
+    """Properties of a sensor and its survey that, besides the shots, determine the packets."""
 
     sensor: Sensor
     mode: str  # mode of the reported returns (`Returns`)
@@ -97,7 +97,7 @@ class PacketSource:
 
 
 class PacketEncoder(ABC):
-    """Encodes the shots of a sensor as datagrams, sweep by sweep.
+    """Encoder that converts the shots of a sensor to datagrams, sweep by sweep.
 
     The constructor of a subclass checks the identifiers and the return mode of the source. Shots
     that do not fill a packet are stored for the next sweep (`CarryOver`).
@@ -126,20 +126,20 @@ class PacketEncoder(ABC):
 
     @abstractmethod
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the datagrams that are complete after the shots of a sweep, grouped by port."""
+        """Return the datagrams that a sweep's shots complete, grouped by port."""
 
     @abstractmethod
     def finish(self) -> list[Datagrams]:
         """Return the datagrams with the shots that remain after the last sweep."""
 
     def files(self) -> Mapping[str, bytes]:
-        """Return additional files that readers of the packets need, by file name suffix."""
+        """Return additional files that readers of the packets need, keyed by file name suffix."""
         return {}
 
     def service(
         self, address: str, destination: Destination, send_to: Callable[[Destination], None]
     ) -> Service | None:
-        """Return the service that answers the manufacturer's software for a live sensor, if any.
+        """Return the service that acts as a live sensor for the manufacturer's software, if any.
 
         `address` is the address to listen on, HOST for the usual port or HOST:PORT. The other
         parameters are the same as in `Service`.
@@ -148,21 +148,21 @@ class PacketEncoder(ABC):
 
     @property
     def ports(self) -> Mapping[str, int]:
-        """Ports of all kinds of packets by kind, starting with the port of the returns."""
+        """Ports of all kinds of packets, keyed by kind. The port of the returns comes first."""
         return {**self.default_ports, **self.source.settings.ports}
 
     @property
     def firing_interval_ns(self) -> int:
-        """Rounded time between consecutive firings in nanoseconds."""
+        """Time between consecutive firings, rounded to nanoseconds."""
         firings = np.arange(2)
         return int(np.rint(np.diff(self.source.sensor.begins_ns(firings))[0]))
 
     def port(self, kind: str, default: int) -> int:
-        """Return the port of a kind of packets from the data file, or the default."""
+        """Return the port for one kind of packet from the sensor's data file, or `default`."""
         return self.source.settings.ports.get(kind, default)
 
     def unusable(self, reason: str) -> LidarError:
-        """Return an error for packets that cannot be encoded, whose message ends with `reason`."""
+        """Return an error for packets that cannot be encoded. Its message ends with `reason`."""
         return LidarError(f"Packets of {self.source.sensor.model} {reason}.")
 
     def number(self, name: str) -> int:
@@ -191,7 +191,7 @@ class PacketEncoder(ABC):
 
 
 class PacketDecoder(ABC):
-    """Reads the sweeps in a file of a manufacturer's packets.
+    """Decoder that reads the sweeps in a file of a manufacturer's packets.
 
     Parameters
     ----------
@@ -222,11 +222,11 @@ class PacketDecoder(ABC):
 
     @abstractmethod
     def sweeps(self, sensor: int) -> Iterable[Any]:
-        """Return the sweeps of a sensor in order, as objects of the manufacturer's software."""
+        """Return a sensor's sweeps in order, as objects of the manufacturer's software."""
 
     @abstractmethod
     def columns(self, sensor: int, sweep: Any) -> dict[str, AnyArray]:
-        """Return the point columns of a sweep, including x, y and z in meters."""
+        """Return the point columns of a sweep, which include x, y and z in meters."""
 
     @abstractmethod
     def time_ns(self, sweep: Any) -> float:
@@ -257,7 +257,7 @@ _DECODERS = (
 
 
 def decoder_of(path: Path, name: str) -> PacketDecoder:
-    """Return the decoder of a file.
+    """Return a decoder for a file.
 
     Captures may also contain datagrams of other programs, so the first packet that any decoder
     recognizes determines the decoder.
@@ -281,20 +281,19 @@ def decoder_of(path: Path, name: str) -> PacketDecoder:
 
 
 def _decoder(decoder: type[PacketDecoder], path: Path, name: str) -> PacketDecoder:
-    """Create a decoder for a file, or raise LidarError if its packets are not supported."""
+    """Create a decoder for a file. Raises LidarError if its packets are not supported."""
     if decoder.refusal:
         raise LidarError(f"{name} contains {decoder.refusal}.")
     return decoder(path, name)
 
 
 def _imported(value: str) -> Any:
-    """Return the class that "module:class" refers to."""
     module, _, attribute = value.partition(":")
     return getattr(import_module(module), attribute)
 
 
 def _encoder_of_plugin(plugin: Plugin) -> type[PacketEncoder]:
-    """Return the encoder class of a plug-in, or raise LidarError if it is no encoder class."""
+    """Load the encoder class of a plug-in. Raises LidarError if it is not an encoder class."""
     encoder = plugin.load(type)
     if not issubclass(encoder, PacketEncoder):
         raise plugin.lacks("a subclass of lidarsim.packets.encoders.PacketEncoder")
@@ -305,7 +304,7 @@ _TABLE: PluginTable[Any] = PluginTable(GROUP, "packet format", ENCODERS, _encode
 
 
 def encoder_class(name: str) -> type[PacketEncoder]:
-    """Return the encoder class of a packet format, built in or from a plug-in.
+    """Return the encoder class of a packet format that is built in or comes from a plug-in.
 
     Raises
     ------
@@ -318,7 +317,7 @@ def encoder_class(name: str) -> type[PacketEncoder]:
 
 
 def encoder_of(source: PacketSource) -> PacketEncoder:
-    """Return the encoder of a sensor.
+    """Create the encoder of a sensor.
 
     Raises
     ------

@@ -33,7 +33,7 @@ _PERIOD_TOLERANCE_US = 0.02
 
 
 class HesaiEncoder(PacketEncoder):
-    """Encodes data packets with sequence numbers and, depending on the model, checksums.
+    """Encoder of data packets with sequence numbers and, depending on the model, checksums.
 
     The azimuth of a block is the azimuth of the head at the block's reference time, clockwise from
     the sensor's y axis. In dual mode, each block of last returns is followed by a block of
@@ -63,7 +63,7 @@ class HesaiEncoder(PacketEncoder):
         self._next_number = 1
 
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the data packets that are complete after the shots of a sweep."""
+        """Return the data packets that a sweep's shots complete."""
         filled = self._carry.whole_packets(shots)
         if not len(filled):
             return []
@@ -75,7 +75,7 @@ class HesaiEncoder(PacketEncoder):
         return [datagrams.without(np.asarray(dropped))]
 
     def finish(self) -> list[Datagrams]:
-        """Return no packets, because the sensor sends only packets whose blocks are full."""
+        """Return no packets, because the sensor only sends packets whose blocks are all full."""
         return []
 
     def files(self) -> Mapping[str, bytes]:
@@ -88,7 +88,7 @@ class HesaiEncoder(PacketEncoder):
     def service(
         self, address: str, destination: Destination, send_to: Callable[[Destination], None]
     ) -> PtcService:
-        """Return the service that reports calibration and identity to readers."""
+        """Return the service that reports the calibration and the identity of the sensor."""
         files = self.files()
         device = PtcDevice(
             name=self.source.name,
@@ -106,11 +106,10 @@ class HesaiEncoder(PacketEncoder):
 
     @property
     def _rate_rpm(self) -> int:
-        """Rotation rate in revolutions per minute."""
         return round(self.source.sensor.head.rate_hz * 60)  # type: ignore[attr-defined]
 
     def _layout_of_model(self) -> HesaiPacketLayout:
-        """Return the packet layout of the model, or raise LidarError if the model is unknown."""
+        """Return the packet layout of the model. Raises LidarError if the model is unknown."""
         model = self.text("model")
         if model not in LAYOUTS:
             names = ", ".join(LAYOUTS)
@@ -119,7 +118,7 @@ class HesaiEncoder(PacketEncoder):
         return LAYOUTS[model]
 
     def _check_sensor(self) -> None:
-        """Raise LidarError if the sensor does not fire as the model does."""
+        """Raise LidarError if the sensor does not fire like its model."""
         sensor = self.source.sensor
         layout = self._layout
         head = sensor.head
@@ -137,7 +136,7 @@ class HesaiEncoder(PacketEncoder):
             )
 
     def _is_ptp(self) -> bool:
-        """Return whether times come from a PTP clock, or raise LidarError for an unknown clock."""
+        """Return whether times come from a PTP clock. Raises LidarError for an unknown clock."""
         clock = self.source.settings.identifiers.get("clock", "gps")
         clocks = _CLOCKS if self._layout.has_epoch_seconds else _CLOCKS[:1]
         if clock not in clocks:
@@ -145,7 +144,7 @@ class HesaiEncoder(PacketEncoder):
         return clock == "ptp"
 
     def _packets(self, shots: Shots) -> Records:
-        """Return the data packets of shots that fill packets, as n records."""
+        """Encode shots as data packets, which the shots must fill completely."""
         layout = self._layout
         packets = np.zeros(len(shots) // self._firings, layout.packet)
         if layout.header:
@@ -168,13 +167,16 @@ class HesaiEncoder(PacketEncoder):
         return packets
 
     def _stamps_us(self, firings_ns: Ints) -> Ints:
-        """Return packet timestamps in µs since 1970 from the firing times of stamped blocks."""
+        """Return packet timestamps in µs since 1970.
+
+        `firings_ns` are the firing times of the blocks to which the timestamps belong.
+        """
         offset_us = self._layout.first_laser_us + self._layout.reference_us
         stamps_ns = self.source.start_ns + firings_ns - round(offset_us * 1000)
         return (stamps_ns + 500) // 1000
 
     def _fill_blocks(self, blocks: AnyArray, shots: Shots) -> None:
-        """Write azimuths and returns of shots to blocks."""
+        """Write the azimuths and returns of shots to blocks."""
         layout = self._layout
         units = np.rint(shots.range_m * (1000 / UNIT_MM))
         fits = (units > 0) & (units <= _MAX_UNITS)  # False without a return, where the range is NaN
@@ -198,12 +200,12 @@ class HesaiEncoder(PacketEncoder):
 
 
 def _epoch_seconds(seconds: Ints) -> Bytes:
-    """Return seconds since 1970 as PTP dates, which are a zero byte and 5 big-endian bytes."""
+    """Encode seconds since 1970 as PTP dates, which are a zero byte and 5 big-endian bytes."""
     return seconds.astype(">u8").view(np.uint8).reshape(-1, 8)[:, 2:] * (np.arange(6) > 0)
 
 
 def _fill_checksums(packets: Records) -> None:
-    """Write the checksums of blocks, functional safety and tail."""
+    """Write the checksums of the blocks, the functional safety fields and the tail."""
     from . import hesai_loops  # imported here because numba takes half a second to import
 
     fields = packets.dtype.fields
@@ -223,11 +225,11 @@ def _fill_checksums(packets: Records) -> None:
 
 
 class HesaiDecoder(PacketDecoder):
-    """Rejects Hesai packets, because no Python package on PyPI reads them as sweeps."""
+    """Decoder that rejects Hesai packets, because no package on PyPI reads them as sweeps."""
 
     refusal = "Hesai packets, which are not supported. Convert them to .pcd with the Hesai SDK"
 
     @staticmethod
     def recognizes(payload: bytes) -> bool:
-        """Return whether a datagram starts with the mark of Hesai's header or first block."""
+        """Return whether a datagram starts with the marker of Hesai's header or first block."""
         return payload[:2] in (b"\xee\xff", b"\xff\xee")

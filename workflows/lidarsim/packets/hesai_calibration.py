@@ -1,4 +1,4 @@
-"""Calibration files of Hesai sensors, with the angles and firing times of the lasers.
+"""Calibration files of Hesai sensors, which contain the lasers' angles and firing times.
 
 Sources: the folder "correction" of HesaiLidar_SDK_2.0, and the parsers that load the files.
 """
@@ -17,7 +17,7 @@ _NEAR_M = "2.85"  # range below which a Pandar128 fires differently, as in the o
 
 
 class LaserTable(NamedTuple):
-    """Lasers in the manufacturer's order."""
+    """Angles and firing times of the lasers, in the manufacturer's order."""
 
     layout: HesaiPacketLayout
     elevation_deg: Floats  # (c,)
@@ -70,11 +70,10 @@ class LaserTable(NamedTuple):
 
 
 def _table(heads: list[list[Any]], times: list[str], columns: int) -> str:
-    """Return a table that repeats the time of each laser in several columns."""
+    """Return a text table with each laser's time repeated in several columns."""
     rows = [[laser, *[time] * columns] for laser, time in enumerate(times, 1)]
     return "\n".join([*(",".join(map(str, row)) for row in [*heads, *rows]), ""])
 
 
 def _decimal(number: float) -> str:
-    """Format a number with at most six decimals."""
     return f"{round(number, 6) + 0.0:.6f}".rstrip("0").rstrip(".")  # + 0.0 avoids -0

@@ -31,7 +31,7 @@ _SEQUENCE = ("sequence", "<u4")
 
 @dataclass(frozen=True, eq=False)
 class HesaiPacketLayout:
-    """Packet layout of a model.
+    """Packet layout of a sensor model.
 
     The reference of a block is the time at which the block's azimuth is the azimuth of the head.
     """
@@ -56,7 +56,7 @@ class HesaiPacketLayout:
     lists_distances: bool = False  # whether each state has columns for far and for near targets
 
     def header_bytes(self, dual: bool) -> Ints:
-        """Return the header bytes in single or dual mode."""
+        """Return the header bytes for single or dual return mode."""
         header = np.array(self.header, np.int64)
         if dual and self.dual_header is not None:
             for position, byte in self.dual_header.items():
@@ -64,7 +64,7 @@ class HesaiPacketLayout:
         return header
 
     def dates(self, seconds: Ints) -> NDArray[np.uint8]:
-        """Return UTC dates, from year to second, for seconds since 1970."""
+        """Convert seconds since 1970 to UTC dates, from year to second."""
         times = seconds.astype("datetime64[s]")
         months = times.astype("datetime64[M]")
         days = times.astype("datetime64[D]")
@@ -83,7 +83,7 @@ class HesaiPacketLayout:
 def _numbered(
     version: tuple[int, int], status: int, lasers: int, blocks: int, flags: int
 ) -> tuple[int, ...]:
-    """Return the 12-byte header of a versioned protocol in a single return mode."""
+    """Return the 12-byte header for single return mode in a versioned protocol."""
     return (*_SOP, *version, status, 0, lasers, blocks, 0, UNIT_MM, 1, flags)
 
 
@@ -94,7 +94,7 @@ _DUAL_NUMBERED = {8: 1, 10: 2}
 def _blocks(
     count: int, lasers: int, returned: list[tuple[str, str]], starts: bool = False
 ) -> tuple[str, np.dtype[np.void], tuple[int]]:
-    """Return the field of a packet that contains its blocks."""
+    """Return the packet field that contains the blocks."""
     start = [("start", "<u2")] if starts else []
     block = np.dtype([*start, ("azimuth", "<u2"), ("returns", np.dtype(returned), (lasers,))])
     return "blocks", block, (count,)

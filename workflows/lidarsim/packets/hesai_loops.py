@@ -25,7 +25,7 @@ def remainders() -> NDArray[np.uint32]:
 
 @compiled()
 def checksums(contents, table, sums):
-    """Write the CRC-32/MPEG-2 of each row of bytes to `sums`.
+    """Write the CRC-32/MPEG-2 of each row of `contents` to `sums`.
 
     `contents` has shape (n, k), `sums` has shape (n,), and `table` is the result of `remainders`.
     """

@@ -54,7 +54,7 @@ _ENDS = (OSError, TimeoutError, asyncio.IncompleteReadError, ValueError, asyncio
 
 @dataclass(frozen=True)
 class PtcDevice:
-    """Properties of a sensor that its commands report."""
+    """Properties of a sensor that PTC responses report."""
 
     name: str  # name of the sensor in its survey
     model_code: int
@@ -68,7 +68,7 @@ class PtcDevice:
     firetimes: bytes  # content of the firing time file
 
     def inventory(self) -> bytes:
-        """Return the serial number, the versions and the model."""
+        """Encode the serial number, the versions and the model."""
         number = crc32(self.name.encode())
         mac = b"\x02" + number.to_bytes(5, "big")  # locally administered address
         fields = (f"SIM{number:010d}".encode(), b"", mac, b"", b"", b"", b"", 0)
@@ -76,7 +76,7 @@ class PtcDevice:
         return packed.ljust(_INVENTORY_BYTES.get(self.model_code, 120), b"\0")
 
     def config(self, own_host: str, destination: Destination) -> bytes:
-        """Return the settings of the network, rotation, clock and returns."""
+        """Encode the network, rotation, clock and return settings."""
         return _CONFIG.pack(
             IPv4Address(own_host).packed,
             b"\xff\xff\xff\0",
@@ -97,7 +97,7 @@ class PtcDevice:
         )
 
     def status(self, uptime_s: float) -> bytes:
-        """Return the uptime and the rotation rate, with all temperatures set to 0."""
+        """Encode the uptime and the rotation rate, with all temperatures set to 0."""
         ptp_state = 2 if self.ptp else 0  # locked, or free run
         return _STATUS.pack(
             int(uptime_s), self.rate_rpm, *[0] * 8, *[self.dated] * 2, 1, 0, ptp_state
@@ -105,7 +105,7 @@ class PtcDevice:
 
 
 class _RefusedError(Exception):
-    """A command that is answered with an error code."""
+    """A command that the sensor answers with an error code."""
 
     def __init__(self, code: int) -> None:
         super().__init__(code)
@@ -199,7 +199,7 @@ class PtcService(TcpService):
         return answers[command]()
 
     def _set_destination(self, parameter: bytes) -> bytes:
-        """Redirect all further datagrams to another address."""
+        """Redirect all further datagrams to a new address."""
         if len(parameter) != _DESTINATION.size:
             raise _RefusedError(_INVALID_PARAMETER)
         packed, port, _ = _DESTINATION.unpack(parameter)

@@ -35,7 +35,7 @@ Headers = Mapping[str, str]  # {name in lower case: value}
 
 @dataclass(frozen=True)
 class Request:
-    """A parsed request."""
+    """A parsed HTTP request."""
 
     method: str
     path: str
@@ -46,14 +46,14 @@ class Request:
 
 @dataclass(frozen=True)
 class Answer:
-    """A response with JSON or text."""
+    """An HTTP response with JSON or text."""
 
     content: Any = None  # JSON-serializable data; None for no content
     status: int = HTTPStatus.OK
     text: str | None = None  # sent instead of JSON if set
 
     def encode(self) -> bytes:
-        """Return the response as HTTP bytes."""
+        """Encode the response as HTTP."""
         body = b""
         kind = "application/json"
         if self.text is not None:
@@ -70,7 +70,7 @@ class Answer:
 
 
 class RequestRefusedError(Exception):
-    """A request that is answered with an error status, and the reason sent to the client."""
+    """A request that is refused with an error status and a reason."""
 
     def __init__(self, reason: str, status: int = HTTPStatus.BAD_REQUEST) -> None:
         super().__init__(reason)
@@ -112,7 +112,7 @@ class HttpService(TcpService):
         return words
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Answer the request on a connection and close the connection."""
+        """Answer a single request on a connection, and close the connection."""
         try:
             with suppress(OSError, TimeoutError, asyncio.IncompleteReadError), self.counted():
                 async with asyncio.timeout(_WITHIN_S):
@@ -203,7 +203,7 @@ def _body_size(headers: Headers) -> int:
 
 
 def receiver_of(name: str, value: Any) -> str:
-    """Return a parameter value that must be the IPv4 address of a single receiver.
+    """Validate a parameter value that must be the IPv4 address of a single receiver.
 
     Raises RequestRefusedError for other values. `name` is the name of the parameter.
     """
@@ -217,7 +217,7 @@ def receiver_of(name: str, value: Any) -> str:
 
 
 def receiver_port(name: str, value: Any) -> int:
-    """Return a parameter value that must be a port, or 0 for packets that are not sent.
+    """Validate a parameter value that must be a port, or 0 if packets are not sent.
 
     Raises RequestRefusedError for other values. `name` is the name of the parameter.
     """

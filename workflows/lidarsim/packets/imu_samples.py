@@ -1,4 +1,4 @@
-"""IMU samples of the platform, in step with the shots of a sensor, for IMU packets."""
+"""IMU samples of the platform for IMU packets, synchronized with the shots of a sensor."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class ImuBatch(NamedTuple):
 
 
 class PacketImuSamples:
-    """IMU samples of the platform in chronological order, or no samples without an IMU."""
+    """Chronological IMU samples of the platform. Without an IMU, there are no samples."""
 
     def __init__(self, source: PacketSource) -> None:
         instruments = source.instruments
@@ -32,17 +32,17 @@ class PacketImuSamples:
         self._jumps_ns: Ints = np.zeros(1, np.int64)  # clock jumps at the last shots
 
     def during(self, shots: Shots) -> ImuBatch | None:
-        """Return the samples up to the last of the shots, or None if there are none."""
+        """Return the samples up to the last of the given shots, or None if there are no samples."""
         self._starts_ns = shots.starts_ns
         self._jumps_ns = shots.stamps_ns - shots.starts_ns
         return self._until(int(shots.starts_ns[-1]))
 
     def remaining(self) -> ImuBatch | None:
-        """Return the samples after the last shots, or None if there are none."""
+        """Return the samples after the last shots, or None if there are no samples."""
         return self._until(None)
 
     def _until(self, until_ns: int | None) -> ImuBatch | None:
-        """Return the samples up to a time, or all samples if it is None.
+        """Return the samples up to a given time, or all samples if the time is None.
 
         The result is None if there are no samples.
         """

@@ -1,4 +1,4 @@
-"""Livox packets in the format of SDK2, with points and IMU samples of Mid-360 and HAP.
+"""Livox SDK2 packets with the points and IMU samples of Mid-360 and HAP sensors.
 
 Sources: Livox communication protocols of the Mid-360 (1.4.11) and the HAP (1.4.8); HAP user manual,
 page 15 (tags); livox_lidar_def.h and define.h in Livox-SDK2 1.4.3; pub_handler.cpp in
@@ -32,7 +32,7 @@ _PTP = 1
 
 @dataclass(frozen=True)
 class Ports:
-    """UDP ports of a device type on the sensor, and default ports on the host."""
+    """UDP ports of a device type: ports on the sensor, and default ports on the host."""
 
     points: int
     imu: int
@@ -75,14 +75,14 @@ _POSITION = "position_m"  # name of the position column of shots
 
 @dataclass(frozen=True)
 class Cartesian:
-    """Data type with Cartesian coordinates."""
+    """Data type of packets with Cartesian coordinates."""
 
     number: str  # dtype of a coordinate
     unit_m: float
 
     @property
     def dots(self) -> np.dtype[np.void]:
-        """Dtype of a point."""
+        """Dtype of a single point."""
         return np.dtype([("position", self.number, (3,)), ("reflectivity", "u1"), ("tag", "u1")])
 
 
@@ -113,7 +113,7 @@ def packet_type(data: np.dtype[np.void], count: int) -> np.dtype[np.void]:
 
 
 class LivoxEncoder(PacketEncoder):
-    """Encodes packets of 96 points, and IMU packets if the platform has an IMU.
+    """Encoder of packets of 96 points, and of IMU packets if the platform has an IMU.
 
     Points are positions in the sensor frame at their firing time, so the motion of the platform is
     not removed. A pulse without a return is a point with all coordinates 0. Lines alternate: point
@@ -158,7 +158,7 @@ class LivoxEncoder(PacketEncoder):
         self._to_sensor = _imu_axes(source)
 
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the packets that are complete after the shots of a sweep, and IMU packets."""
+        """Return the point packets that a sweep's shots complete, and IMU packets."""
         if not len(shots):
             return []
         imu = self._imu(self._samples.during(shots))
@@ -180,7 +180,7 @@ class LivoxEncoder(PacketEncoder):
 
     @property
     def ports(self) -> Mapping[str, int]:
-        """Ports of the host by kind of packets."""
+        """Ports of the host, keyed by kind of packets."""
         ports = PORTS[self.device_type]
         defaults = {"points": ports.host_points, "imu": ports.host_imu}
         return {**defaults, **self.source.settings.ports}
@@ -207,11 +207,11 @@ class LivoxEncoder(PacketEncoder):
         return LivoxService(address, destination, send_to, state, self.set_data_type)
 
     def set_data_type(self, data_type: int) -> None:
-        """Set the data type of all further packets, a key of `CARTESIAN`."""
+        """Set the data type of all further packets to a key of `CARTESIAN`."""
         self.data_type = data_type
 
     def _points(self, shots: Shots) -> Datagrams:
-        """Return the packets of shots that fill packets."""
+        """Encode shots as point packets, which the shots must fill completely."""
         data_type = int(self.data_type)  # a service thread may change it meanwhile
         kind = CARTESIAN[data_type]
         firings = np.arange(len(shots)).reshape(-1, self._firings)
@@ -228,7 +228,7 @@ class LivoxEncoder(PacketEncoder):
         return Datagrams(_with_checksums(packets), due_ns, self.ports["points"], source_port)
 
     def _positions_m(self, shots: Shots) -> Floats:
-        """Return positions in the sensor frame in meters, with NaN for shots without a return."""
+        """Return positions in the sensor frame in meters, or NaN for shots without a return."""
         sensor = self.source.sensor
         channels = self.source.settings.channels
         positions = sensor.directions(shots.firings)[:, channels]
@@ -239,7 +239,7 @@ class LivoxEncoder(PacketEncoder):
         return positions
 
     def _fill_points(self, points: AnyArray, shots: Shots, kind: Cartesian) -> None:
-        """Write positions and reflectivities of shots to `points`."""
+        """Write the positions and reflectivities of shots to `points`."""
         units = shots.columns[_POSITION][0] / kind.unit_m
         np.rint(units, out=units)
         limit = np.iinfo(np.dtype(kind.number)).max
@@ -253,7 +253,7 @@ class LivoxEncoder(PacketEncoder):
             points["tag"] = _HAP_FIRST_RETURN * is_first.reshape(points.shape)
 
     def _numbers(self, first_ns: Ints) -> tuple[Ints, Ints]:
-        """Return the packet numbers within their frames, and the frames, of packets.
+        """Return the frame of each packet, and the packet's number within the frame.
 
         `first_ns` (n,) are the start times of the packets. A frame lasts as long as a frame of the
         sensor, and numbers continue from call to call.
@@ -299,7 +299,7 @@ class LivoxEncoder(PacketEncoder):
 
 
 def _imu_axes(source: PacketSource) -> Floats:
-    """Return the rotation from the axes of the platform's IMU to the sensor's axes."""
+    """Return the rotation from the axes of the platform's IMU to those of the sensor."""
     if source.instruments is None or source.instruments.imu is None:
         return np.eye(3)
     on_platform = matrices(np.array([source.instruments.imu.quaternion]))[0]
@@ -307,19 +307,19 @@ def _imu_axes(source: PacketSource) -> Floats:
 
 
 def _with_checksums(packets: Records) -> Bytes:
-    """Return packets as bytes after computing their CRC-32 checksums."""
+    """Compute the CRC-32 checksums of packets, and return the packets as bytes."""
     payloads = packets.view(np.uint8).reshape(len(packets), packets.dtype.itemsize)
     packets["checksum"] = [crc32(row) for row in payloads[:, _CHECKED_FROM:]]
     return payloads
 
 
 class LivoxDecoder(PacketDecoder):
-    """Rejects Livox packets, because no Python package on PyPI reads them as sweeps."""
+    """Decoder that rejects Livox packets, because no package on PyPI reads them as sweeps."""
 
     refusal = "Livox packets, which are not supported. Record a ROS 2 bag with livox_ros_driver2"
 
     @staticmethod
     def recognizes(payload: bytes) -> bool:
-        """Return whether a datagram is a point or IMU packet, by its version and length."""
+        """Return whether a datagram's version and length are those of a point or IMU packet."""
         size = int.from_bytes(payload[1:3], "little")
         return len(payload) > _CHECKED_FROM and payload[0] == 0 and size == len(payload)

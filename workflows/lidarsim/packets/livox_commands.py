@@ -1,4 +1,4 @@
-"""Commands of Livox SDK2, which are frames with checksums and with parameters as key-value pairs.
+"""Livox SDK2 commands, which are frames with checksums and key-value parameters.
 
 Sources: Livox communication protocol of the Mid-360 (1.4.11); sdk_protocol.cpp, build_request.cpp
 and livox_lidar_def.h in Livox-SDK2 1.4.3. All numbers are little-endian.
@@ -42,7 +42,7 @@ class Command(IntEnum):
 
 
 class Code(IntEnum):
-    """Return codes in responses."""
+    """Result codes in responses."""
 
     SUCCESS = 0x00
     FAILURE = 0x01
@@ -54,7 +54,7 @@ class Code(IntEnum):
 
 
 class Key(IntEnum):
-    """Parameters that this module or the service refers to by name."""
+    """Keys of the parameters that the code refers to by name."""
 
     DATA_TYPE = 0x0000
     PATTERN = 0x0001
@@ -83,7 +83,7 @@ class Key(IntEnum):
 
 
 class CommandFrame(NamedTuple):
-    """A parsed request."""
+    """A parsed command request."""
 
     command: int
     number: int
@@ -92,14 +92,14 @@ class CommandFrame(NamedTuple):
 
 @dataclass
 class CommandRefusedError(Exception):
-    """A request that is answered with an error code, and the key of the invalid parameter."""
+    """A request that is refused with an error code, and the key of the invalid parameter."""
 
     code: Code
     key: int = 0
 
 
 def parse_request(content: bytes) -> CommandFrame | None:
-    """Return the request in a datagram, or None if the frame or its checksums are invalid."""
+    """Parse the request in a datagram. Return None if the frame or its checksums are invalid."""
     if len(content) < _HEAD_BYTES:
         return None
     start, version, length, number, command, kind, _, _ = _HEAD.unpack_from(content)
@@ -114,12 +114,12 @@ def parse_request(content: bytes) -> CommandFrame | None:
 
 
 def answer_frame(command: int, number: int, data: bytes) -> bytes:
-    """Return the frame of the response to a request."""
+    """Return the response frame for a request."""
     return _frame(command, number, data, _ANSWER)
 
 
 def push_frame(number: int, data: bytes) -> bytes:
-    """Return the frame of parameters that the sensor sends unsolicited."""
+    """Return a frame of parameters that the sensor sends without being asked."""
     return _frame(Command.PUSH, number, data, _REQUEST)
 
 
@@ -130,14 +130,13 @@ def _frame(command: int, number: int, data: bytes, kind: int) -> bytes:
 
 
 def _checksum(data: bytes) -> int:
-    """Return the checksum of data, which is 0 for empty data."""
     return crc32(data) if data else 0
 
 
 def parse_values(data: bytes) -> dict[int, bytes]:
-    """Return the parameters in a set request, or raise CommandRefusedError if they are truncated.
+    """Parse the parameters in a set request.
 
-    The result maps keys to values.
+    The result maps keys to values. Raises CommandRefusedError if the parameters are truncated.
     """
     values = {}
     offset = _COUNT.size
@@ -153,7 +152,10 @@ def parse_values(data: bytes) -> dict[int, bytes]:
 
 
 def parse_keys(data: bytes) -> Sequence[int]:
-    """Return the keys in a get request, or raise CommandRefusedError if they are truncated."""
+    """Parse the keys in a get request.
+
+    Raises CommandRefusedError if they are truncated.
+    """
     count = _key_count(data)
     if _COUNT.size + count * _KEY.size > len(data):
         raise CommandRefusedError(Code.WRONG_KEY_NUMBER)
@@ -168,10 +170,10 @@ def _key_count(data: bytes) -> int:
 
 
 def packed_values(values: Mapping[int, bytes]) -> bytes:
-    """Return parameters in the encoding used in responses."""
+    """Encode parameters for a response."""
     return b"".join(_ENTRY.pack(key, len(value)) + value for key, value in values.items())
 
 
 def packed_count(values: Mapping[int, bytes]) -> bytes:
-    """Return the header of parameters that a sensor sends unsolicited."""
+    """Return the header of parameters that a sensor sends without being asked."""
     return _COUNT.pack(len(values), 0)

@@ -75,7 +75,7 @@ _LENGTHS: dict[int, int] = {
 
 @dataclass(frozen=True)
 class LivoxState:
-    """Properties of a sensor that the interface reports."""
+    """Properties of a sensor that the command interface reports."""
 
     device_type: int
     product: str
@@ -90,7 +90,7 @@ class LivoxState:
 
 
 class LivoxService(Service):
-    """Answers commands of Livox-SDK2 on a separate thread, and announces the sensor to the host.
+    """Service that answers commands of Livox-SDK2 and announces the sensor to the host.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ class LivoxService(Service):
 
     @property
     def description(self) -> str:
-        """Address of the sensor and of its host."""
+        """Addresses of the sensor and of its host."""
         return f"Livox commands at {self.host} for the host {self.destination.host}"
 
     def __enter__(self) -> Self:
@@ -169,7 +169,7 @@ class LivoxService(Service):
     # -- the thread ------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        """Answer requests, and announce the sensor every second, until the service stops."""
+        """Answer requests and announce the sensor every second until the service stops."""
         announce_s = time.monotonic()
         requests = 0
         with selectors.DefaultSelector() as selector:
@@ -198,7 +198,7 @@ class LivoxService(Service):
                 opened.sendto(answer_frame(request.command, request.number, data), peer)
 
     def _announce(self) -> None:
-        """Send the host an announcement and the state of the sensor."""
+        """Send an announcement and the state of the sensor to the host."""
         announcement = answer_frame(Command.SEARCH, 0, self._search_answer())
         with suppress(OSError):
             self._sockets[SEARCH_PORT].sendto(announcement, (self.destination.host, SEARCH_PORT))
@@ -215,7 +215,7 @@ class LivoxService(Service):
     # -- answers ---------------------------------------------------------------------------------
 
     def answer(self, request: CommandFrame) -> bytes:
-        """Return the data of the response to a request."""
+        """Return the content of the response to a request."""
         if request.command == Command.SEARCH:
             return self._search_answer()
         if request.command == Command.GET:
@@ -235,7 +235,7 @@ class LivoxService(Service):
         )
 
     def _get(self, data: bytes) -> bytes:
-        """Return the parameters that a get request asks for, skipping unknown parameters."""
+        """Return the parameters that a get request asks for, skipping unknown keys."""
         try:
             keys = parse_keys(data)
         except CommandRefusedError as error:
@@ -245,7 +245,7 @@ class LivoxService(Service):
         return _GET_ANSWER.pack(Code.SUCCESS, len(values)) + packed_values(values)
 
     def _set(self, data: bytes) -> bytes:
-        """Set all parameters of a request and return the response.
+        """Set all parameters in a request, and return the response.
 
         If any value is invalid, no parameter is set.
         """
@@ -276,7 +276,7 @@ class LivoxService(Service):
             raise CommandRefusedError(Code.OUT_OF_RANGE, key)
 
     def _redirect(self) -> None:
-        """Send the datagrams to the host that the parameters specify for points."""
+        """Send datagrams to the host that the parameters specify."""
         address, points_port, _ = _HOST.unpack(self._values[Key.POINTS_HOST])
         _, imu_port, _ = _HOST.unpack(self._values[Key.IMU_HOST])
         if not self._values[Key.IMU_ENABLED][0]:
@@ -332,7 +332,7 @@ class LivoxService(Service):
 
 
 def _check_host(key: int, value: bytes) -> None:
-    """Raise CommandRefusedError unless a value is the address of a single receiver."""
+    """Raise CommandRefusedError if a value is not the address of a single receiver."""
     try:
         address = IPv4Address(value[:4])
     except AddressValueError as error:

@@ -1,4 +1,4 @@
-"""Lidar packets and IMU packets of Ouster sensors, and the metadata that readers need.
+"""Lidar and IMU packets of Ouster sensors, and the metadata that readers need.
 
 Sources: firmware user manual, sections "Lidar Packet Format" and "IMU Data Format"; parsing.cpp,
 packet.cpp, xyzlut.cpp and metadata.cpp in ouster-sdk 1.0.1; sample recordings of ouster-sdk.
@@ -77,7 +77,7 @@ _RETURN_ORDERS = {
 
 @dataclass(frozen=True)
 class Profile:
-    """A layout of lidar packets, with its name in the metadata (`udp_profile_lidar`)."""
+    """Layout of lidar packets, whose name is `udp_profile_lidar` in the metadata."""
 
     name: str
     layout: int  # pixel layout (`ouster_loops`)
@@ -103,7 +103,7 @@ PROFILES = {
 
 
 class RangeUnits(NamedTuple):
-    """Units of ranges in packets, which are measured from the sensor's axis."""
+    """Units and offset of the ranges in packets, which are measured from the sensor's axis."""
 
     offset_mm: float  # distance from the axis to the origin of the beams
     unit_mm: float
@@ -111,9 +111,9 @@ class RangeUnits(NamedTuple):
 
 
 class ReturnImages(NamedTuple):
-    """Returns of n columns of c beams, with up to r returns per beam, nearest first.
+    """Images of up to r returns per beam, nearest first.
 
-    All arrays have shape (r, n, c).
+    All arrays have shape (r, n, c) for n columns of c beams.
     """
 
     range_m: AnyFloats  # range from the beam origin; 0 or NaN without a return
@@ -123,7 +123,7 @@ class ReturnImages(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MeasurementBlocks:
-    """Columns in the order of measurement, which fill packets completely, highest beam first."""
+    """Columns in the order of measurement, with the highest beam first, that fill whole packets."""
 
     frames: Ints  # (n,): number of the revolution
     measurement_ids: Ints  # (n,): column in the revolution
@@ -178,7 +178,7 @@ _MIN_COLUMNS_BYTES = 16 * (12 + 16 * 4)  # for 16 beams with one word each
 def lidar_packets(
     blocks: MeasurementBlocks, profile: Profile, offset_mm: float, columns: int, serial_number: int
 ) -> Bytes:
-    """Return lidar packets as bytes, each with 16 measurement blocks.
+    """Encode measurement blocks as lidar packets with 16 blocks each.
 
     Blocks that are not valid contain zeros, except for their numbers. `offset_mm` is the distance
     from the sensor's axis to the origin of its beams, and `columns` the number of columns per
@@ -216,7 +216,7 @@ def lidar_packets(
 
 
 def _little_endian(number: int, size: int) -> Bytes:
-    """Return a number as bytes, least significant byte first."""
+    """Encode a number as bytes, least significant byte first."""
     return np.frombuffer(number.to_bytes(size, "little"), np.uint8)
 
 
@@ -232,7 +232,7 @@ _IMU_PACKET = np.dtype(
 
 
 def imu_packets(times_ns: Ints, rates: Floats, forces: Floats) -> Bytes:
-    """Return a 48-byte packet for each IMU sample.
+    """Encode each IMU sample as a 48-byte packet.
 
     Parameters
     ----------
@@ -252,7 +252,7 @@ def imu_packets(times_ns: Ints, rates: Floats, forces: Floats) -> Bytes:
 
 
 class OusterEncoder(PacketEncoder):
-    """Encodes lidar packets of 16 columns, and IMU packets if the platform has an IMU.
+    """Encoder of lidar packets with 16 columns, and of IMU packets if the platform has an IMU.
 
     The identifier `profile` selects the layout of lidar packets. The default is
     RNG19_RFL8_SIG16_NIR16, with the suffix `_DUAL` for the mode two_strongest. Reflectivity and
@@ -332,7 +332,7 @@ class OusterEncoder(PacketEncoder):
             )
 
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the lidar packets completed by the shots of a sweep, and IMU packets."""
+        """Return the lidar packets that a sweep's shots complete, and IMU packets."""
         if not len(shots):
             return []
         groups = []
@@ -367,13 +367,13 @@ class OusterEncoder(PacketEncoder):
         return OusterApi(address, destination, send_to, self.metadata(), ports)
 
     def _rest_of_packets(self) -> list[Datagrams]:
-        """Return the packet of columns that wait for further columns, and discard them."""
+        """Encode the remaining columns as a packet, and discard them."""
         rest = self._rest
         self._rest = None
         return [] if rest is None else self._lidar(rest)
 
     def _lidar(self, shots: Shots) -> list[Datagrams]:
-        """Return the lidar packets of shots.
+        """Encode shots as lidar packets.
 
         The first and the last packet may lack columns.
         """
@@ -391,7 +391,7 @@ class OusterEncoder(PacketEncoder):
         return [datagrams.without(np.asarray(lost.all(axis=1)))]
 
     def _blocks(self, shots: Shots) -> MeasurementBlocks:
-        """Return the measurement blocks of shots, padded with invalid blocks to full packets."""
+        """Return the measurement blocks of shots, padded to whole packets with invalid blocks."""
         first = int(shots.firings[0]) // COLUMNS_PER_PACKET * COLUMNS_PER_PACKET
         packets = -(-(int(shots.firings[-1]) + 1 - first) // COLUMNS_PER_PACKET)
         firings = first + np.arange(packets * COLUMNS_PER_PACKET)
@@ -498,12 +498,12 @@ class OusterEncoder(PacketEncoder):
 
 
 def _rounded(values: Floats) -> list[float]:
-    """Return values as a list, rounded to remove digits that the conversion from radians adds."""
+    """Return rounded values as a list, without digits that the conversion from radians adds."""
     return [float(value) for value in np.round(values, 9).ravel() + 0.0]
 
 
 class OusterDecoder(PacketDecoder):
-    """Reads scans with ouster-sdk, with the metadata in a .json file beside the capture.
+    """Decoder that reads scans with ouster-sdk. The metadata is in a .json file beside the capture.
 
     ouster-sdk reads pcap files with common link types. Other captures would appear empty or be
     rejected, so they are rewritten to a temporary folder.
@@ -531,9 +531,10 @@ class OusterDecoder(PacketDecoder):
 
     @staticmethod
     def recognizes(payload: bytes) -> bool:
-        """Return whether a datagram has the size and, unless LEGACY, the type of a lidar packet.
+        """Return whether a datagram has the size and the type of a lidar packet.
 
-        All profiles are recognized, including profiles that cannot be encoded here.
+        Packets of the profile LEGACY have no type, so only their size is checked. All profiles are
+        recognized, including profiles that cannot be encoded here.
         """
         size = len(payload)
         if size in _LEGACY_BYTES:
@@ -547,7 +548,7 @@ class OusterDecoder(PacketDecoder):
         return (scans[sensor] for scans in self._open() if scans[sensor] is not None)
 
     def columns(self, sensor: int, sweep: Any) -> dict[str, AnyArray]:
-        """Return positions, ring, and the fields of reflectivity, signal and near infrared."""
+        """Return the position, ring, reflectivity, signal and near infrared of each point."""
         ring, column = np.nonzero(sweep.field("RANGE"))
         x, y, z = self._positions(sensor)(sweep)[ring, column].T
         columns = {"x": x, "y": y, "z": z, "ring": ring}
@@ -561,7 +562,7 @@ class OusterDecoder(PacketDecoder):
         return float(stamps.min()) if len(stamps) else 0.0
 
     def _readable_file(self, path: Path, metadata: Path) -> Path:
-        """Return the file, or the path of a temporary copy in a format that ouster-sdk reads."""
+        """Return the file itself, or a temporary copy in a format that ouster-sdk reads."""
         capture = Capture(path, self.name)
         if path.suffix.lower() not in ENDINGS or capture.is_classic(_SDK_LINKS):
             return path
@@ -578,7 +579,7 @@ class OusterDecoder(PacketDecoder):
         return import_module("ouster.sdk").open_source(str(self._file))
 
     def _positions(self, sensor: int) -> Any:
-        """Return the function that converts a scan to positions in meters."""
+        """Return a function that converts a scan to positions in meters."""
         if sensor not in self._tables:
             core = import_module("ouster.sdk.core")
             self._tables[sensor] = core.XYZLut(self._infos[sensor], False)

@@ -1,4 +1,4 @@
-"""Configuration interface of a live Ouster sensor, which is the HTTP API of firmware 3.0 and 3.1.
+"""Configuration interface of a live Ouster sensor: the HTTP API of firmware 3.0 and 3.1.
 
 Sources: sensor_http_imp.cpp, client.cpp and sensor_packet_source.cpp in ouster-sdk 1.0.1; the HTTP
 API documentation of the firmware. Clients can only set whether packets are sent and to which
@@ -124,7 +124,7 @@ class OusterApi(HttpService):
         return documents[resource]
 
     def _user(self, request: Request) -> Answer:
-        """Return or change the data that users store in the sensor."""
+        """Return or change the user data that are stored in the sensor."""
         if request.method == "PUT":
             text = _json(request.body)
             if not isinstance(text, str):
@@ -139,7 +139,7 @@ class OusterApi(HttpService):
         return Answer(self._user_data)
 
     def _config(self, request: Request) -> Answer:
-        """Return or change the configuration, as in firmware 3.1."""
+        """Return or change the configuration in the same way as firmware 3.1."""
         options = {name: values[-1].lower() for name, values in parse_qs(request.query).items()}
         if request.method in ("GET", "HEAD"):
             return Answer(self._staged if options.get("staging") == "true" else self._active)
@@ -153,7 +153,7 @@ class OusterApi(HttpService):
         return Answer(status=HTTPStatus.NO_CONTENT)
 
     def _command(self, command: str, request: Request) -> Answer:
-        """Execute a command, as in firmware 3.0 and earlier."""
+        """Execute a command in the same way as firmware 3.0 and earlier."""
         arguments = parse_qs(request.query).get("args", [""])[-1]
         if command == "get_config_param":
             if arguments not in ("active", "staged"):
@@ -215,7 +215,7 @@ def _json(body: bytes) -> Any:
 
 
 def _loose(value: str) -> Any:
-    """Parse an argument as a number, true or false, or return it as text."""
+    """Parse an argument as a number or a Boolean value, or return it as text."""
     try:
         return json.loads(value)
     except (ValueError, RecursionError):

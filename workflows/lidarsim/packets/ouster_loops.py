@@ -1,4 +1,4 @@
-"""Compiled loops over pixels and checksums of Ouster packets (ouster.py)."""
+"""Compiled loops that compute the pixels and checksums of Ouster packets (ouster.py)."""
 
 # mypy: disable-error-code="no-untyped-def"
 

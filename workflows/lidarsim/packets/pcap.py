@@ -1,4 +1,4 @@
-"""Write datagrams as pcap files with Ethernet, IPv4 and UDP headers and times in microseconds."""
+"""Write datagrams to pcap files with Ethernet, IPv4 and UDP headers, and times in microseconds."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _BROADCAST_MAC = b"\xff" * 6
 
 
 class PcapWriter:
-    """Writes frames of datagrams to a binary file, sorted by time within each call.
+    """Writer of datagrams to a pcap file. The datagrams of each call are sorted by time.
 
     `address` is the address of the sensor, and `destination` the address of the receiver.
     `start_ns` is time 0 of the datagrams, in nanoseconds since 1970. The output depends only on the
@@ -68,7 +68,7 @@ class PcapWriter:
         self._file.write(content.data)
 
     def _frames(self, group: Datagrams) -> Bytes:
-        """Return the frames of datagrams including their file headers, with one row per frame."""
+        """Return the frames of datagrams, with pcap record headers and one row per frame."""
         count, size = group.payloads.shape
         frames = np.zeros((count, _PAYLOAD_OFFSET + size), np.uint8)
         frames[:, _PAYLOAD_OFFSET:] = group.payloads
@@ -83,14 +83,12 @@ class PcapWriter:
         return frames
 
     def _ip_header(self, size: int) -> bytes:
-        """Return the IPv4 header of an unfragmented datagram of `size` bytes."""
         head = pack(">BBHHHBB", 0x45, 0, 28 + size, 0, 0x4000, _TIME_TO_LIVE, _UDP)
         words = np.frombuffer(head + self._addresses, ">u2").astype(np.int64)
         checksum = int(_complement(words.sum(keepdims=True))[0])
         return head + pack(">H", checksum) + self._addresses
 
     def _udp_header(self, group: Datagrams, size: int) -> bytes:
-        """Return the UDP header of a datagram without its checksum."""
         return pack(">HHHH", group.source_port or group.port, group.port, 8 + size, 0)
 
     def _udp_checksums(self, segments: Bytes) -> Bytes:
@@ -105,7 +103,7 @@ class PcapWriter:
 
 
 def write_datagrams(file: BinaryIO, datagrams: Iterable[CapturedDatagram]) -> None:
-    """Write captured datagrams as a plain pcap file, broadcast and without checksums.
+    """Write captured datagrams to a plain pcap file, as broadcasts without checksums.
 
     Raises OSError on failure.
     """
@@ -121,7 +119,7 @@ def write_datagrams(file: BinaryIO, datagrams: Iterable[CapturedDatagram]) -> No
 
 
 def _complement(sums: Ints | Indices) -> Ints:
-    """Return the ones' complement checksums (RFC 1071) of sums of 16-bit words."""
+    """Return ones' complement checksums (RFC 1071) from sums of 16-bit words."""
     folded = np.asarray(sums, np.int64)
     for _ in range(3):
         folded = (folded & 0xFFFF) + (folded >> 16)

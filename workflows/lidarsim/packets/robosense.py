@@ -53,7 +53,10 @@ _SIGNED_ANGLE = [("negative", "u1"), ("centidegrees", ">u2")]
 
 
 def _placed(size: int, fields: Mapping[str, tuple[int, DTypeLike]]) -> np.dtype[np.void]:
-    """Return a dtype of `size` bytes, given its fields as {name: (offset, dtype)}."""
+    """Return a dtype of `size` bytes with fields at given offsets.
+
+    The fields are given as {name: (offset, dtype)}.
+    """
     offsets, formats = zip(*fields.values(), strict=True)
     return np.dtype(
         {"names": list(fields), "offsets": offsets, "formats": formats, "itemsize": size}
@@ -61,7 +64,7 @@ def _placed(size: int, fields: Mapping[str, tuple[int, DTypeLike]]) -> np.dtype[
 
 
 def _msop_packet(time: DTypeLike, fields: Mapping[str, tuple[int, DTypeLike]]) -> np.dtype[np.void]:
-    """Return the dtype of a measurement packet, with the given fields in its header."""
+    """Return the dtype of a measurement packet with the given header fields."""
     return _placed(1248, {
         **fields,
         "time": (20, time),
@@ -72,7 +75,7 @@ def _msop_packet(time: DTypeLike, fields: Mapping[str, tuple[int, DTypeLike]]) -
 
 
 def _difop_packet(fields: Mapping[str, tuple[int, DTypeLike]]) -> np.dtype[np.void]:
-    """Return the dtype of a device data packet, with the given model-specific fields."""
+    """Return the dtype of a device data packet with the given model-specific fields."""
     return _placed(1248, {
         "id": (0, ("u1", 8)),
         "rpm": (8, ">u2"),
@@ -90,7 +93,7 @@ def _difop_packet(fields: Mapping[str, tuple[int, DTypeLike]]) -> np.dtype[np.vo
 
 @dataclass(frozen=True)
 class RobosenseModel:
-    """Packet layout of a model, and the values that readers assume."""
+    """Packet layout of a sensor model, and values that readers assume."""
 
     lasers: int
     unit_m: float
@@ -137,7 +140,7 @@ MODELS = {
 
 
 class RobosenseEncoder(PacketEncoder):
-    """Encodes measurement packets and device data packets, both of 1,248 bytes.
+    """Encoder of measurement packets and device data packets, both of 1,248 bytes.
 
     Device data is sent before the first measurements and then ten times per second, because readers
     wait for the angles in it. In dual mode, each block of strongest returns is followed by a block
@@ -165,7 +168,7 @@ class RobosenseEncoder(PacketEncoder):
         self.columns = ("reflectivity", "signal") if source.mode == "dual" else ("reflectivity",)
 
     def _check_source(self) -> None:
-        """Raise LidarError if the source does not match a sensor of the model."""
+        """Raise LidarError if the source is not a sensor of the model."""
         source = self.source
         model = self._model
         if source.mode not in model.modes:
@@ -187,7 +190,7 @@ class RobosenseEncoder(PacketEncoder):
             )
 
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the packets that are complete after the shots of a sweep, and device data."""
+        """Return the measurement packets that a sweep's shots complete, and device data packets."""
         filling = self._carry.whole_packets(shots)
         if not len(filling):
             return []
@@ -196,11 +199,11 @@ class RobosenseEncoder(PacketEncoder):
         return [self._difop(filling, int(msop.due_ns[-1])), msop.without(np.asarray(dropped))]
 
     def finish(self) -> list[Datagrams]:
-        """Return no packets, because the sensor sends only packets whose blocks are full."""
+        """Return no packets, because the sensor only sends packets whose blocks are all full."""
         return []
 
     def _msop(self, shots: Shots) -> Datagrams:
-        """Return the measurement packets of shots that fill packets."""
+        """Encode shots as measurement packets, which the shots must fill completely."""
         firings = np.arange(len(shots)).reshape(-1, self._firings)
         packets = np.zeros(len(firings), self._model.msop)
         packets["id"] = np.frombuffer(self._model.header, np.uint8)
@@ -215,7 +218,7 @@ class RobosenseEncoder(PacketEncoder):
         return Datagrams(_as_bytes(packets), due_ns, self.ports["msop"])
 
     def _fill_blocks(self, blocks: AnyArray, shots: Shots) -> None:
-        """Write azimuths and returns of shots to blocks of `_BLOCK`."""
+        """Write the azimuths and returns of shots to blocks of type `_BLOCK`."""
         units = np.rint(shots.range_m / self._model.unit_m)
         fits = (units > 0) & (units <= _MAX_UNITS)  # False without a return, where the range is NaN
         distances = np.where(fits, units, 0).astype(np.uint16)
@@ -230,7 +233,7 @@ class RobosenseEncoder(PacketEncoder):
         blocks["azimuth"] = azimuths.reshape(len(blocks), self._firings)[:, firing]
 
     def _planes_in_order(self, shots: Shots) -> Ints:
-        """Return the number of the return that is stored in each plane of a packet."""
+        """Return the number of the return to store in each plane of a packet."""
         first = np.zeros((1, *shots.range_m.shape[1:]), np.int64)
         if self._planes == 1:
             return first
@@ -241,7 +244,12 @@ class RobosenseEncoder(PacketEncoder):
         return np.concatenate([first, shots.returned[1:2] ^ first])
 
     def _difop(self, shots: Shots, until_ns: int) -> Datagrams:
-        """Return the device data due up to a time, starting with the first shots."""
+        """Return the device data packets that are due by a given time.
+
+        The first packet of a survey is due at the start of its first shots.
+
+        The first packet is due at the first of the first shots.
+        """
         if self._next_difop_ns is None:
             self._next_difop_ns = int(shots.starts_ns[0])
         due_ns = np.arange(self._next_difop_ns, until_ns + 1, DIFOP_INTERVAL_NS)
@@ -253,7 +261,7 @@ class RobosenseEncoder(PacketEncoder):
         return Datagrams(_as_bytes(packets), due_ns, self.ports["difop"])
 
     def _device_data(self) -> Records:
-        """Return a device data packet of the sensor without a time, as an array of length 1."""
+        """Return a device data packet without a time, as an array of length 1."""
         packets = np.zeros(1, self._model.difop)
         packets["id"] = np.frombuffer(_DIFOP_ID, np.uint8)
         packets["rpm"] = round(60 * self.source.sensor.head.rate_hz)  # type: ignore[attr-defined]
@@ -285,11 +293,10 @@ class RobosenseEncoder(PacketEncoder):
         return packets
 
     def _elevations_deg(self) -> Floats:
-        """Return the elevations of the lasers in degrees."""
         return np.degrees(self.source.sensor.beams.elevation[self.source.settings.channels])
 
     def _azimuths_deg(self) -> Floats:
-        """Return the azimuths of the lasers relative to the head, counterclockwise, in degrees."""
+        """Return the counterclockwise azimuths of the lasers relative to the head, in degrees."""
         beams = self.source.sensor.beams
         head_turn = self.source.sensor.head.radians_per_ns * beams.time_ns  # type: ignore[attr-defined]
         degrees: Floats = np.degrees(beams.azimuth - head_turn)[self.source.settings.channels]
@@ -297,7 +304,7 @@ class RobosenseEncoder(PacketEncoder):
 
 
 def _write_times(times: AnyArray, since_1970_ns: Ints) -> None:
-    """Write times in nanoseconds since 1970 as records of `_DATE` or `_SECONDS`."""
+    """Write times, in nanoseconds since 1970, to records of type `_DATE` or `_SECONDS`."""
     micros = np.maximum(since_1970_ns + 500, 0) // 1000
     seconds, microseconds = np.divmod(micros, 1_000_000)
     if times.dtype == np.dtype(_SECONDS):
@@ -318,12 +325,11 @@ def _write_times(times: AnyArray, since_1970_ns: Ints) -> None:
 
 
 def _as_bytes(packets: Records) -> Bytes:
-    """Return records as bytes."""
     return packets.view(np.uint8).reshape(len(packets), packets.dtype.itemsize)
 
 
 class RobosenseDecoder(PacketDecoder):
-    """Rejects RoboSense packets, because no Python package on PyPI reads them as sweeps."""
+    """Decoder that rejects RoboSense packets, because no package on PyPI reads them as sweeps."""
 
     refusal = (
         "RoboSense packets, which are not supported. Convert them to .pcd with rs_driver, or "

@@ -42,7 +42,7 @@ _ENDS_WITHIN_S = 2.0  # time limit for the process to exit after SIGTERM
 
 @dataclass(frozen=True)
 class Lateness:
-    """Number of datagrams that were sent, and a histogram of their lateness."""
+    """Number of datagrams that were sent, and a histogram of how late they were."""
 
     sent: int = 0
     limits_ms: tuple[float, ...] = ()  # upper limits of the bins
@@ -51,7 +51,10 @@ class Lateness:
     failures: Mapping[str, int] = field(default_factory=dict)  # {error: number of datagrams}
 
     def share_within(self, limit_ms: float) -> float:
-        """Return the share of datagrams that were at most as late as a bin limit."""
+        """Return the fraction of datagrams that were at most `limit_ms` late.
+
+        `limit_ms` is one of the bin limits.
+        """
         stop = self.limits_ms.index(limit_ms) + 1
         return sum(self.counts[:stop]) / max(1, self.sent)
 
@@ -81,7 +84,7 @@ class Lateness:
 
 
 class Sender:
-    """Context manager that sends datagrams of numbered sensors at their due times.
+    """Context manager that sends the datagrams of numbered sensors at their due times.
 
     The sender process ends with the context, or when the current process ends for any reason.
 
@@ -131,7 +134,7 @@ class Sender:
     def send(
         self, sensor: int, groups: Sequence[Datagrams], deadlines_ns: Callable[[Ints], Ints]
     ) -> None:
-        """Pass datagrams to the process, which sends each at `deadlines_ns(due_ns)`.
+        """Pass datagrams to the sender process, which sends each at `deadlines_ns(due_ns)`.
 
         Deadlines are times of `time.monotonic_ns`. The call blocks while too many datagrams are
         pending. Raises LidarError if the process has ended.
@@ -147,7 +150,7 @@ class Sender:
             self._write(_in_order(records, np.concatenate(dues_ns)).data)
 
     def finish(self) -> Lateness:
-        """Wait until all datagrams are sent, and return how late they were."""
+        """Wait until all datagrams have been sent, and return how late they were."""
         self._write(HEADER.pack(END, 0, 0, 0, 0, 0))
         self._wait(None)
         return self._lateness
@@ -158,7 +161,7 @@ class Sender:
         return self._lateness
 
     def _write(self, content: bytes | memoryview) -> None:
-        """Write to the process, or raise LidarError if it has ended."""
+        """Write to the sender process. Raises LidarError if it has ended."""
         assert self._process is not None
         file = self._process.stdin
         assert file is not None
@@ -172,7 +175,7 @@ class Sender:
             ) from error
 
     def _hear(self) -> None:
-        """Read what the process has reported, without blocking."""
+        """Read what the sender process has reported, without blocking."""
         assert self._process is not None
         file = self._process.stdout
         assert file is not None
@@ -196,7 +199,7 @@ class Sender:
             )
 
     def _wait(self, timeout_s: float | None = _ENDS_WITHIN_S) -> None:
-        """Wait until the process ends, and kill it if this takes too long."""
+        """Wait until the process ends. Kill it if this takes too long."""
         assert self._process is not None
         process = self._process
         if process.stdin is None or process.stdin.closed:
@@ -212,14 +215,14 @@ class Sender:
 
 
 def _close(file: IO[bytes] | None) -> None:
-    """Close a pipe whose buffered bytes may have no reader."""
+    """Close a pipe even if nothing reads its buffered bytes."""
     assert file is not None
     with suppress(BrokenPipeError):
         file.close()
 
 
 def _records(sensor: int, group: Datagrams, due_ns: Ints) -> Bytes:
-    """Return datagrams preceded by their record headers, with one row per datagram."""
+    """Return datagrams with their record headers, one datagram per row."""
     count, size = group.payloads.shape
     headers = np.zeros(count, _RECORD)
     headers["kind"] = DATAGRAM
@@ -232,7 +235,7 @@ def _records(sensor: int, group: Datagrams, due_ns: Ints) -> Bytes:
 
 
 def _in_order(records: Sequence[Bytes], due_ns: Ints) -> Bytes:
-    """Return the records of all groups as one flat array, sorted by time."""
+    """Return the records of all groups as a flat array, sorted by time."""
     if len(records) == 1:
         return np.ascontiguousarray(records[0]).reshape(-1)
     sizes = np.concatenate([np.full(len(rows), rows.shape[1]) for rows in records])
@@ -307,7 +310,7 @@ def _is_ipv6(text: str) -> bool:
 
 
 def _resolved(host: str, text: str) -> IPv4Address:
-    """Return the IPv4 address of a host name.
+    """Resolve a host name to an IPv4 address.
 
     Raises LidarError if there is none.
     """

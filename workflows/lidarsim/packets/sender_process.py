@@ -1,4 +1,4 @@
-"""Script of the process that reads datagrams from stdin and sends them at their due times.
+"""Script of a process that reads datagrams from stdin and sends them at their due times.
 
 `send.Sender` runs this file as a script, which reports to stdout. It imports only the standard
 library, so that it starts within milliseconds. It is a separate process, because a thread in the
@@ -44,7 +44,7 @@ class Stop(Exception):  # noqa: N818 - not an error
 
 
 class Route:
-    """Destination of the datagrams of a sensor, and time of the last datagram."""
+    """Destination of a sensor's datagrams, and times of its last datagram."""
 
     def __init__(self) -> None:
         self.host = ""
@@ -65,7 +65,7 @@ class Route:
             self._source = values["source"]
 
     def open_from(self, port: int) -> socket.socket:
-        """Return the socket for a source port, which is opened on first use.
+        """Return the socket for a source port, opening it on first use.
 
         Port 0 stands for any port.
         """
@@ -74,21 +74,21 @@ class Route:
         return self._sockets[port]
 
     def earliest_ns(self, due_ns: int) -> int:
-        """Return the earliest time to send a datagram.
+        """Return the earliest time at which a datagram may be sent.
 
         This is its due time, or a later time if the last datagram was late.
         """
         return max(due_ns, self._sent_ns + (due_ns - self._due_ns) // _CATCH_UP)
 
     def mark_sent(self, due_ns: int) -> int:
-        """Record that a datagram is sent now, and return its lateness in nanoseconds."""
+        """Record that a datagram is being sent, and return its lateness in nanoseconds."""
         self._due_ns = due_ns
         self._sent_ns = time.monotonic_ns()
         return self._sent_ns - due_ns
 
 
 def _open_socket(source: str, port: int) -> socket.socket:
-    """Return a socket bound to a source address and port, or to any if they are unavailable."""
+    """Return a socket bound to a source address and port, or to any if these are unavailable."""
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     for number in (port, 0) if source else (port,):
         with suppress(OSError):
@@ -98,7 +98,7 @@ def _open_socket(source: str, port: int) -> socket.socket:
 
 
 class SendQueue:
-    """Datagrams that wait for their due times, and statistics of those that were sent."""
+    """Datagrams that wait for their due times, and statistics of the datagrams already sent."""
 
     def __init__(self) -> None:
         # A heap sorted by due time and order of arrival.
@@ -114,7 +114,7 @@ class SendQueue:
         self._rest = b""  # beginning of a record that has not completely arrived
 
     def parse_records(self, content: bytes) -> None:
-        """Parse the records in further bytes from stdin."""
+        """Parse the records in the next bytes from stdin."""
         content = self._rest + content
         start = 0
         while len(content) - start >= HEADER.size:
@@ -136,7 +136,7 @@ class SendQueue:
         self._rest = content[start:]
 
     def next_ns(self) -> int | None:
-        """Return the time at which the next datagram will be sent, or None if none is pending."""
+        """Return the time for sending the next datagram, or None if none is pending."""
         if not self.waiting:
             return None
         due_ns, _, sensor, *_ = self.waiting[0]
@@ -176,7 +176,7 @@ class SendQueue:
 
 
 def report(values: dict[str, Any]) -> None:
-    """Write values as a line of JSON to standard output, which the ray-casting process reads.
+    """Write values to standard output as a line of JSON, for the ray-casting process.
 
     Write errors are ignored, because that process may have exited.
     """
@@ -198,7 +198,7 @@ def raise_priority() -> None:
 
 
 def serve(queue: SendQueue) -> None:
-    """Send datagrams at their due times until all are sent after END."""
+    """Send datagrams at their due times until END is received and all are sent."""
     while not queue.ended or queue.waiting:
         next_ns = queue.next_ns()
         wait_s = None if next_ns is None else max(0.0, (next_ns - time.monotonic_ns()) / 1e9)
@@ -214,7 +214,7 @@ def serve(queue: SendQueue) -> None:
 
 
 def main() -> None:
-    """Send until END, SIGTERM, or the end of stdin, and report at the start and at the end."""
+    """Send datagrams until END, SIGTERM or the end of stdin. Report at the start and the end."""
 
     def stop(number: int, frame: object) -> NoReturn:
         raise Stop

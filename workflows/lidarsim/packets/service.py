@@ -24,7 +24,7 @@ class Destination:
 
 
 def is_single_receiver(address: IPv4Address) -> bool:
-    """Return False if an address is unspecified, a multicast address or a broadcast address.
+    """Return whether an address is neither unspecified nor a multicast or broadcast address.
 
     The operating system knows the broadcast addresses of the local networks. It refuses to connect
     sockets to them unless broadcasting has been enabled.
@@ -42,7 +42,7 @@ def is_single_receiver(address: IPv4Address) -> bool:
 
 
 class Service(ABC):
-    """Context manager that answers a manufacturer's software on separate threads.
+    """Context manager that answers a manufacturer's software from separate threads.
 
     Clients that never complete a request or send invalid data must not stop the sensor, so a
     service limits its threads and the size and duration of requests.
@@ -65,11 +65,11 @@ class Service(ABC):
     @property
     @abstractmethod
     def description(self) -> str:
-        """Instructions for reaching the service, which are shown when it is ready."""
+        """Instructions for reaching the service, shown when it is ready."""
 
     @abstractmethod
     def __enter__(self) -> Self:
-        """Start to listen.
+        """Start listening.
 
         Raises LidarError if the address cannot be used.
         """

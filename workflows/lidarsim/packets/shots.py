@@ -1,4 +1,4 @@
-"""Shots of a sensor in the manufacturer's laser order, with and without returns."""
+"""Shots of a sensor's lasers, with and without returns, in the manufacturer's order."""
 
 from __future__ import annotations
 
@@ -36,19 +36,22 @@ class Shots:
         return len(self.firings)
 
     def __getitem__(self, firings: slice) -> Shots:
-        """Select consecutive firings."""
+        """Return the selected firings."""
         columns = {name: values[:, firings] for name, values in self.columns.items()}
         arrays = {name: getattr(self, name)[firings] for name in _OF_FIRINGS}
         return Shots(**arrays, range_m=self.range_m[:, firings], columns=columns)
 
     @property
     def returned(self) -> Bools:
-        """Whether each shot has a return with each number. Shape (r, n, c)."""
+        """Whether each shot has a return of each number.
+
+        The shape is (r, n, c).
+        """
         return ~np.isnan(self.range_m)
 
     @classmethod
     def concatenate(cls, tables: list[Shots]) -> Shots:
-        """Concatenate one or more parts, which must have the same columns."""
+        """Concatenate one or more groups of shots, which must have the same columns."""
         if len(tables) == 1:
             return tables[0]
         columns = {
@@ -90,7 +93,7 @@ class Shots:
 
     @classmethod
     def from_image(cls, image: RayImage, points: Cloud, columns: Iterable[str] = ()) -> Shots:
-        """Return the shots of the points in an image, without faults.
+        """Return the shots in an image of points, without sensor faults.
 
         Raises LidarError if the sensor has no packet format, or if the points lack a column.
         """
@@ -103,7 +106,6 @@ class Shots:
         shot = (image.plane * shape[1] + image.column) * shape[2] + lasers[image.row]
 
         def in_laser_order(values: AnyArray, missing: float) -> AnyArray:
-            """Return point values as an array of shape (r, n, c)."""
             filled = np.full(shape, missing, values.dtype)
             filled.reshape(-1)[shot] = values
             return filled
@@ -121,7 +123,7 @@ class Shots:
         )
 
     def shifted(self, shift_ns: int) -> Shots:
-        """Return the shots with all times shifted, as in a survey that is repeated."""
+        """Return the shots with shifted times, for the repetition of a survey."""
         if not shift_ns:
             return self
         return replace(
@@ -135,7 +137,7 @@ _OF_FIRINGS = tuple(
 
 
 def _dropped(sweeps: Sweeps, sweep: int, firings: Ints, starts_ns: Ints) -> Bools:
-    """Return whether firings of a sweep are in packets that are lost."""
+    """Return whether each firing of a sweep is in a lost packet."""
     sensor = int(sweeps.sensor[sweep])
     sweeps_per_station = int(np.count_nonzero(sweeps.sensor == sensor)) // sweeps.stations
     station = int(sweeps.numbers[sweep]) // sweeps_per_station
@@ -171,7 +173,7 @@ def settings_of(sensor: Sensor) -> PacketSettings:
 
 
 def last_and_strongest(values: AnyArray, returned: Bools) -> list[AnyArray]:
-    """Return the last and the strongest returns for dual mode.
+    """Return the last and the strongest return of each shot, for dual mode.
 
     The results have shape (n, c). `values` (r, n, c) are in the order of `Shots`, and `returned`
     (r, n, c) states whether each return is sent. Where the last return is the strongest, the second
@@ -183,7 +185,7 @@ def last_and_strongest(values: AnyArray, returned: Bools) -> list[AnyArray]:
 
 
 class CarryOver:
-    """Firings that do not fill a packet yet.
+    """Firings that wait until a packet is full.
 
     A revolution does not usually fill a whole number of packets.
     """
@@ -193,7 +195,7 @@ class CarryOver:
         self._rest: Shots | None = None
 
     def whole_packets(self, shots: Shots) -> Shots:
-        """Add firings, return all firings that fill packets, and keep the rest.
+        """Add firings, and return the firings that fill whole packets. Keep the rest.
 
         The result may be empty. Firings that remain at the end of a station are discarded.
         """
@@ -205,14 +207,14 @@ class CarryOver:
         return joined[:count]
 
     def rest(self) -> Shots | None:
-        """Remove and return the firings left over, or None before the first sweep."""
+        """Remove and return the remaining firings. Return None before the first sweep."""
         rest = self._rest
         self._rest = None
         return rest
 
 
 def with_packets() -> tuple[str, ...]:
-    """Return the names of the built-in models that have a packet format, in order."""
+    """Return the names of the built-in models that have a packet format."""
     from ..schema.model_names import model_names
     from ..sensor.models import read_model
 

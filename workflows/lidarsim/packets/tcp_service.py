@@ -1,4 +1,4 @@
-"""Base class of TCP services such as HTTP, which run on a thread with an event loop."""
+"""Base class of TCP services, such as HTTP, that run an event loop on a thread."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _BACKLOG = 128  # number of connections that can wait to be accepted
 
 
 class TcpService(Service):
-    """Serves TCP connections on a thread until the end of the context.
+    """Service that accepts TCP connections on a thread until the context exits.
 
     If there are more than `max_connections`, the oldest connection is closed. Clients that keep
     connections open without completing a request therefore cannot block other clients.
@@ -52,11 +52,13 @@ class TcpService(Service):
 
     @abstractmethod
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Answer the requests on a connection and close the connection."""
+        """Answer the requests on a connection, and close the connection."""
 
     @contextmanager
     def counted(self) -> Iterator[Callable[[], None]]:
-        """Register the connection of the current task, and close the oldest if there are too many.
+        """Register the current task's connection.
+
+        Close the oldest connection if there are too many.
 
         Yields a function that marks the connection as the newest.
         """

@@ -46,7 +46,7 @@ _PACKET = np.dtype(
 
 
 class VelodyneEncoder(PacketEncoder):
-    """Encodes data packets of 1,206 bytes and position packets of 512 bytes.
+    """Encoder of data packets of 1,206 bytes and position packets of 512 bytes.
 
     The azimuth of a block is the azimuth of the head at the block's first firing, clockwise from
     the sensor's x axis. In dual mode, each block of last returns is followed by a block of
@@ -76,7 +76,7 @@ class VelodyneEncoder(PacketEncoder):
         self._positions = PositionPackets(source, self.port("position", POSITION_PORT))
 
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the data packets completed by the shots of a sweep, and position packets."""
+        """Return the data packets that a sweep's shots complete, and position packets."""
         whole = self._carry.whole_packets(shots)
         if not len(whole):
             return []
@@ -88,7 +88,7 @@ class VelodyneEncoder(PacketEncoder):
         return [data.without(np.asarray(dropped)), positions]
 
     def finish(self) -> list[Datagrams]:
-        """Return no packets, because the sensor sends only packets whose blocks are full."""
+        """Return no packets, because the sensor only sends packets whose blocks are all full."""
         return []
 
     def service(
@@ -109,7 +109,7 @@ class VelodyneEncoder(PacketEncoder):
         return VelodyneApi(address, destination, send_to, state, ports)
 
     def _data(self, shots: Shots) -> Datagrams:
-        """Return the data packets of shots that fill packets."""
+        """Encode shots as data packets, which the shots must fill completely."""
         firings = np.arange(len(shots)).reshape(-1, self._firings)
         packets = np.zeros(len(firings), _PACKET)
         packets["mode"] = self._mode
@@ -121,7 +121,7 @@ class VelodyneEncoder(PacketEncoder):
         return Datagrams(payloads, last_ns + self.firing_interval_ns, self._port)
 
     def _stamps_us(self, first_ns: Ints) -> Ints:
-        """Return the timestamps in µs of packets, given the start of their first firings."""
+        """Return packet timestamps in µs past the hour, from the start times of first firings."""
         settings = self.source.settings
         offset_ns = 0.0
         if len(settings.lasers) > _BLOCKS * _BLOCK_LASERS // 4:
@@ -131,7 +131,7 @@ class VelodyneEncoder(PacketEncoder):
         return (stamps_ns + 500) // 1000 % _HOUR_US
 
     def _fill_blocks(self, blocks: AnyArray, shots: Shots) -> None:
-        """Write flags, azimuths and returns of shots to blocks of `_BLOCK`."""
+        """Write the flags, azimuths and returns of shots to blocks of type `_BLOCK`."""
         channels = shots.range_m.shape[2]
         used = self._firings * channels * self._planes // _BLOCK_LASERS
         units = np.rint(shots.range_m / self._unit_m)
@@ -154,7 +154,9 @@ class VelodyneEncoder(PacketEncoder):
 
 
 class VelodyneDecoder(PacketDecoder):
-    """Reads Velodyne packets, which identify the sensor model, with velodyne_decoder.
+    """Decoder that reads Velodyne packets with velodyne_decoder.
+
+    Data packets identify the sensor model.
 
     If a file contains several units, each is a sensor named `ADDRESS:PORT` after the address of the
     unit and the port of the receiver.
@@ -181,7 +183,7 @@ class VelodyneDecoder(PacketDecoder):
         return len(payload) == _PACKET.itemsize and payload[:2] in _FLAG_BYTES
 
     def sweeps(self, sensor: int) -> Iterable[_Sweep]:
-        """Yield the sweeps in the form that velodyne_decoder returns."""
+        """Yield the sweeps as objects of velodyne_decoder."""
         decoder: Any = import_module("velodyne_decoder")
         config = decoder.Config(timestamp_first_packet=True)
         if self._is_hdl64e(sensor):
@@ -211,11 +213,16 @@ class VelodyneDecoder(PacketDecoder):
                 yield datagram
 
     def _is_hdl64e(self, sensor: int) -> bool:
-        """Return whether the last two bytes vary, in which an HDL-64E transmits its state."""
+        """Return whether a sensor is an HDL-64E, whose packets end with two varying bytes.
+
+        The bytes transmit the state of the sensor.
+
+        The bytes transmit the state of the sensor.
+        """
         return len({packet.payload[-2:] for packet in islice(self._packets(sensor), 5)}) > 1
 
     def _hdl64e(self, sensor: int) -> tuple[Any, Any]:
-        """Return the model and calibration that an HDL-64E transmits with its packets.
+        """Return the model and the calibration that an HDL-64E transmits in its packets.
 
         Raises ValueError if they are incomplete.
         """
@@ -231,12 +238,12 @@ class VelodyneDecoder(PacketDecoder):
 
 
 class _Sweep(NamedTuple):
-    """A revolution in the form that velodyne_decoder returns."""
+    """A revolution in the form in which velodyne_decoder returns it."""
 
     stamp: Any  # has the times `host` and `device` in seconds
     points: AnyArray  # structured
 
 
 def _unit_of(datagram: CapturedDatagram) -> tuple[str, int]:
-    """Return the address of a unit and its receiver's port, which identify the unit."""
+    """Return the address of a unit and the receiver's port, which together identify the unit."""
     return datagram.source, datagram.port

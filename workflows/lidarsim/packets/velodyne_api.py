@@ -158,7 +158,7 @@ class VelodyneApi(HttpService):
             self._apply()
 
     def _apply(self) -> None:
-        """Send the packets to the receiver, or stop sending if the laser is off."""
+        """Send packets to the receiver, or stop sending if the laser is off."""
         numbers = [0, 0] if self._laser == "Off" else [*self._host_ports.values()]
         ports = dict(zip(self._ports, numbers, strict=True))
         self.destination = Destination(self._host, ports)

@@ -1,4 +1,6 @@
-"""Velodyne position packets, which report the time as an NMEA 0183 GPRMC sentence every second.
+"""Velodyne position packets, which transmit an NMEA 0183 GPRMC sentence with the time.
+
+There is a new sentence every second.
 
 Sources: user manual of the VLP-16 (63-9243), section 9.3.3, with the ratio of data to position
 packets; telemetry_packet.cpp in valgur/velodyne_decoder.
@@ -34,7 +36,7 @@ _KNOT_M_S = 1852 / 3600
 
 
 class Fix(NamedTuple):
-    """Position and motion that a GNSS receiver reports."""
+    """Position and motion reported by a GNSS receiver."""
 
     latitude_deg: float
     longitude_deg: float
@@ -43,7 +45,7 @@ class Fix(NamedTuple):
 
 
 class PositionPackets:
-    """Position packets between the data packets of a sensor.
+    """Position packets that a sensor sends between its data packets.
 
     There is one position packet for every 14 data packets.
 
@@ -77,7 +79,6 @@ class PositionPackets:
         return Datagrams(_as_bytes(packets), due_ns[follows], self._port)
 
     def _sentence(self, second: int) -> bytes:
-        """Return the sentence for a second since 1970."""
         if second not in self._sentences:
             since_start_ns = second * _SECOND_NS - self._source.start_ns
             fix = None if self._fixes is None else self._fixes.at(since_start_ns)
@@ -86,7 +87,7 @@ class PositionPackets:
 
 
 class _Fixes(NamedTuple):
-    """Fixes of a GNSS receiver in chronological order."""
+    """Chronological fixes of a GNSS receiver."""
 
     times_ns: Ints  # (n,): since the start of the survey
     latitudes_deg: Floats  # (n,)
@@ -94,7 +95,7 @@ class _Fixes(NamedTuple):
 
     @classmethod
     def from_source(cls, source: PacketSource) -> _Fixes | None:
-        """Return the fixes of the platform, or None if it has none with latitudes."""
+        """Return the platform's fixes, or None if it has none with latitudes."""
         instruments = source.instruments
         rows = [] if instruments is None else list(instruments.rows(GNSS_FILE))
         if not rows or len(rows[0]) < 6:
@@ -104,7 +105,7 @@ class _Fixes(NamedTuple):
         return cls(times_ns, latitudes, longitudes)
 
     def at(self, time_ns: int) -> Fix | None:
-        """Return the last fix at or before a time, or None before the first fix."""
+        """Return the last fix at or before a given time, or None before the first fix."""
         row = int(np.searchsorted(self.times_ns, time_ns, "right")) - 1
         if row < 0:
             return None
@@ -121,7 +122,7 @@ class _Fixes(NamedTuple):
 
 
 def gprmc(second: int, fix: Fix | None) -> bytes:
-    r"""Return the GPRMC sentence for a second since 1970 (UTC).
+    r"""Format a GPRMC sentence for a second since 1970 (UTC).
 
     Without a fix, the status in the sentence is V.
 
@@ -146,11 +147,10 @@ def gprmc(second: int, fix: Fix | None) -> bytes:
 
 
 def _angle(angle_deg: float, digits: int) -> str:
-    """Return an angle in the NMEA format, with `digits` digits of degrees followed by minutes."""
+    """Format an angle in the NMEA notation, with `digits` digits of degrees before the minutes."""
     whole, rest = divmod(round(abs(angle_deg) * 60 * 100_000), 60 * 100_000)
     return f"{whole:0{digits}d}{rest / 100_000:08.5f}"
 
 
 def _as_bytes(packets: Records) -> Bytes:
-    """Return records as bytes."""
     return packets.view(np.uint8).reshape(len(packets), packets.dtype.itemsize)

@@ -1,4 +1,4 @@
-"""Lidar sensors, with their beams, heads, optics and noise."""
+"""Lidar sensors: beams, heads, optics and noise."""
 
 from .beams import Beams, Head, Mirror, Spin
 from .noise import Noise

@@ -23,7 +23,7 @@ MAX_CHANNELS = 65_535  # limit of the uint16 column `channel`
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """The beams of a sensor, all of which are fired once per firing.
+    """Beams of a sensor, each of which is fired once per firing.
 
     Channel 0 is the first beam, which is usually the lowest.
 
@@ -82,7 +82,7 @@ class Beams:
         return cls(np.linspace(-half, half, layers) if layers > 1 else np.zeros(1))
 
     def with_rotation(self, radians_per_ns: float) -> Beams:
-        """Return the beams for a head that rotates counterclockwise during a firing.
+        """Return beams for a head that rotates counterclockwise during a firing.
 
         Each beam is rotated by the angle that the head covers until the beam is fired. The ray
         caster therefore only needs the angle of the head at the start of each firing.
@@ -94,7 +94,7 @@ class Beams:
         return Beams(self.elevation, self.azimuth + angle, self.time_ns, origin)
 
     def sort_by_elevation(self) -> Beams:
-        """Return the same beams sorted by elevation, with the lowest beam as channel 0."""
+        """Return the beams sorted by elevation, so that channel 0 is the lowest beam."""
         order = np.argsort(self.elevation, kind="stable")
         return Beams(*(a[order] for a in (self.elevation, self.azimuth, self.time_ns, self.origin)))
 
@@ -107,22 +107,22 @@ class Head(Protocol):
 
     @property
     def period(self) -> int | None:
-        """Number of firings after which azimuths repeat exactly, or None if they never do."""
+        """Number of firings after which azimuths repeat exactly, or None if they never repeat."""
 
     def firings(self, step: int) -> tuple[int, int]:
-        """Return the half-open range of the firing indices in a time step.
+        """Return the half-open range of firing numbers in a time step.
 
         The ranges of consecutive steps must be contiguous.
         """
 
     def times_ns(self, firings: Ints) -> Floats:
-        """Return the start times of several firings in nanoseconds since the head started.
+        """Return the start times of firings in nanoseconds since the head started.
 
         `firings` and the result have shape (k,).
         """
 
     def azimuths(self, firings: Ints) -> Floats:
-        """Return the azimuths of the head at several firings, in radians.
+        """Return the azimuths of the head at the given firings, in radians.
 
         `firings` and the result have shape (k,).
         """
@@ -204,20 +204,20 @@ class Spin:
         return count if count == self.firings_per_turn else None
 
     def firings(self, step: int) -> tuple[int, int]:
-        """Return the half-open range of the firing indices in a time step."""
+        """Return the half-open range of firing numbers in a time step."""
         # Integer arithmetic rounds up here. Fractions would take as long as a small scan.
         count, steps = self._firings_per_step.as_integer_ratio()
         return -(-step * count // steps), -(-(step + 1) * count // steps)
 
     def times_ns(self, firings: Ints) -> Floats:
-        """Return the start times of several firings in nanoseconds since the head started.
+        """Return the start times of firings in nanoseconds since the head started.
 
         `firings` and the result have shape (k,).
         """
         return np.asarray(firings, np.float64) * (1e9 / (self.rate_hz * self.firings_per_turn))
 
     def azimuths(self, firings: Ints) -> Floats:
-        """Return the azimuths of the head at several firings, in radians.
+        """Return the azimuths of the head at the given firings, in radians.
 
         `firings` and the result have shape (k,).
         """
@@ -225,9 +225,9 @@ class Spin:
         return np.radians(self.zero_deg) + (-turned if self.clockwise else turned)
 
     def restrict_to(self, start: float, share: float) -> Mirror:
-        """Return a head that fires only during a part of each revolution.
+        """Return a head that only fires during part of each revolution.
 
-        Time 0 and firing 0 are at the start of this part. A time step contains the same share of
+        Time 0 and firing 0 are at the start of this part. A time step contains the same fraction of
         the firings as before, but at least one firing.
 
         Parameters
@@ -270,7 +270,7 @@ class Spin:
 
 @dataclass(frozen=True)
 class Mirror(Spin):
-    """A mirror that sweeps the beams over a line, back and forth or in a single direction.
+    """A mirror that sweeps the beams along a line, either back and forth or in one direction.
 
     A cycle of the mirror counts as a revolution. It consists of two lines for an oscillating
     mirror, or of the line of one facet for a polygon mirror. Azimuth 0 is the center of a line.
@@ -289,7 +289,7 @@ class Mirror(Spin):
         check_fields(self)
 
     def times_ns(self, firings: Ints) -> Floats:
-        """Return the start times of several firings in nanoseconds since the mirror started.
+        """Return the start times of firings in nanoseconds since the mirror started.
 
         `firings` and the result have shape (k,).
         """
@@ -297,7 +297,7 @@ class Mirror(Spin):
         return (firings - pause) * (1e9 / (self.rate_hz * self.firings_per_turn))
 
     def azimuths(self, firings: Ints) -> Floats:
-        """Return the azimuths along the line at several firings, in radians.
+        """Return the azimuths along the line at the given firings, in radians.
 
         `firings` and the result have shape (k,).
         """
@@ -313,7 +313,7 @@ class Mirror(Spin):
 
 
 def _as_table(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
-    """Convert values to a read-only float64 array of a given shape, with zeros if it is empty."""
+    """Convert values to a read-only float64 array of the given shape. Empty values become zeros."""
     array = as_array(f"Beams.{name}", values).copy()
     if not array.size:
         array = np.zeros(shape)

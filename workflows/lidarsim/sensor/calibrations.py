@@ -28,7 +28,7 @@ from .beams import Beams
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibration of an individual sensor, which consists of either beams or rays.
+    """Calibration of an individual sensor. It consists of either beams or rays.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def _parse_velodyne(name: str, data: Any) -> Calibration:
-    """Create a calibration from the content of a Velodyne YAML file.
+    """Create a calibration from the parsed content of a Velodyne YAML file.
 
     The geometry follows rawdata.cc in ros-drivers/velodyne.
     """
@@ -204,7 +204,7 @@ def _ouster_mode(data: dict[str, Any]) -> tuple[int, int]:
 def _ouster_window(
     data: dict[str, Any], layout: dict[str, Any], columns: int
 ) -> tuple[float, float] | None:
-    """Return `Calibration.window` for an Ouster sensor, or None if the sensor fires in all columns.
+    """Return `Calibration.window` of an Ouster sensor, or None if all columns are fired.
 
     The column window takes precedence over the azimuth window. In the lidar frame, azimuths
     increase counterclockwise, whereas columns are numbered clockwise, starting at azimuth 0. A
@@ -227,7 +227,7 @@ def _ouster_window(
 
 
 def _parse_limits(name: str, limits: Any, maximum: int) -> tuple[int, int]:
-    """Return the two limits of a window.
+    """Parse the two limits of a window.
 
     Raise ValueError if `limits` is not a pair of integers between 0 and `maximum`.
     """
@@ -251,7 +251,7 @@ def _ouster_section(data: dict[str, Any], name: str, default: Any = None) -> dic
 
 
 def _ouster_origin_mm(data: dict[str, Any], beam: dict[str, Any]) -> Floats:
-    """Return the origin of the beams at azimuth 0 in the sensor frame, in millimeters.
+    """Return the origin of the beams in the sensor frame at azimuth 0, in millimeters.
 
     The result has shape (3,).
     """
@@ -279,7 +279,7 @@ def _ouster_origin_mm(data: dict[str, Any], beam: dict[str, Any]) -> Floats:
 
 
 def _calibration_from_rays(name: str, rays: RayList) -> Calibration:
-    """Create a calibration from rays, with a time for each ray."""
+    """Create a calibration from a ray list, adding times if it has none."""
     rays = rays.with_times()
     assert rays.times_ns is not None  # set by with_times
     shot_ns = rays.times_ns.astype(np.float64)
@@ -307,7 +307,6 @@ _HESAI_CHECKSUM = re.compile(r"^[0-9a-f]{64}[,\s]*\Z", re.IGNORECASE | re.MULTIL
 
 
 def _split_cells(line: str) -> list[str]:
-    """Return the comma-separated cells of a line in lower case."""
     return [word.strip().lower() for word in line.split(",")]
 
 
@@ -351,7 +350,7 @@ def _parse_table(name: str, text: str) -> Calibration:
 
 
 def _parse_hesai(name: str, text: str) -> Calibration:
-    """Create a calibration from Hesai angle corrections, from either a sensor or a manual."""
+    """Create a calibration from Hesai angle corrections of a sensor or a user manual."""
     lines = text.splitlines()
     skip = 2 if _split_cells(lines[0])[0] == _HESAI_MARK else 1
     header = lines[skip - 1] if len(lines) >= skip else ""

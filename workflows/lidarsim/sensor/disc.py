@@ -62,7 +62,7 @@ Profile = Literal["even", "gaussian"]
 
 @cache
 def _disc_points(count: int) -> Floats:
-    """Return the positions of sub-rays in the unit disc, starting with the center.
+    """Return the positions of sub-rays in the unit disc, starting with its center.
 
     The result has shape (count, 2).
     """

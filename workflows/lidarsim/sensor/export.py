@@ -1,4 +1,4 @@
-"""Export of a sensor's rays, in firing order and with their times, to files for other programs."""
+"""Export the rays of a sensor, with their times and in firing order, for other programs."""
 
 from __future__ import annotations
 
@@ -194,7 +194,7 @@ def _count_firings(sensor: Sensor, duration_ns: float) -> int:
 
 
 def _cycle_ns(sensor: Sensor, duration_ns: float, count: int, times_ns: Ints) -> float:
-    """Return the time in nanoseconds after which the list of rays may be repeated.
+    """Return the time after which the list of rays may be repeated, in nanoseconds.
 
     The result is greater than `duration_ns` if some beams of the last firing are emitted later.
     """
@@ -205,7 +205,7 @@ def _cycle_ns(sensor: Sensor, duration_ns: float, count: int, times_ns: Ints) ->
 
 
 def _repeats(sensor: Sensor, count: int) -> bool:
-    """Return True if a sensor repeats its first `count` firings.
+    """Return whether a sensor repeats its first `count` firings.
 
     Without an exact period, a deviation of less than one firing is ignored.
     """
@@ -218,7 +218,7 @@ def _repeats(sensor: Sensor, count: int) -> bool:
 
 
 def _missing_properties(sensor: Sensor, row: SensorFormat) -> list[str]:
-    """Return phrases for the properties of a sensor that a format cannot store."""
+    """List the properties of a sensor that a format cannot store, as phrases for a message."""
     has = {
         "times": True,
         "channels": sensor.channels > 1,

@@ -44,7 +44,7 @@ _ADVICE = "The formats npz and csv support any rays."
 
 @dataclass
 class _Channel:
-    """A channel of a scanner.
+    """A single channel of a HELIOS++ scanner.
 
     Attributes
     ----------
@@ -122,7 +122,6 @@ def write(path: Path, sensor: Sensor, duration_s: float, left_out: Sequence[str]
 
 
 def _scanner_lines(name: str, sensor: Sensor, scanner: _Scanner) -> list[str]:
-    """Return the lines of the <scanner> element."""
     optics = sensor.optics
     numbers: dict[str, float] = {
         "pulseFreqs_Hz": scanner.pulse_hz,
@@ -162,7 +161,7 @@ def _emitter_lines(indent: str, channel: _Channel) -> Iterable[str]:
 
 
 def _fixed_axis_angles(rotation: Floats) -> list[tuple[str, float]]:
-    """Decompose a rotation into successive rotations about the fixed axes x, y and z.
+    """Decompose a rotation into successive rotations about the fixed x, y and z axes.
 
     The result contains an axis and an angle in degrees for each rotation that is not zero.
     """
@@ -178,17 +177,17 @@ def _fixed_axis_angles(rotation: Floats) -> list[tuple[str, float]]:
 
 
 def _format_attributes(numbers: dict[str, float]) -> str:
-    """Format numbers as XML attributes, each with a leading space."""
+    """Format numbers as XML attributes, each preceded by a space."""
     return "".join(f' {name}="{_format_number(value)}"' for name, value in numbers.items())
 
 
 def _format_number(value: float) -> str:
-    """Format a number, without a decimal point for integers, because HELIOS++ rejects 1.0."""
+    """Format a number. Integers have no decimal point, because HELIOS++ rejects 1.0."""
     return str(int(value)) if value == int(value) else repr(float(value))
 
 
 def _divergence_mrad(sensor: Sensor) -> float:
-    """Return the divergence of a round beam with the same area, or 0 if it is unknown.
+    """Return the divergence of a round beam of equal area, or 0 if the divergence is unknown.
 
     HELIOS++ only supports round beams.
     """
@@ -199,7 +198,7 @@ def _divergence_mrad(sensor: Sensor) -> float:
 
 
 def _lost_light(sensor: Sensor) -> Iterable[str]:
-    """Yield phrases for the properties of light and noise that HELIOS++ cannot represent."""
+    """Yield the properties of light and noise that HELIOS++ cannot represent, as phrases."""
     divergence_mrad = sensor.optics.divergence_mrad
     if divergence_mrad is not None and np.ptp(divergence_mrad):
         yield (
@@ -248,14 +247,14 @@ def _create_scanner(sensor: Sensor, duration_s: float) -> _Scanner:
 
 
 def _unsupported(sensor: Sensor, reason: str) -> LidarError:
-    """Create an error that states why a sensor cannot be written as a HELIOS++ scanner."""
+    """Create an error that explains why HELIOS++ cannot represent a sensor."""
     return LidarError(
         f"{sensor.model} cannot be written as a HELIOS++ scanner: {reason}. {_ADVICE}"
     )
 
 
 def _whole_hz(sensor: Sensor, exact_hz: float) -> int:
-    """Round a pulse rate to an integer, and raise LidarError if the result is 0."""
+    """Round a pulse rate to an integer. Raises LidarError if the result is 0."""
     if exact_hz < 0.5:
         raise _unsupported(
             sensor,
@@ -268,7 +267,7 @@ def _whole_hz(sensor: Sensor, exact_hz: float) -> int:
 def _rotating_scanner(
     head: Spin, pulse_hz: float, pulses_per_firing: int, duration_s: float
 ) -> _Scanner:
-    """Create a scanner that rotates like a sensor's head and does not have channels yet."""
+    """Create a scanner that rotates like a sensor's head and that has no channels yet."""
     speed = 360 / head.firings_per_turn * pulse_hz / pulses_per_firing
     total_deg = 360 * head.rate_hz * duration_s
     sign = -1 if head.clockwise else 1
@@ -287,7 +286,7 @@ def _rotating_scanner(
 
 
 def _multichannel_scanner(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner:
-    """Create a scanner with a rotating head, a stationary mirror and a channel for each beam.
+    """Create a scanner with a rotating head, a stationary mirror and one channel per beam.
 
     HELIOS++ defines its Velodyne VLP-16 in the same way. A stationary mirror is at angle 0, but its
     scan angle must be greater than 0, because otherwise no pulses leave the device.
@@ -323,7 +322,7 @@ def _multichannel_scanner(sensor: Sensor, head: Spin, duration_s: float) -> _Sca
 
 
 class _EvenLine(NamedTuple):
-    """Beams that are fired upward one after another, evenly spaced in angle and time."""
+    """Beams fired upward one after another, evenly spaced in angle and time."""
 
     lowest_deg: float
     azimuth_deg: float
@@ -332,7 +331,7 @@ class _EvenLine(NamedTuple):
 
 
 def _even_line(beams: Beams, radians_per_ns: float) -> _EvenLine | None:
-    """Return the line that the beams form, or None if they do not form an evenly spaced line.
+    """Return the evenly spaced line that the beams form, or None if they do not form one.
 
     `radians_per_ns` is the angular velocity of the head, which rotates while the beams are fired.
     """
@@ -385,7 +384,7 @@ def _line_scanner(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner | N
 def _set_line(
     scanner: _Scanner, step_deg: float, count: int, pulses_per_line: int, pulse_hz: int
 ) -> float:
-    """Set the mirror of a scanner so that it sweeps lines of `count` pulses.
+    """Set the mirror of a scanner to sweep lines of `count` pulses.
 
     The mirror starts at -scanAngleMax_deg and rotates by `step_deg` per pulse. Only pulses between
     verticalAngleMin_deg and verticalAngleMax_deg leave the device. Return the mirror angle at the
@@ -412,7 +411,7 @@ def _set_line(
 
 
 def _mirror_scanner(sensor: Sensor, head: Mirror, duration_s: float) -> _Scanner:
-    """Create a scanner whose mirror sweeps lines with a single beam.
+    """Create a scanner whose mirror sweeps a single beam along lines.
 
     Raise LidarError if HELIOS++ has no corresponding mirror.
     """
@@ -515,12 +514,10 @@ def _prism_scanner(sensor: PrismSensor, duration_s: float) -> _Scanner:
 
 
 def _about_x(radians: float) -> Floats:
-    """Return the matrix of a rotation about x."""
     sine, cosine = np.sin(radians), np.cos(radians)
     return np.array([[1.0, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
 
 
 def _about_z(radians: float) -> Floats:
-    """Return the matrix of a rotation about z."""
     sine, cosine = np.sin(radians), np.cos(radians)
     return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0.0, 0, 1]])

@@ -1,4 +1,4 @@
-"""Sensor models, which are read from data files, and the sensors that are created from them."""
+"""Sensor models, which are read from data files, and the creation of sensors from them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,10 @@ _MAX_BEAMS = 1_000_000
 
 
 def _expand_numbers(value: Any) -> Any:
-    """Expand a mapping of first, last and count to evenly spaced numbers, including both ends."""
+    """Expand a mapping with `first`, `last` and `count` to evenly spaced numbers.
+
+    Both ends are included.
+    """
     if isinstance(value, dict):
         count = value.get("count")
         if isinstance(count, int) and count > _MAX_BEAMS:
@@ -68,7 +71,7 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class BeamTable(_ModelSection):
-    """Beams of a sensor model in the manufacturer's order.
+    """Beams of a sensor model, in the manufacturer's order.
 
     Except for their units, the fields are those of `Beams`. All beams cross in a point at a
     distance of `crossing_m` from the axis, if it is set.
@@ -116,7 +119,7 @@ class MirrorSpec(_ModelSection):
 
 
 class RangePrecision(_ModelSection):
-    """Standard deviation of ranges on a perpendicular surface."""
+    """Standard deviation of the ranges to a surface at normal incidence."""
 
     sigma_m: Positive
     range_m: Positive
@@ -124,7 +127,7 @@ class RangePrecision(_ModelSection):
 
 
 class Detection(_ModelSection):
-    """Range at which a fraction of the pulses on a perpendicular surface is detected."""
+    """Range at which a given fraction of the pulses is detected, at normal incidence."""
 
     range_m: Positive
     reflectance: Annotated[float, Field(gt=0, le=1)] = TARGET_REFLECTANCE
@@ -132,7 +135,7 @@ class Detection(_ModelSection):
 
     @property
     def threshold_m(self) -> float:
-        """Range at which half of the pulses on a surface with 10 % reflectance are detected."""
+        """Range at which half of the pulses are detected on a surface with 10 % reflectance."""
         range_m = self.range_m * math.sqrt(TARGET_REFLECTANCE / self.reflectance)
         energy = 1 + NormalDist().inv_cdf(self.probability) / THRESHOLD_SIGMAS
         return float(range_m * math.sqrt(max(energy, 0.0)))
@@ -148,7 +151,7 @@ STATED = {
 
 
 class Performance(_ModelSection):
-    """Values from a data sheet that describe a sensor's noise and returns.
+    """Data sheet values that describe a sensor's noise and returns.
 
     `SensorModel.datasheet` converts them to settings.
 
@@ -178,7 +181,7 @@ class Performance(_ModelSection):
         return self
 
     def noise(self, gate_s: float) -> Noise:
-        """Return the noise of a sensor whose receiver waits `gate_s` seconds for returns."""
+        """Return the noise of a sensor whose receiver waits `gate_s` seconds for each return."""
         values = self.model_dump(include={field.name for field in fields(Noise)}, exclude_none=True)
         if self.detection is not None:
             values["detection_range_m"] = self.detection.threshold_m
@@ -190,7 +193,7 @@ class Performance(_ModelSection):
         return Noise(**values)
 
     def _range_sigmas_m(self, threshold_m: float) -> tuple[float, float]:
-        """Return the range standard deviations for strong returns and at the threshold.
+        """Return the standard deviations of ranges for strong returns and at the threshold.
 
         `threshold_m` is `Detection.threshold_m`.
         """
@@ -220,7 +223,7 @@ class PacketSpec(_ModelSection):
 
 
 class SensorModel(_ModelSection):
-    """Content of a sensor data file, whose fields are described in docs/how-to/sensor.md."""
+    """Content of a sensor data file. docs/how-to/sensor.md describes the fields."""
 
     name: str
     sources: dict[str, str] = {}
@@ -267,7 +270,7 @@ class SensorModel(_ModelSection):
 
     @property
     def needs_calibration(self) -> bool:
-        """Whether the model requires a calibration file, because it does not define its rays."""
+        """Whether the model requires a calibration file because it does not define its own rays."""
         return not (self.beams.elevation_deg or self.mirror or self.prisms)
 
     def datasheet(self) -> Datasheet:
@@ -330,7 +333,7 @@ class SensorModel(_ModelSection):
 
 
 def find_model_plugin(name: str | None) -> Plugin | None:
-    """Return the plug-in that provides a sensor model, or None.
+    """Find the plug-in that provides a sensor model. Return None if there is none.
 
     Raises
     ------
@@ -343,7 +346,7 @@ def find_model_plugin(name: str | None) -> Plugin | None:
 
 
 def plugin_model_file(name: str | None) -> Path | None:
-    """Return the data file of a model from a plug-in, or None if the model has another source.
+    """Return a plug-in model's data file, or None if the model does not come from a plug-in.
 
     Raises
     ------
@@ -394,18 +397,17 @@ def read_model(name: str | Path) -> SensorModel:
 
 
 def _normalize(name: str) -> str:
-    """Return the letters and digits of a name in lower case, for example vlp16 for VLP-16."""
+    """Keep the letters and digits of a name in lower case, for example vlp16 for VLP-16."""
     return "".join(filter(str.isalnum, name.lower()))
 
 
 @cache
 def _read_built_in(name: str) -> SensorModel:
-    """Read a model that is included in the package."""
     return _read(BUILT_IN / f"{name}.yaml")
 
 
 def _read(path: Path | Traversable) -> SensorModel:
-    """Read the data file of a model, and raise LidarError if it is invalid."""
+    """Read the data file of a model. Raises LidarError if it is invalid."""
     with converted(f"{path} is not a valid sensor model"):
         text = read_input_text(path) if isinstance(path, Path) else path.read_text("utf-8")
         content = load_yaml(text)
@@ -422,7 +424,7 @@ class Datasheet(NamedTuple):
 
 
 def format_noise(noise: Noise) -> str:
-    """Return the noise fields that differ from their defaults, as written in a scenario."""
+    """Format the noise fields that differ from their defaults, in the syntax of a scenario."""
     shown = (
         f"{field.name}: {value:.4g}"
         for field in fields(noise)
@@ -442,7 +444,7 @@ def load_sensor(
     max_range_m: float | None = None,
     performance: Sheet | None = None,
 ) -> Sensor:
-    """Load a sensor from a sensor model, from the calibration of a unit, or from both.
+    """Load a sensor from a sensor model, the calibration of an individual sensor, or both.
 
     Parameters
     ----------
@@ -530,7 +532,7 @@ def load_sensor(
 
 
 def _sensor_name(sensor_model: SensorModel, unit: Calibration | None) -> str:
-    """Return the name of a sensor for reports, including the origin of its ray pattern."""
+    """Return the name of a sensor in reports, including the origin of its ray pattern."""
     if unit is not None:
         return f"{sensor_model.name}, {unit.file}"
     return f"{sensor_model.name}, typical pattern" if sensor_model.typical else sensor_model.name
@@ -592,7 +594,7 @@ def _create_listed_sensor(
 
 
 def _calibrate_beams(sensor_model: SensorModel, unit: Calibration) -> Beams:
-    """Return calibrated beams, with times and origins from the model if the file has none."""
+    """Return calibrated beams, with missing times and origins taken from the model."""
     beams = unit.beams
     table = sensor_model.beams
     assert beams is not None  # a calibration has beams or rays

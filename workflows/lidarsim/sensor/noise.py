@@ -175,7 +175,7 @@ class Noise:
 
     @property
     def threshold(self) -> float:
-        """Energy at which half of the returns are detected, or 0 if there is no detection range."""
+        """Energy at which half of the returns are detected, or 0 without a detection range."""
         if self.detection_range_m is None:
             return 0.0
         return float(TARGET_REFLECTANCE * normal_incidence_energy(self.detection_range_m))
@@ -197,5 +197,5 @@ class Noise:
         return any((*random, self.walk_m, self.channel_bias_m, self.warm_up_m))
 
     def for_sensor(self, name: str) -> Noise:
-        """Return a copy whose seed also depends on the name of a sensor."""
+        """Return a copy with a seed that also depends on the name of a sensor."""
         return replace(self, seed=named_seed(self.seed, name))

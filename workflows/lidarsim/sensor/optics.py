@@ -1,4 +1,4 @@
-"""Optical parameters of a sensor, and the returns that it reports for each pulse."""
+"""Optical parameters of a sensor, and settings of the returns that it reports."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class Optics(FileSection):
 
 @dataclass(frozen=True)
 class Returns:
-    """Settings for the sub-rays of a beam and for the returns that are reported per pulse.
+    """Settings for the sub-rays of a beam, and for the returns that are reported per pulse.
 
     The mode "dual" reports the strongest and the last return, or the two strongest returns if the
     last return is the strongest. The mode "two_strongest" always reports the two strongest returns.
@@ -204,11 +204,11 @@ class Returns:
         return Beam.from_divergences(self.subrays, divergences, profile, self.exit_m(optics))
 
     def exit_m(self, optics: Optics) -> float:
-        """Return the beam width at the sensor's exit in meters, or 0 if it is unknown."""
+        """Return the width of the beam at the sensor's exit in meters, or 0 if it is unknown."""
         return optics.exit_diameter_m if self.exit_diameter_m is None else self.exit_diameter_m
 
     def _divergences(self, optics: Optics) -> tuple[float, float]:
-        """Return the full horizontal and vertical angles of the beam, in radians."""
+        """Return the full horizontal and vertical divergence angles of the beam, in radians."""
         divergence_mrad = (
             optics.divergence_mrad if self.divergence_mrad is None else self.divergence_mrad
         )

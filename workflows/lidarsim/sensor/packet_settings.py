@@ -37,12 +37,15 @@ class PacketSettings:
 
     @property
     def channels(self) -> Ints:
-        """Channel of each laser in the manufacturer's order, as an int64 array of shape (c,)."""
+        """Channel of each laser in the manufacturer's order.
+
+        The result is an int64 array of shape (c,).
+        """
         return np.argsort(self.lasers)
 
 
 def laser_order(elevations: ArrayLike) -> Ints:
-    """Return the index of each channel's laser in the manufacturer's order.
+    """Return the position of each channel's laser in the manufacturer's order.
 
     The elevations are in the manufacturer's order. Channels are numbered by increasing elevation.
     Both `elevations` and the result have shape (c,).

@@ -1,4 +1,4 @@
-"""Conversion of sensors to JSON data and arrays, so that files can store their ray patterns."""
+"""Conversion of sensors to JSON data and arrays, which files use to store ray patterns."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _LEFT_OUT = ("optics", "noise", "returns")
 
 
 def to_plain_data(value: Any, arrays: MutableMapping[str, AnyArray]) -> Any:
-    """Convert sensors to JSON data, and add their arrays to `arrays` by name.
+    """Convert sensors to JSON data, and add their arrays to `arrays`, keyed by name.
 
     The result is None if a sensor or one of its parts has a user-defined class.
     """
@@ -45,10 +45,6 @@ def to_plain_data(value: Any, arrays: MutableMapping[str, AnyArray]) -> Any:
 
 
 def _to_plain_data(value: Any, arrays: MutableMapping[str, AnyArray]) -> Any:
-    """Convert a value to JSON data.
-
-    Raise TypeError for a user-defined class.
-    """
     if isinstance(value, np.ndarray):
         name = f"rays{len(arrays)}"
         arrays[name] = value

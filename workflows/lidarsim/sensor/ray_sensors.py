@@ -1,4 +1,4 @@
-"""Sensors whose beams do not sweep cones, such as prism scanners and lists of rays."""
+"""Sensors whose beams do not sweep cones: prism scanners and lists of rays."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Prism:
 
 @dataclass(frozen=True)
 class TurningMirror:
-    """A plane mirror that rotates about the axis of the prisms in front of it."""
+    """A plane mirror behind the prisms, which rotates about their axis."""
 
     tilt_deg: Annotated[float, Field(gt=0, lt=90)]  # angle between the normal and the axis
     rpm: float  # revolutions per minute about the axis, from x to y of the sensor
@@ -80,7 +80,7 @@ class PrismSensor(Sensor):
         return None
 
     def directions(self, firings: Ints) -> Floats:
-        """Return the ray directions of several firings in the sensor frame.
+        """Return the ray directions of the given firings in the sensor frame.
 
         For `firings` of shape (k,), the result has shape (k, channels, 3). Directions are unit
         vectors. Directions of consecutive firings are cached for the latest sweeps, because they
@@ -101,7 +101,7 @@ class PrismSensor(Sensor):
         return directions
 
     def _compute_directions(self, firings: Ints) -> Floats:
-        """Compute the result of `directions` with Snell's law."""
+        """Compute the result of `directions` by Snell's law."""
         minutes = self.head.times_ns(firings) / 60e9
         flat = np.array([1.0, 0, 0])[:, None, None]
         ray = np.repeat(self.beam_directions.T[:, None, :], len(firings), axis=1)
@@ -124,7 +124,7 @@ class PrismSensor(Sensor):
         return np.ascontiguousarray(ray.transpose(1, 2, 0))
 
     def _reflect(self, rays: Floats, minutes: Floats) -> Floats:
-        """Reflect rays at the mirror, and make its axis the z axis.
+        """Reflect rays off the mirror, and turn its axis into the z axis.
 
         The rays and the result have shape (3, k, c). The times of the firings in minutes have
         shape (k,).
@@ -149,7 +149,7 @@ _MAX_KEPT_RAYS = 1 << 16  # maximum number of rays in a cached sweep, which take
 
 
 def _refract(rays: Floats, normals: Floats, ratio: float) -> Floats:
-    """Refract rays at a face with Snell's law.
+    """Refract rays at a face by Snell's law.
 
     The rays and the result have shape (3, k, c). `ratio` is the refractive index before the face
     divided by the index behind it. The normals point in the direction of the light and have shape
@@ -172,7 +172,7 @@ def _refract(rays: Floats, normals: Floats, ratio: float) -> Floats:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ListedSensor(Sensor):
-    """A sensor that fires the rays of a list one by one, such as the ray list of a manufacturer.
+    """A sensor that fires the rays of a list, such as a manufacturer's ray list, one by one.
 
     The list is repeated indefinitely. The head divides the list into time steps, but the times and
     azimuths of the head are not used.
@@ -190,23 +190,23 @@ class ListedSensor(Sensor):
 
     @property
     def ring_step(self) -> int | None:
-        """None, because a list may contain the rays of several channels in turn."""
+        """None, because the list may alternate between the rays of several channels."""
         return None
 
     @property
     def period(self) -> int | None:
-        """Number of rays in the list, after which directions repeat."""
+        """Number of rays in the list, which is the period of the directions."""
         return len(self.rays)
 
     def directions(self, firings: Ints) -> Floats:
-        """Return the ray directions of several firings in the sensor frame.
+        """Return the ray directions of the given firings in the sensor frame.
 
         For `firings` of shape (k,), the result has shape (k, 1, 3). Directions are unit vectors.
         """
         return self.rays[firings % len(self.rays)][:, None, :]
 
     def origins(self, firings: Ints) -> Floats | None:
-        """Return the ray origins of several firings in the sensor frame, in meters.
+        """Return the ray origins of the given firings in the sensor frame, in meters.
 
         For `firings` of shape (k,), the result has shape (k, 1, 3). It is None if all rays start at
         the sensor origin.
@@ -216,7 +216,7 @@ class ListedSensor(Sensor):
         return self.starts[firings % len(self.rays)][:, None, :]
 
     def begins_ns(self, firings: Ints) -> Floats:
-        """Return the start times of several firings in nanoseconds since the start of the station.
+        """Return the start times of firings in nanoseconds since the start of the station.
 
         `firings` and the result have shape (k,).
         """

@@ -1,4 +1,4 @@
-"""Scales on which sensor manufacturers report range-corrected reflectances as single bytes."""
+"""Scales on which manufacturers report range-corrected reflectances as single bytes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _BEST = 8 * RETRO_GAIN  # reflectance of the best retroreflective sheeting
 
 
 class ByteScale(NamedTuple):
-    """Scale that encodes reflectances as bytes, linearly up to `code` and logarithmically above."""
+    """Scale of reflectances as bytes, linear up to `code` and logarithmic above."""
 
     code: int
     reflectance: float  # reflectance at `code`
@@ -31,7 +31,7 @@ class ByteScale(NamedTuple):
         return np.rint(np.minimum(code, 255)).astype(np.uint8)
 
     def decode(self, codes: Bytes) -> Floats:
-        """Decode bytes to reflectances, which inverts `encode` except for rounding.
+        """Decode bytes to reflectances. This inverts `encode` except for rounding.
 
         Both arrays have shape (n,).
         """

@@ -1,4 +1,4 @@
-"""Lidar sensors, which consist of beams and a head that moves them."""
+"""Lidar sensors, which consist of beams and a head that moves the beams."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ MaxRange = Annotated[float, Field(gt=0, allow_inf_nan=True)]
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """A lidar sensor, which consists of beams and a head that moves them.
+    """A lidar sensor, which consists of beams and a head that moves the beams.
 
     All beams are fired once per firing.
 
@@ -121,7 +121,7 @@ class Sensor:
             )
 
     def _repr_html_(self) -> str:
-        """Return a table of the main properties, and a picture if a package can draw sensors."""
+        """Return an HTML table of the main properties, with an image if a package can draw it."""
         rows = {
             "sensor": self.model,
             "channels": f"{self.channels:,}",
@@ -134,12 +134,12 @@ class Sensor:
         return html_table(rows.items()) + html_picture(self)
 
     def _revolution_firings(self) -> tuple[int, int]:
-        """Return the half-open range of the firing indices in the first revolution or frame."""
+        """Return the half-open range of firing numbers in the first revolution or frame."""
         steps = self.steps_of_revolution(0)
         return self.firings(steps[0])[0], self.firings(steps[-1])[1]
 
     def _field_of_view(self) -> str:
-        """Return the horizontal and vertical field of view as text, from a sample of the rays."""
+        """Format the horizontal and vertical field of view, estimated from a sample of the rays."""
         first, stop = self._revolution_firings()
         firings = np.linspace(first, stop - 1, min(stop - first, SAMPLED_FIRINGS)).astype(np.int64)
         x, y, z = self.directions(firings).reshape(-1, 3).T
@@ -151,7 +151,7 @@ class Sensor:
         return f"{width:.4g}°, {elevations.min():.3g}° to {elevations.max():.3g}°"
 
     def _rate(self) -> str:
-        """Return the revolution or frame rate and the number of rays per second as text."""
+        """Format the revolution or frame rate and the number of rays per second."""
         first, stop = self._revolution_firings()
         seconds = (self.revolution_start_ns(1) - self.revolution_start_ns(0)) / 1e9
         rays = (stop - first) * self.channels / seconds
@@ -160,7 +160,7 @@ class Sensor:
     def with_packets(
         self, ports: Mapping[str, int], identifiers: Mapping[str, Identifier]
     ) -> Sensor:
-        """Return a copy of the sensor in which some packet ports and identifiers are replaced.
+        """Return a copy of the sensor with some packet ports and identifiers replaced.
 
         Raises
         ------
@@ -178,7 +178,7 @@ class Sensor:
 
     @property
     def model(self) -> str:
-        """Name of the model, for reports."""
+        """Name of the sensor model, for use in reports."""
         return self.name or f"{type(self).__name__} with {self.channels} channels"
 
     @classmethod
@@ -249,7 +249,7 @@ class Sensor:
 
     @property
     def gate_s(self) -> float:
-        """Time in seconds for which the receiver waits for the returns of a pulse."""
+        """Time for which the receiver waits for the returns of a pulse, in seconds."""
         return 2e-9 * (self.max_range_m - self.min_range_m) / LIGHT_M_NS
 
     @property
@@ -264,11 +264,11 @@ class Sensor:
 
     @property
     def period(self) -> int | None:
-        """Number of firings after which directions and origins repeat, or None if they do not."""
+        """Number of firings after which directions and origins repeat, or None if they never do."""
         return self.head.period
 
     def firings(self, step: int) -> tuple[int, int]:
-        """Return the half-open range of the firing indices in a time step.
+        """Return the half-open range of firing numbers in a time step.
 
         The ranges of consecutive steps neither overlap nor leave gaps. Indices continue across
         revolutions.
@@ -276,7 +276,7 @@ class Sensor:
         return self.head.firings(step)
 
     def revolutions(self, steps: ArrayLike) -> Ints:
-        """Return the index of the revolution or frame in which each time step starts.
+        """Return the number of the revolution or frame in which each time step starts.
 
         `steps` and the result have shape (k,). If the head has no `rate_hz`, as is possible for
         custom heads, each step counts as one revolution.
@@ -309,7 +309,6 @@ class Sensor:
 
     @cached_property
     def _steps_in_revolution(self) -> int:
-        """Number of time steps in the first revolution."""
         return self._first_step(1, 1)
 
     def _first_step(self, number: int, steps_per_revolution: int) -> int:
@@ -332,7 +331,7 @@ class Sensor:
         return bisect_left(range(upper + 1), number, lo=lower, key=revolution_of)
 
     def directions(self, firings: Ints) -> Floats:
-        """Return the ray directions of several firings in the sensor frame.
+        """Return the ray directions of the given firings in the sensor frame.
 
         For `firings` of shape (k,), the result has shape (k, channels, 3). Directions are unit
         vectors.
@@ -340,7 +339,7 @@ class Sensor:
         return self._rotate(firings, self.beam_directions)
 
     def origins(self, firings: Ints) -> Floats | None:
-        """Return the ray origins of several firings in the sensor frame, in meters.
+        """Return the ray origins of the given firings in the sensor frame, in meters.
 
         For `firings` of shape (k,), the result has shape (k, channels, 3). It is None if all rays
         start at the sensor origin.
@@ -362,12 +361,12 @@ class Sensor:
 
     @cached_property
     def center(self) -> Floats | None:
-        """Common origin of all beams in the head frame in meters, or None if they differ."""
+        """Common origin of all beams in the head frame, in meters, or None if there is none."""
         origin = self.beams.origin
         return origin[0] if (origin == origin[0]).all() else None
 
     def spins(self, firings: Ints) -> Floats | None:
-        """Return the cosines and sines of the head angles at several firings.
+        """Return the cosines and sines of the head angles at the given firings.
 
         For `firings` of shape (k,), the result has shape (2, k). The head rotates about the z axis
         of its frame, and `axes` transforms the head frame to the sensor frame. The result is None
@@ -384,7 +383,7 @@ class Sensor:
         return None
 
     def _rotate(self, firings: Ints, vectors: Floats) -> Floats:
-        """Rotate one vector per beam with the head, for several firings.
+        """Rotate one vector per beam by the head angles at the given firings.
 
         For `vectors` of shape (c, 3) and `firings` of shape (k,), the result has shape (k, c, 3).
         """
@@ -400,14 +399,14 @@ class Sensor:
         return rotate(rotated.reshape(-1, 3), self.axes).reshape(rotated.shape)
 
     def begins_ns(self, firings: Ints) -> Floats:
-        """Return the start times of several firings in nanoseconds since the start of the station.
+        """Return the start times of firings in nanoseconds since the start of the station.
 
         `firings` and the result have shape (k,).
         """
         return self.start_ns + self.head.times_ns(firings)
 
     def times_ns(self, firings: Ints) -> Ints:
-        """Return the firing times of all rays in nanoseconds since the start of the station.
+        """Return the firing times of rays in nanoseconds since the start of the station.
 
         For `firings` of shape (k,), the result has shape (k, channels) and is rounded to integers.
         """

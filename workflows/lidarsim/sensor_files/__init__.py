@@ -1,1 +1,1 @@
-"""Exchange files that list the rays of sensors or describe their scan patterns."""
+"""Files for other programs that list a sensor's rays or describe its scan pattern."""

@@ -10,7 +10,7 @@ from ..numerics.arrays import Floats
 
 
 def parse_rows(text: str, skip: int, columns: int) -> Floats:
-    """Return the numbers in the lines after a header, with one row per line.
+    """Parse the lines after a header as rows of numbers.
 
     `skip` is the number of header lines.
 

@@ -1,4 +1,4 @@
-"""Write sensor files so that they are either complete or do not exist."""
+"""Write sensor files so that an incomplete file never exists."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..io.storage import Storage
 
 @contextmanager
 def open_complete(path: Path) -> Iterator[IO[bytes]]:
-    """Open a file for writing that appears only when the context ends without an error.
+    """Open a file that only appears once the context exits without an error.
 
     Raises LidarError if the file cannot be written.
     """
@@ -25,7 +25,7 @@ def open_complete(path: Path) -> Iterator[IO[bytes]]:
 
 
 def write_complete_text(path: Path, text: str) -> None:
-    """Write a text file in UTF-8.
+    """Write a UTF-8 text file, which only appears once it is complete.
 
     Raises LidarError if the file cannot be written.
     """
@@ -34,5 +34,5 @@ def write_complete_text(path: Path, text: str) -> None:
 
 
 def xml_comment(text: str) -> str:
-    """Return a text for an XML comment, in which consecutive hyphens are separated."""
+    """Return text for an XML comment, with consecutive hyphens separated."""
     return text.replace("--", "- -").rstrip("-")

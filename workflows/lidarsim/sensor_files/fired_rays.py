@@ -29,7 +29,7 @@ class Light(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RayList:
-    """Rays of a sensor, in the sensor frame with x forward, y left and z up.
+    """Rays in the sensor frame, with x forward, y left and z up.
 
     Attributes
     ----------
@@ -77,23 +77,23 @@ class RayList:
 
     @property
     def azimuths_deg(self) -> Floats:
-        """Azimuths in degrees within ±180, counterclockwise from x."""
+        """Azimuths counterclockwise from x, in degrees within ±180."""
         x, y, _ = self.directions.T
         return np.degrees(arctan2(y, x))
 
     @property
     def elevations_deg(self) -> Floats:
-        """Elevations in degrees above the xy plane."""
+        """Elevations above the xy plane, in degrees."""
         x, y, z = self.directions.T
         return np.degrees(arctan2(z, np.sqrt(x * x + y * y)))
 
     @property
     def origins_or_center(self) -> Floats:
-        """Origins of the rays in meters, which are zero if all start at the center."""
+        """Origins of the rays in meters, or zeros if all rays start at the center."""
         return np.zeros((len(self), 3)) if self.origins is None else self.origins
 
     def with_times(self) -> RayList:
-        """Return the rays with times, which are spread evenly over a frame if they are unknown."""
+        """Return the rays with times. Unknown times are spread evenly over a frame."""
         if self.times_ns is not None:
             return self
         cycle_ns = self.cycle_ns or 1e9 / self.rate_hz
@@ -102,7 +102,7 @@ class RayList:
 
 
 def directions_of(azimuths_deg: Floats, elevations_deg: Floats) -> Floats:
-    """Return the unit directions for azimuths and elevations in degrees."""
+    """Convert azimuths and elevations in degrees to unit directions."""
     up, level = sin_cos(np.radians(elevations_deg))
     sin, cos = sin_cos(np.radians(azimuths_deg))
     return np.column_stack([level * cos, level * sin, up])

@@ -88,7 +88,6 @@ class SensorFormat:
 def _row(
     name: str, endings: str, words: str, holds: Sequence[str] = (), **options: Any
 ) -> SensorFormat:
-    """Return a row of the table for a module in this package."""
     module = options.pop("module", name)
     return SensorFormat(
         name,
@@ -171,7 +170,7 @@ _BY_NAME = {row.name: row for row in FORMATS}
 
 
 def format_of(path: Path, name: str | None) -> SensorFormat:
-    """Return the format in which to write a file, selected by name or by extension.
+    """Return the format for writing a file, selected by name or by file extension.
 
     Raises
     ------
@@ -198,7 +197,7 @@ def format_of(path: Path, name: str | None) -> SensorFormat:
 
 
 def _choices(ending: str) -> str:
-    """Return advice that lists the formats for an extension, or all extensions."""
+    """Return advice that lists the formats for a file extension, or else all extensions."""
     names = [row.name for row in FORMATS if ending in row.endings]
     if names:
         return f"Select a format with {' or '.join(f'--as {name}' for name in names)}."
@@ -209,7 +208,7 @@ def _choices(ending: str) -> str:
 
 
 def read_rays(path: Path) -> RayList | None:
-    """Return the rays in a file, or None if no format that can be read has its extension.
+    """Read the rays in a file. Return None if its extension belongs to no readable format.
 
     Raises
     ------

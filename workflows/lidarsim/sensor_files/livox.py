@@ -47,13 +47,13 @@ def is_livox(text: str) -> bool:
 
 
 def read(path: Path) -> RayList | None:
-    """Read rays from a Livox scan pattern, or return None if the file has another format."""
+    """Read rays from a Livox ray list. Return None if the file has another format."""
     text = read_text(path)
     return rays_of_text(text) if is_livox(text) else None
 
 
 def rays_of_text(text: str) -> RayList:
-    """Return the rays in a list, without times if these are only row numbers.
+    """Parse the rays in a list. Times that are merely row numbers are dropped.
 
     Raises
     ------

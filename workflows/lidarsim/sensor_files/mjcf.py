@@ -63,5 +63,4 @@ def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
 
 
 def _numbers(vector: Floats) -> str:
-    """Return a vector (3,) in the form of an XML attribute."""
     return " ".join(map(repr, vector.tolist()))

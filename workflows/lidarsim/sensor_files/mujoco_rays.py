@@ -1,4 +1,4 @@
-"""Angle arrays `theta` and `phi` for MuJoCo-LiDAR, in the form of its scan patterns.
+"""Angle arrays `theta` and `phi` for MuJoCo-LiDAR, in the same form as its scan patterns.
 
 An .npz file contains the arrays. A Python file (.py) has a function that returns the arrays of a
 frame, and requires only NumPy.
@@ -42,7 +42,7 @@ _NAMES = ("theta", "phi", TIME_COLUMN, HEADER)
 
 
 def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
-    """Write angles and times of rays as an .npz file with a header, or as a Python file."""
+    """Write the angles and times of rays to an .npz file with a header, or to a Python file."""
     if path.suffix.lower() == _PYTHON:
         write_complete_text(path, _python_text(rays.with_times(), left_out))
         return left_out
@@ -59,7 +59,7 @@ def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
 
 
 def _python_text(rays: RayList, left_out: Sequence[str]) -> str:
-    """Return the content of a Python file for rays that have times."""
+    """Return the content of a Python file with the given rays, which must have times."""
     arrays = {
         "_THETA": array_code(np.radians(rays.azimuths_deg), "<f8"),
         "_PHI": array_code(np.radians(rays.elevations_deg), "<f8"),

@@ -63,20 +63,18 @@ def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
 
 
 def _remark(rays: RayList, left_out: Sequence[str]) -> str:
-    """Return the comment in the file, which states the sensor, its axes, and missing properties."""
+    """Return the comment in the file, which states the sensor, the axes and missing properties."""
     lacks = f" Not in this file: {'; '.join(left_out)}." if left_out else ""
     return f"{rays.name}. Axes: {AXES}; azimuths from x, counter-clockwise.{lacks}"
 
 
 def _schemas(states: int) -> Iterator[str]:
-    """Yield the API schemas of a prim with the given number of emitter states."""
     yield '"OmniSensorGenericLidarCoreAPI"'
     for number in range(1, states + 1):
         yield f'"OmniSensorGenericLidarCoreEmitterStateAPI:{_state_name(number)}"'
 
 
 def _state_name(number: int) -> str:
-    """Return the name of an emitter state, counted from 1."""
     return f"s{number:03d}"
 
 
@@ -135,7 +133,7 @@ def _settings(rays: RayList, frames: Sequence[Ints]) -> Iterator[str]:
 
 
 def _state(rays: RayList, number: int, frame: Ints) -> Iterator[str]:
-    """Yield the attributes of an emitter state, which has the rays of one scan."""
+    """Yield the attributes of an emitter state, which contains the rays of one scan."""
     timed = rays.with_times()
     assert timed.times_ns is not None  # `with_times` sets the times
     start_ns = round((number - 1) * 1e9 / rays.rate_hz)
@@ -147,7 +145,7 @@ def _state(rays: RayList, number: int, frame: Ints) -> Iterator[str]:
 
 
 def _array(number: int, kind: str, name: str, values: AnyArray) -> Iterator[str]:
-    """Yield the lines of an array attribute.
+    """Yield the lines that define an array attribute.
 
     Angles are written with the digits of float32.
     """
@@ -167,5 +165,4 @@ def _array(number: int, kind: str, name: str, values: AnyArray) -> Iterator[str]
 
 
 def _text(text: str) -> str:
-    """Escape a text for a quoted USD string."""
     return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")

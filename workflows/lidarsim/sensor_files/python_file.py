@@ -1,4 +1,4 @@
-"""Python files (.py) that contain ray arrays by frame and require only NumPy."""
+"""Python files that contain the ray arrays of each frame and require only NumPy."""
 
 from __future__ import annotations
 
@@ -93,14 +93,14 @@ def python_text(
 
 
 def array_code(values: AnyArray, dtype: str) -> str:
-    """Return an expression that evaluates to an array with the given dtype, flattened."""
+    """Return a Python expression for a flattened array of the given dtype."""
     content = np.ascontiguousarray(values.astype(dtype)).tobytes()
     packed = base64.b64encode(zlib.compress(content, 9)).decode()
     return _ARRAY.format(packed="\n".join(textwrap.wrap(packed, _WIDTH)), dtype=dtype)
 
 
 def times_code(rays: RayList) -> str:
-    """Return an expression that evaluates to the int64 times of rays in nanoseconds."""
+    """Return a Python expression for the int64 times of rays, in nanoseconds."""
     assert rays.times_ns is not None  # the caller sets the times
     steps_code = array_code(np.diff(rays.times_ns, prepend=0), "<i8")
     return f"np.cumsum({steps_code})"

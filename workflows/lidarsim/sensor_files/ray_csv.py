@@ -1,4 +1,4 @@
-"""Rays as a comma-separated table (.csv), with a header in comment lines before the columns."""
+"""Rays as a comma-separated table (.csv), with the header in comments above the columns."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ QUANTITIES = (
 
 
 def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
-    """Write rays as a table with a header in comment lines."""
+    """Write rays as a table, with the header in comments."""
     columns: dict[str, Any] = columns_of(rays)
     for name in ("azimuth_deg", "elevation_deg"):
         columns[name] = np.round(columns[name], _DECIMALS) + 0.0  # + 0.0 avoids -0.0
@@ -45,18 +45,18 @@ def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
 
 
 def is_ray_table(text: str) -> bool:
-    """Return whether a text is a ray table, which has a time column with a distinct name."""
+    """Return whether a text is a ray table, which is recognized by its time column."""
     lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
     return TIME_COLUMN in next(lines, "").split(",")
 
 
 def read(path: Path) -> RayList | None:
-    """Read rays from a text table, as described in `rays_of_text`."""
+    """Read rays from a text table (`rays_of_text`)."""
     return rays_of_text(read_text(path))
 
 
 def rays_of_text(text: str) -> RayList:
-    """Return the rays in a table with azimuths and elevations, or with directions.
+    """Parse a table of rays, which are given by azimuths and elevations or by directions.
 
     Column names and units may have other spellings, such as "Azimuth [rad]". Times in tables of
     other programs are measured from the first ray.
@@ -75,7 +75,7 @@ def rays_of_text(text: str) -> RayList:
 
 
 def _header(text: str) -> dict[str, Any]:
-    """Return the header in the comment lines at the start of a text.
+    """Parse the header in the comments at the start of a text.
 
     Other comments are ignored.
     """

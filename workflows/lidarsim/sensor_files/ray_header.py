@@ -29,7 +29,7 @@ def header_of(
     azimuth: str = "azimuth_deg",
     elevation: str = "elevation_deg",
 ) -> dict[str, Any]:
-    """Return the header of a ray file as plain values, with None for an infinite range.
+    """Return the header of a ray file as plain values. An infinite range becomes None.
 
     `left_out` are phrases for properties that the file does not store. `azimuth` and `elevation`
     are the names of the angle columns, which are in radians unless the names end in _deg.
@@ -52,7 +52,6 @@ def header_of(
 
 
 def _unit(name: str) -> str:
-    """Return the unit of an angle column."""
     return "degrees" if name.endswith("_deg") else "radians"
 
 
@@ -71,7 +70,7 @@ def parsed_header(text: str | bytes) -> dict[str, Any]:
 
 
 def columns_of(rays: RayList) -> dict[str, Floats | Ints]:
-    """Return the columns in `COLUMNS` for rays."""
+    """Return the values of the columns in `COLUMNS` for a list of rays."""
     timed = rays.with_times()
     assert timed.times_ns is not None  # `with_times` sets the times
     angles = (rays.azimuths_deg, rays.elevations_deg)
@@ -173,7 +172,7 @@ def check_times(rays: RayList) -> None:
 
 
 def _directions(columns: Mapping[str, Any]) -> Floats:
-    """Return the unit directions from vector columns, or otherwise from angle columns.
+    """Return unit directions from vector columns, or from angle columns if there are no vectors.
 
     Vectors are normalized unless their length is 1 to twelve digits. Raises ValueError if there are
     neither vectors nor angles.
@@ -208,7 +207,6 @@ def _number(header: Mapping[str, Any], name: str) -> float:
 
 
 def _shown(value: Any) -> str:
-    """Return a header value in a form that fits on one line."""
     return printable(repr(value), 60)
 
 

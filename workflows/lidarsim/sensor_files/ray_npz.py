@@ -1,4 +1,4 @@
-"""Rays as NumPy arrays (.npz), with a one-dimensional array for each column and a JSON header."""
+"""Rays as NumPy arrays (.npz), with one array for each column and a JSON header."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _ENCRYPTED = 1  # flag of an archive member
 
 
 def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
-    """Write rays with a header."""
+    """Write rays and a header to an .npz file."""
     arrays = {HEADER: np.array(json.dumps(header_of(rays, left_out))), **columns_of(rays)}
     with open_complete(path) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
@@ -37,7 +37,7 @@ def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
 
 
 def read(path: Path) -> RayList | None:
-    """Read rays from an .npz file, or return None if its arrays have another format.
+    """Read rays from an .npz file. Return None if its arrays have another format.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def read(path: Path) -> RayList | None:
 
 
 def header_in(arrays: dict[str, Any]) -> dict[str, Any]:
-    """Remove the header from arrays and return it.
+    """Remove the header from `arrays`, and return it parsed.
 
     Raises ValueError if the header is not a JSON object.
     """
@@ -63,7 +63,7 @@ def header_in(arrays: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_arrays(path: Path) -> dict[str, Any]:
-    """Return the arrays in an .npz file by name.
+    """Read the arrays in an .npz file, keyed by name.
 
     Raises
     ------

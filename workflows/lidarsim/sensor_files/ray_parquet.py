@@ -1,4 +1,4 @@
-"""Rays as a Parquet table, with the header in the schema metadata."""
+"""Rays as a Parquet table (.parquet), with the header in the schema metadata."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _NUMBERS = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
 
 
 def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
-    """Write rays as a table.
+    """Write rays to a Parquet table.
 
     The header is stored as JSON in the schema metadata.
     """
@@ -68,7 +68,7 @@ def read(path: Path) -> RayList | None:
 
 
 def _bytes_of(metadata: pq.FileMetaData) -> int:
-    """Return the memory of all columns at 8 bytes per number, or of the pages if that is larger.
+    """Return the memory of the columns at 8 bytes per number, or of the pages if that is larger.
 
     The pages alone do not suffice, because a column of equal values occupies only a few bytes.
     """

@@ -1,4 +1,4 @@
-"""Rays as inputs of RobotecGPULidar nodes (.npz).
+"""Rays as input arrays of RobotecGPULidar nodes (.npz).
 
 According to its header api/core.h, a ray is a matrix (3, 4) that maps the z axis to the direction
 of the ray and the zero vector to its origin. Ring ids are int32, time offsets are float32
@@ -26,7 +26,7 @@ _STEEP = 0.9  # z component above which a ray is treated as vertical
 
 
 def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
-    """Write arrays, each of which is named after the node that it is the input of."""
+    """Write arrays, each of which is named after the node to which it is an input."""
     times_ns = rays.with_times().times_ns
     assert times_ns is not None  # `with_times` sets the times
     header = {
@@ -66,7 +66,7 @@ def _matrices(rays: RayList) -> Floats:
 
 
 def read(path: Path) -> RayList | None:
-    """Read rays from RGL arrays, or return None if the arrays have another format.
+    """Read rays from RGL arrays. Return None if the arrays have another format.
 
     Raises
     ------

@@ -32,7 +32,7 @@ class _Angles(NamedTuple):
 
 
 def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
-    """Write a model with a sensor.
+    """Write a model that contains a <gpu_lidar> sensor.
 
     Raises
     ------
@@ -69,7 +69,6 @@ def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
 
 
 def _scan(name: str, angles: _Angles) -> list[str]:
-    """Return the lines of a <horizontal> or <vertical> element."""
     limits = np.radians([angles.first_deg, angles.last_deg]).tolist()
     return [
         f"            <{name}>",
@@ -81,7 +80,7 @@ def _scan(name: str, angles: _Angles) -> list[str]:
 
 
 def _grid(rays: RayList) -> tuple[_Angles, _Angles]:
-    """Return the azimuths and elevations of a regular grid.
+    """Return the azimuths and elevations of the regular grid that the rays form.
 
     Raises
     ------
@@ -120,7 +119,6 @@ class _Levels(NamedTuple):
 
 
 def _levels(angles_deg: Floats) -> _Levels:
-    """Return the distinct angles of rays."""
     order = np.argsort(angles_deg, kind="stable")
     is_new = np.diff(angles_deg[order], prepend=-np.inf) > _SAME_DEG
     of_ray = np.empty(len(order), np.int64)
@@ -129,7 +127,7 @@ def _levels(angles_deg: Floats) -> _Levels:
 
 
 def _even(name: str, words: str, angles_deg: Floats) -> _Angles:
-    """Return the ends and number of evenly spaced angles.
+    """Return the first, the last and the number of evenly spaced angles.
 
     Raises LidarError if the angles are not evenly spaced.
     """

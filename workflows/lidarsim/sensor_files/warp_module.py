@@ -1,4 +1,4 @@
-"""Rays as a Python file (.py) for programs that cast rays with Warp, such as Isaac Lab.
+"""Rays as a Python file (.py), for programs such as Isaac Lab that cast rays with Warp.
 
 The file requires only NumPy. Its function `rays` returns origins, directions and times of the rays
 in a frame, in the sensor frame with x forward, y left and z up.
@@ -25,7 +25,7 @@ _FUNCTIONS = '''def rays(frame=0):
 
 
 def write(path: Path, rays: RayList, left_out: Sequence[str]) -> Sequence[str]:
-    """Write a Python file."""
+    """Write rays to a Python file."""
     rays = rays.with_times()
     origins = "np.zeros_like(_DIRECTIONS)"
     if rays.origins is not None:

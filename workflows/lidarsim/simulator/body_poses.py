@@ -18,7 +18,7 @@ ROW_SLACK = 1e-8  # tolerance for the last row of a pose matrix
 
 
 class BodyPoses(NamedTuple):
-    """Poses of k bodies, with the trajectories of bodies that move."""
+    """Poses of k bodies, and the trajectories of those that move."""
 
     positions: Floats  # (k, 3), meters; ignored for bodies that move along a trajectory
     rotations: Floats  # (k, 3, 3), from the body frame to the scene frame; ignored likewise
@@ -26,7 +26,10 @@ class BodyPoses(NamedTuple):
 
     @property
     def moves(self) -> Bools:
-        """Mask of the bodies that move during a sweep. Shape (k,)."""
+        """Mask of the bodies that move during a sweep.
+
+        The shape is (k,).
+        """
         return np.array([t is not None and t.moves for t in self.trajectories], np.bool_)
 
     def trajectory(self, number: int) -> Trajectory:
@@ -101,7 +104,7 @@ def poses_of_bodies(poses: Any, count: int, times_s: ArrayLike | None) -> BodyPo
 
 
 def check_matrices(matrices: Floats) -> None:
-    """Raise LidarError if matrices are not rigid transforms."""
+    """Raise LidarError if any of the matrices is not a rigid transform."""
     _check_finite(matrices)
     if not (np.abs(matrices[:, 3] - [0, 0, 0, 1]) <= ROW_SLACK).all():
         raise LidarError("The last row of each matrix of poses must be 0, 0, 0, 1.")
@@ -114,7 +117,7 @@ def _is_single(pose: Any) -> bool:
 
 
 def _listed_poses(poses: Sequence[Any]) -> BodyPoses:
-    """Convert a list whose items are poses, positions or trajectories."""
+    """Convert a list of poses, positions and trajectories to `BodyPoses`."""
     trajectories: list[Trajectory | None] = []
     positions = []
     rotations = []
@@ -131,7 +134,7 @@ def _listed_poses(poses: Sequence[Any]) -> BodyPoses:
 
 
 def _followed_matrices(table: Floats, count: int, times_s: ArrayLike) -> BodyPoses:
-    """Return poses of bodies that follow matrices at times."""
+    """Return the poses of bodies that follow matrices sampled at the given times."""
     try:
         times = np.asarray(times_s, np.float64)
     except (TypeError, ValueError):
@@ -157,7 +160,6 @@ def _table_of(poses: Any) -> Floats:
 
 
 def _check_count(poses: int, names: int) -> None:
-    """Raise LidarError if the number of poses differs from the number of names."""
     if poses != names:
         raise LidarError(
             f"There are {names} names, but {poses} poses. Pass one pose for each name."

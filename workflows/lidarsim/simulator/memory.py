@@ -1,4 +1,4 @@
-"""Estimate how much memory a rig occupies on a worker, and how much casting scans requires."""
+"""Estimate the memory that a rig occupies on a worker, and the memory for casting scans."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def rig_bytes(scene: Scene, survey: Survey) -> int:
 
 
 def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool = False) -> int:
-    """Estimate the peak memory of casting scans and computing their columns, in bytes.
+    """Estimate the peak memory, in bytes, for casting scans and computing their columns.
 
     The estimate assumes that all rays hit, and that all scans come from the sensor that needs the
     most memory. Columns computed by user functions count like built-in columns. Set `on_device` if
@@ -118,7 +118,7 @@ def _bytes(setup: Setup, scans: int, on_device: bool) -> float:
 
 
 def _casting_memory(setup: Setup, sizes: Sizes, firings: int, on_device: bool) -> Memory:
-    """Estimate the memory of rays, poses and steps.
+    """Estimate the memory that rays, poses and steps require.
 
     In the result, `retained` is the memory that stays in use until columns are computed, `casting`
     is the additional memory of rays and poses during casting, and `counting` is the largest
@@ -150,7 +150,7 @@ def _casting_memory(setup: Setup, sizes: Sizes, firings: int, on_device: bool) -
 
 
 def _point_bytes(setup: Setup, scans: int, on_device: bool) -> float:
-    """Estimate the memory in bytes of one reported return while its columns are computed."""
+    """Estimate the memory, in bytes, that a return requires while its columns are computed."""
     survey = setup.survey
     columns = sum(np.dtype(column.dtype).itemsize for column in survey.stored_columns)
     if on_device and not needs_hits(setup.scene, survey):
@@ -170,7 +170,7 @@ def _returns_per_pulse(setup: Setup) -> float:
     if mode == "all":
         added = sum(added_by_step)
     elif reports_two:
-        # The share of pulses to which a step adds a return, if returns are added independently.
+        # The fraction of pulses to which a step adds a return, if returns are added independently.
         added = sum(1 - float(exp(-count)) for count in added_by_step)
     if not (mode == "all" or reports_two) or not (subrays > 1 or setup.has_onward_light):
         return 1 + added

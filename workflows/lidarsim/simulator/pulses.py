@@ -50,7 +50,7 @@ CHUNK_RAYS = 1 << 17  # number of sub-rays that are cast at a time
 
 
 class ScannedReturns(NamedTuple):
-    """Kept returns of consecutive scans, and counts of all returns."""
+    """Returns that are kept from consecutive scans, and counts of all returns."""
 
     returns: PulseReturns
     hit_counts: Ints  # (scans,): returns of each scan, including those that are not kept
@@ -59,7 +59,7 @@ class ScannedReturns(NamedTuple):
 
 
 class PulseCaster:
-    """Casts the scans of one sensor, given by its number in the survey, and applies its steps."""
+    """Caster for the scans of one sensor, which also applies the sensor's simulation steps."""
 
     def __init__(
         self,
@@ -78,7 +78,7 @@ class PulseCaster:
         self.steps: list[PulseStep] = [step(setup, caster, surfaces) for step in steps_of(setup)]
 
     def with_moved_instances(self, scene: Scene, surfaces: SceneSurfaces) -> PulseCaster:
-        """Return a caster for the same scans after instances of the scene have moved."""
+        """Return a caster for the same scans after instances in the scene have moved."""
         caster = copy(self)
         caster.setup = replace(self.setup, scene=scene)
         caster._surfaces = surfaces
@@ -185,7 +185,7 @@ class PulseCaster:
         return ScannedReturns(renumbered.take(in_range), hit_counts, tally)
 
     def _pulses(self, batch: PulseBatch) -> PulseReturns:
-        """Apply all steps that act before thinning to a batch, and return its returns."""
+        """Return the returns of a batch after all steps that act before thinning."""
         returns = PulseReturns.empty()
         for step in self.steps:
             if Role.ON_REPORTED not in step.role:

@@ -1,4 +1,4 @@
-"""The table of returns that the steps of the simulator pass on, and keys of random numbers."""
+"""Table of returns that simulation steps exchange, and the keys of random numbers."""
 
 from __future__ import annotations
 
@@ -43,7 +43,9 @@ RETURN_COLUMNS = "ray", "distance", "triangle", "energy", "color", "cause"
 
 
 class PulseReturns(NamedTuple):
-    """Hits or returns of pulses, as columns of n rows sorted by ray and distance.
+    """Hits or returns of pulses, sorted by ray and distance.
+
+    The columns have n rows.
 
     A column is None if no step of the survey writes it. Until hits are combined into returns,
     `ray` numbers sub-rays. Returns that do not come from a surface have the triangle `NO_SURFACE`.
@@ -89,7 +91,7 @@ class PulseReturns(NamedTuple):
 
     @property
     def height(self) -> Floats:
-        """Peak heights of the returns in the waveform, or their energies without one."""
+        """Peak heights of the returns in the waveform, or energies if there is no waveform."""
         return required(self.energy if self.amplitude is None else self.amplitude)
 
 
@@ -99,7 +101,7 @@ Planes = tuple[Floats, Floats]
 
 
 def required(column: T | None) -> T:
-    """Return a column that an earlier step has written and that is therefore not None."""
+    """Return a column, asserting that an earlier step has written it."""
     assert column is not None
     return column
 
@@ -161,7 +163,7 @@ def merge_returns(returns: PulseReturns, additions: PulseReturns) -> PulseReturn
 
 @dataclass(frozen=True)
 class Keys:
-    """Map rays to the scan and ray numbers that seed their random numbers."""
+    """Mapping from rays to the scan and ray numbers that seed their random numbers."""
 
     scan: int  # number of the first scan; for a frozen sensor, of the older scan that is sent again
     scan_starts: Ints  # (scans,): first ray of each scan
@@ -173,7 +175,7 @@ class Keys:
 
 
 def number_within_ray(ray: Integers) -> Ints:
-    """Return the number of each entry within its ray, starting at 0.
+    """Return the index of each entry within its ray, starting at 0.
 
     The entries of a ray must be consecutive.
     """

@@ -45,7 +45,7 @@ class _Rays(NamedTuple):
 
 
 def rays_repeat(sensor: Sensor, moves: bool) -> tuple[bool, bool]:
-    """Return whether a sensor's rays are computed once, and whether they are cast by head.
+    """Return whether a sensor's rays repeat, and whether the poses of its head rotate them.
 
     `moves` states whether the platform moves. Rays that are cast by head are the rays of one firing
     in the head frame, with a pose for each firing. Other repeated rays are the rays of one head
@@ -102,7 +102,7 @@ class Rig:
             self._rays_of_sensor(number, survey.path.moves)
 
     def _rays_of_sensor(self, number: int, moves: bool) -> _Rays:
-        """Return the rays of a sensor that are cast repeatedly, which are computed on first use.
+        """Return the repeated rays of a sensor, computing them on first use.
 
         `moves` states whether the platform moves.
         """
@@ -154,7 +154,7 @@ class Rig:
             raise
 
     def with_moved_instances(self, owners: Integers, positions: Floats, rotations: Floats) -> Rig:
-        """Return a rig in which the instances of the objects `owners` have moved to new poses.
+        """Return a rig in which the instances of the given objects have moved to new poses.
 
         `owners` are k distinct object numbers. The poses are positions (k, 3) and rotations
         (k, 3, 3), as in `Scene.moved`. The trees are shared and modified, so this rig must not be
@@ -201,7 +201,7 @@ class Rig:
         return self.scene_casters[0].caster.device_lost
 
     def pattern(self, number: int, first: int, stop: int) -> Pattern:
-        """Return the rays of firings `first` to `stop` of a sensor, in the platform frame.
+        """Return a sensor's rays in firings `first` to `stop`, in the platform frame.
 
         The rays are sorted by firing and beam. Firings are counted from the start of the station.
         """
@@ -236,7 +236,7 @@ class Rig:
     def returns(
         self, specs: list[ScanSpec], path: Trajectory, late_ns: float = 0.0, *, tally: bool = True
     ) -> BatchPoints | DevicePoints:
-        """Cast consecutive scans of one sensor and station, and return their points.
+        """Cast consecutive scans of one sensor at one station, and return their points.
 
         For a firing `t` nanoseconds after the start of the station, the platform has the pose of
         `path` at time `t + late_ns`, and actors have their poses at the time of the firing. If
@@ -281,7 +281,7 @@ class Rig:
     def _poses(
         self, firings: Firings, path: Trajectory, late_ns: float, *, by_head: bool
     ) -> CastPoses:
-        """Return the poses of consecutive firings on a path, with the clocks of moving bodies.
+        """Return the poses of consecutive firings along a path, with the clocks of moving bodies.
 
         If `by_head` is set, these are poses of the head, otherwise of the platform. `late_ns`
         nanoseconds are added to the firing times to find the platform's poses, but not for actors.
@@ -316,7 +316,7 @@ class Rig:
     def ranges(
         self, specs: list[ScanSpec], positions: Floats, rotations: Floats | None
     ) -> Floats32:
-        """Return the ranges that the same firings measure from several poses of a static platform.
+        """Return the ranges measured by the same firings from several poses of a static platform.
 
         `specs` are consecutive scans of one station. Their scan numbers, which seed random numbers,
         increase from pose to pose. The poses are positions (k, 3) in meters and rotations (k, 3, 3)
@@ -349,7 +349,7 @@ class Rig:
         first_scan: int,
         image: Floats32,
     ) -> None:
-        """Write the ranges that the same firings measure from several poses into `image`.
+        """Write to `image` the ranges measured by the same firings from several poses.
 
         `pattern` has the rays of the firings in the platform frame. `image` has shape (poses *
         rays,), with all rays of the first pose first. `first_scan` is added to the scan number of
@@ -386,7 +386,7 @@ class Rig:
             image[returns.ray[nearest]] = returns.reported[nearest]
 
     def _pattern_of_firings(self, number: int, first: int, stop: int) -> Pattern:
-        """Return the rays of firings in the platform frame, stored for later calls."""
+        """Return the rays of firings in the platform frame, and cache them."""
         sensor = self.survey.carried[number].sensor
         if sensor.period:
             stop = first % sensor.period + stop - first

@@ -20,10 +20,10 @@ from ..sensor.beams import Beams
 from ..survey.survey import Mounted, Survey
 from .rig import Rig
 
-SAMPLE_RAYS = 500_000  # largest number of rays that `sample_survey` casts
-SAMPLE_SECTIONS = 500  # largest number of sections of consecutive scans that are sampled
-SECTION_SCANS = 40  # largest number of consecutive scans in a section
-RANGE_RAYS = 20_000  # largest number of rays that `sample_ranges` casts
+SAMPLE_RAYS = 500_000  # maximum number of rays that `sample_survey` casts
+SAMPLE_SECTIONS = 500  # maximum number of sections of consecutive scans that are sampled
+SECTION_SCANS = 40  # maximum number of consecutive scans in a section
+RANGE_RAYS = 20_000  # maximum number of rays that `sample_ranges` casts
 GOLDEN = 0.6180339887498949  # golden ratio minus 1
 
 
@@ -64,7 +64,7 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
 
 
 def sample_ranges(scene: Scene, survey: Survey, scans: range | None = None) -> Floats:
-    """Return the distances in meters from sampled rays of a survey to the nearest surfaces.
+    """Return the distances, in meters, at which sampled rays of a survey hit surfaces.
 
     The sensors are simulated without range limits, noise, faults and weather. Rays that hit no
     surface are omitted. Rays are sampled from `scans`, by default from all scans of the survey.
@@ -99,7 +99,7 @@ def sample_ranges(scene: Scene, survey: Survey, scans: range | None = None) -> F
 
 
 def _sampled_scans(survey: Survey, scans: range) -> tuple[Ints, Ints]:
-    """Return the first scans and the stops of evenly spaced sections of `scans`."""
+    """Return the start and stop of evenly spaced sections of `scans`."""
     # Limit the length so that a section spans at most two stations, which are cast separately.
     scans_per_section = max(1, min(*survey.steps_each, SECTION_SCANS))
     sections = even_indices(-(-len(scans) // scans_per_section), SAMPLE_SECTIONS)
@@ -108,7 +108,7 @@ def _sampled_scans(survey: Survey, scans: range) -> tuple[Ints, Ints]:
 
 
 def _with_few_rays(survey: Survey, every: int) -> list[Mounted]:
-    """Return the sensors of a survey, each replaced by a sample of one in `every` of its rays."""
+    """Return a survey's sensors, reduced to one in `every` of their rays."""
     return [
         replace(mounted, sensor=_FewRays.from_sensor(mounted.sensor, every), steps=steps)
         for mounted, steps in zip(survey.carried, survey.steps_each, strict=True)
@@ -116,13 +116,12 @@ def _with_few_rays(survey: Survey, every: int) -> list[Mounted]:
 
 
 def _batches(rig: Rig, firsts: Ints, stops: Ints) -> Iterator[Any]:
-    """Cast sections of a survey, given by first scans and stops, and yield their batches."""
     for first, stop in zip(firsts.tolist(), stops.tolist(), strict=True):
         yield from rig.cast(first, stop)
 
 
 class _SampledRays(NamedTuple):
-    """The k rays of a sensor that belong to a sample."""
+    """Sample of k rays of a sensor."""
 
     firings: Ints  # (f,): distinct firings of the rays
     row: Ints  # (k,): index into `firings` for each ray
@@ -156,20 +155,23 @@ class _FewRays(Sensor):
         )
 
     def firings(self, step: int) -> tuple[int, int]:
-        """Return the first sampled ray of a time step, and one past the last."""
+        """Return the range of sampled rays in a time step."""
         first, stop = self.sampled.firings(step)
         channels = self.sampled.channels
         return first * channels // self.every, stop * channels // self.every
 
     def _rays(self, firings: Ints) -> _SampledRays:
-        """Return the sensor's ray for each firing of this sample."""
+        """Return the sampled ray of the original sensor for each firing."""
         # Multiples of the golden ratio spread the rays evenly over firings and channels.
         ray = firings * self.every + (firings * GOLDEN % 1 * self.every).astype(np.int64)
         fired, channel = np.divmod(ray, self.sampled.channels)
         return _SampledRays(*np.unique(fired, return_inverse=True), channel)
 
     def directions(self, firings: Ints) -> Floats:
-        """Return the directions of sampled rays in the sensor frame. Shape (k, 1, 3)."""
+        """Return the directions of sampled rays in the sensor frame.
+
+        The shape is (k, 1, 3).
+        """
         rays = self._rays(firings)
         return self.sampled.directions(rays.firings)[rays.row, rays.channel, None]
 
@@ -180,6 +182,6 @@ class _FewRays(Sensor):
         return None if origins is None else origins[rays.row, rays.channel, None]
 
     def begins_ns(self, firings: Ints) -> Floats:
-        """Return the start times in nanoseconds of the firings that the sampled rays belong to."""
+        """Return the start time, in nanoseconds, of each sampled ray's firing."""
         rays = self._rays(firings)
         return self.sampled.begins_ns(rays.firings)[rays.row] + self.sampled.lead_ns

@@ -194,7 +194,7 @@ class Scanner:
 
     @property
     def survey(self) -> Survey:
-        """Survey with a single time step, and with the sensor and the options of the scanner."""
+        """Survey of a single time step with the scanner's sensor and options."""
         return self._rig.survey
 
     @property
@@ -211,7 +211,7 @@ class Scanner:
         return self._rig.scene
 
     def span_s(self, number: int = 0, *, start_s: float | None = None) -> tuple[float, float]:
-        """Return the firing times of the first and the last beam of a sweep, in seconds.
+        """Return the firing times, in seconds, of the first and the last beam of a sweep.
 
         `number` and `start_s` are the same as in `sweep`, but `number` is 0 by default.
         """
@@ -410,7 +410,7 @@ class Scanner:
                 self._follow(self._with_moved(actors))
 
     def _numbers_of(self, names: list[str]) -> Indices:
-        """Return the numbers of actors and instances by their names.
+        """Return the numbers of the actors and instances with the given names.
 
         Raises LidarError if a name is unknown or occurs twice.
         """
@@ -442,7 +442,7 @@ class Scanner:
         raise LidarError(f"Unknown actor or instance {name!r}.{hint}")
 
     def _with_moved(self, moves: list[tuple[int, Trajectory]]) -> list[Actor]:
-        """Return all actors, with new trajectories for some of them, which are given by index.
+        """Return all actors, with new trajectories for those in `moves`.
 
         The caller must hold the lock.
         """
@@ -452,7 +452,7 @@ class Scanner:
         return actors
 
     def _follow(self, actors: list[Actor]) -> None:
-        """Update the trajectories of all actors.
+        """Replace the actors of the rig, and with them all trajectories.
 
         The caller must hold the lock.
         """
@@ -466,7 +466,7 @@ class Scanner:
         rotations: Floats,
         actors: list[tuple[int, Trajectory]],
     ) -> None:
-        """Wait for sweeps in progress, then move instances given by their object numbers.
+        """Wait for sweeps in progress, then move the instances of the given objects.
 
         New sweeps wait until the instances have moved. Actors given by index get new trajectories.
         """
@@ -485,7 +485,7 @@ class Scanner:
     def _specs(
         self, rig: Rig, number: int | None, start_s: float | None, count: int
     ) -> tuple[list[ScanSpec], float]:
-        """Return the scans of a revolution, and the delay of its start in nanoseconds.
+        """Return the scans of a revolution, and the delay of its start, in nanoseconds.
 
         The delay is the difference between `start_s` and the start of revolution `number` in a
         survey, or 0 if `start_s` is None. If `number` is None, the scans belong to revolution 0 but
@@ -506,7 +506,7 @@ class Scanner:
     def _scans_of(
         self, rig: Rig, number: int, start_s: float | None, revolutions_ahead: int = 0
     ) -> tuple[list[ScanSpec], float]:
-        """Return the scans of revolution `number`, and the delay of its start in nanoseconds.
+        """Return the scans of revolution `number`, and the delay of its start, in nanoseconds.
 
         The random numbers are those of the revolution that follows `revolutions_ahead` later
         (`ScanSpec.random_offset`).
@@ -524,7 +524,7 @@ class Scanner:
         return [spec.shifted(late_ns, ahead) for spec in specs], late_ns
 
     def _revolution(self, sensor: Sensor, number: int) -> list[ScanSpec]:
-        """Return the scans of revolution `number`, which are stored for the next sweeps."""
+        """Return the scans of revolution `number`, and cache them."""
         specs = self._revolutions.get(number)
         if specs is None:
             specs = [
@@ -566,7 +566,7 @@ def _trajectory_of(pose: Any) -> Trajectory:
 
 
 def _poses_of(poses: Any) -> tuple[Floats, Floats | None]:
-    """Return positions, and rotations or None if the poses are positions."""
+    """Return positions and rotations, or None for the rotations if only positions are given."""
     if isinstance(poses, Pose):
         poses = [poses]
     if isinstance(poses, Sequence) and any(isinstance(pose, Pose) for pose in poses):

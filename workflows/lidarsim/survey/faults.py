@@ -104,7 +104,7 @@ class Fault(FileSection):
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all fields that are not None as a dict."""
+        """Return the fields that are not None as a dictionary."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
     @property
@@ -125,7 +125,7 @@ class Fault(FileSection):
         return np.asarray((stops_ns >= begin) & (starts_ns < end))
 
     def find_dropped(self, firings: Ints, seed: int, station: int, number: int) -> Bools:
-        """Return a mask of the firings that belong to dropped packets.
+        """Return a mask of the firings whose packets are dropped.
 
         Parameters
         ----------
@@ -142,7 +142,7 @@ class Fault(FileSection):
         return np.asarray(uniform(seed, PACKET, station, packets, number) < (self.share or 0.0))
 
     def time_errors_ns(self, times_ns: Floats | Ints) -> Ints:
-        """Return the error of the timestamps at several times, in nanoseconds.
+        """Return the timestamp errors at the given times, in nanoseconds.
 
         Times and results have shape (n,). The error is zero while the fault is inactive.
         """

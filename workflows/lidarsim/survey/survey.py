@@ -58,7 +58,7 @@ _ON_SENSORS = " To load a sensor model, use load_sensor('velodyne/vlp16')."
 
 
 def nanoseconds(moment: datetime) -> int:
-    """Return the nanoseconds from 1970-01-01 UTC to a timezone-aware datetime."""
+    """Convert a timezone-aware datetime to nanoseconds since 1970-01-01 UTC."""
     return (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
 
 
@@ -104,7 +104,7 @@ class Mounted:
 
 @dataclass(frozen=True)
 class ScanSpec:
-    """The firings of a sensor in one time step.
+    """The firings of a sensor in a single time step.
 
     Scans are the units that are ordered and delivered exactly once.
 
@@ -144,7 +144,7 @@ class ScanSpec:
         return (self.firings[1] - self.firings[0]) * self.channels
 
     def shifted(self, start_ns: int, random_offset: int) -> ScanSpec:
-        """Return a copy of the scan with another station start and another random number offset."""
+        """Return a copy with a new station start and a new offset for random numbers."""
         spec = object.__new__(type(self))  # five times as fast as `replace`
         vars(spec).update(vars(self), start_ns=start_ns, random_offset=random_offset)
         return spec
@@ -216,7 +216,7 @@ class CloudOptions(FileSection):
 
 
 class SensorSweeps(NamedTuple):
-    """Sweeps of a sensor in a survey."""
+    """Sweeps of one sensor in a survey."""
 
     firsts: Ints  # (s,), index of the first scan
     starts_ns: Floats  # (s,), start of the first firing since the start of the survey
@@ -326,7 +326,7 @@ class Survey(CloudOptions, Weather):
         check_faults(self.faults, sensors, self.duration_ns)
 
     def _repr_html_(self) -> str:
-        """Return a table of the main properties, and a picture if a package can draw surveys."""
+        """Return an HTML table of the main properties, with an image if a package can draw it."""
         models = [
             f"{carried.name}: {carried.sensor.model}" if carried.name else carried.sensor.model
             for carried in self.carried
@@ -345,7 +345,7 @@ class Survey(CloudOptions, Weather):
         return html_table(rows.items()) + html_picture(self)
 
     def _fill_in(self, name: str, default: Returns | Noise) -> None:
-        """Set the returns or noise to those of the sensors or the default, if they are not set."""
+        """Fill in unset returns or noise with those of the sensors or with the default."""
         if getattr(self, name) is not None:
             return
         if self.sensors:
@@ -359,7 +359,7 @@ class Survey(CloudOptions, Weather):
         self._set(**{name: default})
 
     def _set(self, **fields: Any) -> None:
-        """Set fields although the survey is frozen."""
+        """Set fields even though the survey is frozen."""
         for name, value in fields.items():
             object.__setattr__(self, name, value)
 
@@ -377,7 +377,7 @@ class Survey(CloudOptions, Weather):
         return self.trajectory
 
     def _check_names(self) -> None:
-        """Check that sensor names are unique and that there are not too many sensors."""
+        """Check the number of sensors, and that their names are unique."""
         names = [carried.name for carried in self.sensors]
         if len(names) > MAX_SENSORS or len({*names}) < len(names):
             raise LidarError(
@@ -410,7 +410,7 @@ class Survey(CloudOptions, Weather):
                 self._check_air(number)
 
     def _check_waveform(self, sensor: Sensor, returns: Returns) -> None:
-        """Check that the waveform samples are suitable for the pulse of a sensor and for LAS."""
+        """Check that the waveform samples are suitable for a sensor's pulse and for LAS files."""
         if returns.waveform != "none" or self.waveform_samples:
             sigma_ns = returns.system_ns(sensor.optics)
             min_samples = ceil(WINDOW_SIGMAS * sigma_ns / returns.sample_ns) + 2
@@ -475,7 +475,7 @@ class Survey(CloudOptions, Weather):
             )
 
     def _check_duration(self, sensor: Sensor, steps: int) -> None:
-        """Check that the steps of a sensor fit into the trajectory and do not exceed any limit."""
+        """Check that the time steps of a sensor fit into the trajectory and exceed no limit."""
         needed_s = _last_firing_ns(sensor, steps) / 1e9
         available_s = self.path.duration_ns / 1e9
         if needed_s > available_s:
@@ -505,7 +505,7 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def carried(self) -> tuple[Mounted, ...]:
-        """Mounted sensors, including a sensor that was passed as `sensor`."""
+        """Mounted sensors, including one that was passed as `sensor`."""
         return tuple(self.sensors) or (Mounted(self.sensor),)
 
     @property
@@ -515,7 +515,7 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def returns_each(self) -> tuple[Returns, ...]:
-        """The `Returns` of each sensor."""
+        """Settings for the returns of each sensor."""
         return tuple(carried.returns or self.returns for carried in self.carried)
 
     @cached_property
@@ -527,14 +527,14 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def stored_columns(self) -> tuple[Column, ...]:
-        """All columns that are stored during the run."""
+        """All columns that a run stores."""
         columns = columns_in_parts(optional_columns(self.columns))
         if self.waveform_samples:
             columns = (*columns, waveform_column(self.waveform_samples))
         return columns
 
     def extinction(self, sensor: Sensor) -> float:
-        """Return the extinction coefficient of the air at the wavelength of a sensor, in 1/m."""
+        """Return the extinction coefficient of the air at a sensor's wavelength, in 1/m."""
         return self.extinction_at(sensor.optics.wavelength_nm)
 
     def air(self, number: int) -> Air:
@@ -592,7 +592,7 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def sweeps_each(self) -> tuple[SensorSweeps, ...]:
-        """First scan, start time and end time of all sweeps of each sensor."""
+        """First scan, start time and end time of each sensor's sweeps."""
         sweeps = []
         stations = np.arange(self.path.stations)[:, None]
         for number, carried in enumerate(self.carried):
@@ -626,14 +626,14 @@ class Survey(CloudOptions, Weather):
 
     @property
     def sweep_count(self) -> int:
-        """Number of sweeps, which are revolutions, or frames of sensors without a rotating head.
+        """Number of sweeps, which are revolutions or, for sensors without a rotating head, frames.
 
         The last sweep of a sensor at a station can be incomplete.
         """
         return sum(len(sweeps.firsts) for sweeps in self.sweeps_each)
 
     def sweeps_within(self, start: int, stop: int) -> int:
-        """Return the number of sweeps that end in a range of scans."""
+        """Return the number of sweeps that end within a range of scans."""
         before, until = np.searchsorted(self.sweep_stops, (start, stop), "right")
         return int(until - before)
 
@@ -648,7 +648,7 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def station_ns(self) -> int:
-        """Time in nanoseconds that all sensors need to finish their scans at a station."""
+        """Time that all sensors need to finish their scans at a station, in nanoseconds."""
         return max(
             round(firing_start_ns(carried.sensor, carried.sensor.firings(steps - 1)[1]))
             for carried, steps in zip(self.carried, self.steps_each, strict=True)
@@ -656,7 +656,7 @@ class Survey(CloudOptions, Weather):
 
     @property
     def duration_ns(self) -> float:
-        """Time from the start of the survey to the start of the last firing in nanoseconds."""
+        """Time from the start of the survey to the start of the last firing, in nanoseconds."""
         pairs = zip(self.carried, self.steps_each, strict=True)
         last = max(_last_firing_ns(carried.sensor, steps) for carried, steps in pairs)
         return (self.path.stations - 1) * self.station_ns + last
@@ -685,7 +685,7 @@ class Survey(CloudOptions, Weather):
         }
 
     def sent_scan(self, index: int) -> ScanSpec:
-        """Return the scan that a sensor sends as scan `index`.
+        """Return the scan whose returns a sensor sends as scan `index`.
 
         A frozen sensor repeats older scans: a sweep that starts while the sensor is frozen repeats
         the last sweep that started before the fault. The repeated scan depends only on times, so
@@ -713,7 +713,7 @@ class Survey(CloudOptions, Weather):
         return (self.scan(index) for index in range(self.scan_count))
 
     def pose(self, index: int) -> Pose:
-        """Return the pose of the sensor at the start of the scan with the given index."""
+        """Return the pose of the sensor at the start of a scan."""
         spec = self.scan(index)
         time = self.begins_ns(index) - spec.start_ns
         return self.path.pose(spec.station, time).compose(self.carried[spec.sensor].mount)
@@ -726,7 +726,7 @@ class Survey(CloudOptions, Weather):
 
 
 def _check_noise(noise: Noise, sensor: Sensor) -> None:
-    """Check that the noise is compatible with a sensor and does not cause too many false alarms."""
+    """Check that the noise suits a sensor and does not cause too many false alarms."""
     biases = noise.channel_bias_m
     channels = sensor.channels
     if isinstance(biases, Sequence) and len(biases) != channels:
@@ -765,7 +765,7 @@ def _last_firing_ns(sensor: Sensor, steps: int) -> float:
 
 
 def _poses(poses: Sequence[Any]) -> tuple[Pose, ...]:
-    """Convert positions to poses, and raise LidarError if `poses` is not a list."""
+    """Convert positions to poses. Raises LidarError if `poses` is not a list."""
     if isinstance(poses, str) or not isinstance(poses, Iterable):
         raise LidarError(
             f"poses must be a list of poses, such as [(0, 0, 1)], but is {shown(poses)}."

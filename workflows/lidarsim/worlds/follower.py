@@ -1,4 +1,4 @@
-"""A lidar in a world that is controlled by another program.
+"""A lidar in a world that another program controls.
 
 The program passes the meshes of the bodies once, and their transformation matrices at each step.
 """
@@ -31,7 +31,7 @@ _SLACK_S = 1e-9  # tolerance for the time of the last beam of a sweep
 
 
 class _Step(NamedTuple):
-    """State of the world at a time step."""
+    """State of the world at a single time step."""
 
     time_s: float  # seconds since the first step
     pose: Floats  # (4, 4), from the platform frame to the world
@@ -39,7 +39,7 @@ class _Step(NamedTuple):
 
 
 class Follower:
-    """A lidar in a world that is controlled by another program.
+    """A lidar in a world that another program controls.
 
     `sweep` and `ranges` scan the world as if it were stationary, which is the fastest method.
     `step` records the time steps of a moving world, and simulates each sweep once its last beam has
@@ -115,7 +115,7 @@ class Follower:
 
     @cached_property
     def _moving(self) -> Scanner:
-        """Scanner of a world that moves during a sweep, whose bodies are actors."""
+        """Scanner of a world that moves during a sweep. The bodies of the world are actors."""
         if not self._static:
             raise LidarError(
                 "The world contains nothing stationary. `step` requires at least one static mesh, "
@@ -164,7 +164,7 @@ class Follower:
     def ranges(
         self, poses: ArrayLike, matrices: ArrayLike = (), *, number: int | None = None
     ) -> Floats32:
-        """Simulate the range images that the sensor measures in the current state of the world.
+        """Simulate the range images that a sensor measures in the current state of the world.
 
         Parameters
         ----------
@@ -190,7 +190,7 @@ class Follower:
         return self._frozen.ranges(_to_local(sensor_poses, self._frozen.origin), number=number)
 
     def step(self, time_s: float, pose: ArrayLike, matrices: ArrayLike = ()) -> list[Cloud]:
-        """Record a time step of the world, and return the sweeps completed since the last step.
+        """Record a time step of the world. Return the sweeps completed since the last step.
 
         The first sweep starts at the first step, and each further sweep starts where the previous
         one ends. If the time is before the last step, for example because the world was reset, all
@@ -233,14 +233,14 @@ class Follower:
         return list(self._completed_sweeps())
 
     def reset(self) -> None:
-        """Discard all recorded steps, so that the next step starts a new first sweep."""
+        """Discard all recorded steps, so that the next step starts the first sweep again."""
         self._steps.clear()
         self._start_s = None
         self._number = 0
         self._span_s = None
 
     def _completed_sweeps(self) -> Iterator[Cloud]:
-        """Yield the sweeps whose last beam was fired before or at the last step."""
+        """Yield the sweeps whose last beam was fired no later than the last step."""
         while True:
             if self._span_s is None:
                 self._span_s = self._moving.span_s(self._number)
@@ -274,7 +274,7 @@ class Follower:
 
 
 def _to_local(matrices: Floats, origin: Floats) -> Floats:
-    """Convert matrices from world coordinates to local coordinates with the given origin."""
+    """Convert matrices from world coordinates to local coordinates."""
     if not origin.any():
         return matrices
     local = matrices.copy()

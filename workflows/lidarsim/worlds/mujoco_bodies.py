@@ -24,7 +24,7 @@ Objects = Literal["body", "geom"]
 
 
 class ModelBody(NamedTuple):
-    """A body, or a geom of a body, that is visible to a lidar."""
+    """A body that is visible to a lidar, or one geom of such a body."""
 
     body: int  # ID of the body
     mesh: SceneMesh  # mesh in the body frame, whose arrays are shared by equal bodies
@@ -38,7 +38,7 @@ class ModelBodies(NamedTuple):
 
 
 class BodySelection(NamedTuple):
-    """Selection of the bodies and geoms that are visible to a lidar, and options for their meshes.
+    """Selection of the visible bodies and geoms, and options for their meshes.
 
     The options `sag_m` and `plane_m` are those of `create_geom_mesh`.
     """
@@ -63,7 +63,7 @@ def find_id(model: Any, kind: str, name: str | int) -> int:
 
 
 def names_of(model: Any, kind: str) -> list[str]:
-    """Return the names of all elements of a kind, such as bodies, geoms or sites.
+    """Return the names of all elements of one kind, such as bodies, geoms or sites.
 
     An element without a name is named after its kind and ID, such as "geom 3".
     """
@@ -88,7 +88,7 @@ def require_id(model: Any, kind: str, name: str | int) -> int:
 
 
 def find_excluded(model: Any, names: Iterable[str | int]) -> tuple[list[int], list[int]]:
-    """Return the IDs of excluded bodies and of excluded geoms.
+    """Return the IDs of the excluded bodies and of the excluded geoms.
 
     Parameters
     ----------
@@ -154,7 +154,6 @@ def create_bodies(model: Any, choice: BodySelection) -> ModelBodies:
 
 
 def _static_bodies(model: Any) -> Any:
-    """Return a mask of the static bodies."""
     return (np.asarray(model.body_weldid) == 0) & (np.asarray(model.body_mocapid) < 0)
 
 
@@ -168,7 +167,10 @@ def visible_geoms(model: Any, choice: BodySelection) -> list[int]:
 
 
 def _colors(model: Any) -> Floats:
-    """Return the RGBA values of all geoms, from 0 to 1, with shape (geoms, 4)."""
+    """Return the RGBA values of all geoms, from 0 to 1.
+
+    The shape is (geoms, 4).
+    """
     colors = np.array(model.geom_rgba, np.float64).reshape(-1, 4)
     material = np.asarray(model.geom_matid)
     # As in MuJoCo, the color of the material is used unless the geom has a non-default color.
@@ -199,7 +201,7 @@ def _srgb_of(model: Any, geom: int, color: Floats) -> Bytes:
 def _mesh_of_geoms(
     model: Any, geoms: list[int], colors: Floats, choice: BodySelection
 ) -> SceneMesh:
-    """Create an unnamed mesh from geoms of a body, in the body frame.
+    """Create an unnamed mesh from several geoms of a body, in the body frame.
 
     `colors` contains the colors of all geoms in the model, with shape (geoms, 4).
     """
@@ -224,7 +226,7 @@ def _placed_geom(model: Any, geom: int, choice: BodySelection) -> GeomMesh:
 
 
 def _materials_of(model: Any, geoms: list[int], counts: list[int]) -> FaceMaterials | None:
-    """Return the materials of the faces of several geoms, or None if no geom has a material.
+    """Return the face materials of several geoms, or None if no geom has a material.
 
     `counts` contains the number of faces of each geom.
     """
@@ -238,7 +240,7 @@ def _materials_of(model: Any, geoms: list[int], counts: list[int]) -> FaceMateri
 
 
 def _key(model: Any, geom: int) -> Hashable:
-    """Return a key that is equal for geoms with equal meshes in the frames of their bodies."""
+    """Return a key that is equal for geoms with equal meshes in their body frames."""
     fields = ("type", "dataid", "matid", "size", "pos", "quat", "rgba")
     return tuple(np.asarray(getattr(model, f"geom_{field}")[geom]).tobytes() for field in fields)
 
@@ -251,7 +253,7 @@ def _rotation(quaternion: Any) -> Floats:
 
 
 def _rest_pose(model: Any, body: int) -> tuple[Floats, Floats]:
-    """Return the rotation matrix and position of a body that is welded to the world."""
+    """Return the rotation matrix and the position of a body that is welded to the world."""
     rotation = np.eye(3)
     position = np.zeros(3)
     while body:
@@ -263,7 +265,7 @@ def _rest_pose(model: Any, body: int) -> tuple[Floats, Floats]:
 
 
 def describe_soft_bodies(model: Any) -> str:
-    """Describe how many flexes and skins a model has, because they are invisible to a lidar.
+    """Describe the number of flexes and skins in a model. A lidar cannot see them.
 
     The result is an empty string if the model has none.
     """

@@ -25,7 +25,7 @@ _MAX_SEGMENTS = 1024
 
 
 class GeomType(IntEnum):
-    """Geom types of MuJoCo (mjtGeom)."""
+    """Geom types in MuJoCo (mjtGeom)."""
 
     PLANE = 0
     HFIELD = 1
@@ -102,7 +102,7 @@ def count_segments(radius: float, sag_m: float) -> int:
 
 
 def height_field(model: Any, field: int) -> GeomMesh:
-    """Create the triangle mesh of a height field, which includes its sides and base.
+    """Create the triangle mesh of a height field, including its sides and base.
 
     As in MuJoCo, the diagonal of each cell runs from the vertex with the lowest row and column to
     the vertex with the highest.
@@ -121,7 +121,10 @@ def height_field(model: Any, field: int) -> GeomMesh:
 
 
 def _field_vertices(model: Any, field: int) -> Floats:
-    """Return the vertices of a height field in row order, with shape (rows * columns, 3)."""
+    """Return the vertices of a height field in row order.
+
+    The shape is (rows * columns, 3).
+    """
     rows = int(model.hfield_nrow[field])
     columns = int(model.hfield_ncol[field])
     first = int(model.hfield_adr[field])
@@ -134,7 +137,6 @@ def _field_vertices(model: Any, field: int) -> Floats:
 
 
 def _cells(grid: Ints) -> Ints:
-    """Return two triangles for each cell of a two-dimensional grid of vertex indices."""
     first = grid[:-1, :-1]
     right = grid[:-1, 1:]
     above = grid[1:, :-1]

@@ -161,7 +161,7 @@ class MujocoScanner:
         return images[0] if self._is_single else images
 
     def step(self, data: Any) -> list[Cloud]:
-        """Record a simulation step, and return the sweeps completed since the last step.
+        """Record a simulation step. Return the sweeps completed since the last step.
 
         Call `step` after each `mj_step`. Each beam uses the poses of the lidar and of the bodies at
         its firing time. If the time is before the last step, all earlier steps are discarded and a
@@ -187,13 +187,19 @@ class MujocoScanner:
         return np.asarray(self._poses(data)[0])
 
     def _poses(self, data: Any) -> Floats:
-        """Return the transformation matrices of the lidars, with shape (s, 4, 4)."""
+        """Return the transformation matrices of the lidars.
+
+        The shape is (s, 4, 4).
+        """
         if self._kind == "site":
             return _matrices(data.site_xpos, data.site_xmat, self._frames)
         return _matrices(data.xpos, data.xmat, self._frames)
 
     def _matrices(self, data: Any) -> Floats:
-        """Return the transformation matrices of the moving bodies, with shape (k, 4, 4)."""
+        """Return the transformation matrices of the moving bodies.
+
+        The shape is (k, 4, 4).
+        """
         return _matrices(data.xpos, data.xmat, self._bodies)
 
 

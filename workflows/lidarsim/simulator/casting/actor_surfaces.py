@@ -1,4 +1,4 @@
-"""Geometry of the triangles of actors, which move and may deform."""
+"""Geometry of actors' triangles, which move and may deform."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _NO_ROWS = np.zeros(0, np.intp)
 
 
 class DeformedCorners(NamedTuple):
-    """Corners of triangles of deforming actors, in the actors' frames.
+    """Corners of deforming triangles, in the frames of their actors.
 
     All arrays have shape (n, 3, 3).
     """
@@ -39,7 +39,7 @@ class ActorSurfaces:
         times: Floats | Ints,
         trajectories: ActorTrajectories,
     ) -> DeformedCorners:
-        """Return the corners of triangles of deforming actors at given times.
+        """Return the corners of deforming actors' triangles at the given times.
 
         `triangle_indices` (n,) are rows of the stored triangles, `actors` (n,) are the actors that
         they belong to, and `times` (n,) are in nanoseconds.
@@ -62,7 +62,7 @@ class ActorSurfaces:
     def _actor_rows(
         self, triangle: Integers, trajectories: ActorTrajectories
     ) -> tuple[Indices, Integers]:
-        """Find the triangles that belong to actors, and return their indices and their actors.
+        """Return the indices and the actor numbers of the triangles that belong to actors.
 
         The result is a pair of arrays (k,): indices into `triangle`, and actor numbers. Both are
         empty if there are no trajectories.
@@ -81,7 +81,7 @@ class ActorSurfaces:
         times: Floats | Ints,
         trajectories: ActorTrajectories,
     ) -> None:
-        """Transform points on actors to the actors' undeformed meshes, in place.
+        """Transform points on actors in place to the undeformed meshes of the actors.
 
         `points` (n, 3) are in the scene frame. Points on actors are replaced by the corresponding
         points in the actors' frames. Other points do not change. `triangle` (n,) are the triangles
@@ -111,7 +111,7 @@ class ActorSurfaces:
         times: Floats | Ints,
         trajectories: ActorTrajectories,
     ) -> Floats:
-        """Return the velocities in m/s of points on triangles, in the scene frame.
+        """Return the velocities of points on triangles in the scene frame, in m/s.
 
         `points` have shape (n, 3). Actors have their poses at `times` (n,) in nanoseconds.
         """
@@ -144,7 +144,7 @@ class ActorSurfaces:
         actor: Integers,
         trajectories: ActorTrajectories,
     ) -> Floats:
-        """Return the velocities in m/s that points have because their actors deform.
+        """Return the velocities, in m/s, that points have because their actors deform.
 
         Points (n, 3) and velocities (n, 3) are in the scene frame. `actor` (n,) are the numbers of
         the deforming actors.
@@ -159,7 +159,7 @@ class ActorSurfaces:
 
 
 def _weights(corners: Floats, points: Floats) -> Floats:
-    """Return the barycentric coordinates of points in triangles."""
+    """Return the barycentric coordinates of each point in its triangle."""
     a, b, c = corners.transpose(1, 2, 0)
     edge_1 = b - a
     edge_2 = c - a

@@ -42,7 +42,7 @@ class _StraightTracks(NamedTuple):
 
 
 def _straight_tracks(trajectories: Sequence[Trajectory]) -> Iterator[_StraightTracks]:
-    """Yield the piecewise linear tracks of trajectories, grouped by batch.
+    """Yield the piecewise linear tracks of the given trajectories, grouped by batch.
 
     All stationary actors form one group. Smooth tracks and trajectories of other classes are
     skipped.
@@ -64,13 +64,11 @@ def _straight_tracks(trajectories: Sequence[Trajectory]) -> Iterator[_StraightTr
 
 
 def _limits_of(track: Track) -> tuple[float, float, float, float]:
-    """Return a row of `TrackTable.limits` for a track."""
     first_s, last_s = track.times_s[[0, -1]].tolist()
     return float(track.start_s or 0), first_s, last_s, track.slack_s
 
 
 def _single_track(actor: int, track: Track) -> _StraightTracks:
-    """Return the piecewise linear track of one actor."""
     track = track.with_turns
     counts = np.array([len(track.times_s) - 1], np.int64)
     limits = np.array([_limits_of(track)])
@@ -78,7 +76,7 @@ def _single_track(actor: int, track: Track) -> _StraightTracks:
 
 
 def _batch_tracks(actors: list[int], tracks: Sequence[Any]) -> _StraightTracks:
-    """Return the piecewise linear tracks of actors whose tracks belong to the same batch."""
+    """Return the piecewise linear tracks of actors in the same batch."""
     batch = tracks[0].batch
     steps = len(batch.times_s) - 1
     return _StraightTracks(
@@ -91,7 +89,7 @@ def _batch_tracks(actors: list[int], tracks: Sequence[Any]) -> _StraightTracks:
 
 
 def _static_tracks(actors: list[int], trajectories: Sequence[Any]) -> _StraightTracks:
-    """Return the tracks of stationary actors, whose trajectories are `Stations` or `StaticPose`."""
+    """Return single-segment tracks for actors with a `Stations` or `StaticPose` trajectory."""
     count = len(actors)
     positions = np.empty((count, 3))
     rotations = np.empty((count, 3, 3))
@@ -115,7 +113,7 @@ def _static_tracks(actors: list[int], trajectories: Sequence[Any]) -> _StraightT
 
 
 class ActorTrajectories(tuple[Trajectory, ...]):
-    """Trajectories of all actors by actor number, or of a single platform.
+    """Trajectories of all actors, indexed by actor number, or of a single platform.
 
     Only trajectories made by `from_actors` have deforming actors in `animated`.
     """
@@ -134,14 +132,14 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         return trajectories
 
     def deforming_rows(self, actors: Integers) -> Indices:
-        """Return the rows of `actors` whose mesh is deformed by an animation."""
+        """Return the indices of the entries in `actors` that refer to a deforming actor."""
         animated = list(self.animated)
         if not animated:
             return np.zeros(0, np.intp)
         return np.flatnonzero(np.isin(actors, animated))
 
     def animation_frames(self, actors: Integers, times_ns: Floats | Ints) -> Floats:
-        """Return the animation frames that actors show at given times, and the frame rates.
+        """Return the animation frames and frame rates of actors at the given times.
 
         `actors` (n,) are numbers of actors with an animation, and `times_ns` (n,) are nanoseconds
         since the start of the survey. The result has shape (2, n): fractional frame numbers, and
@@ -157,7 +155,10 @@ class ActorTrajectories(tuple[Trajectory, ...]):
 
     @cached_property
     def presence_ns(self) -> Floats:
-        """First and last time at which each actor is in the scene, in nanoseconds. Shape (w, 2)."""
+        """First and last time at which each actor is in the scene, in nanoseconds.
+
+        The shape is (w, 2).
+        """
         presence = [
             presence_ns(trajectory) if find_batch(trajectory) is None else ALWAYS
             for trajectory in self
@@ -165,7 +166,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         return np.array(presence, np.float64).reshape(-1, 2)
 
     def table(self, number: Integers, times_ns: Floats) -> Floats:
-        """Return the poses of trajectories at given times.
+        """Return the poses of the given trajectories at the given times.
 
         `number` (n,) are trajectory numbers, and `times_ns` (n,) are nanoseconds since the start of
         the trajectory, which for actors is the start of the survey. The result has shape (12, n).
@@ -199,7 +200,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         return table
 
     def poses(self, number: Integers, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return the positions and rotations of trajectories at given times.
+        """Return the positions and rotations of the given trajectories at the given times.
 
         `number` (n,) are trajectory numbers, and `times_ns` (n,) are nanoseconds.
 
@@ -212,7 +213,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         return table[:3].T, table[3:].reshape(3, 3, -1).transpose(2, 0, 1)
 
     def pose_runs(self, number: Integers, times_ns: Floats) -> tuple[Floats, Ints]:
-        """Return one pose per run of equal rows, and the run that each row belongs to.
+        """Return one pose for each run of equal rows, and the run number of each row.
 
         A run consists of consecutive rows with the same trajectory and time, which therefore have
         the same pose. The poses have shape (12, m), as in `table`. Rows with a negative number have
@@ -228,7 +229,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
 
     @cached_property
     def _tracks(self) -> TrackTable:
-        """Piecewise linear tracks among the trajectories, as arrays for compiled loops."""
+        """Tracks of the piecewise linear trajectories, as arrays for compiled loops."""
         from .surface_loops import TrackTable
 
         tracks = [_no_tracks(), *_straight_tracks(self)]
@@ -238,7 +239,6 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         counts = np.concatenate([group.counts for group in tracks])
 
         def joined(part: int) -> Floats:
-            """Concatenate field `part` of the segments of all tracks along the last axis."""
             return np.concatenate([group.segments[part] for group in tracks], axis=-1)
 
         return TrackTable(
@@ -255,5 +255,5 @@ class ActorTrajectories(tuple[Trajectory, ...]):
 
 
 def _no_tracks() -> _StraightTracks:
-    """Return an empty set of tracks, whose arrays have the right shapes for concatenation."""
+    """Return an empty set of tracks, so that concatenation always has an operand."""
     return _static_tracks([], [])

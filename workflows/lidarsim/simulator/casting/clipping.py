@@ -23,7 +23,7 @@ class ClippedMesh(NamedTuple):
 
     vertices: Floats  # (v, 3)
     faces: Ints  # (f, 3)
-    origin: Indices  # (f,): original triangle that each triangle is a part of, ascending
+    origin: Indices  # (f,): original triangle of which each triangle is part, ascending
 
 
 def box_planes(region: Floats, transform: Floats | None = None) -> Floats:
@@ -41,7 +41,7 @@ def box_planes(region: Floats, transform: Floats | None = None) -> Floats:
 
 
 def clip_triangles(vertices: Floats, faces: Integers, planes: Floats) -> ClippedMesh | None:
-    """Clip triangles to the inside of all planes, or return None if none is cut."""
+    """Clip triangles to the inner side of all planes. Return None if all triangles are inside."""
     is_outside = _outside(vertices, planes)[faces]  # (f, 3, 6)
     crossing = is_outside.any(axis=(1, 2))
     if not crossing.any():
@@ -65,21 +65,23 @@ def clip_triangles(vertices: Floats, faces: Integers, planes: Floats) -> Clipped
 
 
 class _Part(NamedTuple):
-    """A triangle that is a part of a clipped face."""
+    """A triangle that remains of a clipped face."""
 
     face: int
     corners: tuple[_Corner, _Corner, _Corner]
 
 
 def _outside(vertices: Floats, planes: Floats) -> Bools:
-    """Return whether each vertex is outside each plane."""
     x, y, z = vertices.T[:, :, None]
     a, b, c, offset = planes.T
     return np.asarray(a * x + b * y + c * z > offset)
 
 
 def _parts_of(face: int, polygon: Sequence[_Corner], planes: Floats) -> list[_Part]:
-    """Clip a polygon to the inside of planes, and triangulate it (Sutherland and Hodgman 1974)."""
+    """Clip a polygon to the inner side of planes, and triangulate the result.
+
+    The algorithm is that of Sutherland and Hodgman (1974).
+    """
     for plane in planes.tolist():
         polygon = _cut_polygon(polygon, plane)
     return [_Part(face, (polygon[0], second, third)) for second, third in pairwise(polygon[1:])]
@@ -101,7 +103,7 @@ def _cut_polygon(polygon: Sequence[_Corner], plane: list[float]) -> list[_Corner
 
 
 def _crossing(first: tuple[_Corner, float], second: tuple[_Corner, float]) -> _Corner:
-    """Return the point where an edge crosses a plane, given its corners with signed heights.
+    """Return the intersection of an edge with a plane, from the signed heights of its ends.
 
     The corners are sorted so that both triangles that share the edge get the same point.
     """

@@ -1,4 +1,4 @@
-"""Bodies that contain a medium, which are closed surfaces of water, glass or leaves."""
+"""Closed surfaces of water, glass or leaves, which contain a medium."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .triangle_kinds import TriangleKinds
 
 
 class MediaBodies:
-    """Bodies of a scene that contain a medium, by kind of surface."""
+    """Bodies of a scene that contain a medium, indexed by kind of surface."""
 
     def __init__(self, scene: Scene, kinds: TriangleKinds, table: MaterialTable) -> None:
         self._scene = scene
@@ -24,7 +24,7 @@ class MediaBodies:
 
     @cached_property
     def solids(self) -> tuple[Bools, Bools]:
-        """Whether surfaces of media are closed, and whether they are inside out.
+        """Masks of the surface kinds that are closed, and of those that are inside out.
 
         Both are arrays of shape (kinds,). A closed surface is inside out if its volume is negative.
         """
@@ -54,7 +54,7 @@ class MediaBodies:
 
     @cached_property
     def static_kinds(self) -> tuple[int, ...]:
-        """Kinds of surfaces of closed static bodies that contain a medium, including instances."""
+        """Surface kinds of the closed static bodies that contain a medium, including instances."""
         table = self._table
         closed, _ = self.solids
         holds_medium = (table.leafy | table.refracts) & closed
@@ -62,7 +62,7 @@ class MediaBodies:
         return tuple(np.flatnonzero(holds_medium).tolist())
 
     def offset_vertices(self, by_m: float) -> Floats:
-        """Return the vertices of the scene with the surfaces of media moved outwards by `by_m`.
+        """Return the scene's vertices, with the surfaces of media moved outward by `by_m` meters.
 
         Water that touches its basin, or leaves that touch other leaves, would otherwise coincide
         with the other surface, and light that hits one of the two surfaces would miss the other.
@@ -114,6 +114,9 @@ def _closed(vertices: Floats, faces: Integers) -> bool:
 
 
 def _volume(vertices: Floats, faces: Integers) -> float:
-    """Return the volume in m³ inside a closed surface, which is negative if it is inside out."""
+    """Return the volume in m³ enclosed by a surface.
+
+    It is negative if the surface is inside out.
+    """
     a, b, c = (vertices[faces] - vertices[faces[0, 0]]).transpose(1, 0, 2)
     return float((np.cross(a, b) * c).sum() / 6)

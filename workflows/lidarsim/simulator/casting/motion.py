@@ -1,4 +1,4 @@
-"""Poses of a platform or of a sensor head at each firing, and the motion until the next firing."""
+"""Poses of a platform or sensor head at each firing, and its motion until the next firing."""
 
 from __future__ import annotations
 
@@ -69,7 +69,10 @@ class Firings:
 
     @classmethod
     def from_scans(cls, sensor: Sensor, specs: Sequence[ScanSpec], repetitions: int = 1) -> Firings:
-        """Return the firings of consecutive scans, repeated `repetitions` times as a whole."""
+        """Return the firings of consecutive scans.
+
+        The whole sequence is repeated `repetitions` times.
+        """
         numbers = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
         if repetitions > 1:
             numbers = np.tile(numbers, repetitions)
@@ -89,7 +92,7 @@ class Firings:
 
 @dataclass(frozen=True)
 class CastPoses:
-    """Poses for `RayCaster.scan`, either of the sensor's head or of its platform.
+    """Poses of the sensor's head or of its platform for `RayCaster.scan`.
 
     Rotations map the frame of the head or platform to the scene frame.
     """
@@ -105,7 +108,7 @@ class CastPoses:
 
     @cached_property
     def caster_arguments(self) -> dict[str, Any]:
-        """Arguments of `RayCaster.scan` and `pattern_rays`."""
+        """Keyword arguments for `RayCaster.scan` and `pattern_rays`."""
         if self.rays_per_pose is None:
             return {"positions": self.positions, "rotations": self.rotations}
         # Use poses that `check_trajectory` has checked. Another check would cost 2.5 % of casting.
@@ -121,14 +124,14 @@ class CastPoses:
         return ActorTrajectories() if self.clock is None else self.clock.trajectories
 
     def times(self, ray: Integers) -> Floats:
-        """Return the firing times of rays, or zeros without actors.
+        """Return the firing times of rays, or zeros if there are no actors.
 
         Times are nanoseconds since the start of the survey.
         """
         return np.zeros(len(ray)) if self.clock is None else self.clock.times(ray)
 
     def for_subrays(self, start: int, stop: int, subrays: int) -> CastPoses:
-        """Return the poses for `subrays` sub-rays of each of the rays `start` to `stop`.
+        """Return the poses of rays `start` to `stop`, each divided into `subrays` sub-rays.
 
         Sub-rays are numbered from 0 at ray `start`. The range must consist of complete poses:
         `start` is the first ray of a pose, and `stop` follows the last ray of a pose or of all
@@ -172,7 +175,7 @@ class CastPoses:
         return velocity + np.cross(rate, origins - positions)
 
     def rays(self, pattern: Pattern, ray: Integers, start: int = 0) -> tuple[Floats, Floats]:
-        """Return origins and directions of rays of a pattern, in the scene frame.
+        """Return the origins and directions of a pattern's rays in the scene frame.
 
         Ray k is row ``start + k`` of the pattern, which repeats (`raybeam.pattern_rays`). Both
         arrays have shape (n, 3), but the origins have shape (1, 3) if all rays share one.
@@ -181,7 +184,7 @@ class CastPoses:
 
 
 def order_along_rings(ray: Ints, channels: int) -> Indices:
-    """Return an order in which rays of the same ring follow each other.
+    """Return an order of the rays in which those of the same ring are consecutive.
 
     `ray` (n,) are ray numbers sorted by firing and channel. Within each block of `RING_FIRINGS`
     firings, rays are sorted by channel and keep their order within a channel. Consecutive rays are
@@ -192,7 +195,9 @@ def order_along_rings(ray: Ints, channels: int) -> Indices:
 
 
 def check_trajectory(path: Trajectory) -> None:
-    """Check the first pose of each station of a trajectory, which may be a user-defined class.
+    """Check the first pose of a trajectory at each of its stations.
+
+    The trajectory may be of a user-defined class.
 
     Raises
     ------
@@ -206,7 +211,7 @@ def check_trajectory(path: Trajectory) -> None:
 def poses_of_firings(
     carried: Mounted, path: Trajectory, station: int, first: int, stop: int, late_ns: float = 0.0
 ) -> CastPoses:
-    """Return the poses of a sensor's beams in firings `first` to `stop` of a station.
+    """Return the poses of a sensor's beams for firings `first` to `stop` at a station.
 
     If a head rotates all beams (`Sensor.spins`), these are poses of the head, and the rays of one
     firing are valid for all firings. Otherwise they are poses of the platform. Each pose is taken
@@ -259,7 +264,7 @@ def poses_of_firings(
 
 
 def _head_rotations(carried: Mounted, rotations: Floats, spins: Floats) -> Floats:
-    """Return the rotations from the head, at its current azimuth, to the scene frame.
+    """Return the rotations from the head frame, at its current azimuths, to the scene frame.
 
     `rotations` (k, 3, 3) map the platform frame to the scene frame. `spins` (2, k) are the cosines
     and sines of the head's azimuths.
@@ -272,7 +277,10 @@ def _head_rotations(carried: Mounted, rotations: Floats, spins: Floats) -> Float
 
 
 def rotated_about_z(rotations: Floats, spins: Floats) -> Floats:
-    """Multiply rotations by rotations about z, given the cosines and sines of the angles."""
+    """Multiply rotation matrices by rotations about the z axis.
+
+    `spins` has the cosines and sines of the angles.
+    """
     cos, sin = spins
     products = np.empty((3, 3, spins.shape[1])).transpose(2, 0, 1)
     for row in range(3):

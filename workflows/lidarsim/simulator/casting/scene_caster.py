@@ -41,9 +41,9 @@ from .surfaces import SceneSurfaces
 from .visibility import static_key, unseen_objects
 
 AUTO_ADVICE = "The backend 'auto' selects one that is available."
-_MAX_ROOM_RAYS = 1 << 18  # largest number of rays that are stored for both casts: 13 MB
+_MAX_ROOM_RAYS = 1 << 18  # maximum number of rays that are stored for both casts: 13 MB
 _NEVER_NS = np.array([np.inf, -np.inf])  # presence of an actor that is never in the scene
-REACHED = 1e-3  # a ray reaches a point if it gets this close, as a share of the distance
+REACHED = 1e-3  # a ray reaches a point if it gets this close, as a fraction of the distance
 
 
 class _NearestHits(NamedTuple):
@@ -55,10 +55,11 @@ class _NearestHits(NamedTuple):
 
 
 class _ActorShapes(NamedTuple):
-    """The s distinct shapes of the a actors in a scene.
+    """Distinct shapes of the actors in a scene.
 
-    Actors with the same mesh share a shape. A mesh has a part for its opaque triangles and a part
-    for each mask (`split_by_masks`). Each part is an instance in the shape's caster.
+    There are s shapes of a actors, because actors with the same mesh share a shape. A mesh has a
+    part for its opaque triangles and a part for each mask (`split_by_masks`). Each part is an
+    instance in the shape's caster.
     """
 
     casters: tuple[RayCaster | DeformingMesh, ...]  # (s,): in the mesh frame
@@ -76,7 +77,10 @@ class CastBodies(NamedTuple):
 
 
 def check_backend_here(backend: str, advice: str = AUTO_ADVICE) -> None:
-    """Raise LidarError, ending with `advice`, if a backend is not available on this machine."""
+    """Raise LidarError if a backend is not available on this machine.
+
+    The error message ends with `advice`.
+    """
     # An interrupt during the import of an extension module would look like a missing module.
     with defer_interrupts():
         backends = {"auto": "", **available_backends()}
@@ -88,7 +92,7 @@ def check_backend_here(backend: str, advice: str = AUTO_ADVICE) -> None:
 
 
 class SceneCaster:
-    """Casts scans like `RayCaster.scan`, but also returns hits on actors.
+    """Ray caster of a scene, which extends `RayCaster.scan` with hits on actors.
 
     Triangles of instances are numbered after the faces of the scene, and triangles of actors after
     both. Rays that hit no actor return bit-identical results with and without actors. The poses of
@@ -142,7 +146,7 @@ class SceneCaster:
         self._actor_triangles = (static_triangles + np.cumsum([0, *sizes[:-1]])).astype(np.int32)
 
     def update_instances(self, surfaces: SceneSurfaces, instances: Instances) -> None:
-        """Update the surfaces and instances after instances of the scene have moved.
+        """Replace the surfaces and instances after instances in the scene have moved.
 
         The trees are not updated. To update them, use the function `move_instances`.
         """
@@ -150,12 +154,12 @@ class SceneCaster:
         self._instances = instances
 
     def ensure_trees(self, positions: Floats) -> None:
-        """Build any missing trees of bodies within range of sensors at positions."""
+        """Build missing trees of bodies within range of sensors at the given positions."""
         self._static.ensure_trees(positions, self._range_m)
 
     @property
     def caster(self) -> RayCaster:
-        """Caster of the static bodies, in which some triangles may be clipped or omitted."""
+        """Caster of the static bodies, some of whose triangles may be clipped or omitted."""
         return self._static.trees.caster
 
     def counters(self) -> tuple[Ints, int]:
@@ -176,7 +180,7 @@ class SceneCaster:
 
     @property
     def body_rows(self) -> Indices:
-        """Rows of `StoredTriangles.bodies` for the bodies that this caster contains.
+        """Rows of this caster's bodies in `StoredTriangles.bodies`.
 
         These are the faces of the scene, the instances that are cast, and all actors as one body.
         Static bodies that no ray can hit are omitted.
@@ -195,7 +199,7 @@ class SceneCaster:
 
     @property
     def on_device(self) -> bool:
-        """Whether hits can stay on a CUDA device."""
+        """Whether hits can remain in the memory of a CUDA device."""
         return self._static.on_device
 
     def scan(
@@ -211,7 +215,7 @@ class SceneCaster:
         tally: bool = False,
         out: Floats | None = None,
     ) -> ScanReturns:
-        """Cast rays of a pattern at static bodies and actors.
+        """Cast the rays of a pattern against static bodies and actors.
 
         The arguments are those of `RayCaster.scan`. If there are actors, `poses` must have a clock.
         `window` has the start and stop of the pattern rows to cast, by default all rows. Hits are
@@ -273,7 +277,7 @@ class SceneCaster:
         times: Floats,
         actor_trajectories: ActorTrajectories,
     ) -> Bools:
-        """Return whether points are visible from origins in the scene frame.
+        """Return whether each point is visible from its origin in the scene frame.
 
         `towards` (n, 3) are vectors from the origins to the points, and `distance` (n,) their
         lengths in meters. `times` (n,) determine the poses of actors, in nanoseconds since the
@@ -289,7 +293,10 @@ class SceneCaster:
         return visible
 
     def _with_actors(self, static_hits: ScanReturns, scan: Scan, poses: CastPoses) -> _NearestHits:
-        """Combine hits of a scan on static bodies with hits on actors, keeping the nearest."""
+        """Merge a scan's hits on static bodies with hits on actors.
+
+        Each ray keeps the nearest hit.
+        """
         from . import surface_loops  # imported here because numba takes half a second to import
 
         static_distance = np.full(len(scan), np.inf)
@@ -311,7 +318,7 @@ class SceneCaster:
         return _NearestHits(joined.ray[:count], joined.distance[:count], joined.triangle[:count])
 
     def find_actor_hits(self, scan: Scan, poses: CastPoses) -> ExternalHits:
-        """Find the nearest hits of rays on actors, including actors hidden by static bodies."""
+        """Find the nearest hit of each ray on an actor, even if static bodies are closer."""
         if self._shapes is None:
             return ExternalHits(np.zeros(0, np.uint32), np.zeros(0), np.zeros(0, np.int32))
         moving, shapes = self._moving_actors(poses)
@@ -327,7 +334,6 @@ class SceneCaster:
         trajectories = poses.actor_trajectories
 
         def frames(actor: Ints, times: Floats) -> Floats:
-            """Return the animation frames of actors at given times."""
             return trajectories.animation_frames(actor, times)[0]
 
         presence_ns = trajectories.presence_ns
@@ -351,7 +357,7 @@ def casters_of_sensors(
     known: Iterable[SceneCaster] = (),
     **options: Any,
 ) -> tuple[SceneCaster, ...]:
-    """Return the casters of a survey's sensors, shared by sensors that see the same objects.
+    """Return a caster for each sensor of a survey, shared by sensors that see the same objects.
 
     Parameters
     ----------
@@ -379,11 +385,11 @@ def casters_of_sensors(
 
     @cache
     def vertices() -> Floats:
-        # Surfaces of media are moved outwards so that light hits both of two touching surfaces.
+        # Surfaces of media are moved outward so that light hits both of two touching surfaces.
         return surfaces.media_bodies.offset_vertices(1.5 * _clearance_m(scene))
 
     def bodies_without(unseen: Bools | None) -> CastBodies:
-        """Return the bodies of the scene without the static objects in a mask."""
+        """Return the scene's bodies, except the static objects that a mask marks as unseen."""
         objects = static_key(scene, unseen)
         key = media, objects
         if key not in static_bodies:
@@ -414,7 +420,7 @@ def move_instances(
     instances: Instances,
     instance_indices: Indices,
 ) -> None:
-    """Move instances to their transforms in `instances`.
+    """Move instances in the casters to their new transforms.
 
     No scan may be in progress.
 
@@ -443,14 +449,14 @@ def _clearance_m(scene: Scene) -> float:
 
 
 def _rows_to_keep(counts: Ints, keep_every: int) -> Indices:
-    """Return the first and then every n-th row of groups that have `counts` hits."""
+    """Return the indices of every n-th row in each group, starting with its first row."""
     starts = np.cumsum(counts) - counts
     number_in_group = np.arange(int(counts.sum())) - np.repeat(starts, counts)
     return np.flatnonzero(number_in_group % keep_every == 0)
 
 
 def _shapes(actors: tuple[Actor, ...], options: dict[str, Any]) -> _ActorShapes | None:
-    """Build the casters of the actors' shapes, or return None without actors.
+    """Build the casters of the actors' shapes. Return None if there are no actors.
 
     `options` are arguments of `RayCaster`.
     """

@@ -35,12 +35,12 @@ _SLACK_M = 200.0  # part of the margin reserved for sensors mounted away from th
 
 
 def largest_range_m(survey: Survey) -> float:
-    """Return the largest range of the sensors of a survey in meters."""
+    """Return the maximum range of the survey's sensors, in meters."""
     return max(carried.sensor.max_range_m for carried in survey.carried)
 
 
 def warn_of_reach(scene: Scene, survey: Survey) -> None:
-    """Log a warning if a part of the scene is omitted because no sensor can reach it."""
+    """Log a warning if part of the scene is omitted because no sensor can reach it."""
     range_m = largest_range_m(survey)
     reach_m = _half_side(scene.bounds)
     if reach_m > MAX_REACH_M and _is_short(range_m):
@@ -54,17 +54,17 @@ def warn_of_reach(scene: Scene, survey: Survey) -> None:
 
 
 def _half_side(bounds: Floats) -> float:
-    """Return half of the longest side of a box, given as its lower and upper corner."""
+    """Return half the length of the longest side of a box."""
     return float(np.ptp(bounds, axis=0).max(initial=0.0)) / 2
 
 
 def _is_short(range_m: float) -> bool:
-    """Return whether a region around sensors with this range is small enough to omit the rest."""
+    """Return whether the range of sensors is so short that the region beyond it can be omitted."""
     return 2 * (2 * range_m + MARGIN_M) <= MAX_REACH_M
 
 
 class _Trees(NamedTuple):
-    """A caster of the static bodies, possibly within a region, and its triangle numbering."""
+    """Caster of the static bodies, or of those within a region, with its triangle numbering."""
 
     caster: RayCaster
     region: Floats | None  # (2, 3), meters; None for the whole scene
@@ -72,16 +72,16 @@ class _Trees(NamedTuple):
     first_triangles: Ints32 | None
     # (r,): rows of the scene's instances that are the last r instances of the caster, ascending
     instance_indices: Ints
-    # {instance of the caster: original triangle that each clipped triangle is a part of}
+    # {instance of the caster: original triangle of which each clipped triangle is part}
     origins: dict[int, Indices]
 
     @property
     def face_bodies(self) -> int:
-        """Number of instances of the caster that represent the faces of the scene, 0 or 1."""
+        """Number of instances (0 or 1) in the caster that represent the scene's faces."""
         return self.caster.instance_count - len(self.instance_indices)
 
     def numbered(self, hits: ScanReturns) -> Ints32:
-        """Return the triangles of hits in the numbering of the scene."""
+        """Convert the triangles of hits to the scene's triangle numbers."""
         triangle = hits.triangle
         if self.origins:
             triangle = triangle.copy()
@@ -147,7 +147,7 @@ class StaticBodies:
 
     @property
     def trees(self) -> _Trees:
-        """The trees of the whole scene, or of the region that was covered last."""
+        """Trees of the whole scene, or of the most recent region."""
         if self._trees is None:
             with self._lock:
                 self._trees = self._trees or self._build(None)
@@ -162,11 +162,11 @@ class StaticBodies:
 
     @property
     def on_device(self) -> bool:
-        """Whether hits can stay on a CUDA device."""
+        """Whether hits can remain in the memory of a CUDA device."""
         return not self._may_cut and self.trees.caster.on_device
 
     def ensure_trees(self, positions: Floats, range_m: float) -> None:
-        """Build trees of all bodies within range of sensors at positions, if needed.
+        """Build the trees of all bodies within range of sensors at the given positions, if needed.
 
         Casts in progress can continue to use the trees of an earlier region.
         """
@@ -189,7 +189,7 @@ class StaticBodies:
             self._trees = self._build(None if _half_side(region) > MAX_REACH_M else region)
 
     def move(self, instances: Instances, instance_indices: Indices) -> None:
-        """Move instances, given by their rows, to their transforms in `instances`.
+        """Move the instances in the given rows to their transforms in `instances`.
 
         No cast may be in progress. Trees are rebuilt if an instance enters or leaves the region
         that sensors can reach, as a body that falls forever does, or if it was clipped.
@@ -245,7 +245,7 @@ class StaticBodies:
         return _Trees(caster, region, None, _NO_ROWS, {0: faces.origin})
 
     def _cut_faces(self, region: Floats) -> ClippedMesh | None:
-        """Clip the visible faces to a region, or return None if all faces are inside."""
+        """Clip the visible faces to a region. Return None if all faces are inside it."""
         cut_mesh = clip_triangles(self._vertices, self._faces, box_planes(region))
         if cut_mesh is None or self._sees_all_faces:
             return cut_mesh
@@ -253,7 +253,7 @@ class StaticBodies:
         return cut_mesh._replace(faces=cut_mesh.faces[seen], origin=cut_mesh.origin[seen])
 
     def _build_transparent(self) -> _Trees:
-        """Build a tree with a single triangle that lets all rays pass, because nothing is visible.
+        """Build a tree that lets all rays pass, for sensors that see no static bodies.
 
         A caster requires a triangle with a nonzero area. The other triangles are degenerate and
         make up the number of faces in the scene.
@@ -269,7 +269,7 @@ class StaticBodies:
     def _build_nested(
         self, instances: Instances, region: Floats | None, faces: ClippedMesh | None
     ) -> _Trees:
-        """Build the trees of faces, which may be clipped, and of instances."""
+        """Build the trees of the instances and of the faces, which may be clipped."""
         bodies: list[Instance] = []
         origins: dict[int, Indices] = {}
         if faces is None and self._has_faces:
@@ -308,7 +308,9 @@ class StaticBodies:
 def _parts_in(
     instances: Instances, region: Floats | None, is_seen: Bools | None
 ) -> Iterator[tuple[int, ClippedMesh | None]]:
-    """Yield the rows of visible instances within a region, with the clipped mesh or None.
+    """Yield the row of each visible instance in a region, and its clipped mesh.
+
+    The mesh is None if the instance is not clipped.
 
     `is_seen` (n,) is a mask of the visible instances, or None if all are visible. Parts with an
     opacity mask are not clipped, because rounding their texture coordinates to single precision
@@ -336,13 +338,11 @@ def _parts_in(
 
 
 def _have_area(vertices: Floats, faces: Integers) -> bool:
-    """Return whether any triangle has a nonzero area."""
     a, b, c = vertices[faces[(faces != faces[:, :1]).any(axis=1)]].transpose(1, 0, 2)
     return bool(np.cross(b - a, c - a).any())
 
 
 def _is_near(instances: Instances, region: Floats) -> Bools:
-    """Return for each instance whether its bounding box intersects a region."""
     lower, upper = instances.bounds.transpose(1, 0, 2)
     return np.asarray(((lower <= region[1]) & (region[0] <= upper)).all(axis=1))
 

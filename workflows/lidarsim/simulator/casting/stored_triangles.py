@@ -1,4 +1,4 @@
-"""Numbering of the triangles in a scene, and the geometry that copies share."""
+"""Triangle numbers of a scene, and the geometry that instances share."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ BLOCK_FACES = 1 << 18  # number of triangles whose normals are computed at a tim
 
 
 class StoredTriangles:
-    """Numbers and owners of the triangles in a scene, and the triangles that are stored once.
+    """Numbers, owners and shared geometry of the triangles in a scene.
 
     Triangles are numbered in this order: the faces of the scene, the triangles of each instance,
     and the triangles of each actor. Stored triangles are the faces of the scene, the distinct
@@ -56,21 +56,24 @@ class StoredTriangles:
 
     @cached_property
     def normal_matrices(self) -> Floats:
-        """Matrices from normals of parts to unnormalized normals of instances. Shape (n, 3, 3)."""
+        """Matrices that map part normals to unnormalized instance normals.
+
+        The shape is (n, 3, 3).
+        """
         instances = self._scene.instances
         if instances is None:
             return np.zeros((0, 3, 3))
         return np.ascontiguousarray(inverse(instances.transforms[:, :, :3]).transpose(0, 2, 1))
 
     def with_moved_instances(self, scene: Scene) -> StoredTriangles:
-        """Return the triangles of a scene in which instances have new transforms."""
+        """Return a copy for a scene in which instances have moved."""
         triangles = copy(self)
         triangles._scene = scene
         vars(triangles).pop("normal_matrices", None)
         return triangles
 
     def locate(self, triangle: Integers) -> TriangleOwners:
-        """Return the stored rows, objects and instances of triangles."""
+        """Return the stored row, object and instance of each triangle."""
         from . import surface_loops  # imported here because numba takes half a second to import
 
         count = len(triangle)
@@ -81,7 +84,7 @@ class StoredTriangles:
 
     @cached_property
     def _triangle_numbers(self) -> TriangleNumbers:
-        """Numbers of triangles, objects and instances, as arrays for compiled loops."""
+        """Triangle, object and instance numbers, as arrays for compiled loops."""
         from .surface_loops import TriangleNumbers
 
         instances = self._scene.instances
@@ -129,13 +132,13 @@ class StoredTriangles:
         return np.concatenate(bodies).astype(np.int64), np.concatenate(normal_matrices)
 
     def objects(self, triangle: Integers) -> Ints32:
-        """Return the objects that triangles belong to, or -1 for `NO_SURFACE`."""
+        """Return the object of each triangle, or -1 for `NO_SURFACE`."""
         if self._scene.instances is None:
             return self.owners[triangle]
         return self.locate(triangle).object
 
     def instances(self, triangle: Integers) -> Indices:
-        """Return the instances of triangles, all of which must belong to instances."""
+        """Return the instance of each triangle. All triangles must belong to instances."""
         return np.searchsorted(self.instance_starts, triangle, side="right") - 1
 
     def counter(self, triangle: Integers) -> Integers:
@@ -155,12 +158,15 @@ class StoredTriangles:
         return np.where(instance >= 0, face_count + instance, face_or_actor)
 
     def count(self, triangle: Integers) -> Ints:
-        """Count the hits on triangles by hit counter. Shape (counters,)."""
+        """Return the number of hits per hit counter.
+
+        The shape is (counters,).
+        """
         return np.bincount(self.counter(triangle), minlength=self.counters)
 
     @property
     def stored_bodies(self) -> list[tuple[Floats, Integers, Colors | None]]:
-        """Vertices, faces and colors of the scene, of the actors' meshes, and of instance parts."""
+        """Vertices, faces and colors of the scene, the actors' meshes, and the instance parts."""
         scene = self._scene
         bodies: list[tuple[Floats, Integers, Colors | None]] = [
             (scene.vertices, scene.faces, scene.colors)
@@ -173,7 +179,10 @@ class StoredTriangles:
 
     @cached_property
     def unit_normals(self) -> Floats32:
-        """Unit normals of the stored triangles. Shape (f, 3)."""
+        """Unit normals of the stored triangles.
+
+        The shape is (f, 3).
+        """
         bodies = self.stored_bodies
         normals = np.empty((sum(len(faces) for _, faces, _ in bodies), 3), np.float32)
         row = 0
@@ -186,7 +195,7 @@ class StoredTriangles:
 
     @cached_property
     def part_starts(self) -> Indices:
-        """Stored row of the first triangle of each mesh part of instances."""
+        """Index of each mesh part's first stored triangle."""
         assert self._scene.instances is not None
         sizes = [len(part.faces) for part in self._scene.instances.mesh_parts]
         return self._parts_start + np.cumsum([0, *sizes[:-1]])

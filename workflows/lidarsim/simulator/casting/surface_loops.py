@@ -1,4 +1,4 @@
-"""Compiled loops over hits, for surfaces, normals, and reflected and transmitted light."""
+"""Compiled loops over hits that compute surfaces, normals, and reflected or transmitted light."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -22,7 +22,7 @@ water_film_factor = inlined(water_film_factor_of_arrays)
 
 
 class TriangleNumbers(NamedTuple):
-    """Numbering of the triangles of the scene's faces, followed by instances and actors."""
+    """Numbering of a scene's triangles, in the order of faces, instances and actors."""
 
     instance_starts: Ints  # (i + 1,): first triangle of each instance, then of the actors
     # (f + a + 1,): objects of the triangles of faces and actors; the last is -1, for `NO_SURFACE`
@@ -34,7 +34,7 @@ class TriangleNumbers(NamedTuple):
 
 
 class TriangleOwners(NamedTuple):
-    """Owners of n triangles."""
+    """Objects and instances to which n triangles belong."""
 
     row: Ints  # row of the stored triangles, which actors and instances share
     object: Ints32
@@ -42,7 +42,7 @@ class TriangleOwners(NamedTuple):
 
 
 class HitSurfaces(NamedTuple):
-    """Surfaces of n hits."""
+    """Surfaces at n hits."""
 
     row: Ints  # row of the normal in `NormalTables.stored`, or `~row` in `NormalTables.deformed`
     kind: Ints32  # kind of surface, a number of a material of an object (`Scene.surface_kinds`)
@@ -63,7 +63,7 @@ class NormalTables(NamedTuple):
 
 
 class Incidence(NamedTuple):
-    """How rays meet surfaces."""
+    """Normals, incidence cosines and returned energies of rays at surfaces."""
 
     normals: Floats  # (3, n): unit normals in the scene frame
     cosines: Floats  # (n,): dot products of normals and directions, of either sign
@@ -71,17 +71,17 @@ class Incidence(NamedTuple):
 
 
 class WaterFilm(NamedTuple):
-    """A film of water on surfaces."""
+    """Film of water on surfaces."""
 
     level: float  # smallest z of a normal, on the visible side, for surfaces that hold water
-    wet: float  # share of these surfaces that is covered by water
+    wet: float  # fraction of these surfaces that is covered by water
     dry: Bools  # (kinds,): whether a kind of surface stays dry
 
 
 class OnwardOptics(NamedTuple):
-    """Optical properties of n kinds of surfaces for light that continues beyond a hit."""
+    """Optical properties of n surface kinds that determine how light continues beyond a hit."""
 
-    specular: Floats  # share of light that is reflected specularly at normal incidence
+    specular: Floats  # fraction of light that is reflected specularly at normal incidence
     passes: Bools  # whether light passes through, as through glass
     # Whether light is not refracted because the surface bounds no refracting medium.
     straight: Bools
@@ -89,26 +89,29 @@ class OnwardOptics(NamedTuple):
 
 
 class OnwardHits(NamedTuple):
-    """Hits at which light continues, as arrays of shape (n,)."""
+    """Hits at which light continues.
+
+    All arrays have shape (n,).
+    """
 
     kind: Ints32
     cosines: Floats  # cosines of incidence, of either sign
     film: Bools  # whether there may be water; empty without water
-    share: Floats  # share of the energy that is left, because light crosses each surface twice
+    share: Floats  # fraction of the energy that is left, because light crosses each surface twice
     distance: Floats  # optical path length from the sensor, meters
 
 
 class OnwardLimits(NamedTuple):
     """Thresholds for light that continues beyond a hit."""
 
-    wet: float  # share of surfaces with a film that is covered by water
+    wet: float  # fraction of surfaces with a film that is covered by water
     brightest: float  # largest energy that any surface returns from a distance of 10 m
     extinction: float  # 1/m
     faintest: float  # light is dropped if it cannot return more energy than this
 
 
 class ActorTriangles(NamedTuple):
-    """Numbering of the triangles of actors.
+    """Numbering of the actors' triangles.
 
     A shape is a distinct mesh, which several actors may share. Its parts are cast separately.
     """
@@ -120,7 +123,10 @@ class ActorTriangles(NamedTuple):
 
 
 class JoinedHits(NamedTuple):
-    """Output arrays for the nearest hits, each of shape (n,)."""
+    """Output arrays for the nearest hits.
+
+    Each array has shape (n,).
+    """
 
     ray: Ints
     distance: Floats  # meters
@@ -128,7 +134,7 @@ class JoinedHits(NamedTuple):
 
 
 class TrackTable(NamedTuple):
-    """Piecewise linear tracks among trajectories, with their segments sorted by track."""
+    """Tracks of piecewise linear trajectories, with their segments sorted by track."""
 
     member: Ints  # (w,): track of each trajectory, from 0 to t - 1; -1 for curved trajectories
     first: Ints  # (t,): first segment of each track
@@ -147,13 +153,13 @@ class TrackTable(NamedTuple):
 
 @inlined
 def _product(x, y, z, a, b, c):
-    """Return a dot product, with the order of operations of `vectors.dot`."""
+    """Return a dot product, with the same order of operations as `vectors.dot`."""
     return (x * a + y * b) + z * c
 
 
 @inlined
 def _instance_of(t, instance_starts):
-    """Return the instance that a triangle belongs to, by binary search."""
+    """Find the instance that contains a triangle by binary search."""
     lower = 0
     upper = len(instance_starts) - 1
     while upper - lower > 1:
@@ -167,7 +173,7 @@ def _instance_of(t, instance_starts):
 
 @compiled()
 def find_owners(triangle, numbers, output):
-    """Write the stored rows, objects and instances of triangles to `output`.
+    """Write the stored row, object and instance of each triangle to `output`.
 
     `numbers` is a `TriangleNumbers`, and `output` a `TriangleOwners`.
     """
@@ -197,7 +203,7 @@ def find_owners(triangle, numbers, output):
 
 @inlined
 def _instance_normal(matrices, i, x, y, z):
-    """Return the unit normal of an instance, rounded in the same order as in columns.cu."""
+    """Return an instance's unit normal, with operations in the same order as in columns.cu."""
     a = _product(matrices[i, 0, 0], matrices[i, 0, 1], matrices[i, 0, 2], x, y, z)
     b = _product(matrices[i, 1, 0], matrices[i, 1, 1], matrices[i, 1, 2], x, y, z)
     c = _product(matrices[i, 2, 0], matrices[i, 2, 1], matrices[i, 2, 2], x, y, z)
@@ -207,7 +213,7 @@ def _instance_normal(matrices, i, x, y, z):
 
 @inlined
 def _actor_normal(poses, run, x, y, z):
-    """Return a normal rotated by column `run` of the poses."""
+    """Rotate a normal by the rotation in column `run` of `poses`."""
     a = _product(poses[3, run], poses[4, run], poses[5, run], x, y, z)
     b = _product(poses[6, run], poses[7, run], poses[8, run], x, y, z)
     c = _product(poses[9, run], poses[10, run], poses[11, run], x, y, z)
@@ -216,7 +222,7 @@ def _actor_normal(poses, run, x, y, z):
 
 @compiled()
 def compute_incidence(hits, directions, tables, reflectance, retro, output):  # noqa: PLR0914 - a compiled loop
-    """Write to `output` how rays with directions meet surfaces.
+    """Write the normals, incidence cosines and returned energies of hits to `output`.
 
     `hits` is a `HitSurfaces`, `tables` a `NormalTables`, and `output` an `Incidence`. `reflectance`
     and `retro` have one value per kind of surface. The reflected light is computed for surfaces
@@ -263,7 +269,7 @@ def compute_incidence(hits, directions, tables, reflectance, retro, output):  # 
 
 @inlined
 def normal_incidence_energy(distance, extinction):
-    """Return the energy from a white surface at normal incidence.
+    """Return the energy received from a white surface at normal incidence.
 
     This is the scalar version of `materials.normal_incidence_energy`.
     `distance` is in meters, and `extinction` in 1/m.
@@ -285,10 +291,10 @@ def attenuate_energies(distance, extinction, energy):
 def apply_water_film(normals_z, cosines, kinds, shares, water, film, back):
     """Reduce the energies of hits on wet surfaces, and mark these hits in `film`.
 
-    `normals_z` are the z components of the normals, `shares` are the shares of light that surfaces
-    scatter, and `back` are the received energies, each of shape (n,). `water` is a `WaterFilm`. The
-    share `WaterFilm.wet` of each marked surface scatters light through water, whose surface
-    reflects a part of the light on the way in and on the way out.
+    `normals_z` are the z components of the normals, `shares` are the fractions of light that
+    surfaces scatter, and `back` are the received energies, each of shape (n,). `water` is a
+    `WaterFilm`. The fraction `WaterFilm.wet` of each marked surface scatters light through water,
+    whose surface reflects part of the light on the way in and on the way out.
     """
     level = water.level
     wet = water.wet
@@ -303,17 +309,17 @@ def apply_water_film(normals_z, cosines, kinds, shares, water, film, back):
 
 @compiled()
 def divide_light(row_indices, reflected, hits, shares, optics, limits, onward_share):
-    """Compute the light that continues from hits, transmitted or reflected, and drop faint light.
+    """Compute the transmitted and reflected fractions of light at hits, and drop faint light.
 
     `row_indices` (k,) are rows of the hits, `reflected` (k,) is True for light that the surface
-    reflects and False for light that it transmits, and `shares` (k,) are the shares of light that
-    the surfaces scatter. `hits` is an `OnwardHits`, `optics` an `OnwardOptics`, and `limits` an
-    `OnwardLimits`. Surfaces of refracting media do not divide light here, because
+    reflects and False for light that it transmits, and `shares` (k,) are the fractions of light
+    that the surfaces scatter. `hits` is an `OnwardHits`, `optics` an `OnwardOptics`, and `limits`
+    an `OnwardLimits`. Surfaces of refracting media do not divide light here, because
     `LightInMedia.cross` does that.
 
     The function overwrites `row_indices` and `reflected` with the light that is bright enough,
-    writes its share of the energy to `onward_share`, and returns the number of remaining rows. The
-    share counts each surface twice, because light crosses it on the way out and back.
+    writes its fraction of the energy to `onward_share`, and returns the number of remaining rows.
+    The fraction counts each surface twice, because light crosses it on the way out and back.
     """
     count = 0
     for j in range(len(row_indices)):
@@ -345,7 +351,7 @@ def divide_light(row_indices, reflected, hits, shares, optics, limits, onward_sh
 
 @compiled()
 def start_behind(origins, directions, step_m, clear_m, starts, onward):
-    """Write where light continues, `clear_m` beyond its ends, and normalize its directions.
+    """Compute the starting points of light beyond surfaces, and normalize its directions.
 
     The light ends at distances `step_m` (n,) from `origins` along `directions`. It continues from
     `starts` along `onward`, which is normalized in place. Vectors have shape (3, n).
@@ -417,7 +423,7 @@ def merge_hits(ray, triangle, nearest, actors, output):
 
 @compiled()
 def find_runs(trajectory, times, first_rows, run_numbers):
-    """Write the run number of each row and the first row of each run, and return the run count.
+    """Write the run of each row and the first row of each run. Return the number of runs.
 
     The rows of a run have the same trajectory and time. `trajectory` (n,) are trajectory numbers.
     Rows with a negative number get run -1 and do not interrupt a run.
@@ -438,7 +444,7 @@ def find_runs(trajectory, times, first_rows, run_numbers):
 
 @inlined
 def _segment_at(tracks, track, time_s):
-    """Return the last segment of a track that starts at or before a time, by binary search."""
+    """Find a track's last segment that starts no later than `time_s`, by binary search."""
     segment = tracks.first[track]
     later_segments = tracks.segments[track] - 1
     while later_segments:
@@ -465,7 +471,7 @@ def _write_pose(tracks, segment, elapsed_s, poses, k):
 
 @compiled()
 def poses_on_tracks(trajectory, times_ns, tracks, poses):
-    """Write the poses of trajectories on piecewise linear tracks.
+    """Write the poses of piecewise linear trajectories at the given times to `poses`.
 
     The operations are those of `Track.poses`. `trajectory` (n,) are trajectory numbers, and
     `tracks` is a `TrackTable`. Columns of curved trajectories are not written. Returns the first

@@ -1,4 +1,4 @@
-"""Surfaces of a scene with their normals, colors, and the light that their materials reflect."""
+"""Normals and colors of a scene's surfaces, and the light that their materials reflect."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ class SensorLight(NamedTuple):
 
     wavelength_nm: float
     extinction: float  # 1/m
-    wet: float = 0.0  # share of upward-facing surfaces that is covered by water
+    wet: float = 0.0  # fraction of upward-facing surfaces that is covered by water
 
 
 class IlluminatedHits(NamedTuple):
-    """Hits of rays on surfaces, with the energy that the sensor receives."""
+    """Ray hits on surfaces, with the energies that the sensor receives."""
 
     normals: Floats  # (n, 3): unit normals in the scene frame, on either side of the surface
     cosines: Floats  # (n,): cosines of the angles between normals and directions, of either sign
@@ -54,7 +54,7 @@ class IlluminatedHits(NamedTuple):
 
 
 def sensor_light_of(survey: Survey, sensor: Sensor) -> SensorLight:
-    """Return the light of a sensor in the air of a survey.
+    """Return the properties of a sensor's light in the weather of a survey.
 
     All values are floats, because an int would cause the compiled loops to be compiled again.
     """
@@ -102,15 +102,15 @@ class SceneSurfaces:
 
     @property
     def materials(self) -> MaterialTable:
-        """Materials by kind of surface. Only the reflectance depends on the wavelength."""
+        """Materials, indexed by kind of surface. Only the reflectance depends on the wavelength."""
         return next(iter(self._tables.values()))
 
     def at_wavelength(self, wavelength_nm: float) -> MaterialTable:
-        """Return the materials by kind of surface at the wavelength of a sensor."""
+        """Return the materials at the wavelength of a sensor, indexed by kind of surface."""
         return self._tables[wavelength_nm]
 
     def with_moved_instances(self, scene: Scene) -> SceneSurfaces:
-        """Return the surfaces of a scene in which instances have new transforms."""
+        """Return a copy for a scene in which instances have moved."""
         assert scene.instances is not None
         surfaces = copy(self)
         surfaces._scene = scene
@@ -139,7 +139,7 @@ class SceneSurfaces:
         times: Floats | Ints,
         trajectories: ActorTrajectories,
     ) -> tuple[Incidence, Ints32]:
-        """Return the incidence of rays on triangles, and the kinds of the triangles' surfaces.
+        """Return the incidence of rays on triangles, and the surface kinds of the triangles.
 
         `directions` (n, 3) are in the scene frame. `times` (n,) determine the poses of actors, in
         nanoseconds. `Incidence.back`, the energy received from 10 m, is valid for surfaces that are
@@ -185,7 +185,7 @@ class SceneSurfaces:
         trajectories: ActorTrajectories,
         colors: UInts32 | None = None,
     ) -> IlluminatedHits:
-        """Return the normals, cosines, kinds of surfaces and received energies of hits.
+        """Return the normals, cosines, surface kinds and received energies of hits.
 
         Parameters
         ----------
@@ -228,7 +228,7 @@ class SceneSurfaces:
         times: Floats | Ints,
         trajectories: ActorTrajectories,
     ) -> UInts32:
-        """Return the packed colors of points on triangles.
+        """Return the packed colors at points on triangles.
 
         Points are in the scene frame in meters. If the scene has no colors, all points are gray.
         Actors have their poses at `times` (n,) in nanoseconds.
@@ -246,7 +246,6 @@ class SceneSurfaces:
     def _block_colors(
         self, triangle: Integers, points: Floats, times: Any, trajectories: ActorTrajectories
     ) -> UInts32:
-        """Return the colors of a block of points for `colors`."""
         assert self._lookup is not None
         stored_rows, _, instance = self.triangles.locate(triangle)
         on_instances = np.flatnonzero(instance >= 0)
@@ -279,7 +278,7 @@ class SceneSurfaces:
         return Lookup(colors, corners)
 
     def kinds(self, triangle: Integers) -> Ints32:
-        """Return the kinds of surfaces of triangles, or -1 for `NO_SURFACE`."""
+        """Return the surface kind of each triangle, or -1 for `NO_SURFACE`."""
         return self.triangle_kinds.of_triangles(triangle)
 
     def energy(
@@ -290,7 +289,7 @@ class SceneSurfaces:
         sensor_light: SensorLight,
         colors: UInts32 | None = None,
     ) -> Floats:
-        """Return the received energy of rays that end on triangles at distances in meters.
+        """Return the energies received from triangles at the given distances in meters.
 
         The energy is ``reflectance * cosine * (10 m / distance)**2 * exp(-2 * extinction *
         distance)``. For a retroreflector, a gain replaces the cosine. Rough surfaces add gloss.

@@ -14,7 +14,7 @@ from .stored_triangles import StoredTriangles
 
 
 class TriangleKinds:
-    """Kinds of surfaces of the triangles in a scene, which are rows of the material table.
+    """Surface kinds of the triangles in a scene. Each kind is a row of the material table.
 
     A kind of surface is an object, or one material of an object whose files have several materials.
     """
@@ -32,7 +32,7 @@ class TriangleKinds:
         self.material_kinds = kinds
 
     def of_triangles(self, triangle: Integers) -> Ints32:
-        """Return the kinds of surfaces of triangles, or -1 for `NO_SURFACE`.
+        """Return the surface kind of each triangle, or -1 for `NO_SURFACE`.
 
         If several material names of an object match the same material of the survey, they are one
         kind.
@@ -43,7 +43,7 @@ class TriangleKinds:
         return self.of_rows(triangle_indices, objects)
 
     def of_rows(self, triangle_indices: Indices, objects: Ints32) -> Ints32:
-        """Return the kinds of surfaces from rows of the stored triangles and objects.
+        """Return the surface kinds for the given stored triangles and objects.
 
         Objects are required because instances of different objects can share stored triangles.
         """
@@ -54,9 +54,10 @@ class TriangleKinds:
 
     @cached_property
     def _kind_in_object(self) -> Ints32 | None:
-        """Kind of each stored triangle, numbered within its object. Shape (f,).
+        """Kind of each stored triangle, numbered within its object.
 
-        None if each object has a single kind, whose number is then the number of the object.
+        The shape is (f,). The value is None if each object has a single kind, whose number is then
+        the number of the object.
         """
         if len(self.material_kinds.object) == len(self.material_kinds.names):
             return None
@@ -74,7 +75,7 @@ class TriangleKinds:
         return np.concatenate(numbers)
 
     def material_numbers(self, triangle: Integers) -> Ints32:
-        """Return the materials of triangles as indices into `Scene.material_names`, or -1."""
+        """Return the material of each triangle as an index into `Scene.material_names`, or -1."""
         triangle_indices, objects, _ = self._triangles.locate(triangle)
         kinds = self.material_kinds.first[:-1][objects]
         if self._kind_in_object is not None:
@@ -89,11 +90,11 @@ class TriangleKinds:
 
     @cached_property
     def _material_kind(self) -> Ints32:
-        """For each kind, the first kind of the same object with the same material. Shape (kinds,).
+        """For each kind, the number of the first kind with the same object and material.
 
-        Several material names in an object's files may match a single material of the survey. Their
-        faces then form a single kind, so that a body of water or leaves is closed even if its faces
-        have several names.
+        The shape is (kinds,). Several material names in an object's files may match a single
+        material of the survey. Their faces then form a single kind, so that a body of water or
+        leaves is closed even if its faces have several names.
         """
         kinds = self.material_kinds
         first = first_matches(self._materials, self.material_kinds)
@@ -105,13 +106,13 @@ class TriangleKinds:
 
     @cached_property
     def _faces_by_object(self) -> tuple[Indices, Indices]:
-        """Rows of the scene's faces sorted by object, and where each object starts."""
+        """Rows of the scene's faces sorted by object, and the start of each object's rows."""
         owners = self._scene.face_object
         order = np.argsort(owners, kind="stable")
         return order, np.searchsorted(owners[order], np.arange(self._triangles.static_objects + 1))
 
     def faces_of(self, kind: int) -> Integers:
-        """Return the faces of the scene that have a kind of surface."""
+        """Return the scene's faces of the given surface kind."""
         order, starts = self._faces_by_object
         owner = int(self.material_kinds.object[kind])
         face_indices = order[starts[owner] : starts[owner + 1]]
@@ -121,7 +122,7 @@ class TriangleKinds:
         return self.select(kind, self._scene.faces[face_indices], materials)
 
     def select(self, kind: int, faces: Integers, materials: FaceMaterials | None) -> Integers:
-        """Select the faces that have a kind of surface from the faces of an object."""
+        """Select an object's faces of the given surface kind."""
         if self._kind_in_object is None:
             return faces
         kinds = self.material_kinds

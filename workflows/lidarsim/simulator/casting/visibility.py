@@ -51,7 +51,7 @@ def static_key(scene: Scene, unseen: Bools | None) -> bytes:
 
 
 def without_objects(scene: Scene, unseen: Bools) -> Scene | None:
-    """Return a scene with only the visible static objects, or None if no object is left.
+    """Return the scene without invisible static objects, or None if no object is left.
 
     `unseen` is a mask (objects,). Objects keep their numbers. Colors, materials and actors are
     omitted.

@@ -16,7 +16,7 @@ _LEVEL = 1e-30  # voxels per meter; light that is slower along an axis stays in 
 
 
 class GridPassage(NamedTuple):
-    """Result of following n rays of light through k grids each."""
+    """Result of following n rays through k grids each."""
 
     meters: Floats  # (n,): distance from the start to the leaf that light hits, or inf
     # (n,): optical depth left until a leaf, at the end of the path; -inf if light hits a leaf.
@@ -25,7 +25,7 @@ class GridPassage(NamedTuple):
 
 
 class _GridRays(NamedTuple):
-    """Rays of light in the voxels of k grids.
+    """State of light rays in the voxels of k grids.
 
     The last axis of each array is the axis of the rays.
 
@@ -48,7 +48,6 @@ class _GridRays(NamedTuple):
     projection: Floats
 
     def take(self, row_indices: Indices) -> _GridRays:
-        """Return the light in the selected rows."""
         return _GridRays._make(array[..., row_indices] for array in self)
 
 
@@ -72,7 +71,7 @@ class Grids:
 
     @classmethod
     def from_instances(cls, shared: Instances | None) -> Grids | None:
-        """Return the grids of instances, or None if no instance has a grid."""
+        """Return the voxel grids of the instances, or None if no instance has a grid."""
         if shared is None or all(part.voxels is None for part in shared.mesh_parts):
             return None
         return cls(shared)
@@ -84,7 +83,7 @@ class Grids:
         return grids
 
     def _place_instances(self, shared: Instances) -> None:
-        """Compute the origins of the instances' grids, and the matrices to their voxels."""
+        """Compute each instance's grid origin, and its matrix from scene to voxel coordinates."""
         self._part = shared.part
         to_scene = shared.transforms
         matrices = self._matrices[self._part]
@@ -146,7 +145,6 @@ class Grids:
         length: Floats,
         depth: Floats,
     ) -> GridPassage:
-        """Follow a block of light for `follow`."""
         passage = GridPassage(
             np.full(len(depth), np.inf), np.full(len(depth), -np.inf), np.zeros(instances.shape)
         )
@@ -198,7 +196,7 @@ class Grids:
         length: Floats,
         depth: Floats,
     ) -> _GridRays:
-        """Return the light of a block in the voxels at its start, for `follow`."""
+        """Return the rays of a block in the voxels where they start."""
         to_grid = self._to_grid[instances].transpose(2, 3, 1, 0)  # (axis, axis, k, n)
         x, y, z = (starts[:, None] - self._origins[instances]).transpose(2, 1, 0)
         u, v, w = directions.T[:, None]
@@ -227,7 +225,7 @@ class Grids:
         )
 
     def _density(self, rays: _GridRays) -> tuple[Floats, Bools]:
-        """Return leaf area densities in m²/m³, and whether the light is inside a grid.
+        """Return the leaf area densities in m²/m³, and whether each ray is inside each grid.
 
         Both arrays have shape (k, n). Densities outside grids are 0.
         """
@@ -240,7 +238,9 @@ class Grids:
 
 
 def _border(rays: _GridRays, inside: Bools) -> Floats:
-    """Return the distances in meters from the start to the next voxel borders. Shape (3, k, n).
+    """Return the distances in meters from the start to the next voxel borders.
+
+    The shape is (3, k, n).
 
     For light that has left a grid for good, as determined from `inside` (k, n), there are no more
     borders, and `rays.shift` is set to inf.

@@ -13,7 +13,7 @@ from .device_columns import DevicePoints
 
 
 def columns_of(batches: Sequence[BatchPoints | DevicePoints]) -> PartColumns:
-    """Return the stored columns of a batch, and the number of hits of each hit counter.
+    """Return the stored columns of a batch, and the count of each hit counter.
 
     `batches` are the returns of consecutive scans in order, as `Rig.cast` yields them: one item for
     each sensor and station. All items must belong to the same survey.
@@ -40,5 +40,5 @@ def columns_of(batches: Sequence[BatchPoints | DevicePoints]) -> PartColumns:
 
 
 def _joined(arrays: list[NDArray]) -> NDArray:  # type: ignore[type-arg]
-    """Concatenate arrays, or return a single array, made contiguous."""
+    """Concatenate arrays. A single array is copied only if it is not contiguous."""
     return np.ascontiguousarray(arrays[0]) if len(arrays) == 1 else np.concatenate(arrays)

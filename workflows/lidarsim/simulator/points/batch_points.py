@@ -31,11 +31,13 @@ from ..steps.doppler import VELOCITY, radial_velocities
 from ..steps.step_list import received_causes
 
 BLOCK_HITS = 1 << 16  # number of hits whose normals are computed at a time
-MIN_REMAINING = 1e-30  # smallest share of light, which keeps quotients finite in single precision
+MIN_REMAINING = (
+    1e-30  # smallest fraction of light, which keeps quotients finite in single precision
+)
 
 
 class BatchPoints:
-    """Reported returns of consecutive scans of one station, sorted by scan and ray.
+    """Reported returns of consecutive scans at one station, sorted by scan and ray.
 
     The properties are the sources of columns (`lidarsim.columns.table`). Each is an array with one
     value per return (n,), and expensive ones are computed on first use.
@@ -93,34 +95,37 @@ class BatchPoints:
 
     @cached_property
     def counts(self) -> Ints:
-        """Number of returns of each scan. Shape (scans,)."""
+        """Number of returns in each scan.
+
+        The shape is (scans,).
+        """
         cuts = np.searchsorted(self.pulse_returns.ray, self._first_rays)
         return np.diff(np.append(cuts, len(self))).astype(np.int64)
 
     @cached_property
     def scan(self) -> Ints32:
-        """Number of the scan."""
+        """Scan number of each return."""
         first = self.specs[0].scan
         return np.repeat(np.arange(first, first + len(self.specs), dtype=np.int32), self.counts)
 
     @cached_property
     def ray(self) -> Ints:
-        """Number of the ray within its scan."""
+        """Ray number of each return within its scan."""
         return self.pulse_returns.ray.astype(np.int64) - np.repeat(self._first_rays, self.counts)
 
     @cached_property
     def channel(self) -> UInts32:
-        """Channel of the sensor."""
+        """Sensor channel of each return."""
         return np.asarray(self.pulse_returns.ray % np.uint32(self.sensor.channels), np.uint32)
 
     @cached_property
     def firing(self) -> Ints:
-        """Number of the firing, counted from the start of the station."""
+        """Firing number, starting at the first firing of the station."""
         return self.specs[0].firings[0] + self._firing_in_run
 
     @property
     def sensor_number(self) -> Bytes:
-        """Number of the sensor."""
+        """Sensor number of each return."""
         return np.full(len(self), self.specs[0].sensor, np.uint8)
 
     @cached_property
@@ -153,7 +158,7 @@ class BatchPoints:
 
     @cached_property
     def _firing_in_run(self) -> Ints:
-        """Number of the firing, counted from the first firing of the first scan."""
+        """Firing number, starting at the first firing of the first scan."""
         return self.pulse_returns.ray // np.int64(self.sensor.channels)
 
     # -- positions ---------------------------------------------------------------------------
@@ -168,30 +173,36 @@ class BatchPoints:
 
     @property
     def origins(self) -> Floats:
-        """Origins of the rays in the scene frame, in meters. Shape (n, 3)."""
+        """Origins of the rays in the scene frame, in meters.
+
+        The shape is (n, 3).
+        """
         return np.broadcast_to(self._rays[0], (len(self), 3))
 
     @property
     def directions(self) -> Floats:
-        """Unit directions in the scene frame. Shape (n, 3)."""
+        """Unit directions in the scene frame.
+
+        The shape is (n, 3).
+        """
         return self._rays[1]
 
     @property
     def range(self) -> Floats:
-        """Distance from the origin of the ray in meters, with noise."""
+        """Distance from the ray origin in meters, including noise."""
         return required(self.pulse_returns.reported)
 
     @cached_property
     def positions(self) -> Floats:
-        """End points of the rays in the scene frame, in meters. Shape (n, 3).
+        """End points of the rays in the scene frame, in meters.
 
-        Points that a frozen sensor sends again stay fixed in the sensor frame, and so move with the
-        sensor.
+        The shape is (n, 3). Points that a frozen sensor sends again stay fixed in the sensor frame,
+        and so move with the sensor.
         """
         return self._moved_with_frozen_sensor(self._scene_positions)
 
     def _moved_with_frozen_sensor(self, points: Floats) -> Floats:
-        """Move points with a frozen sensor from the old sweep to the sweep that it replaces.
+        """Move points along with a frozen sensor, from its old pose to its current pose.
 
         Points are in the scene frame. If the sensor is not frozen, they are returned unchanged.
         """
@@ -205,7 +216,10 @@ class BatchPoints:
 
     @cached_property
     def ray_origins(self) -> Floats:
-        """Origins of the rays in the survey's point coordinates, in meters. Shape (n, 3)."""
+        """Origins of the rays in the survey's point coordinates, in meters.
+
+        The shape is (n, 3).
+        """
         if self.survey.coordinates == "sensor":
             return self._in_sensor(np.zeros(len(self)))
         return self._moved_with_frozen_sensor(self.origins) + self.scene.origin
@@ -227,14 +241,20 @@ class BatchPoints:
 
     @cached_property
     def _scene_positions(self) -> Floats:
-        """End points of the rays when they were fired, in the scene frame. Shape (n, 3), meters."""
+        """End points of the rays at their firing times, in the scene frame, in meters.
+
+        The shape is (n, 3).
+        """
         origins, directions = self._rays
         positions = directions * self.range[:, None]
         return np.add(positions, origins, out=positions)
 
     @cached_property
     def cells(self) -> Ints32:
-        """Positions as integer multiples of the survey's precision. Shape (3, n)."""
+        """Positions as integer multiples of the survey's precision.
+
+        The shape is (3, n).
+        """
         world = self.survey.coordinates == "world"
         scaled = (self.positions if world else self.sensor_positions) / self.survey.precision_m
         cells = np.empty((3, len(self)), np.int32)
@@ -252,32 +272,38 @@ class BatchPoints:
 
     @property
     def cell_x(self) -> Ints32:
-        """Quantized x of each return, in multiples of the precision from the local origin."""
+        """Quantized x coordinate, in multiples of the precision from the local origin."""
         return self.cells[0]
 
     @property
     def cell_y(self) -> Ints32:
-        """Quantized y of each return, in multiples of the precision from the local origin."""
+        """Quantized y coordinate, in multiples of the precision from the local origin."""
         return self.cells[1]
 
     @property
     def cell_z(self) -> Ints32:
-        """Quantized z of each return, in multiples of the precision from the local origin."""
+        """Quantized z coordinate, in multiples of the precision from the local origin."""
         return self.cells[2]
 
     @cached_property
     def _pattern_rows(self) -> Ints:
-        """Row of the ray in the pattern."""
+        """Pattern row of each return's ray."""
         return (self._start + self.pulse_returns.ray.astype(np.int64)) % len(self._pattern)
 
     @cached_property
     def _sensor_directions(self) -> Floats:
-        """Unit directions in the sensor frame. Shape (n, 3)."""
+        """Unit directions in the sensor frame.
+
+        The shape is (n, 3).
+        """
         return self._to_sensor(self._pattern.directions[self._pattern_rows])
 
     @cached_property
     def sensor_positions(self) -> Floats:
-        """End points of the rays in the sensor frame at the firing. Shape (n, 3), meters."""
+        """End points of the rays in the sensor frame at the firing time, in meters.
+
+        The shape is (n, 3).
+        """
         return self._in_sensor(self.range)
 
     def _in_sensor(self, distance: Floats) -> Floats:
@@ -309,7 +335,7 @@ class BatchPoints:
         return rotate(vectors, None if mount is None else mount.T)
 
     def _world_to_sensor(self, vectors: Floats) -> Floats:
-        """Rotate vectors from the scene frame to the sensor frame at the firing."""
+        """Rotate vectors from the scene frame to the sensor frame at the firing time."""
         in_platform = np.empty(vectors.shape[::-1])
         for axis, unit in enumerate(np.eye(3)):
             _, axes = self._poses.rays(Pattern(unit[None]), self.pulse_returns.ray, self._start)
@@ -331,24 +357,24 @@ class BatchPoints:
 
     @property
     def triangle(self) -> Ints32:
-        """Triangle of the scene."""
+        """Number of the scene triangle that each return comes from."""
         return self.pulse_returns.triangle
 
     @cached_property
     def object(self) -> Ints32:
-        """Object of the scene."""
+        """Number of the scene object that each return comes from."""
         return self._surfaces.triangles.objects(self.pulse_returns.triangle)
 
     @cached_property
     def _kinds(self) -> Ints32:
-        """Kind of surface of each return, a row of the material table, or -1."""
+        """Surface kind of each return as a row of the material table, or -1."""
         if not self.scene.has_mixed_objects:
             return self.object
         return self._surfaces.kinds(self.pulse_returns.triangle)
 
     @cached_property
     def cosine(self) -> Floats:
-        """Cosine of the angle between the ray and the normal of its triangle, 0 to 1.
+        """Cosine of the angle between the ray and its triangle's normal, from 0 to 1.
 
         Undefined for returns without a surface.
         """
@@ -356,7 +382,7 @@ class BatchPoints:
 
     @cached_property
     def _facing_normals(self) -> tuple[Floats, Floats]:
-        """Unit normals on the side that was hit, in the scene frame, and cosines of incidence.
+        """Scene-frame unit normals on the side that was hit, and the cosines of incidence.
 
         Values are NaN for returns without a surface, for leaves within a crown, and for ghosts,
         whose last ray starts at a mirror.
@@ -384,9 +410,10 @@ class BatchPoints:
 
     @cached_property
     def normals(self) -> Floats:
-        """Unit normals on the side that was hit, in the frame of the survey's points. Shape (n, 3).
+        """Unit normals on the side that was hit, in the frame of the survey's points.
 
-        Values are NaN for returns without a surface, for leaves within a crown, and for ghosts.
+        The shape is (n, 3). Values are NaN for returns without a surface, for leaves within a
+        crown, and for ghosts.
         """
         normals, _ = self._facing_normals
         if self.survey.coordinates == "sensor":
@@ -417,7 +444,7 @@ class BatchPoints:
 
     @cached_property
     def _lit(self) -> tuple[Floats, Floats]:
-        """Cosines of incidence, of either sign, and energies, computed in blocks to save memory."""
+        """Signed cosines of incidence and received energies, computed in blocks to save memory."""
         sensor_light = sensor_light_of(self.survey, self.sensor)
         cosines, energy = np.empty((2, len(self)))
         colors = self._colors if self._surfaces.materials.textured else None
@@ -460,17 +487,17 @@ class BatchPoints:
 
     @property
     def red(self) -> Bytes:
-        """Red component of the surface color, sRGB."""
+        """Red component of the surface color in sRGB."""
         return unpack_colors(self._colors)[:, 0]
 
     @property
     def green(self) -> Bytes:
-        """Green component of the surface color, sRGB."""
+        """Green component of the surface color in sRGB."""
         return unpack_colors(self._colors)[:, 1]
 
     @property
     def blue(self) -> Bytes:
-        """Blue component of the surface color, sRGB."""
+        """Blue component of the surface color in sRGB."""
         return unpack_colors(self._colors)[:, 2]
 
     @property
@@ -482,18 +509,18 @@ class BatchPoints:
 
     @property
     def signal(self) -> NDArray[np.uint16]:
-        """Counts proportional to the clipped energy."""
+        """Signal counts, proportional to the clipped energy."""
         return np.minimum(np.rint(self._clipped_energy * COUNTS), 65_535).astype(np.uint16)
 
     @property
     def reflectivity(self) -> Bytes:
-        """Clipped energy, corrected for the loss with distance, on the manufacturer's scale."""
+        """Clipped energy corrected for distance, on the manufacturer's reflectivity scale."""
         remaining = normal_incidence_energy(self.pulse_returns.distance)
         return SCALES[self.sensor.optics.reflectivity].encode(self._clipped_energy / remaining)
 
     @property
     def reflectance(self) -> Floats:
-        """Intensity, corrected for the losses due to distance and air."""
+        """Intensity corrected for the losses due to distance and air."""
         remaining = normal_incidence_energy(
             self.pulse_returns.distance, self.survey.extinction(self.sensor)
         )
@@ -502,7 +529,7 @@ class BatchPoints:
 
     @cached_property
     def radial_velocity(self) -> Floats:
-        """Rate of change of the range in m/s with noise.
+        """Rate of change of the range in m/s, including noise.
 
         The rate is NaN for returns that the receiver added.
         """
@@ -530,7 +557,7 @@ class BatchPoints:
 
     @property
     def amplitude(self) -> Floats:
-        """Height of the pulse in the waveform, or `intensity` without waveforms.
+        """Height of the pulse in the waveform, or `intensity` if there are no waveforms.
 
         Both are on the scale of `SceneSurfaces.energy`.
         """
@@ -559,12 +586,12 @@ class BatchPoints:
 
     @property
     def return_number(self) -> Bytes:
-        """Number among the reported returns of the pulse, starting at 1."""
+        """Number of the return within its pulse, starting at 1."""
         return required(self.pulse_returns.number)
 
     @property
     def returns(self) -> Bytes:
-        """Number of reported returns of the pulse."""
+        """Number of returns that are reported for the pulse."""
         return required(self.pulse_returns.return_counts)
 
     @property

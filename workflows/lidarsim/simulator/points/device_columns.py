@@ -1,4 +1,4 @@
-"""Compute columns on a CUDA device, and transfer only their values, in their file types.
+"""Compute columns on a CUDA device, and transfer only their values in the file's data types.
 
 Formulas and results are bit-identical to `BatchPoints`. If a survey has other columns, the reported
 hits are transferred as well, and NumPy computes these columns. They include energies in haze,
@@ -56,7 +56,7 @@ _NO_HITS = (np.zeros(0, np.int64), *(np.zeros(0, kind) for kind in _HITS))
 
 
 def _device_column_names(scene: Scene, survey: Survey) -> set[str]:
-    """Return the names of the columns that a device can compute for a survey of a scene."""
+    """Return the names of the columns that a device can compute for a survey in a scene."""
     hazy = any(survey.extinction(carried.sensor) for carried in survey.carried)
     several_wavelengths = (
         len({carried.sensor.optics.wavelength_nm for carried in survey.carried}) > 1
@@ -77,14 +77,14 @@ def _device_column_names(scene: Scene, survey: Survey) -> set[str]:
 
 
 def needs_hits(scene: Scene, survey: Survey) -> bool:
-    """Return whether NumPy computes a column, so that all reported hits must leave the device."""
+    """Return whether all reported hits must leave the device because NumPy computes a column."""
     names = {column.name for column in survey.stored_columns}
     return not names <= _device_column_names(scene, survey) | {*_CONSTANT_COLUMNS}
 
 
 @dataclass(frozen=True, eq=False)
 class DevicePoints:
-    """Points of consecutive scans of a station, with columns as in `BatchPoints`."""
+    """Points of consecutive scans at one station, with the same columns as `BatchPoints`."""
 
     scene: Scene
     survey: Survey
@@ -131,7 +131,7 @@ class VisibleBodies:
 
 
 class DeviceColumns:
-    """Casts surveys in which each ray has at most one return, and computes columns on the device.
+    """Caster for surveys with at most one return per ray, which computes columns on the device.
 
     NumPy computes the columns that the device cannot compute, as described in the module docstring.
     `casters` are the casters by sensor number.
@@ -179,7 +179,7 @@ class DeviceColumns:
         window: tuple[int, int],
         groups: Ints,
     ) -> DevicePoints:
-        """Cast consecutive scans of a station, and compute their columns.
+        """Cast consecutive scans at one station, and compute their columns.
 
         `window` has the first ray in `pattern` and one past the last. `groups` (scans,) has the
         first ray of each scan, counted from the start of the window.
@@ -239,7 +239,7 @@ class DeviceColumns:
     def write_ranges(
         self, number: int, pattern: Pattern, poses: CastPoses, image: Floats32
     ) -> None:
-        """Write the ranges in meters of the rays of a sensor to `image`.
+        """Write the ranges of a sensor's rays, in meters, to `image`.
 
         Ray i is row ``i % len(pattern)`` of the pattern. The caller fills `image` with inf, which
         remains where a ray has no return.
@@ -287,7 +287,7 @@ class DeviceColumns:
 
 
 def _actor_hits(seen: VisibleBodies, scan: Scan, poses: CastPoses) -> ExternalHits | None:
-    """Find the hits of a scan on visible actors, or return None without actors.
+    """Find the hits of a scan on visible actors. Return None if there are no actors.
 
     All actors are the last body, and its triangles are numbered from 0.
     """
@@ -298,7 +298,7 @@ def _actor_hits(seen: VisibleBodies, scan: Scan, poses: CastPoses) -> ExternalHi
 
 
 class _ColumnTransfer:
-    """Computes the columns of a batch on the device, and sends their values to the host.
+    """Computation of a batch's columns on the device, and their transfer to the host.
 
     `maker` has the columns and the surface tables. The caster passes the hits of the batch to
     `make` in parts. `finish` returns the columns of all hits.
@@ -382,7 +382,7 @@ class _ColumnTransfer:
         return np.concatenate([row_indices for row_indices, *_ in self._on_actors])
 
     def finish(self) -> tuple[dict[str, AnyArray], tuple[AnyArray, ...]]:
-        """Wait for the values, and return the columns by name, and the hits that NumPy needs.
+        """Wait for the values. Return the columns by name, and the hits that NumPy needs.
 
         The hits are arrays of rays, distances and triangles. They cover all hits, only the hits on
         actors, or no hits.
@@ -418,7 +418,10 @@ class _ColumnTransfer:
         return _TransferBuffers(kernel, kernel_arguments, outbox, columns, hits)
 
     def _kernel_arguments(self, cupy: Any) -> tuple[Any, ...]:
-        """Return the device arrays that are the kernel arguments between hits and columns."""
+        """Return the kernel arguments that follow the hits and precede the columns.
+
+        They are device arrays and scalars.
+        """
         maker = self._maker
         specs = self._specs
         sensor = maker.survey.carried[specs[0].sensor].sensor
@@ -449,7 +452,7 @@ class _ColumnTransfer:
 
 @dataclass(frozen=True, eq=False)
 class _TransferBuffers:
-    """Kernel for the hits of a batch, and page-locked host arrays that receive the values."""
+    """Kernel and page-locked host arrays for the transfer of a batch."""
 
     kernel: Any
     kernel_arguments: tuple[Any, ...]  # arguments between hits and columns
@@ -460,7 +463,10 @@ class _TransferBuffers:
 
 @lru_cache(maxsize=16)
 def _kernel(cupy: Any, device: int) -> Any:
-    """Compile columns.cu for the current device, whose number is `device`, once."""
+    """Compile columns.cu for the current device, which has the number `device`.
+
+    The compiled kernel is cached for each device.
+    """
     code = importlib.resources.files(__package__).joinpath("columns.cu").read_text("utf-8")
     module = cupy.RawModule(code=f'#line 1 "columns.cu"\n{code}', options=OPTIONS)
     return module.get_function("columns")

@@ -17,23 +17,23 @@ UP = Purpose(3, "vertical noise of a beam direction")
 
 
 class AngleNoiseStep(PulseStep):
-    """Rotates each beam by a random angle."""
+    """Simulation step that rotates each beam by a random angle."""
 
     role = Role.AIMS
     purposes = ACROSS, UP
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if directions have random errors."""
+        """Return whether beam directions have random errors."""
         return setup.noise.angle_deg > 0
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the memory of the directions of beams, in bytes."""
+        """Return the memory of the beam directions, in bytes."""
         return beam_memory(setup, sizes)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Add random angles to the beams of a batch, and return the returns unchanged."""
+        """Add random angles to the beams of a batch. The returns do not change."""
         beams = np.arange(batch.start, batch.stop)
         scan, ray = batch.keys.scan_and_number(beams)
         across, up = angle_errors(self.setup.noise, scan, ray)
@@ -42,14 +42,14 @@ class AngleNoiseStep(PulseStep):
 
 
 class RippleStep(PulseStep):
-    """Rotates beams by an azimuth error that repeats with each revolution of the head."""
+    """Simulation step for azimuth errors that repeat with each revolution of the head."""
 
     role = Role.AIMS | Role.ABOUT_AXIS
     effects = ("Systematic errors",)
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if azimuths have a periodic error."""
+        """Return whether azimuths have a periodic error."""
         return setup.noise.ripple_deg > 0
 
     @staticmethod
@@ -58,7 +58,7 @@ class RippleStep(PulseStep):
         return Memory() if setup.noise.angle_deg else beam_memory(setup, sizes)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Add the azimuth errors to the beams of a batch, and return the returns unchanged."""
+        """Add azimuth errors to the beams of a batch. The returns do not change."""
         noise = self.setup.noise
         sensor = self.setup.sensor
         azimuth = sensor.head.azimuths(batch.firings.numbers[batch.row_range])
@@ -83,7 +83,7 @@ def angle_errors(noise: Noise, scan: Integers, ray: Integers) -> tuple[Floats, F
 
 
 def beam_memory(setup: Setup, sizes: Sizes) -> Memory:
-    """Return the memory of the directions of deflected beams, in bytes."""
+    """Return the memory of deflected beam directions, in bytes."""
     if setup.return_count_varies:  # the beams are deflected batch by batch
         return Memory()
     return Memory(retained=32 * sizes.rays, casting=20 * sizes.rays)

@@ -1,4 +1,4 @@
-"""Cast sub-rays, and follow their light through glass and its reflection from mirrors.
+"""Cast sub-rays, and follow their light through glass and off mirrors.
 
 A surface can reflect, transmit and scatter parts of the light. Each part continues separately.
 """
@@ -30,7 +30,7 @@ from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 GHOST = CAUSES.index("ghost")
 MAX_PASSES = 16  # number of surfaces that light can pass before it is dropped
-MAX_LEAFY_PASSES = 64  # limit with crowns, because light passes the surface of a crown twice
+MAX_LEAFY_PASSES = 64  # limit with crowns, whose surface light passes twice
 MAX_REFLECTIONS = 2  # number of times that light can be reflected; each may divide the light
 
 
@@ -47,7 +47,7 @@ class LightPaths:
     times: Floats  # firing times, nanoseconds since the start of the survey; 0 without actors
     origins: Floats  # start points of the segments, meters
     directions: Floats  # unit vectors
-    # Share of the energy left by the earlier surfaces, on the way out and back; 1 at the sensor.
+    # Fraction of the energy left by the earlier surfaces, on the way out and back; 1 at the sensor.
     share: Floats
     optical_start: Floats  # optical path length from the sensor to the origins, meters
     # (n, 3, 3): product of the reflections so far, which maps fired directions to the directions of
@@ -61,7 +61,7 @@ class LightPaths:
     range_rate: Floats | None = None
 
     def take(self, row_indices: Integers) -> LightPaths:
-        """Return the light in the selected rows."""
+        """Return the light paths in the given rows."""
         return LightPaths(*select_rows(vars(self).values(), row_indices))
 
     def optical_end(self, step_m: Floats) -> Floats:
@@ -72,12 +72,15 @@ class LightPaths:
 
     @property
     def index(self) -> Floats | float:
-        """Refractive index of the medium around the light, or 1.0 without media."""
+        """Refractive index of the medium around the light, or 1.0 if the scene has no media."""
         return 1.0 if self.in_media is None else self.in_media.index
 
 
 class CastLight(NamedTuple):
-    """Light that hits surfaces, and the triangles that it hits, as arrays of shape (n,)."""
+    """Light that hits surfaces, and the triangles that it hits.
+
+    All arrays have shape (n,).
+    """
 
     light: LightPaths
     # Distance in meters from which on the light can hit leaves: the sensor's minimum range or, for
@@ -107,12 +110,15 @@ class SurfaceHits(NamedTuple):
 
 
 class VisibleHits(NamedTuple):
-    """The k hits that the sensor can see, and where the light of all n hits continues."""
+    """Hits that the sensor can see, and masks of the hits at which light continues.
+
+    The sensor sees k of the n hits.
+    """
 
     hits: PulseReturns  # k rows; these are all hits if there are no media
     normals: Floats  # (k, 3): normals of the hits, reflected back to match the fired directions
     transmits: Bools  # (n,): whether light continues through the surface
-    mirrors: Bools  # (n,): whether the surface reflects a part of the light specularly
+    mirrors: Bools  # (n,): whether the surface reflects part of the light specularly
 
 
 class SurfaceCrossings(NamedTuple):
@@ -133,14 +139,14 @@ class SurfaceCrossings(NamedTuple):
 
 
 class OnwardRows(NamedTuple):
-    """Rows of light that continues, as arrays of shape (k,).
+    """Rows of light that continues.
 
-    Light that is divided has two rows.
+    All arrays have shape (k,). Light that is divided has two rows.
     """
 
     row_indices: Indices
     reflected: Bools  # True if the light of the row is reflected, False if it is transmitted
-    share: Floats  # share behind the surface, as in `LightPaths.share`
+    share: Floats  # fraction of the energy behind the surface, as in `LightPaths.share`
 
 
 class Deflection(NamedTuple):
@@ -150,13 +156,13 @@ class Deflection(NamedTuple):
     """
 
     directions: Floats
-    share: Floats  # share behind the surface, as in `LightPaths.share`
+    share: Floats  # fraction of the energy behind the surface, as in `LightPaths.share`
     mirrored: Bools  # whether light is reflected, including total internal reflection
     twice_normals: Floats  # twice the normal where light is reflected, otherwise 0
 
 
 class OnwardLight(NamedTuple):
-    """Light behind the surfaces of its last hits, before the next cast.
+    """Light just behind the surfaces that it last hit, ready for the next cast.
 
     All arrays have shape (n,).
     """
@@ -167,7 +173,7 @@ class OnwardLight(NamedTuple):
 
 
 class CastStep(PulseStep):
-    """Casts sub-rays, and records hits where their light meets surfaces and leaves.
+    """Simulation step that casts sub-rays and records their hits on surfaces and leaves.
 
     Light that a surface transmits or reflects is cast again and can produce further hits.
     """
@@ -211,26 +217,27 @@ class CastStep(PulseStep):
         )
 
     def with_moved_instances(self, setup: Setup, surfaces: SceneSurfaces) -> PulseStep:
-        """Return the step for a scene with moved instances and updated bounds of media."""
+        """Return a copy for a scene in which instances have moved, with updated bounds of media."""
         if self._media is not None:
             return super().with_moved_instances(setup, surfaces)
         return self.with_setup(setup, surfaces)
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if a ray may have several returns or none."""
+        """Return whether a ray may have several returns or none."""
         return setup.return_count_varies
 
     @staticmethod
     def added_returns(setup: Setup) -> float:
-        """Return the largest number of ghosts of a pulse, as an upper bound of the mean number."""
+        """Return the maximum number of ghosts per pulse, as an upper bound for the mean."""
         return MAX_REFLECTIONS * setup.has_mirrors
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the memory of sub-rays and hits in bytes, which is larger if light continues.
+        """Return the memory of sub-rays and hits in bytes.
 
-        It consists of the memory used while rays are cast and while returns are counted (`Memory`).
+        The memory is larger if light continues beyond hits. It consists of the memory used while
+        rays are cast and while returns are counted (`Memory`).
         """
         subray = 200 if not setup.has_onward_light else 1350 if setup.refracts else 650
         casting = (subray + 200 * setup.has_velocities) * sizes.subrays + 30 * sizes.return_count
@@ -276,12 +283,11 @@ class CastStep(PulseStep):
 
     @property
     def _leafy(self) -> bool:
-        """Whether the scene has crowns."""
         return self._media is not None and self._media.leafy
 
     @property
     def _reach_m(self) -> float:
-        """Largest length of a cast ray in meters, or inf if there are crowns.
+        """Maximum length of a cast ray in meters, or inf if there are crowns.
 
         A path through a crown ends at the surface on the far side, which can be at any distance.
         """
@@ -299,7 +305,7 @@ class CastStep(PulseStep):
     # -- the first cast ----------------------------------------------------------------------
 
     def _cast_first(self, batch: PulseBatch) -> tuple[CastLight, Floats]:
-        """Cast the sub-rays of a batch, and return the light that hits a surface, and all rays.
+        """Cast a batch's sub-rays. Return the light that hits surfaces, and all rays.
 
         The rays are an array of shape (6, s) with origins and unit directions of all s sub-rays in
         the scene frame, or of shape (3, s) if the origins are not needed. The light has one row for
@@ -323,7 +329,7 @@ class CastStep(PulseStep):
         return CastLight(light, start_m, hits.distance, hits.triangle), rays
 
     def _light_of_rays(self, ray: Ints, rays: Floats, batch: PulseBatch) -> LightPaths:
-        """Return the light, at the sensor, of sub-rays `ray` that hit a surface.
+        """Return the light at the sensor for the sub-rays that hit a surface.
 
         `rays` has all sub-rays of the batch (`_cast_first`).
         """
@@ -400,7 +406,7 @@ class CastStep(PulseStep):
         )
 
     def _meet_leaves(self, cast: CastLight, batch: PulseBatch) -> tuple[CastLight, Leaves | None]:
-        """Return the light, shortened where it hits leaves, and the leaves.
+        """Shorten light paths at the leaves that they hit. Return the paths and the leaves.
 
         The leaves are None without media.
         """
@@ -424,7 +430,7 @@ class CastStep(PulseStep):
     def _leaf_energy(
         self, leaves: Leaves, triangle: Ints32, distance: Floats, color: UInts32 | None
     ) -> Floats:
-        """Return the received energies of leaves.
+        """Return the energies received from leaves.
 
         `triangle`, `distance` (meters) and `color` belong to all hits (n,), including hits on
         leaves.
@@ -446,7 +452,7 @@ class CastStep(PulseStep):
         triangle: Ints32,
         actor_trajectories: ActorTrajectories,
     ) -> Floats:
-        """Return the velocities in m/s of surfaces at hits, or no rows if they are not needed."""
+        """Return the velocities of the surfaces at hits in m/s, or an empty array if not needed."""
         if light.range_rate is None:
             return np.zeros((0, 3))
         return velocities_of_ends(
@@ -459,7 +465,7 @@ class CastStep(PulseStep):
         )
 
     def _visible_hits(self, light: LightPaths, surface_hits: SurfaceHits) -> VisibleHits:
-        """Return the hits that the sensor can see, and where light continues.
+        """Return the hits that the sensor can see, and masks of the hits at which light continues.
 
         With media, hits on the surfaces of crowns and hits beyond the sensor's range are omitted.
         """
@@ -513,7 +519,7 @@ class CastStep(PulseStep):
         visible: VisibleHits,
         subrays_per_beam: int,
     ) -> OnwardLight | None:
-        """Return the light that surfaces transmit or reflect, ready to cast, or None if none does.
+        """Return the light that surfaces transmit or reflect, or None if there is none.
 
         Light that is both transmitted and reflected has two rows. Rows are ordered by ring.
         """
@@ -546,7 +552,7 @@ class CastStep(PulseStep):
     def _divide(
         self, light: LightPaths, surface_hits: SurfaceHits, row_indices: Indices, reflected: Bools
     ) -> OnwardRows:
-        """Compute the shares of light that surfaces transmit or reflect, and drop faint light.
+        """Compute the fractions of light that surfaces transmit or reflect, and drop faint light.
 
         `surface_hits` has a row for each row of `light`. `row_indices` (k,) are the rows whose
         light continues. `reflected` (k,) is True for reflected light, and False for transmitted
@@ -592,7 +598,7 @@ class CastStep(PulseStep):
         return OnwardRows(row_indices[:count], reflected[:count], share[:count])
 
     def _cast_again(self, onward: OnwardLight, actor_trajectories: ActorTrajectories) -> CastLight:
-        """Cast the light behind surfaces, and return the light that hits a surface in range.
+        """Cast light onward from surfaces, and return the light that hits another surface in range.
 
         With crowns, hits beyond the range are returned too, because there may be leaves before
         them.
@@ -689,7 +695,7 @@ class CastStep(PulseStep):
         return OnwardLight(behind, -clear_m, pattern)
 
     def _deflect(self, light: LightPaths, crossings: SurfaceCrossings) -> Deflection:
-        """Return directions and shares of light behind surfaces that refract or reflect it.
+        """Return the directions and fractions of light behind surfaces that refract or reflect it.
 
         This moves the light into the media behind the surfaces.
         """
@@ -735,7 +741,7 @@ def _range_rate_behind(
 def _pattern_behind(
     light: LightPaths, step_m: Floats, clear_m: Floats, outgoing: Floats
 ) -> tuple[Pattern, Floats]:
-    """Return rays that start `clear_m` beyond the ends of light, and their origins.
+    """Return rays that continue `clear_m` beyond the ends of light paths, and their origins.
 
     The light ends at distances `step_m` (n,) in meters from its origins. `outgoing` (n, 3) are the
     directions of the rays, whose lengths must be close to 1.

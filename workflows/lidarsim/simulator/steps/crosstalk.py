@@ -39,12 +39,15 @@ if TYPE_CHECKING:
 FOREIGN_PULSE = Purpose(23, "energy noise of a pulse from another sensor")
 CROSSTALK = CAUSES.index("crosstalk")
 CELL_RAYS = 1 << 6  # number of rays that are compared with a spot at a time
-FILTER_NM = 20.0  # largest difference of wavelengths that passes a receiver's filter
-SLACK_NS = 10.0  # largest error of the estimated time at which a pulse reaches the receiver
+FILTER_NM = 20.0  # maximum difference of wavelengths that passes a receiver's filter
+SLACK_NS = 10.0  # maximum error of the estimated time at which a pulse reaches the receiver
 
 
 class ReceivedPulses(NamedTuple):
-    """Pulses of other sensors that rays receive, as arrays of shape (k,)."""
+    """Pulses of other sensors that rays receive.
+
+    All arrays have shape (k,).
+    """
 
     row: Indices  # rows of the receiving rays
     distance: Floats  # apparent distance of the pulse, meters
@@ -52,7 +55,7 @@ class ReceivedPulses(NamedTuple):
 
 
 class _WaitingRays(NamedTuple):
-    """Rays whose receiver waits for light.
+    """Rays whose receivers wait for light.
 
     Arrays have shape (n,). Arrays of vectors have shape (n, 3) and are in the scene frame.
     """
@@ -65,7 +68,10 @@ class _WaitingRays(NamedTuple):
 
 
 class _Spots(NamedTuple):
-    """Points on surfaces that the pulses of a sensor illuminate, as arrays of shape (n,)."""
+    """Points on surfaces that the pulses of a sensor illuminate.
+
+    All arrays have shape (n,).
+    """
 
     time: Floats  # when the pulse illuminates the spot, nanoseconds since the start of the station
     position: Floats  # (n, 3), meters, scene frame
@@ -75,7 +81,10 @@ class _Spots(NamedTuple):
 
 
 class _Candidates(NamedTuple):
-    """Spots, and consecutive rays that may see each spot, as arrays of shape (k,)."""
+    """Spots, and the ranges of consecutive rays that may see them.
+
+    All arrays have shape (k,).
+    """
 
     spot: Indices
     start: Indices  # index of the first ray in `_WaitingRays.order`
@@ -83,7 +92,7 @@ class _Candidates(NamedTuple):
 
 
 class CrosstalkStep(PulseStep):
-    """Adds pulses of other sensors that a sensor receives.
+    """Simulation step that adds the pulses of other sensors that a sensor receives.
 
     A pulse of another sensor illuminates a spot. A ray receives light from the spot if the spot is
     visible and in the field of view of the ray's receiver, which is as wide as the beam, and if
@@ -111,12 +120,12 @@ class CrosstalkStep(PulseStep):
         ]
 
     def with_moved_instances(self, setup: Setup, surfaces: SceneSurfaces) -> PulseStep:
-        """Return a copy for a scene with moved instances."""
+        """Return a copy for a scene in which instances have moved."""
         return self.with_setup(setup, surfaces)
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if the sensor has crosstalk."""
+        """Return whether the sensor has crosstalk."""
         return setup.noise.crosstalk
 
     @staticmethod
@@ -128,7 +137,7 @@ class CrosstalkStep(PulseStep):
         )
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns of a batch together with received foreign pulses."""
+        """Add the received foreign pulses to the returns of a batch."""
         rays = np.arange(batch.start, batch.stop)
         row, distance, energy = self.receive(
             batch.keys.scan, rays, *batch.central_rays, batch.subray_poses
@@ -188,7 +197,7 @@ class CrosstalkStep(PulseStep):
         return ReceivedPulses(row[visible], distance[visible], energy)
 
     def _sightings(self, waiting: _WaitingRays, spots: _Spots) -> ReceivedSpots:
-        """Return pairs of a ray and a spot in its field of view that arrive while the ray waits."""
+        """Pair each ray with the spots in its field of view whose light arrives while it waits."""
         from . import stray_loops  # imported here because numba takes half a second to import
 
         candidates = self._candidates(waiting, spots)
@@ -216,7 +225,7 @@ class CrosstalkStep(PulseStep):
         return sightings.first(count)
 
     def _candidates(self, waiting: _WaitingRays, spots: _Spots) -> _Candidates:
-        """Return spots, and for each spot the rays that may receive its light.
+        """Return spots, and the rays that may receive the light of each spot.
 
         These rays wait when the light of the spot arrives, and their cell faces the spot.
         """
@@ -239,7 +248,7 @@ class CrosstalkStep(PulseStep):
         return _Candidates(spot, first_row, np.minimum(stop[spot], (cell + 1) * CELL_RAYS))
 
     def _cells(self, directions: Floats) -> tuple[Floats, Floats]:
-        """Return the axes and opening angles of cones around consecutive rays.
+        """Return the axes and opening angles of cones that enclose consecutive rays.
 
         The axes have shape (c, 3), and the angles (c,) are in radians. Consecutive rays lie in a
         narrow cone, which contains few spots.
@@ -290,7 +299,7 @@ class CrosstalkStep(PulseStep):
     def _fired_rays(
         self, number: int, station: int, firings: Ints, firing_starts: Floats
     ) -> tuple[Floats, Floats]:
-        """Return origins and directions of the rays of firings, in the scene frame."""
+        """Return the origins and directions of the rays that a sensor fires, in the scene frame."""
         carried = self._survey.carried[number]
         path = self._survey.path
         sensor = carried.sensor
@@ -326,7 +335,7 @@ class CrosstalkStep(PulseStep):
 
 
 def _expanded(first: Indices, stop: Indices) -> tuple[Indices, Indices]:
-    """Enumerate the integers in half-open ranges, and the range that each belongs to."""
+    """Return the range number and the value of each integer in half-open ranges."""
     counts = np.maximum(stop - first, 0)
     row = np.repeat(np.arange(len(counts)), counts)
     return row, first[row] + np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -345,7 +354,7 @@ def _firings_in(sensor: Sensor, steps: int, span: tuple[float, float]) -> tuple[
 
 
 def _foreign_pulses(survey: Survey, sensor: Sensor) -> float:
-    """Return the number of foreign pulses per pulse of a sensor."""
+    """Return the number of pulses that other sensors fire per pulse of a sensor."""
 
     def rate(lidar: Sensor) -> float:
         first, stop = lidar.firings(0)

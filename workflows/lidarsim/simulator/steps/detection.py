@@ -16,7 +16,9 @@ LOSS = Purpose(5, "whether a return is lost")
 
 
 class DetectionStep(PulseStep):
-    """Drops weak returns found in waveforms, and a random share of all returns (`Noise.dropout`).
+    """Simulation step that drops weak returns in waveforms, and a random fraction of all returns.
+
+    The fraction is `Noise.dropout`.
 
     Without waveforms, `SeparationStep` drops returns with the same function, `detected`.
     """
@@ -27,11 +29,11 @@ class DetectionStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if returns are found in waveforms and can be lost because of noise."""
+        """Return whether returns are found in waveforms and can be lost because of noise."""
         return setup.noise.loses_returns and setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the detected returns."""
+        """Keep the detected returns of a batch."""
         scan, ray = batch.keys.scan_and_number(returns.ray)
         detected_mask = detected(
             self.setup.noise, returns.height, scan, ray, number_within_ray(returns.ray)

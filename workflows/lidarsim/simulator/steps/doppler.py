@@ -1,4 +1,4 @@
-"""Radial velocities, which are the rates of change of ranges that a coherent lidar measures.
+"""Radial velocities, the rates of change of range that a coherent lidar measures.
 
 A radial velocity is the velocity of the hit point minus the velocity of the ray's origin, projected
 on the ray. FMCW lidars measure it from the Doppler shift 2 v / wavelength
@@ -49,7 +49,7 @@ def radial_velocities(
     triangle: Ints32,
     times: Floats | Ints,
 ) -> Floats:
-    """Return the radial velocities of the end points of rays, in m/s, positive if receding.
+    """Return the radial velocities of ray end points in m/s. Receding points have positive values.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def velocities_of_ends(
     triangle: Ints32,
     times: Floats | Ints,
 ) -> Floats:
-    """Return the velocities of actors' surfaces at the ends of rays, in m/s, in the scene frame.
+    """Return the scene-frame velocities, in m/s, of actors' surfaces at the ends of rays.
 
     `rays` are origins and unit directions (n, 3) in the scene frame. `distance` (n,) is in meters,
     and `times` (n,) are firing times in nanoseconds since the start of the survey.

@@ -21,7 +21,10 @@ PEAK = Purpose(21, "energy of a false alarm")
 
 
 class FalseAlarms(NamedTuple):
-    """False alarms of rays, as arrays of shape (k,)."""
+    """False alarms of rays.
+
+    All arrays have shape (k,).
+    """
 
     row: Indices  # rows of the rays that have the alarms
     time_s: Floats  # time since the receiver opened, seconds
@@ -29,7 +32,7 @@ class FalseAlarms(NamedTuple):
 
 
 class FalseAlarmStep(PulseStep):
-    """Adds false alarms to the returns of pulses."""
+    """Simulation step that adds false alarms to the returns of pulses."""
 
     role = Role.RECEIVES
     effects = ("False alarms",)
@@ -40,7 +43,7 @@ class FalseAlarmStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if the receiver has false alarms."""
+        """Return whether the receiver has false alarms."""
         return setup.noise.false_alarm_hz > 0
 
     @staticmethod
@@ -50,11 +53,11 @@ class FalseAlarmStep(PulseStep):
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the memory of the rays and of a cause for each return, in bytes."""
+        """Return the memory of the rays and of the return causes, in bytes."""
         return Memory(retained=10 * sizes.return_count, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns of a batch together with the false alarms of its rays."""
+        """Add the false alarms of rays to the returns of a batch."""
         sensor = self.setup.sensor
         rays = np.arange(batch.start, batch.stop)
         scan, ray = batch.keys.scan_and_number(rays)

@@ -1,4 +1,4 @@
-"""Refraction, attenuation and random leaf hits of light in media within closed surfaces.
+"""Refraction and attenuation of light in closed media, and random hits on leaves.
 
 Directions follow Snell's law. Energies follow Fresnel's equations, the Beer-Lambert law, and the
 divergence of the beam, for which ray differentials (Igehy 1999) track the cross-section of a cone
@@ -44,7 +44,7 @@ Draw = Callable[[Purpose, Ints], NDArray[np.uint64]]
 
 
 class MediaRays(NamedTuple):
-    """Light of sub-rays at its origins, and the trajectories of actors."""
+    """Origins, directions and times of light, and the trajectories of the actors."""
 
     origins: Floats  # (n, 3): meters, scene frame
     directions: Floats  # (n, 3): unit vectors, scene frame
@@ -54,7 +54,7 @@ class MediaRays(NamedTuple):
 
 @dataclass
 class MediaStack:
-    """Media around the light of sub-rays, innermost first.
+    """Media that surround the light of each sub-ray, innermost first.
 
     The arrays have shape (n, MAX_MEDIA), with -1 for no medium.
     """
@@ -64,11 +64,11 @@ class MediaStack:
 
     @classmethod
     def empty(cls, count: int) -> MediaStack:
-        """Return the stacks of light in air."""
+        """Return empty stacks, for light in air."""
         return cls(*(np.full((count, MAX_MEDIA), -1, np.int32) for _ in range(2)))
 
     def __getitem__(self, row_indices: Integers) -> MediaStack:
-        """Return the stacks of selected sub-rays."""
+        """Return the stacks of the selected sub-rays."""
         return MediaStack(self.kinds[row_indices], self.triangles[row_indices])
 
     def enter(self, row_indices: Indices, kinds: Ints32, triangles: Ints32) -> None:
@@ -88,7 +88,7 @@ class MediaStack:
         self.triangles[row_indices[free], depth[free]] = triangles[free]
 
     def leave(self, row_indices: Indices, kinds: Ints32) -> Bools:
-        """Remove a medium from the stacks of rows, and return False for rows without the medium."""
+        """Remove a medium from each selected row, and return whether the row contained it."""
         matches = self.kinds[row_indices] == kinds[:, None]
         in_stack = matches.any(axis=1)
         row_indices = row_indices[in_stack]
@@ -103,7 +103,7 @@ class MediaStack:
 
 @dataclass
 class RayDifferentials:
-    """Refraction, attenuation and divergence of the light of sub-rays."""
+    """Refraction, attenuation and divergence of light along sub-rays."""
 
     index: Floats  # (n,): refractive index at the light's position
     initial_index: Floats  # (n,): refractive index at the light's origin
@@ -113,17 +113,17 @@ class RayDifferentials:
 
     @classmethod
     def from_directions(cls, directions: Floats, index: Floats) -> RayDifferentials:
-        """Return the differentials of light at its origin, from its directions."""
+        """Return the initial differentials of light with the given directions."""
         derivatives = np.stack([axis.T for axis in perpendicular_axes(directions.T)], axis=1)
         zeros = np.zeros(len(derivatives))
         return cls(index.copy(), index, zeros, np.zeros_like(derivatives), derivatives)
 
     def __getitem__(self, row_indices: Integers) -> RayDifferentials:
-        """Return the differentials of selected sub-rays."""
+        """Return the differentials of the selected sub-rays."""
         return RayDifferentials(*select_rows(vars(self).values(), row_indices))
 
     def advance(self, step: Floats, attenuation: Floats) -> None:
-        """Advance the light by steps in meters through an attenuation in 1/m."""
+        """Advance light by the given steps in meters, with an attenuation in 1/m."""
         shift = step[:, None, None] * self.direction_derivatives
         self.position_derivatives = self.position_derivatives + shift
         self.attenuation_depth = self.attenuation_depth + attenuation * step
@@ -150,7 +150,7 @@ class RayDifferentials:
     def deflect(
         self, incoming: Floats, outgoing: Floats, normals: Floats, mirrored: Bools, index: Floats
     ) -> None:
-        """Update the differentials at flat surfaces that change directions.
+        """Update the differentials at flat surfaces that change the direction of light.
 
         Directions change from `incoming` to `outgoing` (n, 3). `index` (n,) is the refractive index
         behind the surfaces, for light that is not reflected.
@@ -223,7 +223,10 @@ class Media:
                 mean_projection(angle, np.ones(1))  # computes and caches the table for this angle
 
     def enters(self, kinds: Ints32, cosines: Floats) -> Bools:
-        """Return whether light enters bodies, given the cosines between normals and light."""
+        """Return whether light that crosses surfaces enters the bodies that they enclose.
+
+        `cosines` are those between normals and light.
+        """
         return np.asarray((cosines < 0) != self._inwards[kinds])
 
     def stack_at(self, caster: SceneCaster, rays: MediaRays) -> MediaStack:
@@ -260,7 +263,7 @@ class Media:
         times: Floats,
         actor_trajectories: ActorTrajectories,
     ) -> MediaStack:
-        """Find the media around origins by casting rays upwards.
+        """Find the media around origins by casting rays upward.
 
         If a ray leaves a medium that it has not entered, its origin is inside this medium.
         """
@@ -306,7 +309,7 @@ class Media:
     def initial_state(
         self, caster: SceneCaster, rays: MediaRays, depths: Floats | None
     ) -> LightInMedia:
-        """Return the state of the light of n rays at its origins.
+        """Return the initial state of light on n rays.
 
         `depths` (n,) are the optical depths at which light hits a leaf, or None without leaves.
         """
@@ -324,14 +327,17 @@ class Media:
         return _first_masked(indices, indices > 0, 1.0)
 
     def attenuation(self, stack: MediaStack) -> Floats:
-        """Return the extinction in 1/m of the innermost refracting medium, or of the air."""
+        """Return the extinction, in 1/m, of the innermost refracting medium or of the air."""
         refracts = self._index[stack.kinds] > 0
         return _first_masked(self._attenuation[stack.kinds], refracts, self.air_extinction)
 
     def stack_behind(
         self, stack: MediaStack, kinds: Ints32, triangles: Ints32, cosines: Floats
     ) -> MediaStack:
-        """Return the media behind surfaces, given the cosines between normals and light."""
+        """Return the stacks of media behind surfaces that light crosses.
+
+        `cosines` are those between normals and light.
+        """
         behind = stack[np.arange(len(kinds))]
         enters = self.enters(kinds, cosines)
         filled = self.filled[kinds]
@@ -369,7 +375,10 @@ class Media:
 
 
 class LightInGrids(NamedTuple):
-    """Light that passes voxel grids, as arrays of shape (k,)."""
+    """Light that passes through voxel grids.
+
+    All arrays have shape (k,).
+    """
 
     row_indices: Indices  # rows of the light
     meters: Floats  # distance to the leaf that the light hits, or inf
@@ -380,19 +389,22 @@ class LightInGrids(NamedTuple):
 
 
 class Refraction(NamedTuple):
-    """Light behind surfaces.
+    """Result of refracting light at surfaces.
 
     Arrays have shape (n,), and arrays of vectors have shape (n, 3).
     """
 
     directions: Floats
-    # Share of the light, one way: transmitted light, or reflected light where light is reflected.
+    # Fraction of the light, one way: transmitted, or reflected where the light is reflected.
     shares: Floats | float
     totally_reflected: Bools  # whether light is totally reflected; its direction is then unchanged
 
 
 class Leaves(NamedTuple):
-    """Leaves that light hits, as arrays of shape (k,)."""
+    """Leaves that light hits.
+
+    All arrays have shape (k,).
+    """
 
     row_indices: Indices  # rows of the light
     meters: Floats  # distance from the start of the span to the leaf
@@ -413,7 +425,7 @@ class LightInMedia:
     remaining_depth: Floats | None  # (n,): optical depth to a leaf; None without leaves
 
     def __getitem__(self, row_indices: Integers) -> LightInMedia:
-        """Return the state of selected sub-rays."""
+        """Return the state of the selected sub-rays."""
         return LightInMedia(
             self.media,
             *select_rows((self.stack, self.differentials, self.remaining_depth), row_indices),
@@ -425,7 +437,7 @@ class LightInMedia:
         return 1.0 if self.differentials is None else self.differentials.index
 
     def optical_length(self, step: Floats) -> Floats:
-        """Return the optical path lengths of steps in meters."""
+        """Convert the lengths of steps to optical path lengths, both in meters."""
         return step if self.differentials is None else step * self.differentials.index
 
     def meet_leaves(
@@ -524,7 +536,7 @@ class LightInMedia:
         return LightInGrids(row_indices, meters, remaining_depth, media_density)
 
     def advance(self, step: Floats) -> None:
-        """Advance the light by steps in meters."""
+        """Advance the light by the given steps, in meters."""
         if self.differentials is not None:
             self.differentials.advance(step, self.media.attenuation(self.stack))
 
@@ -566,7 +578,7 @@ class LightInMedia:
         return Refraction(outgoing, shares, refraction.totally_reflected)
 
     def deflect(self, incoming: Floats, outgoing: Floats, normals: Floats, mirrored: Bools) -> None:
-        """Update the differentials at flat surfaces that change directions."""
+        """Update the differentials at flat surfaces that change the direction of light."""
         if self.differentials is not None:
             self.differentials.deflect(
                 incoming, outgoing, normals, mirrored, self.media.index(self.stack)
@@ -615,13 +627,12 @@ def random_depths(bits: NDArray[np.uint64]) -> Floats:
 
 @cache
 def _logs() -> Floats:
-    """Return the negative logarithms of equal steps from 1/2 to 1, rounded to single precision."""
+    """Return a table of negative logarithms between 1/2 and 1, rounded to single precision."""
     steps = (np.arange(1 << 15) + 0.5) / (1 << 16) + 0.5
     return -log(steps).astype(np.float32).astype(np.float64)
 
 
 def _away_from_zero(cosine: Floats) -> Floats:
-    """Replace cosines close to 0 by 1e-9."""
     return np.where(np.abs(cosine) > 1e-9, cosine, 1e-9)
 
 

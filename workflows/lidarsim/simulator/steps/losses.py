@@ -13,7 +13,7 @@ from .step import PulseBatch, PulseStep, Role, Setup
 
 
 class DirtStep(PulseStep):
-    """Attenuates light that passes through a dirty part of the window."""
+    """Simulation step that attenuates light passing through dirt on the window."""
 
     role = Role.CHANGES
     effects = ("Faults",)
@@ -22,11 +22,11 @@ class DirtStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if the window of the sensor has dirt."""
+        """Return whether the window of the sensor has dirt."""
         return bool(setup.faults("dirt"))
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the hits with energies reduced by dirt, which replace the hits of the batch."""
+        """Return the hits with their energies reduced by dirt, and store them in the batch."""
         sensor = self.setup.sensor
         beams = np.arange(batch.start, batch.stop)
         transmission = np.ones(len(beams))
@@ -46,7 +46,7 @@ class DirtStep(PulseStep):
 
 
 def _in_spot(fault: Fault, x: Floats, y: Floats, z: Floats) -> Bools:
-    """Return whether unit directions in the sensor frame pass through the dirt of a fault."""
+    """Return whether unit directions in the sensor frame pass through the given dirt."""
     begin, end = fault.azimuth_deg or (0, 360)
     half = ((end - begin) % 360 or 360) / 2
     lowest, highest = fault.elevation_deg or (-90, 90)
@@ -58,7 +58,7 @@ def _in_spot(fault: Fault, x: Floats, y: Floats, z: Floats) -> Bools:
 
 
 class LossStep(PulseStep):
-    """Drops returns of dead channels, lost packets, and scans missing from a frozen sweep."""
+    """Simulation step for dead channels, lost packets, and scans missing from frozen sweeps."""
 
     role = Role.CHANGES
     effects = ("Faults",)
@@ -67,11 +67,11 @@ class LossStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if the sensor has dead channels, lost packets or frozen sweeps."""
+        """Return whether the sensor has dead channels, lost packets or frozen sweeps."""
         return bool(setup.faults("dead_channels", "dropped_packets", "frozen"))
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns that are not lost."""
+        """Drop the lost returns of a batch."""
         from . import fault_loops  # imported here because numba takes half a second to import
 
         firings = batch.firings

@@ -16,16 +16,16 @@ from .random_loops import SHIFT_TO_INDEX, bits, uniform
 
 
 class ParticleTables(NamedTuple):
-    """Tables of a kind of detectable particles, as in `particles.DetectableParticles`."""
+    """Tables for one kind of detectable particle (`particles.DetectableParticles`)."""
 
     counts: Floats  # (k,): cumulative probabilities of 0, 1, … particles in a beam; the last is 1
     by_range: Floats  # (5, shares): rows as in `particles.DetectableParticles.by_range`
-    step_mm: float  # diameter that a share exp(-1) of the particles exceeds
+    step_mm: float  # diameter that a fraction exp(-1) of the particles exceeds
     exponential: Floats  # quantiles of the exponential distribution
 
 
 class FogTables(NamedTuple):
-    """Cells of detectable fog, as in `particles.FogCells`."""
+    """Cells of detectable fog (`particles.FogCells`)."""
 
     begin_m: float  # range of the first cell
     end_m: float  # range where fog ends
@@ -36,7 +36,7 @@ class FogTables(NamedTuple):
 
 @inlined
 def write_particle(ray, column, quantile, subrays, tables, hits, row):
-    """Write the hit of a particle on a sub-ray to a row of `hits`, a `SampledHits`.
+    """Write a sub-ray's hit on a particle to a row of `hits`, which is a `SampledHits`.
 
     `column` is the particle's column in `tables.by_range`. `quantile`, in [0, 1), is the quantile
     of its diameter among the particles that can be detected at this range.
@@ -54,7 +54,7 @@ def write_particle(ray, column, quantile, subrays, tables, hits, row):
 
 @compiled()
 def sample_particles(beam, stop, subrays, tables, keys, reach, hits):
-    """Sample the particles of a kind that beams `beam` to `stop` meet, until `hits` is full.
+    """Sample particles of one kind along beams `beam` to `stop` until `hits` is full.
 
     `tables` is a `ParticleTables`, `keys` a `RandomKeys`, and `reach` (beams * subrays,) is the
     range that the light of each sub-ray reaches, in meters. The function writes `SampledHits`, and

@@ -48,7 +48,7 @@ PARTICLE_RANGE = Purpose(13, "range of a particle")
 PARTICLE_DIAMETER = Purpose(14, "diameter of a particle")
 PARTICLE_SUBRAY = Purpose(15, "sub-ray that hits a particle")
 AIR = CAUSES.index("air")
-QUANTILES = 1 << 16  # number of equal shares of a distribution in tables
+QUANTILES = 1 << 16  # number of equal parts of a distribution in tables
 CACHED_TABLES = 32  # cached because a scanner rebuilds its casters whenever an object is moved
 MAX_FOG_CELLS = 255  # cells of half a pulse length
 # Probabilities are summed up to this many standard deviations below and above the highest signal.
@@ -56,18 +56,18 @@ TAIL_SIGMAS = 6.0
 
 
 class DetectableParticles(NamedTuple):
-    """Distribution of the detectable particles of a kind."""
+    """Distribution of the detectable particles of one kind."""
 
     counts: Floats  # (k,): cumulative probabilities of 0, 1, … particles in a beam
-    # (5, QUANTILES), with a column for each equal share of the particles by range: ascending
+    # (5, QUANTILES), with a column for each equal fraction of the particles by range: ascending
     # distances in meters, smallest detectable diameters in mm, 1 - exp(-slope * (largest -
     # smallest)), energies of a particle of 1 mm, and energies of a particle that fills the beam.
     by_range: Floats
-    step_mm: float  # 1 / slope, the diameter that a share exp(-1) of the particles exceeds
+    step_mm: float  # 1 / slope, the diameter that a fraction exp(-1) of the particles exceeds
 
 
 class FogCells(NamedTuple):
-    """Consecutive cells of detectable fog from the sensor on, each half a pulse long."""
+    """Consecutive cells of detectable fog, each half a pulse long, starting at the sensor."""
 
     begin_m: float  # range of the first cell
     cell_m: float  # length of a cell
@@ -78,7 +78,7 @@ class FogCells(NamedTuple):
 
 
 class WeatherStep(PulseStep):
-    """Samples the returns of rain, snow, fog and dust.
+    """Simulation step that samples the returns of rain, snow, fog and dust.
 
     Raises
     ------
@@ -122,12 +122,12 @@ class WeatherStep(PulseStep):
         )
 
     def with_moved_instances(self, setup: Setup, surfaces: SceneSurfaces) -> PulseStep:
-        """Return a copy for a scene with moved instances."""
+        """Return a copy for a scene in which instances have moved."""
         return self.with_setup(setup, surfaces)
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if the weather returns light that the sensor may detect."""
+        """Return whether the weather returns light that the sensor may detect."""
         return setup.survey.returns_light and setup.noise.detection_range_m is not None
 
     @staticmethod
@@ -186,7 +186,7 @@ class WeatherStep(PulseStep):
         return air_hits
 
     def _refracting(self, hits: PulseReturns) -> Indices:
-        """Return rows of hits on surfaces of refracting water and glass.
+        """Return the rows of hits on surfaces of refracting water and glass.
 
         In each ray, the first, third, … of these hits enter a body, and the others leave it.
         """
@@ -199,7 +199,7 @@ class WeatherStep(PulseStep):
         )
 
     def _in_refracting_bodies(self, hits: PulseReturns, ray: Ints, distance: Floats) -> Bools:
-        """Return whether points at distances along rays are inside water or glass."""
+        """Return whether points at the given distances along rays are inside water or glass."""
         row_indices = self._refracting(hits)
         surface_ray = hits.ray[row_indices]
         surface_distance = hits.distance[row_indices]
@@ -212,7 +212,7 @@ class WeatherStep(PulseStep):
         return np.asarray(count % 2 == 1)
 
     def _fog_ends(self, hits: PulseReturns, reach: Floats) -> Floats:
-        """Return the ranges in meters at which the fog in front of each sub-ray ends.
+        """Return the ranges, in meters, at which the fog on each sub-ray ends.
 
         Fog ends at `reach`, or where the sub-ray enters water or glass that is thicker than half
         the pulse length. Panes of glass do not end fog.
@@ -236,7 +236,7 @@ class WeatherStep(PulseStep):
 def light_reach(
     materials: MaterialTable, surfaces: SceneSurfaces, hits: PulseReturns, count: int
 ) -> Floats:
-    """Return the ranges in meters that the light of `count` sub-rays reaches.
+    """Return the ranges, in meters, that the light of `count` sub-rays reaches.
 
     This is the distance of a sub-ray's last surface hit. It is inf if there is no hit, or if the
     last surface transmits light. `hits.ray` are sub-rays, numbered from 0.
@@ -258,7 +258,7 @@ def light_reach(
 def add_air_hits(
     setup: Setup, returns: PulseReturns, batch: PulseBatch, air_hits: PulseReturns
 ) -> PulseReturns:
-    """Return the hits of a batch after adding hits in the air.
+    """Add hits in the air to the hits of a batch, and return its hits.
 
     With waveforms, hits in the air are inserted before the hits on surfaces. Otherwise they are
     stored in `batch.air` for `SeparationStep`.
@@ -280,14 +280,14 @@ def add_air_hits(
 
 
 def random_keys(seed: int, purposes: tuple[Purpose, ...], keys: Keys, first: int) -> RandomKeys:
-    """Return the random number keys of beams from number `first` on, for compiled loops."""
+    """Return the random number keys of the beams from number `first`, for compiled loops."""
     from .random_loops import RandomKeys
 
     return RandomKeys(starts(seed, *purposes), keys.scan, owned(keys.scan_starts, np.int64), first)
 
 
 def room_for_hits(size: int) -> SampledHits:
-    """Return arrays to which compiled loops write up to `size` hits."""
+    """Allocate arrays to which compiled loops write up to `size` hits."""
     from .pulse_loops import SampledHits
 
     return SampledHits(np.empty(size, np.int64), np.empty(size), np.empty(size))
@@ -296,7 +296,10 @@ def room_for_hits(size: int) -> SampledHits:
 def _particles(
     detectable: DetectableParticles, random: RandomKeys, subrays: int, reach: Floats
 ) -> Iterator[SampledHits]:
-    """Yield the hits of particles of a kind on sub-rays that reach `reach` in meters."""
+    """Yield hits on particles of one kind, in front of the ends of sub-rays.
+
+    `reach` (rays,) are the ranges of these ends in meters.
+    """
     from . import particle_loops  # imported here: numba takes half a second
 
     beams = len(reach) // subrays
@@ -313,7 +316,7 @@ def _particles(
 
 
 def _fog_hits(fog: FogCells, random: RandomKeys, subrays: int, reach: Floats) -> SampledHits:
-    """Return a fog hit on the first sub-ray of each beam that has fog.
+    """Return the fog hit on the first sub-ray of each beam that meets fog.
 
     `reach` (rays,) is the range in meters at which fog ends on each sub-ray.
     """
@@ -328,7 +331,7 @@ def _fog_hits(fog: FogCells, random: RandomKeys, subrays: int, reach: Floats) ->
 def insert_air_hits(
     hits: PulseReturns, planes: Planes | None, air_hits: PulseReturns
 ) -> tuple[PulseReturns, Planes | None]:
-    """Insert hits in the air before the surface hits of their rays, in both hits and planes.
+    """Insert hits in the air before the surface hits of their rays, into both hits and planes.
 
     Planes of hits in the air are 0. If `planes` is None, it stays None.
     """
@@ -344,7 +347,10 @@ def insert_air_hits(
 def _detectable(
     air: Air, kind: Particles, min_energy: float, min_range_m: float, max_range_m: float
 ) -> DetectableParticles | None:
-    """Return the distribution of particles that return at least `min_energy`, or None if empty."""
+    """Return the distribution of detectable particles, or None if no particle is detectable.
+
+    A particle is detectable if it returns at least `min_energy`.
+    """
     tables = seen_by_range(air, kind, min_energy, min_range_m, max_range_m)
     if tables is None:
         return None
@@ -381,7 +387,7 @@ def seen_by_range(
 
 
 def _poisson(mean: float) -> Floats:
-    """Return the cumulative Poisson probabilities of 0, 1, … events, ending with 1."""
+    """Return the cumulative Poisson probabilities of 0, 1, … events, the last of which is 1."""
     sums = []
     term = exp_of(-mean)
     count = 0
@@ -419,7 +425,7 @@ def _fog_cells(
 
 
 def highest_probabilities(signals: Floats) -> Floats:
-    """Return cumulative probabilities that each signal is the highest of the first n.
+    """Return the cumulative probabilities that each of the first n signals is the highest.
 
     `signals` (k,) are descending, with noise of standard deviation 1. Row n of the result (k + 1,
     k) is for the first n signals, and row 0 is 1.
@@ -450,6 +456,6 @@ def round_to_single(table: Floats) -> Floats:
 
 @cache
 def exponential_quantiles() -> Floats:
-    """Return the quantiles of the exponential distribution at the centers of equal shares."""
+    """Return the exponential distribution's quantiles at the centers of equal intervals."""
     shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
     return round_to_single(-log1p(-shares))

@@ -17,14 +17,17 @@ SLOPE = 0.5  # largest gap between planes of one surface, relative to the distan
 
 
 class SampledHits(NamedTuple):
-    """Arrays of shape (k,) to which loops write sampled hits of sub-rays."""
+    """Sampled hits on sub-rays, to which loops write.
+
+    All arrays have shape (k,).
+    """
 
     ray: Ints  # sub-ray
     distance: Floats  # meters
     energy: Floats
 
     def first(self, count: int) -> SampledHits:
-        """Return the first `count` hits, which a loop has written."""
+        """Return the first `count` hits."""
         return SampledHits(self.ray[:count], self.distance[:count], self.energy[:count])
 
 
@@ -41,7 +44,10 @@ class SubrayNeighbors(NamedTuple):
 
 
 class SurfaceMarks(NamedTuple):
-    """Marks of hits in the order of `PulseHits`, each of shape (n,)."""
+    """Marks of hits, in the order of `PulseHits`.
+
+    All arrays have shape (n,).
+    """
 
     solid: Bools  # whether the hit is on a surface that may continue
     starts_return: Bools  # whether a return starts at the hit
@@ -49,7 +55,10 @@ class SurfaceMarks(NamedTuple):
 
 
 class PulseHits(NamedTuple):
-    """Hits sorted by beam and distance, each array of shape (n,), and scratch memory."""
+    """Hits sorted by beam and distance, and scratch memory.
+
+    The arrays of hits have shape (n,).
+    """
 
     subray: Ints  # number among the sub-rays of all beams
     distance: Floats  # meters
@@ -60,7 +69,7 @@ class PulseHits(NamedTuple):
 
 @inlined
 def beam_of(ray, subrays):
-    """Return the beam that a sub-ray belongs to."""
+    """Return the beam of a sub-ray, given the number of sub-rays per beam."""
     return ray if subrays == 1 else ray // subrays  # the division would take most of the time
 
 
@@ -74,7 +83,7 @@ def scan_row(scan_starts, beam, row):
 
 @compiled()
 def thin_out(ray, scan_starts, keep_every, hit_counts, row_indices, number, return_counts):
-    """Count the returns of each scan, and select every `keep_every`-th return of a scan.
+    """Count the returns of each scan, and select every `keep_every`-th return.
 
     Scans begin at the rays `scan_starts`, and their counts are added to `hit_counts`. For each kept
     return, the function writes the row to `row_indices`, the number in the pulse (from 1) to
@@ -102,7 +111,7 @@ def thin_out(ray, scan_starts, keep_every, hit_counts, row_indices, number, retu
 
 @inlined
 def _half_way(hit, neighbor, inverse_distance, neighbors):
-    """Return the range in meters of the plane of a hit, half-way to a neighboring hit.
+    """Return the range of a hit's plane, in meters, midway to the ray of a neighboring hit.
 
     `hit` and `neighbor` are rows in `SubrayNeighbors`, and `inverse_distance` is that of `hit`, in
     1/m.
@@ -124,11 +133,11 @@ def _half_way(hit, neighbor, inverse_distance, neighbors):
 
 @noinline
 def continue_surfaces(begin, stop, marks, hits, gap_m, neighbors):  # noqa: C901, PLR0914 - a compiled loop
-    """Clear `marks.starts_surface` where a hit of a beam continues the previous hit's surface.
+    """Clear `marks.starts_surface` at hits that continue the surface of the beam's previous hit.
 
     The hits of the beam are rows `begin` to `stop` of `hits`, a `PulseHits`, and of `marks`, a
     `SurfaceMarks`. Only `solid` hits are considered. Two neighboring sub-rays hit the same surface
-    if the planes through their hits meet half-way between the hits, within `gap_m` or within half
+    if the planes through their hits meet halfway between the hits, within `gap_m` or within half
     of the distance between the hits. The inverse range of a plane is linear in the ray's direction,
     so two hits on one plane always meet, whatever the angle. The tolerance of half the distance
     allows for rough ground.

@@ -21,12 +21,12 @@ _11 = np.uint64(11)
 _FIRST_FACTOR = np.uint64(0xBF58476D1CE4E5B9)
 _SECOND_FACTOR = np.uint64(0x94D049BB133111EB)
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)
-_NUMBERS = np.uint64(256)  # largest number of random numbers of a ray for one purpose
+_NUMBERS = np.uint64(256)  # maximum number of random numbers of a ray for one purpose
 _NEXT = np.uint64(1)
 
 
 class RandomKeys(NamedTuple):
-    """Keys of the random numbers of consecutive beams."""
+    """Keys for the random numbers of consecutive beams."""
 
     starts: AnyArray  # uint64 (purposes,), from `random_numbers.starts`; empty if none are needed
     scan: int  # number of the first scan
@@ -36,7 +36,7 @@ class RandomKeys(NamedTuple):
 
 @inlined
 def _mixed(x):
-    """Apply the last step of SplitMix64 to a 64-bit number, as `random_numbers._mixed` does."""
+    """Apply the final step of SplitMix64 to a 64-bit number, like `random_numbers._mixed`."""
     x = (x ^ (x >> _30)) * _FIRST_FACTOR
     x = (x ^ (x >> _27)) * _SECOND_FACTOR
     return x ^ (x >> _31)
@@ -44,12 +44,12 @@ def _mixed(x):
 
 @inlined
 def bits(start, scan, ray, number):
-    """Return 64 random bits, determined by the hash start of a purpose, a ray and a number."""
+    """Return 64 random bits for a purpose (given by its hash start), a ray and a number."""
     scan_state = _mixed(start + np.uint64(scan) * _GAMMA)
     return _mixed(scan_state + (np.uint64(ray) * _NUMBERS + np.uint64(number) + _NEXT) * _GAMMA)
 
 
 @inlined
 def uniform(start, scan, ray, number):
-    """Return a uniform random number in [0, 1), a multiple of 2**-53."""
+    """Return a uniform random number in [0, 1) that is a multiple of 2**-53."""
     return np.float64(bits(start, scan, ray, number) >> _11) * 2.0**-53

@@ -1,4 +1,4 @@
-"""Range errors, which comprise noise, range walk, and lasting errors.
+"""Range errors: noise, range walk and lasting errors.
 
 The noise is larger for weak returns.
 """
@@ -19,7 +19,7 @@ CHANNEL = Purpose(60, "range error of a channel")
 
 
 class RangeNoiseStep(PulseStep):
-    """Adds errors to the ranges of reported returns."""
+    """Simulation step that adds errors to the reported ranges."""
 
     role = Role.ON_REPORTED
     effects = "Weak returns and range walk", "Systematic errors"
@@ -29,11 +29,11 @@ class RangeNoiseStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if the noise changes ranges."""
+        """Return whether the noise changes ranges."""
         return setup.noise.has_range_errors
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns with their reported ranges."""
+        """Add reported ranges to the returns of a batch."""
         # The leading edge of a clipped pulse is the same as that of the whole pulse.
         height = returns.height if self.setup.in_waveforms else returns.energy
         scan, ray = batch.keys.scan_and_number(returns.ray)
@@ -54,7 +54,7 @@ def noisy_ranges(
     ray: Integers,
     number: Integers,
 ) -> Floats:
-    """Return the reported ranges of returns in meters, which are at least 0.
+    """Return the reported ranges in meters, which are at least 0.
 
     `distance` (n,) is in meters. `energy` (n,) is the energy, or the height of the return in a
     waveform. It may be None if neither noise nor range walk depends on it. `scan`, `ray` and
@@ -72,7 +72,7 @@ def noisy_ranges(
 
 
 def range_walk(noise: Noise, energy: Floats) -> Floats:
-    """Return the range walk of returns in meters, relative to a return at the threshold.
+    """Return the range walk in meters, relative to a return at the detection threshold.
 
     A Gaussian pulse whose height is ``energy / threshold`` times a fixed threshold crosses the
     threshold √(2 ln(energy / threshold)) standard deviations before its maximum.
@@ -82,7 +82,10 @@ def range_walk(noise: Noise, energy: Floats) -> Floats:
 
 
 def lasting_errors(noise: Noise, channel: Integers, times_ns: Ints) -> Floats:
-    """Return the lasting range errors in meters for channels and times since the survey start."""
+    """Return the lasting range errors, in meters, for the given channels and times.
+
+    `times_ns` are nanoseconds since the start of the survey.
+    """
     biases = np.asarray(noise.channel_bias_m, np.float64)
     if not biases.ndim:
         channels = np.arange(channel.max(initial=0) + 1)

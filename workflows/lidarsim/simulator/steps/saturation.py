@@ -15,7 +15,7 @@ _HALF_WIDTH_M_NS = LIGHT_M_NS / 4  # half of a pulse's width in meters of range,
 
 
 class SaturationStep(PulseStep):
-    """Clips and widens pulses that saturate the receiver, and merges them with hidden returns."""
+    """Simulation step that clips and widens strong pulses, and merges the returns they hide."""
 
     role = Role.RECEIVES
     effects = ("Saturation",)
@@ -24,16 +24,16 @@ class SaturationStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if the noise of the sensor includes saturation."""
+        """Return whether the noise of the sensor includes saturation."""
         return setup.noise.saturation is not None
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the memory of widths, amplitudes and merged returns, in bytes."""
+        """Return the memory of the widths, amplitudes and merged returns, in bytes."""
         return Memory(retained=16 * sizes.return_count, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns of a batch after saturation."""
+        """Apply saturation to the returns of a batch."""
         setup = self.setup
         optics = self.setup.sensor.optics
         pulse_ns = setup.reporting.length_ns(optics)

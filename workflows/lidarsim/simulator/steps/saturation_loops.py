@@ -12,7 +12,10 @@ from ...numerics.arrays import Bools, Floats, Ints
 
 
 class PulseExtents(NamedTuple):
-    """Returns of pulses sorted by ray and distance, each array of shape (n,)."""
+    """Returns of pulses, sorted by ray and distance.
+
+    All arrays have shape (n,).
+    """
 
     ray: Ints
     clipped: Bools  # whether the return saturates the receiver
@@ -25,7 +28,7 @@ class PulseExtents(NamedTuple):
 
 @compiled()
 def join_clipped(pulses, remains):
-    """Merge overlapping returns of a pulse if one of them is clipped, and mark what remains.
+    """Merge overlapping returns of a pulse if any is clipped, and mark the returns that remain.
 
     The highest of the merged returns remains, with the total energy of all merged returns, and with
     the outermost edges and the smallest distance of the clipped returns. These values are written

@@ -1,4 +1,4 @@
-"""Combine hits that a receiver cannot separate into returns, and select reported returns."""
+"""Combine inseparable hits into returns, and select the returns to report."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _NO_VALUES = np.zeros(0)
 
 
 class Reporting(NamedTuple):
-    """Detection and selection of returns."""
+    """Settings for the detection and selection of returns."""
 
     mode: Mode = "all"
     noise: Noise | None = None  # noise that makes returns undetected; None if all are detected
@@ -53,7 +53,7 @@ def separate_hits(
     air: PulseReturns | None = None,
     reporting: Reporting | None = None,
 ) -> PulseReturns:
-    """Combine the hits of each beam that a receiver cannot separate into returns.
+    """Combine hits of a beam into one return where the receiver cannot separate them.
 
     Hits of a beam form a single return if each is within `gap_m` of the next. Hits of neighboring
     sub-rays on one surface also form a single return, however far apart they are: a beam that
@@ -146,7 +146,7 @@ def _detection_keys(reporting: Reporting) -> RandomKeys:
 
 
 def _columns(hits: PulseReturns, air_hits: PulseReturns, output: ReturnArrays) -> PulseReturns:
-    """Return the columns of returns from their strongest hits, on surfaces or in the air."""
+    """Return the columns of returns, taken from the strongest hit of each."""
     row = output.row
     if len(hits.ray):
         columns = hits.triangle, hits.color, hits.cause
@@ -168,7 +168,7 @@ def _columns(hits: PulseReturns, air_hits: PulseReturns, output: ReturnArrays) -
 
 
 def _subray_hits(hits: PulseReturns, solid: Bools, *, with_velocity: bool) -> SubrayHits:
-    """Return hits for compiled loops, with velocities on request.
+    """Convert hits for compiled loops, optionally with velocities.
 
     `solid` (n,) states whether each hit is on a surface. It is empty for hits in the air.
     """
@@ -185,7 +185,7 @@ def _subray_hits(hits: PulseReturns, solid: Bools, *, with_velocity: bool) -> Su
 
 
 def neighbors_of(subrays: int, planes: Planes | None) -> SubrayNeighbors:
-    """Return neighboring sub-rays and planes for compiled loops.
+    """Return the neighboring sub-rays and the planes of hits, for compiled loops.
 
     Without planes, no surface continues from sub-ray to sub-ray.
     """
@@ -200,7 +200,7 @@ def neighbors_of(subrays: int, planes: Planes | None) -> SubrayNeighbors:
 
 
 class SeparationStep(PulseStep):
-    """Combines hits into returns by distance, and keeps the detected and reported returns."""
+    """Simulation step that combines nearby hits into returns, and keeps those to be reported."""
 
     role = Role.FRAME
     reads = "ray", "distance", "triangle", "energy", "velocity"
@@ -209,11 +209,11 @@ class SeparationStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if rays may have several returns or none, and waveforms are not used."""
+        """Return whether rays may have several returns or none, and waveforms are not used."""
         return setup.return_count_varies and not setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns of the hits of a batch."""
+        """Combine the hits of a batch into returns."""
         setup = self.setup
         # If the receiver adds or merges returns, `SelectionStep` selects the reported returns.
         mode: Mode = "all" if setup.has_received_returns else setup.reporting.mode
@@ -229,23 +229,23 @@ class SeparationStep(PulseStep):
 
 
 class SelectionStep(PulseStep):
-    """Selects the reported returns of a pulse after the receiver has added or merged returns."""
+    """Simulation step that selects the returns to report after the receiver adds or merges some."""
 
     role = Role.FRAME
     reads = "ray", "energy", "amplitude"
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if the receiver adds or merges returns before the selection."""
+        """Return whether the receiver adds or merges returns before the selection."""
         return setup.has_received_returns
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the reported returns of a batch."""
+        """Keep the reported returns of a batch."""
         return returns.take(reported_mask(returns, self.setup.reporting.mode))
 
 
 def reported_mask(returns: PulseReturns, mode: Mode) -> Bools:
-    """Return whether a mode reports each return."""
+    """Return whether each return is reported in the given mode."""
     from . import separation_loops
 
     shown = np.empty(len(returns.ray), np.bool_)

@@ -20,7 +20,10 @@ ALL, FIRST, LAST, STRONGEST, DUAL, TWO_STRONGEST = range(6)
 
 
 class SubrayHits(NamedTuple):
-    """Hits sorted by sub-ray, each array of shape (n,)."""
+    """Hits sorted by sub-ray.
+
+    All arrays have shape (n,).
+    """
 
     ray: Ints  # sub-ray
     distance: Floats  # meters
@@ -30,13 +33,13 @@ class SubrayHits(NamedTuple):
 
 
 class Receiver(NamedTuple):
-    """Resolution, detection and reporting of a receiver."""
+    """Receiver settings for resolution, detection and reporting."""
 
     subrays: int  # number of sub-rays per beam
     gap_m: float  # half of the pulse length; closer hits form one return
     mode: int  # which returns are reported
     with_velocity: bool  # whether returns have velocities
-    dropout: float  # share of returns that are lost
+    dropout: float  # fraction of returns that are lost
     threshold: float  # energy at which half of the returns are detected; 0 without detection
     threshold_sigmas: float  # threshold in standard deviations of the noise
     quantiles: Floats  # quantiles of the normal distribution; empty without detection
@@ -45,7 +48,7 @@ class Receiver(NamedTuple):
 class _Detection(NamedTuple):
     """Detection settings of a `Receiver`, and the hash starts of its random numbers."""
 
-    dropout: float  # share of returns that are lost
+    dropout: float  # fraction of returns that are lost
     threshold: float  # energy at which half of the returns are detected; 0 without detection
     threshold_sigmas: float  # threshold in standard deviations of the noise
     quantiles: Floats  # pointer to the quantiles of the normal distribution
@@ -56,7 +59,10 @@ class _Detection(NamedTuple):
 
 
 class ReturnArrays(NamedTuple):
-    """Arrays of shape (k,) to which returns are written."""
+    """Output arrays for returns.
+
+    All arrays have shape (k,).
+    """
 
     beam: Ints  # number of the ray in the scans, counted from sub-ray 0
     row: Ints  # row of the strongest hit; -1, -2, … for hits in the air
@@ -65,7 +71,7 @@ class ReturnArrays(NamedTuple):
     velocity: Floats  # radial, m/s
 
     def first(self, count: int) -> ReturnArrays:
-        """Return copies of the first `count` returns, which a loop has written."""
+        """Return copies of the first `count` returns."""
         return ReturnArrays(
             self.beam[:count].copy(),
             self.row[:count].copy(),
@@ -76,7 +82,7 @@ class ReturnArrays(NamedTuple):
 
 
 class _BeamRows(NamedTuple):
-    """Rows of the hits of a beam on surfaces and in the air."""
+    """Row ranges of a beam's hits on surfaces and in the air."""
 
     start: int
     stop: int
@@ -85,7 +91,7 @@ class _BeamRows(NamedTuple):
 
 
 class _BeamScratch(NamedTuple):
-    """Scratch memory for the hits and returns of a beam."""
+    """Scratch memory for the hits and returns of one beam."""
 
     hits: PulseHits  # row[k, 0] is the row on surfaces, or -1, -2, … in the air
     marks: SurfaceMarks
@@ -98,7 +104,7 @@ class _BeamScratch(NamedTuple):
 # tuples, which takes as long as the rest of the loop.
 @inlined
 def _pointers_to_hits(hits):
-    """Return a `SubrayHits` of pointers to the arrays of `hits`, which must stay alive."""
+    """Return a `SubrayHits` with pointers to the arrays of `hits`, which must stay alive."""
     return SubrayHits(
         int64s(hits.ray.ctypes.data),
         float64s(hits.distance.ctypes.data),
@@ -110,7 +116,7 @@ def _pointers_to_hits(hits):
 
 @inlined
 def _pointers_to_returns(output):
-    """Return a `ReturnArrays` of pointers to the arrays of `output`, which must stay alive."""
+    """Return a `ReturnArrays` with pointers to the arrays of `output`, which must stay alive."""
     return ReturnArrays(
         int64s(output.beam.ctypes.data),
         int64s(output.row.ctypes.data),
@@ -122,7 +128,7 @@ def _pointers_to_returns(output):
 
 @noinline
 def _max_hits(ray, subrays):
-    """Return the largest number of hits of a beam."""
+    """Return the maximum number of hits in a beam."""
     max_count = 0
     begin = 0
     end = -1
@@ -136,7 +142,6 @@ def _max_hits(ray, subrays):
 
 @noinline
 def _room_for_hits(size, subrays):
-    """Return scratch memory for up to `size` hits of a beam."""
     pulse_hits = PulseHits(
         np.empty(size, np.int64),
         np.empty(size),
@@ -156,7 +161,7 @@ def _room_for_hits(size, subrays):
 
 @inlined
 def _end_of_beam(ray, size, row, end_ray):
-    """Return the first row, from `row` on, whose sub-ray is at least `end_ray`."""
+    """Return the first row, starting at `row`, whose sub-ray is at least `end_ray`."""
     while row < size and ray[row] < end_ray:
         row += 1
     return row
@@ -164,7 +169,7 @@ def _end_of_beam(ray, size, row, end_ray):
 
 @inlined
 def _single_return(hits, beam_rows, beam, receiver, count, output):
-    """Write the return of a beam if all of its surface hits are within the receiver's gap.
+    """Write a single return for a beam if its surface hits are all within the receiver's gap.
 
     Returns whether the hits are within the gap, and the number of returns written so far.
     """
@@ -296,7 +301,10 @@ def _mark_returns(hits, air, count, exceeds_gap, receiver, neighbors, scratch):
 
 @inlined
 def _write_returns(hit_count, beam, receiver, scratch, count, output):
-    """Write the returns of the first `hit_count` hits in `scratch`, and return their number."""
+    """Write the returns of the first `hit_count` hits in `scratch`.
+
+    Return the number of returns.
+    """
     row = scratch.hits.row
     distance = scratch.hits.distance
     starts_return = scratch.marks.starts_return
@@ -330,7 +338,7 @@ def _write_returns(hit_count, beam, receiver, scratch, count, output):
 
 @inlined
 def _keep(output, k, count):
-    """Move return `k` to the end of the `count` kept returns, and return the new count."""
+    """Move return `k` behind the `count` kept returns, and return the new count."""
     output.beam[count] = output.beam[k]
     output.row[count] = output.row[k]
     output.distance[count] = output.distance[k]
@@ -341,7 +349,10 @@ def _keep(output, k, count):
 
 @inlined
 def _detection_of(receiver, starts):
-    """Return the detection settings of a receiver. `starts` is empty if no returns are lost."""
+    """Return the detection settings of a receiver.
+
+    `starts` is empty if no returns are lost.
+    """
     loses = len(starts) > 0
     count = len(receiver.quantiles)
     return _Detection(
@@ -381,7 +392,7 @@ def _detected(energy, scan, number_in_scan, return_index, detection):
 
 @inlined
 def _keep_detected(begin, stop, scan, number_in_scan, detection, output):
-    """Keep the detected returns of a beam, rows `begin` to `stop`, and return the next free row.
+    """Keep the detected returns among rows `begin` to `stop`. Return the next free row.
 
     `scan` and the beam's `number_in_scan` are keys of the random numbers (`_detected`).
     """
@@ -394,7 +405,7 @@ def _keep_detected(begin, stop, scan, number_in_scan, detection, output):
 
 @noinline
 def _mark(energy, begin, stop, mode, shown):
-    """Mark the returns of a pulse that a mode reports.
+    """Mark the returns of a pulse that are reported in the given mode.
 
     Among returns of equal strength, the closest one is preferred.
 
@@ -419,13 +430,13 @@ def _mark(energy, begin, stop, mode, shown):
 
 @inlined
 def _start_of_scan(scan_starts, row):
-    """Return the first beam of a scan, or a very large number after the last scan."""
+    """Return the first beam of a scan, or the largest integer after the last scan."""
     return scan_starts[row] if row < len(scan_starts) else np.iinfo(np.int64).max
 
 
 @inlined
 def _keep_reported(begin, stop, mode, scratch, output):
-    """Keep the returns of a beam that a mode reports, and return the next free row."""
+    """Keep the returns of a beam that are reported in the given mode. Return the next free row."""
     for k in range(begin, stop):
         scratch.energy[k - begin] = output.energy[k]
     _mark(scratch.energy, 0, stop - begin, mode, scratch.shown)
@@ -438,7 +449,10 @@ def _keep_reported(begin, stop, mode, scratch, output):
 
 @compiled()
 def mark_reported(ray, energy, mode, shown):
-    """Mark in `shown` which returns, sorted by ray, a mode reports."""
+    """Mark in `shown` the returns that are reported in the given mode.
+
+    The returns are sorted by ray.
+    """
     begin = 0
     while begin < len(ray):
         stop = begin + 1
@@ -450,7 +464,7 @@ def mark_reported(ray, energy, mode, shown):
 
 @compiled()
 def separate(hits, air, neighbors, receiver, keys, output):  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write the returns of beams to `output`, for `separation.separate_hits`.
+    """Combine the hits of beams into returns, and write these to `output`.
 
     `hits` and `air` are `SubrayHits` on surfaces and in the air, `neighbors` is a
     `SubrayNeighbors`, `receiver` a `Receiver`, and `output` a `ReturnArrays`. `keys` is a

@@ -1,4 +1,4 @@
-"""Spray, which consists of clumps of drops that vehicles leave behind on wet ground.
+"""Spray: clumps of drops that vehicles leave behind on wet ground.
 
 Every tenth of a second, each vehicle leaves a box of spray that is as wide and high as the vehicle,
 and as long as the distance that it has driven. A box stays in place while its drops fall to the
@@ -58,7 +58,7 @@ STEP_NS = 5e5  # time between the two poses from which a vehicle's velocity is c
 
 
 class SprayStep(PulseStep):
-    """Samples the returns of spray behind vehicles, and attenuates light that passes spray.
+    """Simulation step that samples returns of spray, and attenuates light that passes through it.
 
     Raises
     ------
@@ -98,12 +98,12 @@ class SprayStep(PulseStep):
         self._raising = [n for n, actor in enumerate(setup.scene.actors) if actor.spray]
 
     def with_moved_instances(self, setup: Setup, surfaces: SceneSurfaces) -> PulseStep:
-        """Return a copy for a scene with moved instances."""
+        """Return a copy for a scene in which instances have moved."""
         return self.with_setup(setup, surfaces)
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if spray is enabled and an actor raises spray."""
+        """Return whether spray is enabled and an actor raises spray."""
         actors = setup.scene.actors
         return setup.survey.spray_g_m3 > 0 and any(actor.spray for actor in actors)
 
@@ -118,7 +118,7 @@ class SprayStep(PulseStep):
         return Memory(casting=300 * sizes.beams + 30 * sizes.subrays)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Add hits on spray to the hits of a batch, and attenuate the light that passes spray."""
+        """Add hits on spray to the hits of a batch, and attenuate light that crosses spray."""
         if self._clump_distribution is None:
             return returns
         from . import pulse_loops, spray_loops  # imported here: numba takes half a second to import
@@ -140,7 +140,7 @@ class SprayStep(PulseStep):
     def _sample_clumps(
         self, returns: PulseReturns, batch: PulseBatch, crossings: BoxCrossings, reach_m: Floats
     ) -> PulseReturns:
-        """Return the hits on clumps in the boxes that beams cross, sorted by sub-ray."""
+        """Sample hits on clumps in the boxes that beams cross, sorted by sub-ray."""
         from . import spray_loops
 
         assert self._clump_distribution is not None
@@ -165,7 +165,7 @@ class SprayStep(PulseStep):
         return clumps.take(np.argsort(clumps.ray, kind="stable"))
 
     def _crossings(self, batch: PulseBatch, reach_m: Floats) -> BoxCrossings:
-        """Return the crossings of the central rays of beams with boxes.
+        """Return where the central rays of beams cross boxes.
 
         `reach_m` (beams,) is the range in meters at which each beam ends. The crossings of a beam
         are consecutive, sorted by vehicle and then by the time at which the vehicle leaves the box.
@@ -228,7 +228,7 @@ class SprayStep(PulseStep):
     def _boxes_of(
         self, trajectories: ActorTrajectories, actor: Ints, created_ns: Floats, pose_ns: Floats
     ) -> tuple[Floats, Floats]:
-        """Return the boxes that actors leave at `created_ns`, and the actors' speeds in m/s.
+        """Return the boxes that actors leave at the given times, and the actors' speeds in m/s.
 
         Each row of the boxes (b, 12) is a center and three vectors, half of the box's sides, in
         meters in the scene frame. A box starts at the rear of the actor. Along the actor's x axis,

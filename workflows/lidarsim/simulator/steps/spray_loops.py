@@ -16,12 +16,15 @@ from .particle_loops import write_particle
 from .pulse_loops import beam_of, scan_row
 from .random_loops import SHIFT_TO_INDEX, bits, uniform
 
-MAX_CLUMPS = 255  # largest number of clumps that a beam can meet, limited by its random numbers
+MAX_CLUMPS = 255  # maximum number of clumps that a beam can meet, limited by its random numbers
 _GUIDE_PARTS = 1024  # number of parts of a lookup table for columns
 
 
 class BoxPairs(NamedTuple):
-    """Pairs of a cell of consecutive rays and a box that may meet, sorted by cell."""
+    """Pairs of a box and a cell of rays that may meet it, sorted by cell.
+
+    A cell consists of consecutive rays.
+    """
 
     cell: Ints  # (p,): number of the cell
     box: Ints  # (p,): row of `SprayBoxes`
@@ -42,7 +45,7 @@ class SprayBoxes(NamedTuple):
 
 
 class BoxCrossings(NamedTuple):
-    """Crossings of beams and boxes.
+    """Intervals in which beams are inside boxes.
 
     The crossings of a beam are consecutive.
     """
@@ -54,17 +57,16 @@ class BoxCrossings(NamedTuple):
 
 
 class ClumpTables(NamedTuple):
-    """Tables of detectable clumps of spray, as in `particles.DetectableParticles`."""
+    """Tables of detectable clumps of spray (`particles.DetectableParticles`)."""
 
     mean: float  # detectable clumps per beam in air of density `Survey.spray_g_m3`
-    by_range: Floats  # (5, shares): columns of ascending range that hold equal shares of `mean`
-    step_mm: float  # diameter that a share exp(-1) of the drops exceeds
+    by_range: Floats  # (5, shares): columns of ascending range that hold equal fractions of `mean`
+    step_mm: float  # diameter that a fraction exp(-1) of the drops exceeds
     exponential: Floats  # quantiles of the exponential distribution
 
 
 @noinline
 def _ball_radii(boxes):
-    """Return the radii in meters of the bounding spheres of boxes."""
     radii = np.zeros(len(boxes))
     for b in range(len(boxes)):
         for side in range(3, 12):
@@ -75,7 +77,7 @@ def _ball_radii(boxes):
 
 @inlined
 def _span_in_box(boxes, b, to_middle, direction, reach_m):  # noqa: PLR0914 - a compiled loop
-    """Return the distances at which a ray enters and leaves a box, in meters.
+    """Return the distances, in meters, at which a ray enters and leaves a box.
 
     The distances are ascending only if the ray meets the box. `to_middle` is the vector from the
     ray's origin to the center of the box.
@@ -103,7 +105,7 @@ def _span_in_box(boxes, b, to_middle, direction, reach_m):  # noqa: PLR0914 - a 
 
 @inlined
 def _write_crossing(k, b, time, span, spray_boxes, crossings, count):
-    """Write a crossing of ray `k` and box `b` to row `count` if `crossings` is large enough.
+    """Write the crossing of ray `k` through box `b` to row `count` if there is room for it.
 
     `span` is the result of `_span_in_box`, and `time` is the time of the ray in nanoseconds.
     """
@@ -119,7 +121,7 @@ def _write_crossing(k, b, time, span, spray_boxes, crossings, count):
 
 @compiled()
 def find_crossings(rays, times, reach, pairs, spray_boxes, crossings):  # noqa: PLR0914 - a compiled loop
-    """Write where rays cross boxes, and return the number of crossings.
+    """Write the crossings of rays through boxes, and return their number.
 
     `rays` (6, n) are origins and directions, `times` (n,) are in nanoseconds, and `reach` (n,) are
     the lengths of the rays in meters. `pairs` is a `BoxPairs`, and `spray_boxes` a `SprayBoxes`.
@@ -164,7 +166,7 @@ def find_crossings(rays, times, reach, pairs, spray_boxes, crossings):  # noqa: 
 
 @noinline
 def _column(ranges, guide, part_m, distance):
-    """Return the first column at the given distance or farther.
+    """Return the first column whose range is at least the given distance.
 
     `ranges` are the ascending ranges of the columns in meters. The search starts at the column that
     `guide` has for the distance (`_guide`), where `part_m` is the length of a guide part. A search
@@ -178,7 +180,7 @@ def _column(ranges, guide, part_m, distance):
 
 @noinline
 def _guide(ranges, part_m):
-    """Return the columns at which searches for distances start.
+    """Return the columns at which searches for a distance start.
 
     `guide[k]` is the first column at ``(k - 1) * part_m`` or farther. It is one part early, so that
     a rounded distance never starts its search too late.
@@ -191,7 +193,7 @@ def _guide(ranges, part_m):
 
 @compiled()
 def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Sample the clumps of spray that beams meet, from crossing `k` on, until `hits` is full.
+    """Sample clumps of spray on beams, starting at crossing `k`, until `hits` is full.
 
     `tables` is a `ClumpTables`, `keys` a `RandomKeys`, and `reach` (beams * subrays,) is the range
     in meters that the light of each sub-ray reaches. The depth between two clumps, measured as the
@@ -255,7 +257,7 @@ def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PL
 
 @compiled()
 def attenuate(crossings, subrays, extinction, reach, hits):
-    """Multiply the energies of surface hits by the two-way transmission of spray.
+    """Multiply the energies of surface hits by the two-way transmission through spray.
 
     `hits` is a `SampledHits`, `extinction` is the extinction in 1/m of spray of density 1, and
     `reach` (beams * subrays,) is the range in meters that the light of each sub-ray reaches.

@@ -1,4 +1,4 @@
-"""Interface of the simulation steps, each of which is one effect on the pulses of a sensor.
+"""Interface of the simulation steps. Each step is one effect on the pulses of a sensor.
 
 `step_list.py` lists the steps in their order. A step is a class that declares its role, when it
 applies, the columns that it reads and writes, its random numbers and its memory. Nothing else
@@ -33,7 +33,7 @@ from ..returns import Keys, Planes, PulseReturns
 
 
 class Role(Flag):
-    """Kinds of effects on pulses.
+    """Roles of simulation steps.
 
     Each step declares one or more flags.
     """
@@ -50,7 +50,7 @@ class Role(Flag):
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """A sensor of a survey in a scene, which determines the steps that apply."""
+    """A sensor of a survey in a scene, which determines the simulation steps that apply."""
 
     scene: Scene
     survey: Survey
@@ -60,22 +60,22 @@ class Setup:
 
     @property
     def sensor(self) -> Sensor:
-        """Sensor that is simulated."""
+        """The simulated sensor."""
         return self.survey.carried[self.number].sensor
 
     @property
     def noise(self) -> Noise:
-        """Noise of the sensor."""
+        """Noise settings of the sensor."""
         return self.survey.noise_each[self.number]
 
     @property
     def reporting(self) -> Returns:
-        """Beam profile of the sensor, and the mode that selects the reported returns."""
+        """Beam profile of the sensor, and the mode that selects its reported returns."""
         return self.survey.returns_each[self.number]
 
     @property
     def half_pulse_m(self) -> float:
-        """Half of the pulse length in meters, which is the smallest gap between two returns."""
+        """Half the pulse length in meters, which is the smallest gap between two returns."""
         return self.reporting.min_gap_m(self.sensor.optics)
 
     @property
@@ -131,7 +131,7 @@ class Setup:
         return self.has_role(Role.RECEIVES)
 
     def has_role(self, roles: Role) -> bool:
-        """Return True if any step that applies has one of the roles.
+        """Return whether any step that applies has one of the roles.
 
         Raises
         ------
@@ -143,7 +143,7 @@ class Setup:
         return bool(self.roles & roles)
 
     def faults(self, *kinds: FaultKind) -> dict[int, Fault]:
-        """Return the sensor's faults of the given kinds, by their number in the survey."""
+        """Return the sensor's faults of the given kinds, keyed by their number in the survey."""
         return self.survey.sensor_faults(self.number, *kinds)
 
 
@@ -158,7 +158,7 @@ class Sizes(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """Peak memory of casting in bytes."""
+    """Peak memory of casting, in bytes."""
 
     retained: float = 0.0  # from the step until columns are computed from the returns
     casting: float = 0.0  # while the beams of a `PulseBatch` are cast
@@ -167,7 +167,7 @@ class Memory(NamedTuple):
 
 
 class Emitter:
-    """Divides the beams of a sensor into sub-rays."""
+    """Division of a sensor's beams into sub-rays."""
 
     def __init__(self, setup: Setup) -> None:
         self.beam = setup.reporting.beam(setup.sensor.optics)
@@ -179,7 +179,7 @@ class Emitter:
         self._about_axis = self.beam.oval or setup.has_role(Role.ABOUT_AXIS)
 
     def __len__(self) -> int:
-        """Return the number of sub-rays of a beam."""
+        """Return the number of sub-rays per beam."""
         return len(self.beam)
 
     def subrays_of(
@@ -190,7 +190,7 @@ class Emitter:
         *,
         by_head: bool = False,
     ) -> Pattern:
-        """Return the sub-rays of beams.
+        """Return the sub-rays of the given beams.
 
         Parameters
         ----------
@@ -213,7 +213,7 @@ class Emitter:
 
 @dataclass(eq=False)
 class PulseBatch:
-    """Consecutive rays of scans that are cast together, and data that steps pass to later steps.
+    """Consecutive rays that are cast together, and data that steps pass to later steps.
 
     `PulseCaster.scan` divides the rays of its scans into such batches. A beam is a ray of the
     scans, numbered from 0 at the first scan. A batch has the beams `start` to `stop`.
@@ -245,7 +245,7 @@ class PulseBatch:
         self.offsets = earlier + offsets
 
     def select(self, row_indices: Indices) -> PulseReturns:
-        """Keep the selected rows of `hits` and `planes`, and return the remaining hits."""
+        """Keep only the selected rows of `hits` and `planes`. Return the remaining hits."""
         assert self.hits is not None
         self.hits = self.hits.take(row_indices)
         if self.planes is not None:
@@ -260,7 +260,7 @@ class PulseBatch:
 
     @cached_property
     def beams(self) -> Pattern:
-        """Sub-rays of the batch's beams or, if no beam is deflected, of all rays of the pattern.
+        """Sub-rays of the batch's beams or, if no beam is deflected, of all rays in the pattern.
 
         `window` has the batch's rows in this pattern. If no beam is deflected, batches share the
         pattern, so it is not sliced.
@@ -279,7 +279,7 @@ class PulseBatch:
 
     @property
     def window(self) -> tuple[int, int]:
-        """Start and stop of the batch's sub-rays in the rows of `beams`, which repeat."""
+        """Start and stop of the batch's sub-rays in the repeating rows of `beams`."""
         row = 0 if self.offsets is not None else (self.first + self.start) * self.subrays_per_beam
         return row, row + (self.stop - self.start) * self.subrays_per_beam
 
@@ -290,9 +290,10 @@ class PulseBatch:
 
     @cached_property
     def central_rays(self) -> tuple[Floats, Floats]:
-        """Origins in meters and directions of the central sub-ray of each beam. Shape (n, 3).
+        """Origins (in meters) and directions of the beams' central sub-rays.
 
-        The central sub-ray is the first of each beam. Both arrays are in the scene frame.
+        The shape is (n, 3). The central sub-ray is the first of each beam. Both arrays are in the
+        scene frame.
         """
         subray_indices = np.arange(self.stop - self.start) * self.subrays_per_beam
         origins, directions = self.subray_poses.rays(self.beams, subray_indices, self.window[0])
@@ -300,7 +301,7 @@ class PulseBatch:
 
 
 class PulseStep(ABC):
-    """An effect on the pulses of a sensor.
+    """A single effect on the pulses of a sensor.
 
     Defining a subclass without a `role` raises a TypeError, because the role decides how rays are
     cast.
@@ -323,7 +324,7 @@ class PulseStep(ABC):
         self.surfaces = surfaces
 
     def with_moved_instances(self, setup: Setup, surfaces: SceneSurfaces) -> PulseStep:
-        """Return the step for a scene in which instances have moved.
+        """Return a copy of the step for a scene in which instances have moved.
 
         By default, a new step is created. A step that takes long to create and stores no surface
         positions returns `with_setup` instead.
@@ -331,7 +332,7 @@ class PulseStep(ABC):
         return type(self)(setup, self.caster, surfaces)
 
     def with_setup(self, setup: Setup, surfaces: SceneSurfaces) -> Self:
-        """Return a copy of the step with a different setup and different surfaces."""
+        """Return a copy of the step with a new setup and new surfaces."""
         step = copy(self)
         step.setup = setup
         step.surfaces = surfaces
@@ -340,11 +341,11 @@ class PulseStep(ABC):
     @staticmethod
     @abstractmethod
     def applies(setup: Setup) -> bool:
-        """Return True if the step acts on the sensor."""
+        """Return whether the step acts on the sensor."""
 
     @staticmethod
     def added_returns(setup: Setup) -> float:
-        """Return the mean number of returns that the step adds to a pulse, or an upper bound."""
+        """Return the mean number of returns that the step adds per pulse, or an upper bound."""
         return 0.0
 
     @staticmethod
@@ -354,7 +355,7 @@ class PulseStep(ABC):
 
     @abstractmethod
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns of a batch after the step.
+        """Apply the step to the returns of a batch.
 
         Until `SeparationStep` or `WaveformStep` combines hits into returns, `returns` are the hits
         of sub-rays, and `ray` has sub-ray numbers. A step that changes hits must also assign the

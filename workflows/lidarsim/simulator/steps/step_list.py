@@ -1,4 +1,4 @@
-"""The simulation steps, in the order in which they act on pulses."""
+"""List of the simulation steps, in the order in which they act on pulses."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ STEPS: list[type[PulseStep]] = [
 
 
 def setup_of(scene: Scene, survey: Survey, number: int) -> Setup:
-    """Return the setup of a sensor, with the roles of the steps that apply to the sensor."""
+    """Return the setup of a sensor, including the roles of the steps that apply to it."""
     setup = Setup(scene, survey, number, None)
     effects = [step for step in STEPS if Role.FRAME not in step.role and step.applies(setup)]
     roles = reduce(or_, (step.role for step in effects), Role(0))
@@ -59,7 +59,7 @@ def steps_of(setup: Setup) -> list[type[PulseStep]]:
 
 
 def received_causes() -> list[int]:
-    """Return the causes, as indices into `CAUSES`, of returns that the receiver adds.
+    """Return the causes of returns that the receiver adds, as indices into `CAUSES`.
 
     Such returns do not come from a point that reflects light, so they have no velocity.
     """

@@ -1,4 +1,4 @@
-"""Stray light that a receiver gets from retroreflectors beside its beam."""
+"""Stray light that reaches a receiver from retroreflectors outside its beam."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ STRAY = Purpose(22, "energy noise of stray light")
 BLOOMING = CAUSES.index("blooming")
 NEAREST_TRIANGLES = 4  # number of a cluster's triangles, nearest by angle, compared with a ray
 CLUSTER_M = 1.0  # size of a cluster of triangles that are compared with rays together
-FAINTEST = 0.1  # fainter light, as a share of the detection threshold, is never detected
+FAINTEST = 0.1  # fainter light, as a fraction of the detection threshold, is never detected
 
 
 class StrayLightStep(PulseStep):
-    """Adds stray light of retroreflectors beside beams."""
+    """Simulation step that adds stray light from retroreflectors outside the beams."""
 
     role = Role.RECEIVES
     effects = ("Blooming",)
@@ -49,7 +49,7 @@ class StrayLightStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if the noise of the sensor includes stray light."""
+        """Return whether the noise of the sensor includes stray light."""
         return setup.noise.stray_light > 0
 
     @staticmethod
@@ -58,7 +58,7 @@ class StrayLightStep(PulseStep):
         return Memory(retained=10 * sizes.return_count, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns of a batch together with stray light.
+        """Add stray light to the returns of a batch.
 
         A beam adds its strongest stray light if this light is detected, in range, visible from the
         beam's origin, and not too close to another return of the beam to be separated from it.
@@ -90,7 +90,7 @@ class StrayLightStep(PulseStep):
         return merge_returns(returns, stray)
 
     def _strongest(self, batch: PulseBatch, times: Floats) -> StrayLight:
-        """Return the strongest stray light for the central ray of each beam.
+        """Return the strongest stray light on the central ray of each beam.
 
         `times` (n,) are the firing times of the beams in nanoseconds. Points are relative to the
         rays' origins, along the axes of the scene frame.
@@ -130,7 +130,7 @@ class StrayLightStep(PulseStep):
         return light
 
     def _triangles(self, cluster: _RetroCluster, table: MaterialTable) -> RetroTriangles:
-        """Return the triangles of a cluster for loops, with their energy at normal incidence."""
+        """Return a cluster's triangles together with their energies at normal incidence."""
         from .stray_loops import RetroTriangles
 
         white = np.ones(len(cluster.triangles))
@@ -138,7 +138,7 @@ class StrayLightStep(PulseStep):
         return RetroTriangles(cluster.corners, *cluster.bounds, back)
 
     def _has_return(self, returns: PulseReturns, ray: Ints, distance: Floats) -> Bools:
-        """Return whether beams `ray` have a return close to the given distances.
+        """Return whether each of the given beams has a return close to the given distance.
 
         Two returns are close if they are within half a pulse length, so that the receiver cannot
         separate them.
@@ -156,7 +156,7 @@ class StrayLightStep(PulseStep):
 
 
 def _ray_cells(origins: Floats, directions: Floats) -> RayCells:
-    """Return rays for compiled loops, with cones around cells of consecutive rays."""
+    """Return rays and the cones around cells of consecutive rays, for compiled loops."""
     from . import stray_loops
 
     cones = np.empty((-(-len(origins) // stray_loops.CELL_RAYS), 5))
@@ -166,7 +166,7 @@ def _ray_cells(origins: Floats, directions: Floats) -> RayCells:
 
 
 class _Bounds(NamedTuple):
-    """Bounding sphere and centers of triangles."""
+    """Centers and bounding sphere of triangles."""
 
     middles: Floats  # (k, 3): centers of the triangles
     center: Floats  # (3,): center of the bounding sphere
@@ -193,7 +193,7 @@ class _RetroCluster:
 def _retro_clusters(
     scene: Scene, surfaces: SceneSurfaces, unseen: Bools | None
 ) -> Iterator[_RetroCluster]:
-    """Yield the retroreflectors of a scene, its instances and its actors, in clusters.
+    """Yield the clusters of retroreflecting triangles in a scene, its instances and its actors.
 
     Objects in the mask `unseen` (objects,) are omitted.
     """
@@ -235,7 +235,7 @@ def _retro_clusters(
 def _clusters(
     triangles: Integers, corners: Floats, actor: int | None = None
 ) -> Iterator[_RetroCluster]:
-    """Divide triangles with corners into clusters by the cells of a grid."""
+    """Yield clusters of triangles, which are grouped by the cells of a grid."""
     if not len(triangles):
         return
     cells = np.floor(corners.mean(axis=1) / CLUSTER_M).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Compiled loops for stray light and crosstalk (stray_light.py and crosstalk.py)."""
+"""Compiled loops for stray light (stray_light.py) and crosstalk (crosstalk.py)."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -18,14 +18,14 @@ from ...sensor.optics import LIGHT_M_NS
 from ..casting.surface_loops import normal_incidence_energy
 
 CELL_RAYS = 1 << 8  # number of consecutive rays that are compared with retroreflectors at a time
-MAX_STRAY = math.radians(30.0)  # largest angle between a ray and stray light
-# Rays to an edge of a triangle are moved towards its center by this share of the distance, so that
-# they hit the triangle.
+MAX_STRAY = math.radians(30.0)  # maximum angle between a ray and stray light
+# Rays to an edge of a triangle are moved towards its center by this fraction of the distance, so
+# that they hit the triangle.
 INWARDS = 0.02
 
 
 class RayCells(NamedTuple):
-    """Rays, and cones around cells of `CELL_RAYS` consecutive rays."""
+    """Rays, and the cones around cells of `CELL_RAYS` consecutive rays."""
 
     origins: Floats  # (3, n)
     directions: Floats  # (3, n)
@@ -34,7 +34,7 @@ class RayCells(NamedTuple):
 
 
 class RetroTriangles(NamedTuple):
-    """A cluster of retroreflecting triangles."""
+    """Cluster of retroreflecting triangles."""
 
     corners: Floats  # (t, 3, 3)
     middles: Floats  # (t, 3): centers of the triangles
@@ -48,13 +48,15 @@ class StrayLimits(NamedTuple):
     """Detection limits of stray light."""
 
     min_range_m: float
-    share_at_degree: float  # energy at an angle of 1 degree, as a share of the energy in the beam
-    faintest: float  # smallest energy that may be detected
+    share_at_degree: (
+        float  # energy at an angle of 1 degree, as a fraction of the energy in the beam
+    )
+    faintest: float  # minimum energy that may be detected
     extinction: float  # 1/m
 
 
 class StrayLight(NamedTuple):
-    """Strongest stray light of rays, written by compiled loops."""
+    """Strongest stray light on each ray, written by compiled loops."""
 
     energy: Floats  # (n,)
     # (n, 3), meters: from the ray's origin to the source of the light, along the axes in which rays
@@ -64,7 +66,10 @@ class StrayLight(NamedTuple):
 
 
 class SpotPairs(NamedTuple):
-    """Pairs of a spot and the rays that may see it, as arrays of shape (p,)."""
+    """Pairs of a spot and the rays that may see it.
+
+    All arrays have shape (p,).
+    """
 
     spot: Ints  # row of `LitSpots`
     first: Ints  # first ray, as a row of `ReceivingRays.order`
@@ -88,15 +93,18 @@ class LitSpots(NamedTuple):
 
 
 class ReceptionLimits(NamedTuple):
-    """Limits within which a receiver gets pulses of other sensors."""
+    """Limits within which a receiver detects pulses of other sensors."""
 
     cosine: float  # cosine of the largest angle between a ray and a spot
-    min_range_m: float  # smallest apparent distance of a spot
+    min_range_m: float  # minimum apparent distance of a spot
     max_range_m: float
 
 
 class ReceivedSpots(NamedTuple):
-    """Arrays of shape (k,) to which loops write rays that receive the light of spots."""
+    """Output arrays for rays that receive the light of spots.
+
+    All arrays have shape (k,).
+    """
 
     row: Ints  # row of the ray, in `ReceivingRays`
     spot: Ints  # row of `LitSpots`
@@ -104,7 +112,7 @@ class ReceivedSpots(NamedTuple):
     range_m: Floats  # actual distance of the spot, meters
 
     def first(self, count: int) -> ReceivedSpots:
-        """Return views of the first `count` rows, which a loop has written."""
+        """Return views of the first `count` rows."""
         return ReceivedSpots(
             self.row[:count], self.spot[:count], self.distance[:count], self.range_m[:count]
         )
@@ -112,14 +120,14 @@ class ReceivedSpots(NamedTuple):
 
 @inlined
 def _angle(cosine):
-    """Return the angle in radians for a cosine that rounding may have moved beyond 1."""
+    """Return the angle, in radians, of a cosine that rounding may have moved beyond 1."""
     cosine = min(max(cosine, -1.0), 1.0)
     return arctan2(math.sqrt((1 - cosine) * (1 + cosine)), cosine)
 
 
 @compiled()
 def bound_cells(origins, directions, cones):
-    """Write the cones around cells of rays for `RayCells`."""
+    """Write the cones that bound cells of rays for `RayCells`."""
     count = origins.shape[1]
     for c in range(len(cones)):
         first = c * CELL_RAYS
@@ -150,7 +158,7 @@ def bound_cells(origins, directions, cones):
 
 @noinline
 def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
-    """Return the tangent of the angle between a ray and a triangle, and the closest point by angle.
+    """Return the tangent of the angle between a ray and a triangle, and the nearest point by angle.
 
     `ray` is an origin and a direction. The point is a vector from the ray's origin. The tangent is
     0 if the ray hits the triangle, and -1 if the triangle is not in front of the ray.
@@ -186,7 +194,7 @@ def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
         step = min(max(-(x * u + y * v) / max(u * u + v * v, 1e-300), 0.0), 1.0)
         tangent = math.sqrt((x + step * u) * (x + step * u) + (y + step * v) * (y + step * v))
         if tangent < min_tangent:
-            # A step on the plane corresponds to a different share of the edge in space.
+            # A step on the plane corresponds to a different fraction of the edge in space.
             share = step * p_depth / (step * p_depth + (1 - step) * q_depth)
             nearest = px + share * (qx - px), py + share * (qy - py), pz + share * (qz - pz)
             min_tangent = tangent
@@ -195,7 +203,7 @@ def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
 
 @inlined
 def _reach_of_cell(rays, c, triangles, limits):
-    """Return whether cell `c` of rays may receive light of triangles, and a cosine.
+    """Return whether a cell of rays may receive light from triangles, and a limiting cosine.
 
     The cosine is that of the largest angle between a ray of the cell and the center of the
     triangles at which the ray may receive light. At larger angles, the light of the nearest
@@ -226,7 +234,7 @@ def _reach_of_cell(rays, c, triangles, limits):
 
 @inlined
 def _choose_triangles(middles, ray, chosen):
-    """Write the triangles whose centers are nearest to a ray by angle, and return their number.
+    """Write the triangles whose centers are at the smallest angles to a ray. Return their number.
 
     `middles` has shape (t, 3). The length of `chosen` is the number of triangles to choose.
     """
@@ -254,7 +262,7 @@ def _choose_triangles(middles, ray, chosen):
 
 @inlined
 def _add_light(k, t, ray, triangles, limits, strongest):
-    """Write the light of triangle `t` to row `k` of `strongest` if it is stronger."""
+    """Replace row `k` of `strongest` with the light of triangle `t` if that is stronger."""
     middles = triangles.middles
     tangent, nearest = _nearest_point(triangles.corners, t, ray)
     angle = math.degrees(arctan2(tangent, 1.0))
@@ -275,7 +283,7 @@ def _add_light(k, t, ray, triangles, limits, strongest):
 
 @compiled()
 def find_stray_light(rays, triangles, limits, chosen, strongest):  # noqa: PLR0914 - a compiled loop
-    """Write the light of `triangles` to the rows of `strongest` in which it is stronger.
+    """Replace rows of `strongest` with the light of `triangles` where that is stronger.
 
     `rays` is a `RayCells`, `triangles` a `RetroTriangles` in the frame of the rays, `limits` a
     `StrayLimits`, and `strongest` a `StrayLight`. The light comes from the point on the triangles
@@ -309,7 +317,7 @@ def find_stray_light(rays, triangles, limits, chosen, strongest):  # noqa: PLR09
 
 @compiled()
 def receive(pairs, rays, spots, limits, output):
-    """Write which rays receive the light of spots to `output`, and return their number.
+    """Write the rays that receive the light of spots to `output`. Return their number.
 
     `pairs` is a `SpotPairs`, `rays` a `ReceivingRays`, `spots` a `LitSpots`, `limits` a
     `ReceptionLimits`, and `output` a `ReceivedSpots`. The apparent distance of a spot is computed

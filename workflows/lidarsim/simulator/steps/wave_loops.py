@@ -26,22 +26,25 @@ MEET = 1.0
 APART = 6.0
 # Gaussians that are closer form one return.
 CLOSE = 1.0
-# Largest distance that a fit may move a Gaussian from its initial position.
+# Maximum distance that a fit may move a Gaussian from its initial position.
 MOVES = 2.0
 
-FAINT = 0.01  # lowest peak that is found, as a share of the waveform's highest sample
-CURVED = 0.005  # smallest curvature times variance of a detectable Gaussian, as such a share
-TOGETHER = 4  # largest number of Gaussians that are fitted together
-STEPS = 30  # largest number of Levenberg-Marquardt steps
-GAIN = 1e-3  # smallest relative reduction of the sum of squares for which a fit continues
+FAINT = 0.01  # lowest peak that is found, as a fraction of the waveform's highest sample
+CURVED = 0.005  # minimum curvature times variance of a detectable Gaussian, as such a fraction
+TOGETHER = 4  # maximum number of Gaussians that are fitted together
+STEPS = 30  # maximum number of Levenberg-Marquardt steps
+GAIN = 1e-3  # minimum relative reduction of the sum of squares for which a fit continues
 ENOUGH = 1e-9  # sum of squares at which a fit stops
-HIGHEST = 1.2  # largest height of a Gaussian, as a share of the highest sample
+HIGHEST = 1.2  # maximum height of a Gaussian, as a fraction of the highest sample
 _AREA = math.sqrt(2 * math.pi)  # area of a Gaussian of height and standard deviation 1
 _KEY_STEPS = 1024  # subdivisions of a sample for comparing the times of hits and peaks
 
 
 class WaveMarks(NamedTuple):
-    """Marks of hits sorted by beam and distance, each of shape (n,)."""
+    """Marks of hits sorted by beam and distance.
+
+    All arrays have shape (n,).
+    """
 
     solid: Bools  # whether the hit is on a surface rather than in the air
     # Whether a waveform starts at the hit, as set by `divide_into_waveforms`. In waveforms that
@@ -65,21 +68,24 @@ class WaveHits(NamedTuple):
 
 
 class WaveLight(NamedTuple):
-    """Light of hits sorted by beam and distance, each array of shape (n,)."""
+    """Times and energies of hits sorted by beam and distance.
+
+    Both arrays have shape (n,).
+    """
 
     time: Floats  # in samples, counted from range 0
     energy: Floats  # height of the hit's Gaussian, which is its share of the beam's energy
 
 
 class WaveSampling(NamedTuple):
-    """Sampling and search of waveforms."""
+    """Settings for sampling and searching waveforms."""
 
     sigma: float  # standard deviation of the system waveform, samples
     decomposes: bool  # whether waveforms are decomposed into Gaussians; otherwise peaks are found
 
 
 class WavePeaks(NamedTuple):
-    """The peak that each hit belongs to, in the waveforms that `search_waveforms` searches."""
+    """Peaks to which the hits in searched waveforms belong."""
 
     number: Ints  # (n,): number of the peak, counted over all waveforms; -1 without a peak
     # (3, n): time of the peak in samples from range 0, energy, and width as a multiple of the
@@ -88,7 +94,10 @@ class WavePeaks(NamedTuple):
 
 
 class WaveReturnArrays(NamedTuple):
-    """Arrays of shape (k,) to which returns are written."""
+    """Output arrays for returns.
+
+    All arrays have shape (k,).
+    """
 
     beam: Ints  # number of the beam in the batch
     row: Ints  # row of the strongest hit, in the table of hits before sorting
@@ -98,7 +107,7 @@ class WaveReturnArrays(NamedTuple):
     width: Floats  # as a multiple of the system waveform's width
 
     def first(self, count: int) -> WaveReturnArrays:
-        """Return copies of the first `count` returns, which a loop has written."""
+        """Return copies of the first `count` returns."""
         return WaveReturnArrays(
             self.beam[:count].copy(),
             self.row[:count].copy(),
@@ -110,10 +119,10 @@ class WaveReturnArrays(NamedTuple):
 
 
 class FitScratch(NamedTuple):
-    """Scratch memory for a fit of up to `TOGETHER` Gaussians to up to `length` samples.
+    """Scratch memory for fitting up to `TOGETHER` Gaussians to up to `length` samples.
 
-    Heights are shares of the highest sample. Positions and widths are in standard deviations of the
-    system waveform.
+    Heights are fractions of the highest sample. Positions and widths are in standard deviations of
+    the system waveform.
     """
 
     # (3, TOGETHER): heights, positions and widths, initially of the guess and finally of the fit.
@@ -129,7 +138,7 @@ class FitScratch(NamedTuple):
 
 
 class GaussianScratch(NamedTuple):
-    """Scratch memory to decompose `length` samples into Gaussians.
+    """Scratch memory for decomposing `length` samples into Gaussians.
 
     All arrays have shape (length,).
     """
@@ -137,7 +146,7 @@ class GaussianScratch(NamedTuple):
     curvature: Floats  # second differences of the samples
     minima: Ints  # samples at which the curvature has a minimum
     x: Floats  # samples of a piece, in standard deviations of the system waveform
-    y: Floats  # samples of a piece, as shares of the highest sample
+    y: Floats  # samples of a piece, as fractions of the highest sample
     time: Floats  # times of the Gaussians, in samples from range 0
     height: Floats  # heights in units of the samples
     width: Floats  # widths in standard deviations of the system waveform
@@ -154,7 +163,7 @@ class SearchScratch(NamedTuple):
 
 
 class SampledWaveform(NamedTuple):
-    """Samples of a part of a waveform."""
+    """Samples of part of a waveform."""
 
     samples: Floats  # (length or more,)
     length: np.int64
@@ -165,7 +174,7 @@ class SampledWaveform(NamedTuple):
 
 @noinline
 def _sample(light, begin, stop, first, length, sigma, samples):
-    """Write the summed pulses of hits `begin` to `stop`, and return the highest sample.
+    """Write the sum of the pulses of hits `begin` to `stop`. Return the highest sample.
 
     The first of the `length` samples has the number `first`.
     """
@@ -187,7 +196,6 @@ def _sample(light, begin, stop, first, length, sigma, samples):
 
 @inlined
 def _is_peak(samples, s, top):
-    """Return whether a sample is a local maximum that is not too faint."""
     w = samples[s]
     return w > samples[s - 1] and w >= samples[s + 1] and w >= FAINT * top
 
@@ -208,7 +216,7 @@ def _vertex(samples, peak):
 
 @noinline
 def _peaks(wave, stops, peaks):
-    """Write the local maxima of a waveform to `stops` and `peaks`, and return their number.
+    """Write the local maxima of a waveform to `stops` and `peaks`. Return their number.
 
     The arguments are described in `SearchScratch`. Times and heights come from the Gaussian through
     three samples. Energies are the areas between the lowest samples on both sides.
@@ -248,7 +256,7 @@ def _peaks(wave, stops, peaks):
 
 @noinline
 def _residual(x, y, sample_count, gaussians, count, residual, slopes):
-    """Write the residual and derivatives of a sum of Gaussians, and return the sum of squares.
+    """Write the residual and derivatives of a sum of Gaussians. Return the sum of squares.
 
     `x` and `y` are `GaussianScratch.x` and `.y`. `gaussians`, `residual` and `slopes` are arrays of
     a `FitScratch`.
@@ -275,7 +283,7 @@ def _residual(x, y, sample_count, gaussians, count, residual, slopes):
 
 @noinline
 def _solve(lower, size, step):
-    """Solve a system by its Cholesky factor, replacing the right-hand side `step` by the result."""
+    """Solve a system by its Cholesky factor. The result replaces the right-hand side `step`."""
     for row in range(size):
         for k in range(row):
             step[row] -= lower[row, k] * step[k]
@@ -289,7 +297,7 @@ def _solve(lower, size, step):
 
 @noinline
 def _step(residual, slopes, sample_count, count, damping, lower, step):
-    """Write a Levenberg-Marquardt step for `count` Gaussians, solved by Cholesky factorization."""
+    """Write a Levenberg-Marquardt step for `count` Gaussians, using a Cholesky factorization."""
     size = 3 * count
     for row in range(size):
         gradient = 0.0
@@ -313,7 +321,7 @@ def _step(residual, slopes, sample_count, count, damping, lower, step):
 
 @noinline
 def _fit(x, y, sample_count, count, scratch):
-    """Fit a sum of `count` Gaussians to `sample_count` samples `y` at `x` by least squares.
+    """Fit a sum of `count` Gaussians to `sample_count` samples by least squares.
 
     The Levenberg-Marquardt method stops when a step gains too little, or after `STEPS` steps.
     Heights are at most `HIGHEST`, positions are within `MOVES` of the guess, and widths (standard
@@ -377,7 +385,7 @@ def _fit(x, y, sample_count, count, scratch):
 
 @noinline
 def _find_minima(wave, scratch):
-    """Write the samples at which the second derivative is minimal, and return their number.
+    """Write the samples at which the second derivative has a minimum. Return their number.
 
     Each minimum is the initial guess of a Gaussian. `scratch` is a `GaussianScratch`, whose
     `minima` receive sample indices.
@@ -435,7 +443,7 @@ def _fit_piece(wave, begin, stop, first, end, scratch):
 
 @noinline
 def _sort_gaussians(scratch, count, faintest):
-    """Sort Gaussians by time, drop those lower than `faintest`, and return the remaining number.
+    """Sort Gaussians by time, and drop those lower than `faintest`. Return the remaining number.
 
     Sorting is needed because a fit may move a Gaussian out of its piece.
     """
@@ -464,10 +472,12 @@ def _sort_gaussians(scratch, count, faintest):
 
 @noinline
 def _join_gaussians(wave, scratch, count, stops, peaks):
-    """Merge close Gaussians into peaks, write `stops` and `peaks`, and return the number of peaks.
+    """Merge close Gaussians into peaks, and write these to `stops` and `peaks`.
+
+    Return their number.
 
     The arguments are described in `SearchScratch`. A peak has the sum, mean and variance of its
-    Gaussians, and ends half-way to the next peak.
+    Gaussians, and ends halfway to the next peak.
     """
     sigma = wave.sigma
     time = scratch.time
@@ -502,7 +512,7 @@ def _join_gaussians(wave, scratch, count, stops, peaks):
 
 @noinline
 def _gaussians(wave, scratch, stops, peaks):
-    """Decompose a waveform into Gaussians, with the same arguments and result as `_peaks`.
+    """Decompose a waveform into Gaussians, with the same arguments and outputs as `_peaks`.
 
     Each minimum of the second derivative is a Gaussian (after Hofton et al. 2000, who use the
     inflection points around the minima). None is narrower than the system waveform.
@@ -530,11 +540,11 @@ def _gaussians(wave, scratch, stops, peaks):
 
 @compiled()
 def order_hits(subrays, ray, distance, energy, row):
-    """Write the rows of hits that have energy to `row[:, 0]`, sorted by beam and distance.
+    """Write the rows of hits with energy to `row[:, 0]`, sorted by beam and distance.
 
     Hits are in the order of rays, which are sub-rays, with `subrays` per beam. `row` is
     `PulseHits.row`, whose other column is scratch memory of `continue_surfaces`. Returns the number
-    of hits that have energy, and the largest number of hits of a beam.
+    of hits that have energy, and the maximum number of hits in a beam.
     """
     count = 0
     begin = 0
@@ -558,7 +568,7 @@ def order_hits(subrays, ray, distance, energy, row):
 
 @inlined
 def _end_of_beam(beam, begin):
-    """Return the row after the last hit of the beam whose first hit is in row `begin`."""
+    """Return the row after the last hit of the beam that starts in row `begin`."""
     end = begin + 1
     while end < len(beam) and beam[end] == beam[begin]:
         end += 1
@@ -567,7 +577,7 @@ def _end_of_beam(beam, begin):
 
 @inlined
 def _has_several_surfaces(starts_surface, first, end):
-    """Return whether hits `first` to `end` are on several surfaces, according to their marks."""
+    """Return whether hits `first` to `end` are on several surfaces."""
     several = False
     for k in range(first + 1, end):
         several |= starts_surface[k]
@@ -576,7 +586,7 @@ def _has_several_surfaces(starts_surface, first, end):
 
 @compiled()
 def divide_into_waveforms(hits, sigma_m, neighbors, hit_ranges):
-    """Mark where waveforms start, write which waveforms to search, and return their number.
+    """Mark the starts of waveforms, and write the waveforms to be searched. Return their number.
 
     A waveform starts at the first hit of a beam, and at each hit whose Gaussian does not overlap
     the previous hit's Gaussian. A waveform is searched if its hits are more than `NARROW` standard
@@ -629,7 +639,7 @@ def divide_into_waveforms(hits, sigma_m, neighbors, hit_ranges):
 
 
 def scratch_for(length: int) -> SearchScratch:
-    """Return scratch memory for waveforms of up to `length` samples."""
+    """Allocate scratch memory for waveforms of up to `length` samples."""
     size = 3 * TOGETHER
     fit = FitScratch(
         best=np.empty((3, TOGETHER)),
@@ -658,7 +668,7 @@ def scratch_for(length: int) -> SearchScratch:
 
 @inlined
 def _peak_of_hit(time, wave, stops, count):
-    """Return the peak, out of `count` peaks, that a hit at a given time belongs to."""
+    """Return which of `count` peaks a hit at the given time belongs to."""
     key = np.int64(np.rint(time * _KEY_STEPS)) - _KEY_STEPS * wave.first
     number = 0
     while number < count - 1 and stops[number] < key:
@@ -668,7 +678,7 @@ def _peak_of_hit(time, wave, stops, count):
 
 @compiled()
 def search_waveforms(light, hit_ranges, sampling, starts, peaks, scratch):
-    """Sample waveforms, and write the peak that each of their hits belongs to.
+    """Sample waveforms, and write the peak to which each of their hits belongs.
 
     Waveform k has the hits `hit_ranges[k, 0]` to `hit_ranges[k, 1]` of `light`, a `WaveLight`.
     `sampling` is a `WaveSampling`, and `scratch` a `SearchScratch`. The function writes `peaks`, a
@@ -704,7 +714,7 @@ def search_waveforms(light, hit_ranges, sampling, starts, peaks, scratch):
 
 @compiled()
 def make_returns(hits, sigma_m, samples_per_m, neighbors, peaks, output):  # noqa: C901, PLR0914, PLR0915 - a compiled loop
-    """Write the returns of the waveforms of beams to `output`, for `waveform.returns_in`.
+    """Write the returns in the waveforms of beams to `output`.
 
     `hits` is a `WaveHits`, `peaks` a `WavePeaks`, `neighbors` a `pulse_loops.SubrayNeighbors`, and
     `output` a `WaveReturnArrays`. `sigma_m` is the standard deviation of the system waveform in

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class WaveformStep(PulseStep):
-    """Finds returns in the waveforms of pulses."""
+    """Simulation step that finds returns in the waveforms of pulses."""
 
     role = Role.CHANGES | Role.RECEIVES
     effects = ("Waveforms",)
@@ -35,11 +35,11 @@ class WaveformStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if the sensor finds returns in waveforms."""
+        """Return whether the sensor finds returns in waveforms."""
         return setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns found in the waveforms of a batch, with the beam as `ray`."""
+        """Find the returns in the waveforms of a batch. Their `ray` is the beam number."""
         digitizer = Digitizer.for_sensor(self.setup)
         in_waveforms = returns_in(returns, digitizer, batch.subrays_per_beam, batch.planes)
         return in_waveforms._replace(ray=batch.start + in_waveforms.ray)
@@ -47,7 +47,7 @@ class WaveformStep(PulseStep):
 
 @dataclass(frozen=True)
 class Digitizer:
-    """Settings of a receiver that samples waveforms and searches them for returns."""
+    """Settings of a receiver that samples waveforms and finds returns in the samples."""
 
     sigma_ns: float  # standard deviation of the system waveform, ns
     sample_ns: float  # time between samples, ns
@@ -72,7 +72,7 @@ class Digitizer:
 
     @property
     def reach(self) -> int:
-        """Number of samples before or after the peak of a return at which the return is not 0."""
+        """Number of samples, on either side of a return's peak, at which the return is not 0."""
         return int(np.ceil(CUT * self.sigma))
 
     @property
@@ -94,7 +94,7 @@ class Digitizer:
 def returns_in(
     hits: PulseReturns, digitizer: Digitizer, subrays: int = 1, planes: Planes | None = None
 ) -> PulseReturns:
-    """Return the returns found in the waveforms of beams, sorted by beam and distance.
+    """Find the returns in the waveforms of beams, and sort them by beam and distance.
 
     Hits that are close together, or on one surface (`pulse_loops.continue_surfaces`), form one
     Gaussian with their mean and variance. Other waveforms are sampled and searched. The triangle
@@ -151,7 +151,7 @@ def returns_in(
 
 
 def _wave_hits(hits: PulseReturns, subrays: int) -> WaveHits:
-    """Return the hits that have energy, sorted by beam and distance, for compiled loops.
+    """Return the hits with energy, sorted by beam and distance, for compiled loops.
 
     `marks.solid` and `marks.all_start` are filled in, and loops write the other marks.
     """
@@ -189,7 +189,7 @@ def _wave_hits(hits: PulseReturns, subrays: int) -> WaveHits:
 
 
 def _search(hits: WaveHits, digitizer: Digitizer, subrays: int, hit_ranges: Ints) -> WavePeaks:
-    """Return the peaks of hits in searched waveforms, and mark where peaks start.
+    """Return the peaks of hits in the searched waveforms, and mark where peaks start.
 
     `hit_ranges` (k, 2) are the first hit and one past the last hit of each waveform. This writes
     `hits.marks.starts`.

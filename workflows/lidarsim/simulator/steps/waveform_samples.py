@@ -23,7 +23,10 @@ BLOCK_SAMPLES = 1 << 20  # number of samples that are computed at a time
 
 
 class Windows(NamedTuple):
-    """Windows of consecutive waveform samples, as arrays of shape (n,)."""
+    """Windows of consecutive waveform samples.
+
+    All arrays have shape (n,).
+    """
 
     beam: Ints  # number of the beam in the batch
     begin: Ints  # number of the first sample, counted from the firing
@@ -31,12 +34,12 @@ class Windows(NamedTuple):
     stop_hit: Ints  # one past the row of the last hit of the beam
 
     def take(self, row_range: slice) -> Windows:
-        """Return the windows in a slice of rows."""
+        """Return the selected windows."""
         return Windows(*(column[row_range] for column in self))
 
 
 class RecordingStep(PulseStep):
-    """Records the waveforms of returns, including receiver noise."""
+    """Simulation step that records the waveforms of returns, including receiver noise."""
 
     role = Role.CHANGES
     effects = ("Waveforms",)
@@ -46,18 +49,18 @@ class RecordingStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return True if waveforms are recorded."""
+        """Return whether waveforms are recorded."""
         return setup.waveform_samples > 0
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the memory of a block of samples, and of all records, in bytes."""
+        """Return the memory of a block of samples and of all records, in bytes."""
         recorded = record(setup.waveform_samples).itemsize * sizes.return_count
         sampled = 40 * min(sizes.subrays * setup.waveform_samples, BLOCK_SAMPLES)
         return Memory(casting=sampled + recorded, counting=2.3 * recorded)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns with their recorded waveforms.
+        """Add recorded waveforms to the returns of a batch.
 
         A window starts where the signal of its first return starts. Later returns of the pulse
         share the window if their signals end within it. Overlapping windows of a pulse contain
@@ -132,7 +135,7 @@ def _windows(
 def _signal_samples(
     batch: PulseBatch, digitizer: Digitizer, windows: Windows, count: int
 ) -> Floats:
-    """Return the summed signals of all hits in each window, without noise."""
+    """Return the summed signals of the hits in each window, without noise."""
     hits = required(batch.hits)
     hit_counts = windows.stop_hit - windows.first_hit
     window = np.repeat(np.arange(len(hit_counts)), hit_counts)
@@ -151,7 +154,7 @@ def _signal_samples(
 
 
 def digitize(samples: Floats) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
-    """Round samples to integers around `ZERO`, with a power-of-two step for each row.
+    """Round samples to integers around `ZERO`, with a power-of-two step in each row.
 
     Returns the integers as uint16 (n, k), and the exponents of the steps (n,).
     """
