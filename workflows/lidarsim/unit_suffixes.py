@@ -85,7 +85,7 @@ def unit_of(name: str) -> str | None:
 
 
 def find_other_unit(name: str, candidates: Iterable[str]) -> str | None:
-    """Return the candidate that differs from a name only in its unit, or None.
+    """Return the candidate that differs from a name only in its unit, or None if there is none.
 
     Examples
     --------

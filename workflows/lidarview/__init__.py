@@ -1,4 +1,4 @@
-"""Draw pictures and films of scenes and point clouds, and serve them as browser pages."""
+"""Draw images and films of scenes and point clouds, and serve them as browser pages."""
 
 from lidarsim.environment.notebook import register_drawers
 

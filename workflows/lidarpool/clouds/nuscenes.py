@@ -102,7 +102,7 @@ class NuScenes(MultiFileFormat):
         self.label_of_class = _labels_of_classes(sweeps.classes)
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, FileContent], Boxes]:
-        """Return the point file and the label file of a sweep, and its boxes."""
+        """Return the point file and the label file of a sweep, and the sweep's boxes."""
         inside = self.sweeps.compensated(number, points)
         intensity = np.clip(points["intensity"], 0, 1) * 255
         rows = np.empty((len(points), 5), "<f4")
@@ -148,7 +148,10 @@ class NuScenes(MultiFileFormat):
 
     @classmethod
     def renaming_notes(cls, sensors: Sequence[str]) -> list[str]:
-        """Return a note if the first sensor is renamed, because readers expect a certain name."""
+        """Return a note if the first sensor is renamed.
+
+        Readers expect a certain name.
+        """
         if not sensors or sensors[0] in ("", FIRST_SENSOR):
             return []
         note = (
@@ -161,7 +164,7 @@ class NuScenes(MultiFileFormat):
 
     @classmethod
     def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
-        """Return the name of the point file and, if classes have names, the label file."""
+        """Return the name of the point file and, if classes have names, of the label file."""
         sweeps = job.sweeps
         names = job.cached(
             "names",

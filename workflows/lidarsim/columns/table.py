@@ -300,10 +300,10 @@ TABLE = {column.name: column for column in (SCAN, *ALWAYS, *OPTIONAL)}
 
 
 def optional_columns(columns: Iterable[str | Column]) -> tuple[Column, ...]:
-    """Resolve a selection of columns to the optional columns that it contains.
+    """Return the optional columns in a selection of columns.
 
-    Names may be those in `TABLE` or those in files. Duplicates, and columns that every part has,
-    are removed.
+    Columns can be selected by their names in `TABLE` or in files. Duplicates are removed, and so
+    are columns that every part has.
 
     Raises
     ------

@@ -51,14 +51,20 @@ Piece = bytes | memoryview  # a piece of a file that is written in pieces
 
 
 def pack_arrays(arrays: Mapping[str, Any]) -> bytes:
-    """Create a compressed archive of arrays. Equal arrays result in equal bytes."""
+    """Create a compressed archive of arrays.
+
+    Equal arrays result in equal bytes.
+    """
     memory = io.BytesIO()  # NumPy leaves a file open if writing fails
     np.savez_compressed(memory, **arrays)
     return memory.getvalue()
 
 
 class StoredArray(NamedTuple):
-    """Location and type of an array in an uncompressed archive, for reading it in pieces."""
+    """Location and type of an array in an uncompressed archive.
+
+    They allow reading the array in pieces.
+    """
 
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
@@ -106,7 +112,7 @@ class _StoredFile(NamedTuple):
 
 
 def archive_pieces(arrays: Mapping[str, AnyArray]) -> list[Piece]:
-    """Create an uncompressed archive of arrays, and return it in pieces to be written in order.
+    """Create an uncompressed archive of arrays as pieces to be written in order.
 
     Contiguous arrays are not copied. Their pieces are views, which must be written before the
     arrays change. Equal arrays result in equal bytes, which are the same as those that zipfile
@@ -140,9 +146,9 @@ def _npy_head(array: AnyArray) -> bytes:
 
 
 def _directory_end(count: int, size: int, offset: int) -> bytes:
-    """Return the records after a central directory with the given entry count, size and offset.
+    """Return the records that follow a central directory.
 
-    The size and offset are in bytes.
+    `count` is the number of its entries, and `size` and `offset` are in bytes.
     """
     end = b""
     if max(size, offset) > _MAX_SIZE:
@@ -157,7 +163,7 @@ def _directory_end(count: int, size: int, offset: int) -> bytes:
 def open_archive(
     path: Path | str, read: Callable[[], bytes] | None = None
 ) -> Iterator[dict[str, Any]]:
-    """Read an archive without unpickling objects, and provide its arrays.
+    """Read the arrays of an archive without unpickling objects.
 
     Exceptions raised while the archive is read or in the context are converted to LidarError. If
     `read` is set, it is called to obtain the content of the file, and the path is used only in

@@ -188,8 +188,9 @@ def find_header(
     """Find the header of a table, or return None if the table has no header.
 
     The header is the first line that is neither empty nor a comment, unless all its cells are
-    numbers. In that case, the header is the last comment before the rows that has as many names as
-    the first row has cells, provided that `is_known` is true for at least half or four of them.
+    numbers. In that case, the header is the last comment before the rows with as many names as the
+    first row has cells. `is_known` must be true for at least half of these names, or for at least
+    four of them.
     """
     body = next((i for i, line in enumerate(lines) if not _is_remark(line)), len(lines))
     if body < len(lines) and not _all_numbers(lines[body]):
@@ -208,18 +209,18 @@ def find_header(
 
 
 def _is_remark(line: str) -> bool:
-    """Return True if a line is empty or a comment."""
+    """Return whether a line is empty or a comment."""
     return not line.strip() or line.lstrip().startswith("#")
 
 
 def _all_numbers(line: str) -> bool:
-    """Return True if every cell in a line is empty or a number."""
+    """Return whether every cell in a line is empty or a number."""
     cells = [cell for cell in _cells(line, _separator_of(line)) if cell]
     return all(map(_is_number, cells))
 
 
 def _is_number(cell: str) -> bool:
-    """Return True if a cell is a number, which may be infinite or NaN."""
+    """Return whether a cell is a number, which may be infinite or NaN."""
     try:
         float(cell)
     except ValueError:
@@ -341,7 +342,7 @@ class _UnitMissingError(ValueError):
 
 
 class _ColumnReader:
-    """Assigns the columns in a header to quantities."""
+    """Assignment of header columns to quantities."""
 
     def __init__(
         self,
@@ -575,7 +576,7 @@ class _ColumnReader:
 
 
 def _refuse(faults: Sequence[str]) -> None:
-    """Raise ValueError if there are faults, with a message that lists all of them."""
+    """Raise a ValueError that lists all faults, if there are any."""
     if faults:
         first, *others = faults
         raise ValueError(". ".join([first, *(fault[0].upper() + fault[1:] for fault in others)]))

@@ -34,7 +34,7 @@ class FaceMaterials:
         return cls((name,)) if name else None
 
     def take(self, face_selection: Integers | slice) -> FaceMaterials:
-        """Return the materials of selected faces without removing unused names."""
+        """Return the materials of the selected faces, keeping unused names."""
         return self if self.index is None else FaceMaterials(self.names, self.index[face_selection])
 
     def check(self, name: str, faces: int) -> None:

@@ -115,7 +115,7 @@ def _in_file(value: Any) -> str:
 
 
 def _sentence(path: FieldPath, detail: ErrorDetails, hint: Any, advice: str) -> str:
-    """Return a sentence that states the location, the value, the allowed values and the advice."""
+    """Compose a sentence from the location, the value, the allowed values and the advice."""
     location = dotted(path)
     kind = detail["type"]
     value = detail["input"]

@@ -1,4 +1,4 @@
-"""Serve HTTP requests that pass a check of their headers, over a limited number of connections.
+"""Serve HTTP requests after checking their headers, over a limited number of connections.
 
 A request is refused before its body is read, so programs that do not know the address of the page
 cannot make the server store data. Each request must arrive within a time limit. If too many
@@ -71,7 +71,7 @@ class _GuardedServer(HTTPServer):
     def start_request(
         self, server_conn: object, request_conn: HTTPConnection
     ) -> HTTPMessageDelegate:
-        """Start the time limit of a request, and return the delegate that receives the request."""
+        """Start a request's time limit and return the delegate that receives the request."""
         self._open.add(server_conn)
         stream = cast(HTTP1ServerConnection, server_conn).stream
         timer = asyncio.get_running_loop().call_later(REQUEST_WITHIN_S, stream.close)
@@ -105,7 +105,7 @@ class _GuardedServer(HTTPServer):
 
 
 class _GuardedRequest(HTTPMessageDelegate):
-    """A request that is passed to the application once its headers have been checked."""
+    """A request that is passed to the application after its headers have been checked."""
 
     def __init__(
         self,
@@ -123,7 +123,7 @@ class _GuardedRequest(HTTPMessageDelegate):
     def headers_received(
         self, start_line: RequestStartLine | ResponseStartLine, headers: HTTPHeaders
     ) -> Awaitable[None] | None:
-        """Refuse the request, or start passing it to the application."""
+        """Refuse the request or start passing it to the application."""
         start_line = cast(RequestStartLine, start_line)
         refusal = self._check(start_line, headers) or _too_large(headers)
         if refusal is not None:

@@ -35,7 +35,10 @@ _WRAPS: dict[Any, Wrap] = {33071: "clamp", 33648: "mirror"}
 
 
 class GltfMaterials:
-    """Masks, base colors and names of the materials of a file, with each texture created once."""
+    """Masks, base colors and names of a file's materials.
+
+    Each texture is created only once.
+    """
 
     def __init__(self, file: GltfFile, options: ReadOptions) -> None:
         self._file = file
@@ -114,7 +117,7 @@ class GltfMaterials:
         return Texture(colors, (wrap_u, wrap_v), self._allowance)
 
     def _wraps(self, texture: dict[str, Any]) -> tuple[Wrap, Wrap]:
-        """Return how a texture continues beyond its edges along u and along v."""
+        """Return the wrap modes of a texture along u and v."""
         sampler = self._file.part("samplers", texture["sampler"]) if "sampler" in texture else {}
         wrap_u, wrap_v = (_WRAPS.get(sampler.get(name), "repeat") for name in ("wrapS", "wrapT"))
         return wrap_u, wrap_v
@@ -138,7 +141,7 @@ class GltfMaterials:
         return name[:80] or f"material {str(number)[:20]}"
 
     def _read_texture(self, number: int) -> tuple[Texture, dict[str, Any]] | None:
-        """Return the mask of a material and its texture info, or None if the material is opaque."""
+        """Return the mask and texture info of a material, or None if the material is opaque."""
         material = self._file.part("materials", number)
         mode = material.get("alphaMode", "OPAQUE")
         if mode not in _CUT:
@@ -174,7 +177,7 @@ class GltfMaterials:
         return self._file.image(index, read_opacity)
 
     def _coordinates(self, info: dict[str, Any], primitive: dict[str, Any], mesh: Any) -> Any:
-        """Return the texture coordinates of a primitive for a texture info.
+        """Return the texture coordinates of a primitive that a texture info refers to.
 
         The shape is (v, 2).
         """
@@ -210,7 +213,10 @@ class GltfMaterials:
 
 
 def _base_of(material: dict[str, Any]) -> tuple[dict[str, Any] | None, Sequence[float]]:
-    """Return the texture info of the base color of a material, or None, and the color factors."""
+    """Return the texture info and the factors of a material's base color.
+
+    The texture info is None if the material has no texture.
+    """
     usual = material.get("pbrMetallicRoughness", {})
     glossy = extension(material, _GLOSSY)
     info = usual.get("baseColorTexture") or glossy.get("diffuseTexture")
@@ -218,7 +224,7 @@ def _base_of(material: dict[str, Any]) -> tuple[dict[str, Any] | None, Sequence[
 
 
 def _image_of(texture: dict[str, Any]) -> int:
-    """Return the index of the image of a texture, or raise MaskError for an unsupported format."""
+    """Return the image index of a texture, or raise MaskError if its format is unsupported."""
     index = texture.get("source", extension(texture, "EXT_texture_webp").get("source"))
     if index is None:
         raise MaskError("its image is in a format that cannot be read")
