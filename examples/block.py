@@ -150,7 +150,7 @@ class Block:
         return mesh.GetPrim()
 
     def color(self, prim: Usd.Prim, colors: list[tuple[float, ...]]) -> None:
-        """Set the color of a mesh, or of each of its polygons (linear RGB)."""
+        """Set the color of a mesh, or the color of each of its polygons (linear RGB)."""
         primvar = UsdGeom.Gprim(prim).CreateDisplayColorPrimvar(
             UsdGeom.Tokens.uniform if len(colors) > 1 else UsdGeom.Tokens.constant
         )
@@ -186,7 +186,10 @@ class Block:
         UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
 
     def strip(self, name: str, begin: float, end: float, step: float, lift: float) -> Usd.Prim:
-        """Add a section of the street. The texture of `Street` repeats every 12 m."""
+        """Add a section of the street.
+
+        The texture of `Street` repeats every 12 m.
+        """
         distance_m, aside = np.meshgrid(
             np.arange(begin, end + step / 2, step), np.linspace(-WIDTH / 2, WIDTH / 2, 5),
             indexing="ij",

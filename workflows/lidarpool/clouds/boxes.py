@@ -18,11 +18,9 @@ from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
 class Boxes:
     """Bounding boxes of all actors at the start of a sweep.
 
-    The start is the timestamp of the sweep.
-
-    Each point is measured at its own time, so points of a moving actor can lie outside its box. The
-    size of a box is the same in all sweeps. The box of an actor that deforms contains the actor in
-    all its shapes.
+    The start is the timestamp of the sweep. Each point is measured at its own time, so points of a
+    moving actor can lie outside its box. The size of a box is the same in all sweeps. The box of an
+    actor that deforms contains the actor in all its shapes.
 
     The box of an actor that appears during the sweep is extrapolated back to the start of the
     sweep, using the actor's velocity when it appears. There is no box for an actor that has left

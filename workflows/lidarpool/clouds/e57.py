@@ -397,9 +397,7 @@ def _stated_name(header: Any) -> str:
 def _pose(header: Any, name: str) -> tuple[Floats | None, tuple[str, ...]]:
     """Return the pose matrix of a scan and notes about the pose.
 
-    The matrix is None if the scan has no pose.
-
-    Raises ValueError if the pose is not finite.
+    The matrix is None if the scan has no pose. Raises ValueError if the pose is not finite.
     """
     node = header.node
     if not node.isDefined("pose"):

@@ -195,7 +195,7 @@ class NuScenes(MultiFileFormat):
     def merge_jobs(
         cls, storage: Storage, manifests: Iterable[Mapping[str, Any]]
     ) -> dict[str, list[int]]:
-        """Write the tables of a data set, and return the jobs whose labels must be renumbered."""
+        """Write the tables of a data set and return the jobs whose labels must be renumbered."""
         shared: set[str] = set()  # tokens of rows that are shared by several jobs
         with ExitStack() as stack:
             files = {
@@ -236,7 +236,7 @@ class NuScenes(MultiFileFormat):
     def renumber_labels(
         cls, name: str, read: Callable[[str], bytes], before: Sequence[int], after: Sequence[int]
     ) -> bytes | None:
-        """Return the content of a nuScenes-lidarseg file with labels for the classes `after`."""
+        """Renumber the labels in a nuScenes-lidarseg file to match the classes `after`."""
         if not name.startswith(LABELS):
             return None
         table = _labels_of_classes(after)[[0, *before]]
@@ -249,7 +249,7 @@ def _channels(sweeps: Sweeps) -> list[str]:
 
 
 def _samples(sweeps: Sweeps) -> tuple[Ints, Bools]:
-    """Return the sample of each sweep, and a mask of key frames.
+    """Return the sample of each sweep and a mask of key frames.
 
     A key frame is the first sweep of a sensor in a sample.
     """
@@ -268,7 +268,7 @@ def _files(sweeps: Sweeps, channels: Sequence[str], first: Bools, entry: Entry |
 
 
 def _labels_of_classes(classes: Collection[int]) -> Bytes:
-    """Return the label of each class number, which is 0 for classes without a name.
+    """Return the label of each class number, or 0 for classes without a name.
 
     Parameters
     ----------
@@ -333,7 +333,7 @@ def _spelled_alike(name: str) -> str:
 
 
 class _JobClasses:
-    """Collects the classes of all jobs in a data set."""
+    """Collection of the classes of all jobs in a data set."""
 
     def __init__(self) -> None:
         self._names: dict[int, dict[str, None]] = {}  # {class: its names in the jobs, in order}
@@ -348,13 +348,17 @@ class _JobClasses:
 
     @property
     def names(self) -> dict[int, str]:
-        """Class names by number. Different names for the same number are joined by semicolons."""
+        """Class names, keyed by number.
+
+        Different names for the same number are joined by semicolons.
+        """
         return {number: "; ".join(names) for number, names in self._names.items()}
 
     def relabeled_jobs(self) -> dict[str, list[int]]:
-        """Return the jobs whose labels must be renumbered, as {name of the job: all classes}.
+        """Return the jobs whose labels must be renumbered, with all classes of the data set.
 
-        These are the jobs that do not have all classes of the data set.
+        The result maps the name of each of these jobs to the classes. The jobs do not have all of
+        these classes themselves.
         """
         numbers = sorted(self._names)
         _labels_of_classes(numbers)  # raises LidarError if there are too many
@@ -370,7 +374,7 @@ def _no_map() -> bytes:
 
 
 class _Tables:
-    """Builds the nuScenes tables of a survey.
+    """Builder of the nuScenes tables of a survey.
 
     The tokens of the rows are derived from the survey and the job, so they are reproducible.
     """
@@ -527,7 +531,7 @@ def _open_data_set(source: RecordingSource) -> Recording:
 
 
 class _DataSet:
-    """Tables of a nuScenes data set, from which the sweeps of its lidars are read.
+    """Tables of a nuScenes data set with the sweeps of its lidars.
 
     File names in the tables are relative to the parent of the folder that contains the tables.
     """
@@ -553,9 +557,10 @@ class _DataSet:
         return {row["token"]: row for row in rows}
 
     def lidars(self) -> dict[str, Recording]:
-        """Return a recording for each lidar channel, whose sweeps are sorted by time.
+        """Return one recording per lidar channel.
 
-        If there are several scenes, the name of the scene precedes the name of the channel.
+        The sweeps of a recording are sorted by time. If there are several scenes, the name of the
+        scene precedes the name of the channel.
         """
         sensors = self._table("sensor")
         scenes = self._table("scene")

@@ -133,7 +133,7 @@ class _EncodedMessage:
         return self.message.version
 
     def has_field(self, name: str) -> bool:
-        """Return True if the message has a field."""
+        """Return whether the message has a field."""
         return bool(self.message.has_field(name))
 
     def desc(self) -> Any:
@@ -141,13 +141,16 @@ class _EncodedMessage:
         return self.message.desc()
 
     def to_binary(self) -> bytes:
-        """Encode all fields. Their order does not matter in the wire format."""
+        """Encode all fields.
+
+        Their order does not matter in the wire format.
+        """
         data: bytes = self.message.to_binary()
         return data + self.encoded_fields
 
 
 class _OSIMessages:
-    """Creates the messages for sweeps.
+    """Conversion of sweeps to OSI messages.
 
     Object identifiers are the numbers in the column `object`. The host vehicle is the vehicle that
     carries the sensors. Its identifier is the next number.
@@ -278,7 +281,7 @@ class _OSIMessages:
 
 
 def _type_fields(osi: Any, name: str) -> Mapping[str, Any]:
-    """Return the type fields of a moving object, which are derived from the name of an actor."""
+    """Return the type fields of a moving object, derived from an actor's name."""
     kind = osi.MovingObject.Type
     words = [name.lower(), *re.findall("[a-z]+", name.lower())]
     if not _PERSONS.isdisjoint(words):
@@ -348,7 +351,10 @@ def encode_detections(positions: Floats, points: Cloud) -> bytes:
 
 
 class _Record:
-    """Encodes many messages with the same fields and lengths at once, field by field."""
+    """Encoder for many messages with the same fields and lengths.
+
+    Each field is encoded for all messages at once.
+    """
 
     def __init__(self) -> None:
         # Bytes that differ between messages, as uint8 with shape (n, k), or common bytes.

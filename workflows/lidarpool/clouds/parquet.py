@@ -121,7 +121,10 @@ class Parquet(MultiFileFormat):
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open a .parquet file or a folder of such files, whose row groups are read separately."""
+        """Open a .parquet file or a folder of such files.
+
+        Row groups are read separately.
+        """
         with reading(source.name):
             return _parts(source)
 
@@ -142,7 +145,10 @@ def _size_of(table: Any) -> int:
 
 
 def _group(fragment: Any, allowance: Allowance, cache: dict[tuple[str, int], Any]) -> Any:
-    """Read a row group. The last two are cached, because neighboring sweeps share row groups."""
+    """Read a row group.
+
+    The last two row groups are cached, because neighboring sweeps share row groups.
+    """
     key = fragment.path, fragment.row_groups[0].id
     if key not in cache:
         rows = read_group(fragment, number_columns(fragment.physical_schema), allowance)

@@ -58,7 +58,10 @@ class Rings:
 
     @classmethod
     def from_sweeps(cls, name: str, sweeps: Sequence[Sweep]) -> Rings:
-        """Find the rings in the returns of some sweeps, which should not be motion-compensated."""
+        """Find the rings in the returns of several sweeps.
+
+        The sweeps should not be motion-compensated.
+        """
         if not sweeps:
             return cls(name)
         if all("channel" in sweep.columns for sweep in sweeps):
@@ -205,7 +208,7 @@ def _clusters(points: Floats) -> Floats | None:
 
 
 def _runs(points: Floats) -> tuple[Ints, Bools]:
-    """Return the starts of runs with monotonic azimuths, and a mask of the runs that are rings."""
+    """Return the starts of runs with monotonic azimuths and a mask of the runs that are rings."""
     azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
     steps = np.diff(azimuth)
     direction = np.sign(np.sum(np.sign(steps)))

@@ -93,10 +93,8 @@ def density_label(density: float) -> str:
 def _corner_means(pieces: Floats32, areas: Floats, density: Floats) -> Floats:
     """Return the mean density of all pieces around each corner.
 
-    This makes transitions smooth.
-
-    `pieces` (k, 3, 3) are the corners, `areas` (k,) are in square meters, and `density` (k, 3) is
-    given at the corners, as is the result.
+    This makes transitions smooth. `pieces` (k, 3, 3) are the corners, `areas` (k,) are in square
+    meters, and `density` (k, 3) is given at the corners, as is the result.
     """
     corner_keys = np.ascontiguousarray(pieces).view("V12").ravel()
     _, corner = np.unique(corner_keys, return_inverse=True)

@@ -151,9 +151,7 @@ def make_light_map(
 def _quarters(has_surface: Bools) -> Ints:
     """Return which quarter of its two-by-two block each grid point with a surface occupies.
 
-    Quarters are numbered from 0 to 3.
-
-    `has_surface` has shape (rows, columns).
+    Quarters are numbered from 0 to 3. `has_surface` has shape (rows, columns).
     """
     row, column = np.nonzero(has_surface)
     return np.asarray(row % 2 + 2 * (column % 2))
@@ -171,10 +169,8 @@ def _rotated(direction: Floats, rotation: float) -> Floats:
 def _lights(sun: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the directions, strengths, and rotations of lights.
 
-    The lights represent the sky and the sun.
-
-    The directions (k, 3) are evenly spread. The strengths (k,) add up to 1 on level ground. The
-    rotations (k,) are in radians.
+    The lights represent the sky and the sun. The directions (k, 3) are evenly spread. The strengths
+    (k,) add up to 1 on level ground. The rotations (k,) are in radians.
     """
     n = np.arange(SUN_LIGHTS)
     azimuth = 2 * np.pi * 0.6180339887 * n

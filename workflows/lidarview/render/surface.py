@@ -92,10 +92,8 @@ def separate_objects(scene: Scene, objects: Integers, step: float) -> Scene:
 def _shared_corners(scene: Scene, objects: Integers) -> Ints:
     """Return a number for each vertex.
 
-    Vertices of an object at the same position have the same number.
-
-    In files such as .stl, each triangle has its own vertices, and these triangles must stay
-    connected.
+    Vertices of an object at the same position have the same number. In files such as .stl, each
+    triangle has its own vertices, and these triangles must stay connected.
     """
     key = np.zeros(len(scene.vertices), np.uint64)
     key[scene.faces] = objects[:, None]

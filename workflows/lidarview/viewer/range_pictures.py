@@ -100,9 +100,9 @@ def _range_colors(ranges: Floats, limits: tuple[float, float]) -> Bytes:
 
 
 def surround_object(sensors: Floats, bounds: Floats) -> bool:
-    """Return whether several sensors surround an object.
+    """Return whether there are several sensors, all of which are outside an object.
 
-    All of them are then beside or above the object.
+    They can be beside or above the object.
 
     `sensors` has shape (n, 3) and `bounds` (2, 3).
     """

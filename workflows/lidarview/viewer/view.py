@@ -509,10 +509,9 @@ class View:
     def _points(self, arguments: Arguments, is_disconnected: Callable[[], bool]) -> Answer:
         """Return points with their colors.
 
-        The points can be restricted by a filter, ranges of scans, and a camera.
-
-        Positions are local, and "rows" are row indices. "count" is the number of points that pass
-        the filter before they are thinned out.
+        The points can be restricted by a filter, ranges of scans, and a camera. Positions are
+        local, and "rows" are row indices. "count" is the number of points that pass the filter
+        before they are thinned out.
         """
         finder = self._finder
         version = self.version

@@ -158,9 +158,8 @@ class _NodeReader:
     def node(self, index: int) -> Node:
         """Return a node.
 
-        A node without a name is named after its mesh.
-
-        Hidden nodes are returned without meshes and children.
+        A node without a name is named after its mesh. Hidden nodes are returned without meshes and
+        children.
         """
         data = self._file.part("nodes", index)
         name = str(data.get("name") or "")

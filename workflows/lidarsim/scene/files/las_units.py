@@ -1,10 +1,8 @@
 """Coordinate units according to the coordinate system that a file states.
 
-The system is stated as WKT or as GeoTIFF keys.
-
-OGC WKT 1 and 2 state the length of each unit. GeoTIFF keys refer to units or coordinate systems by
-EPSG codes. The units of a coordinate system are looked up in the PROJ database, which is part of
-rasterio.
+The system is stated as WKT or as GeoTIFF keys. OGC WKT 1 and 2 state the length of each unit.
+GeoTIFF keys refer to units or coordinate systems by EPSG codes. The units of a coordinate system
+are looked up in the PROJ database, which is part of rasterio.
 """
 
 from __future__ import annotations
@@ -92,9 +90,7 @@ _OVERRIDE = (
 def reprojection_advice(epsg: int | None) -> str:
     """Suggest how to transform a cloud to a coordinate system in meters.
 
-    The result is a sentence.
-
-    `epsg` is the code of the suggested system, or None.
+    The result is a sentence. `epsg` is the code of the suggested system, or None.
     """
     code = epsg or "CODE"
     return (

@@ -281,9 +281,7 @@ def _summary(
 def written_by_lidarpool(path: Path) -> bool:
     """Return whether lidarpool wrote the file.
 
-    Files written by lidarpool are in meters.
-
-    The format of the file must not state a unit itself.
+    Files written by lidarpool are in meters. The format of the file must not state a unit itself.
     """
     with open_input(path) as file:
         return FORMAT_COMMENT.encode() in file.read(_HEAD_BYTES)

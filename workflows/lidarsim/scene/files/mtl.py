@@ -91,12 +91,11 @@ class _Entry:
 class MtlMaterials:
     """Masks and colors of the materials in an .obj file.
 
-    Each image is read only once.
-
-    The material files are named by the `libraries` statements. Masks are `map_d` images, or the
-    alpha channels of `map_Kd` images if there are none. Constant opacities (`d` and `Tr`) are
-    ignored because some programs confuse the two. Colors are `map_Kd` images, or `Kd` if there are
-    none. `Kd` is ignored if there is an image because some programs set it to black then.
+    Each image is read only once. The material files are named by the `libraries` statements. Masks
+    are `map_d` images, or the alpha channels of `map_Kd` images if there are none. Constant
+    opacities (`d` and `Tr`) are ignored because some programs confuse the two. Colors are `map_Kd`
+    images, or `Kd` if there are none. `Kd` is ignored if there is an image because some programs
+    set it to black then.
     """
 
     def __init__(

@@ -331,9 +331,8 @@ def _check_length(header: _Header, row_size: int, size: int) -> None:
 def _read_compressed(header: _Header, body: memoryview, file_size: int) -> list[AnyArray]:
     """Read the fields of a compressed body.
 
-    Each array has shape (n, count).
-
-    The fields are stored one after the other. PCL does not store padding, but other programs do.
+    Each array has shape (n, count). The fields are stored one after the other. PCL does not store
+    padding, but other programs do.
     """
     if len(body) < 8:
         raise CutShortError("the sizes of its compressed points are missing")
@@ -385,10 +384,8 @@ def _decompress(packed: memoryview, size: int) -> Bytes:
 def _read_text(header: _Header, body: memoryview) -> list[AnyArray]:
     """Read the fields of text lines.
 
-    Each array has shape (n, count).
-
-    Floating-point fields are read in double precision regardless of their SIZE, since programs
-    write more digits.
+    Each array has shape (n, count). Floating-point fields are read in double precision regardless
+    of their SIZE, since programs write more digits.
     """
     names = [name for field in header.fields for name in _column_names(field)]
     lines = bytes(body).rstrip().count(b"\n") + 1

@@ -538,10 +538,9 @@ class _PlyHeader(NamedTuple):
 def read_ply_mesh(data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read a Stanford polygon (.ply) file.
 
-    The file can be text or binary, and its polygons can have different numbers of corners.
-
-    Vertex colors are the properties red, green and blue. They are integers, or floating-point
-    numbers from 0 to 1 or 255.
+    The file can be text or binary, and its polygons can have different numbers of corners. Vertex
+    colors are the properties red, green and blue. They are integers, or floating-point numbers from
+    0 to 1 or 255.
     """
     header = _ply_header(data)
     counts = {element.name: element.count for element in header.elements}

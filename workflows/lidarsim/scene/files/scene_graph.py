@@ -298,10 +298,8 @@ def join_pieces(
 ) -> list[SceneMesh]:
     """Merge pieces into a list with a single mesh.
 
-    The list is empty if the pieces have no faces.
-
-    Pieces with masks come last. No allowance is required for formats in which the content cannot be
-    much larger than the file.
+    The list is empty if the pieces have no faces. Pieces with masks come last. No allowance is
+    required for formats in which the content cannot be much larger than the file.
 
     Raises
     ------
