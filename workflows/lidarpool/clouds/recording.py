@@ -65,8 +65,8 @@ class Recording:
     count
         Number of sweeps or parts.
     read
-        Function that returns a sweep, given its number, with the units and column names in the
-        file.
+        Function that returns the sweep with a given number. The sweep has the units and column
+        names of the file.
     is_cloud
         Whether the items are parts of a cloud without sweeps.
     point_count
@@ -76,11 +76,11 @@ class Recording:
     read_stamps
         Function that returns the timestamps of all sweeps in nanoseconds, or None.
     read_poses
-        Function that returns the poses of all sweeps in the world, of shape (count, 4, 4), or None
-        if some are unknown. It is faster than reading every sweep.
+        Function that returns the poses of all sweeps in the world frame, with shape (count, 4, 4).
+        It returns None if a pose is unknown. It is faster than reading every sweep.
     fired
-        Function that returns a sweep as fired, with its `firing_poses`, given its number. None if
-        the firing poses are unknown, as in most recordings from real sensors.
+        Function that returns the sweep with a given number as fired, including its `firing_poses`.
+        None if the firing poses are unknown, as in most recordings from real sensors.
     sample
         Function that returns approximately the given number of points, which are evenly distributed
         in the file.

@@ -47,7 +47,7 @@ class Rings:
     are_cones
         Whether the rings were determined from elevation angles.
     note
-        How the rings were determined, or why they are unknown.
+        Description of how the rings were determined, or of why they are unknown.
     """
 
     name: str

@@ -51,7 +51,7 @@ class Column:
     meaning
         Description in a few words, without a period.
     source
-        Source of the values. Either the name of an attribute of
+        Source of the values. It is either the name of an attribute of
         `lidarsim.simulator.points.batch_points.BatchPoints`, which contains the returns in a batch,
         or a function that receives this object and returns an array of shape (n,). The function
         runs on the worker that casts the rays. By default, the attribute with the same name as the

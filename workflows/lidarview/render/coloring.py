@@ -127,7 +127,7 @@ def make_coloring(
     names
         Names of the values 0, 1, 2, … of a label column.
     limits
-        Ends of a scale, in its unit. By default, they are percentiles of the values.
+        Limits of the scale, in its unit. By default, they are percentiles of the values.
     """
     if column in (RGB, NORMALS):
         return Coloring(lambda packs: unpack_colors(packs) / 255, column.name, "", column.meaning)

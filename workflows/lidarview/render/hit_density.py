@@ -51,7 +51,8 @@ def hit_colors(
     colors
         (k, 3, 3) colors at the corners.
     limits
-        Ends of the logarithmic scale in hits per square meter. The colors of the scale are `TURBO`.
+        Limits of the logarithmic scale in hits per square meter. The colors of the scale are
+        `TURBO`.
     """
     triangle_density = hit_density(scene, hit_counts)
     pieces, owner, areas, point_density = _divide(corners, hit_counts > 0, points, max_pieces)

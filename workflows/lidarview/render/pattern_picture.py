@@ -43,7 +43,8 @@ class _Pattern(NamedTuple):
     times_s
         (n,) times of the rays in seconds.
     met_s
-        (rows, columns) time of the first ray in each cell, in seconds, or infinity.
+        (rows, columns) time at which each cell is first hit, in seconds, or infinity for cells that
+        are never hit.
     every
         The frame contains only one out of this many firings.
     """

@@ -80,8 +80,8 @@ def draw_hits(
     points
         (n, 3) evenly spaced sample of the hits, local, in meters. It may have gaps.
     sample_rays
-        (n, 2, 3) start and end points of rays, local, in meters. Some of the rays that end in the
-        picture are drawn.
+        (n, 2, 3) start and end points of rays, local, in meters. Some of the rays that end inside
+        the plot are drawn.
     """
     hits = hit_counts[shot.part.parents] * shot.part.shares
     corners = shot.scene.vertices[shot.scene.faces].astype(np.float32)

@@ -248,11 +248,11 @@ def take_shot(
     actors
         Number of actors, which are the last objects of the scene.
     caption
-        Caption of the picture, by default the number of sensors.
+        Caption of the plot. The default is the number of sensors.
     models
         Sensor models, for a second caption.
     size
-        Width and height of the picture in pixels.
+        Width and height of the plot in pixels.
     backend
         Backend of the ray caster.
     """

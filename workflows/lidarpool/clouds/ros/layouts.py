@@ -87,9 +87,9 @@ class PointLayout(ABC):
         Parameters
         ----------
         since_ns
-            Firing times in nanoseconds since the stamp of the message.
+            Firing times in nanoseconds since the timestamp of the message.
         stamp_ns
-            Stamp of the message in nanoseconds since 1970.
+            Timestamp of the message in nanoseconds since 1970.
         """
 
     @abstractmethod

@@ -304,7 +304,7 @@ def stated_meters(
     system
         The system that the file states, or None for meters.
     positions
-        All positions in the file, or a sample, in the units of the file. Shape (n, 3).
+        Positions in the file, or a sample of them, in the units of the file. Shape (n, 3).
     unit
         Unit specified by the user, which replaces the units of the system.
 
