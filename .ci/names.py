@@ -33,7 +33,6 @@ def _files(folders: tuple[str, ...], pattern: str) -> list[Path]:
 
 
 def _repeated_classes(texts: dict[Path, str]) -> Iterator[str]:
-    """Yield public class names that are defined in several places."""
     places = defaultdict[str, list[str]](list)
     for path, text in texts.items():
         for node in ast.walk(ast.parse(text)):
@@ -55,7 +54,6 @@ def _missing_modules(texts: dict[Path, str]) -> Iterator[str]:
 
 
 def _notes(source: str) -> Iterator[str]:
-    """Yield the comments and docstrings of Python code."""
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
             yield token.string

@@ -61,7 +61,7 @@ LENGTH = 4 * (2 * (HALF - CORNER) + np.pi / 2 * CORNER)
 
 
 def raster(path: Path) -> None:
-    """Write the hills as a raster of 200 x 200 pixels of 2 m."""
+    """Write the hills as a raster of 200 x 200 pixels, each of which is 2 m wide."""
     coordinates = np.arange(-199.0, 200, 2)
     heights = height(coordinates[None, :], coordinates[::-1, None])
     transform = from_origin(EAST - 200, NORTH + 200, 2, 2)

@@ -160,7 +160,6 @@ draw_storedcloud = draw_cloud
 
 
 def _sampled(cloud: CloudLike, step: int) -> Floats:
-    """Return the positions of every `step`-th point of a cloud."""
     pieces = [np.zeros((0, 3))]
     first = 0
     for piece in cloud.chunks():

@@ -247,7 +247,7 @@ class PictureContent:
         path.write_bytes(pack_arrays(arrays))
 
     def _track_arrays(self) -> dict[str, Any]:
-        """Return the positions of sensors and the trajectories of actors as named arrays."""
+        """Return sensor positions and actor trajectories as named arrays."""
         arrays: dict[str, Any] = {}
         for number, sensor in enumerate(self.sensors):
             arrays[f"sensor{number}_times"] = sensor.times_ns

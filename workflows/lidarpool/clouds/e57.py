@@ -294,7 +294,6 @@ def _states(kind: str) -> list[str]:
 
 
 def _positions(read: Mapping[str, AnyArray], kind: str) -> Floats:
-    """Return the positions in a scan as Cartesian coordinates."""
     first, second, third = (read[axis].astype(np.float64) for axis in _COORDINATES[kind])
     if kind == "cartesian":
         return np.stack([first, second, third], axis=1)
@@ -376,7 +375,6 @@ def _limit(header: Any, group: str, name: str) -> float | None:
 
 
 def _number(node: Any) -> float:
-    """Return the value of a numeric node."""
     from pye57 import libe57
 
     is_scaled = isinstance(node, libe57.ScaledIntegerNode)

@@ -88,7 +88,6 @@ class ImageFolder(MultiFileFormat):
 
     @classmethod
     def _folders_of(cls, sweeps: Sweeps, entry: Entry | None) -> list[str]:
-        """Return the folder of each sensor."""
         names = make_identifiers(name or "lidar" for name in sweeps.sensors)
         return names if entry is None else [f"{cls.path_of_job(entry)}/{name}" for name in names]
 

@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 class JobReader:
-    """Reader of the files of one data set job.
+    """Reader for the files of a data set job.
 
     The files can be read in any order, but only from one thread.
     """

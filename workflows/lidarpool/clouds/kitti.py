@@ -1,4 +1,4 @@
-"""Read and write KITTI folders with the labels of SemanticKITTI and bounding boxes of actors."""
+"""Read and write KITTI folders with SemanticKITTI labels and bounding boxes of actors."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ class KITTI(MultiFileFormat):
         return files
 
     def _tracks(self, numbers: Sequence[int], boxes: Sequence[Boxes | None]) -> bytes:
-        """Return the boxes of all sweeps of a sensor in the layout of KITTI tracking."""
+        """Format a sensor's boxes in all sweeps for KITTI tracking."""
         sweeps = self.sweeps
         lines = []
         for frame, number in enumerate(numbers):

@@ -120,7 +120,7 @@ def _records(
 
 
 def _layout(file: BinaryIO) -> tuple[int, int, int]:
-    """Return the header size, the offset of the points and the number of VLRs.
+    """Return the header size, the point offset and the number of VLRs.
 
     Raises ValueError if these numbers are inconsistent with each other or with the file size.
     Without this check, laspy would try to read up to four billion records.

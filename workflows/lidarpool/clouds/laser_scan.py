@@ -1,4 +1,4 @@
-"""Conversion of sweeps from 2D scanners to the fields of ROS LaserScan messages."""
+"""Conversion of 2D scanner sweeps to the fields of ROS LaserScan messages."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ class MultiFileFormat(CloudFormat):
         return {}
 
     def summary(self, details: Sequence[Any]) -> dict[str, Any]:
-        """Return a JSON-serializable summary of this job for the manifest of a data set."""
+        """Return a JSON-serializable summary of this job for the data set manifest."""
         return {}
 
     def write(
@@ -115,7 +115,7 @@ class MultiFileFormat(CloudFormat):
         storage.tidy()
 
     def write_range(self, storage: Storage, first: int, stop: int) -> WrittenRange:
-        """Write the files of a range of pieces, with one piece in memory at a time.
+        """Write the files of a range of pieces, holding one piece in memory at a time.
 
         Raises OSError if a file cannot be written.
         """

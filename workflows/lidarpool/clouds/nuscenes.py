@@ -259,7 +259,6 @@ def _samples(sweeps: Sweeps) -> tuple[Ints, Bools]:
 
 
 def _files(sweeps: Sweeps, channels: Sequence[str], first: Bools, entry: Entry | None) -> list[str]:
-    """Return the name of each sweep's point file."""
     below = "" if entry is None else f"{entry.name}/"
     return [
         f"{'samples' if key else 'sweeps'}/{channels[sensor]}/{below}{number:06}.pcd.bin"

@@ -124,20 +124,16 @@ class _EncodedMessage:
 
     @property
     def timestamp(self) -> Any:
-        """Timestamp in the message."""
         return self.message.timestamp
 
     @property
     def version(self) -> Any:
-        """OSI version in the message."""
         return self.message.version
 
     def has_field(self, name: str) -> bool:
-        """Return whether the message has a field."""
         return bool(self.message.has_field(name))
 
     def desc(self) -> Any:
-        """Return the descriptor of the message's type."""
         return self.message.desc()
 
     def to_binary(self) -> bytes:
@@ -295,7 +291,6 @@ def _type_fields(osi: Any, name: str) -> Mapping[str, Any]:
 
 
 def _vector(osi: Any, vector: Floats) -> Any:
-    """Convert a vector to a message."""
     x, y, z = vector.tolist()
     return osi.Vector3d(x=x, y=y, z=z)
 
@@ -312,7 +307,7 @@ def _orientation(osi: Any, quaternion: Floats) -> Any:
 
 
 def encode_detections(positions: Floats, points: Cloud) -> bytes:
-    """Encode the detections of points as fields of LidarDetectionData.
+    """Encode points as fields of LidarDetectionData.
 
     As defined by Spherical3d in OSI, azimuth and elevation are right-handed rotations about the z
     axis and the rotated y axis. Points above the sensor therefore have a negative elevation.
@@ -361,7 +356,6 @@ class _Record:
         self._parts: list[AnyArray | bytes] = []
 
     def add_double(self, number: int, values: Floats) -> None:
-        """Add a field with one floating-point number per message."""
         self._parts.append(_key(number, _FIXED64))
         self._parts.append(np.ascontiguousarray(values, "<f8").view(np.uint8).reshape(-1, 8))
 
@@ -379,7 +373,6 @@ class _Record:
         self._parts.append(groups.astype(np.uint8))
 
     def add_record(self, number: int, record: _Record) -> None:
-        """Add a field with one submessage per message."""
         rows = record.rows()
         self._parts.append(_key(number, _LENGTH) + _varint(rows.shape[1]))
         self._parts.append(rows)
@@ -407,7 +400,6 @@ def _key(number: int, wire_type: int) -> bytes:
 
 
 def _field(number: int, content: bytes) -> bytes:
-    """Encode a field that contains a message."""
     return _key(number, _LENGTH) + _varint(len(content)) + content
 
 

@@ -130,7 +130,6 @@ class Parquet(MultiFileFormat):
 
 
 def _dataset(storage: Storage, folder: str) -> Any:
-    """Open the partition of a job as a pyarrow data set."""
     import pyarrow.dataset
 
     if storage.is_local:
@@ -140,7 +139,6 @@ def _dataset(storage: Storage, folder: str) -> Any:
 
 
 def _size_of(table: Any) -> int:
-    """Return the total size of the files in a partition in bytes."""
     return sum(info.size for info in table.filesystem.get_file_info(table.files))
 
 

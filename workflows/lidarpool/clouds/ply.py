@@ -254,7 +254,6 @@ class PlyAppender:
         self._start = len(head)
 
     def _write(self, data: bytes | memoryview) -> None:
-        """Append bytes to the file."""
         view = memoryview(data)
         while view:  # Linux writes at most 2 GiB in one call
             view = view[self._file.write(view) :]
@@ -273,7 +272,6 @@ def _comments(table: Sequence[Column], sweeps: Sweeps) -> str:
 
 
 def _write_at(file: int, data: memoryview, offset: int) -> None:
-    """Write bytes at an offset in a file."""
     while data:  # Linux writes at most 2 GiB in one call
         count = os.pwrite(file, data, offset)
         data = data[count:]

@@ -1,4 +1,4 @@
-"""Conversion of the columns of a part to rows of a PLY file, in a single compiled pass."""
+"""Conversion of part columns to rows of a PLY file, in a single compiled pass."""
 
 from __future__ import annotations
 
@@ -133,6 +133,5 @@ class PlyRowEncoder:
 
 
 def _offset(row: np.dtype[np.void], name: str) -> int:
-    """Return the offset of a field in a row, in bytes."""
     assert row.fields is not None, "named fields"
     return row.fields[name][1]

@@ -322,7 +322,7 @@ class Recording:
         return rings
 
     def times_of(self, sweep: Sweep) -> Floats | None:
-        """Return the time of each point relative to the timestamp of its sweep, in seconds.
+        """Return each point's time in seconds relative to the timestamp of its sweep.
 
         Returns None if the times are unknown, otherwise an array with shape (n,).
         """

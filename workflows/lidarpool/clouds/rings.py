@@ -218,7 +218,6 @@ def _runs(points: Floats) -> tuple[Ints, Bools]:
 
 
 def _medians(values: Floats, starts: Ints) -> Floats:
-    """Return the median of each run of values."""
     return np.array([np.median(run) for run in np.split(values, starts[1:])])
 
 

@@ -273,7 +273,6 @@ def _samples(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
 
 
 def _slice(path: Path, offset: int, size: int) -> bytes:
-    """Read `size` bytes of a file, starting at an offset."""
     with path.open("rb") as file:
         file.seek(offset)
         return file.read(size)

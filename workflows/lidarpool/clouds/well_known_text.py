@@ -58,8 +58,6 @@ def wkt(epsg: int) -> str:
 
 
 def _utm(epsg: int, zone: int, south: bool, system: _Geodetic) -> str:
-    """Return the WKT 1 string for a UTM zone."""
-
     def code(number: int) -> str:
         return f'AUTHORITY["EPSG","{number}"]'
 

@@ -204,7 +204,6 @@ class ExportSpec(FileSection):
         return notes + self.cloud_format.renaming_notes(sweeps.sensors)
 
     def _is_missed(self, name: str, requested: Collection[str] | None) -> bool:
-        """Return whether the omission of a column should be noted."""
         if name in ("scan", "sensor"):  # sweeps and sensors are separate files, scans or topics
             return False
         if requested is not None:

@@ -85,7 +85,6 @@ def _on_signals(handler: Callable[[int, FrameType | None], object]) -> None:
 
 
 def _exit_at_once(message: bytes) -> NoReturn:
-    """End the process immediately with a message on stderr."""
     with suppress(OSError):  # the terminal may already be closed
         os.write(2, message)
     os._exit(INTERRUPTED)

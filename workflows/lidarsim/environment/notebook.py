@@ -33,7 +33,7 @@ def register_drawers(drawers: Mapping[str, str]) -> None:
 
 
 def html_table(rows: Iterable[tuple[str, str]]) -> str:
-    """Return an HTML table of names and values in the color theme of the notebook."""
+    """Return an HTML table of names and values that follows the notebook's color theme."""
     from html import escape
 
     left = " style='text-align:left'"

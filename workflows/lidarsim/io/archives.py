@@ -74,8 +74,6 @@ class StoredArray(NamedTuple):
 
 
 class _StoredFile(NamedTuple):
-    """An uncompressed file in an archive."""
-
     name: bytes
     flags: int
     crc: int
@@ -289,8 +287,6 @@ def read_npy(content: bytes | memoryview, name: str) -> AnyArray:
 
 
 class _ArrayType(NamedTuple):
-    """Contents of an NPY header."""
-
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
     is_fortran: bool

@@ -371,7 +371,6 @@ class _ColumnReader:
         return None if quantity is None else (quantity, name.unit)
 
     def choose(self, columns: Mapping[str, str] | None) -> None:
-        """Assign the columns that the user specified."""
         self.can_choose = columns is not None
         faults: list[str] = []
         for name, file_name in (columns or {}).items():
@@ -382,7 +381,6 @@ class _ColumnReader:
         _refuse(faults)
 
     def _choose(self, name: str, file_name: str) -> None:
-        """Assign a single column that the user specified."""
         match = self.quantity_of(name)
         if match is None:
             raise ValueError(
@@ -414,7 +412,6 @@ class _ColumnReader:
         self._add(quantity, matches[0], unit)
 
     def leave_out(self, ignore: Sequence[str]) -> None:
-        """Skip the columns that the user ignores."""
         self.left_out |= ignored_columns(self.cells, ignore)
 
     def assign(
@@ -459,7 +456,6 @@ class _ColumnReader:
         _refuse(faults)
 
     def _unknown(self, cells: Sequence[str]) -> str:
-        """Return a message about unknown columns."""
         columns = "columns" if len(cells) > 1 else "column"
         pronoun = "them" if len(cells) > 1 else "it"
         hint = did_you_mean_each(cells, [quantity.name for quantity in self.quantities])
@@ -487,7 +483,6 @@ class _ColumnReader:
         )
 
     def _unit_missing(self, quantity: Quantity, cell: str) -> _UnitMissingError:
-        """Return the error to raise for a column without a unit."""
         first, *other_units = quantity.units
         stem = quantity.name.removesuffix(f"_{first}")
         choice = f", or set `columns: {{{quantity.name}: {printable(cell)}}}`" * self.can_choose
@@ -588,7 +583,6 @@ def _listed(cells: Sequence[str]) -> str:
 
 
 def _ignoring(cells: Sequence[str]) -> str:
-    """Return the scenario setting that ignores columns."""
     return f"{{file: …, ignore: {format_yaml_list(cells)}}}"
 
 

@@ -177,7 +177,7 @@ class Actor:
 
     @cached_property
     def _traveled(self) -> tuple[Floats, Floats]:
-        """Sample times in nanoseconds, and the distance in meters that is traveled by each time.
+        """Sample times in nanoseconds, and the distances traveled up to these times in meters.
 
         Distances decrease while the actor moves backward. The actor is stationary before the first
         and after the last time. Both arrays have shape (k,).

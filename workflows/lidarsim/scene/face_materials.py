@@ -14,7 +14,7 @@ from .colors import are_valid_indices
 
 @dataclass(frozen=True, eq=False)
 class FaceMaterials:
-    """Material names of the faces of a mesh.
+    """Material names of mesh faces.
 
     Attributes
     ----------

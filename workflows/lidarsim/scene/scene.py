@@ -674,8 +674,6 @@ def local_origin(vertices: Floats) -> Floats:
 
 
 class _PlacedPart(NamedTuple):
-    """A mesh part and its pose in the scene."""
-
     owner: int  # index of the object
     part: int  # index of the part
     matrix: Floats  # (4, 4), from the frame of the part to world coordinates

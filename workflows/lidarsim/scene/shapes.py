@@ -121,9 +121,10 @@ def cylinder(radius: float, height: float, segments: int, name: str) -> SceneMes
 
 
 def _revolved_faces(rings: int, segments: int) -> Ints:
-    """Return the faces of a surface of revolution with `rings` circles of `segments` vertices each.
+    """Return the faces of a surface of revolution.
 
-    The last two vertices are the lower pole and the upper pole.
+    The surface has `rings` circles with `segments` vertices each. The last two vertices are the
+    lower pole and the upper pole.
     """
     grid = np.arange(rings * segments).reshape(rings, segments)
     following = np.roll(grid, -1, axis=1)

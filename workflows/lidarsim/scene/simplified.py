@@ -90,7 +90,7 @@ class _DrawnPart(NamedTuple):
 
 
 class _CopiedInstances:
-    """Collector of the triangles of a scene and of its instances' copies."""
+    """Collector of a scene's triangles and of copies of its instances."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -200,7 +200,7 @@ def _cut_part(part: MeshPart, max_pieces: float) -> MeshPart:
 
 
 def _piece_corners(steps: int) -> Floats:
-    """Return the barycentric corner coordinates of the pieces of a triangle.
+    """Return the barycentric coordinates of the corners of a triangle's pieces.
 
     Each edge of the triangle is divided into `steps` segments. The shape is (steps², 3, 3).
     """
@@ -242,8 +242,6 @@ def _triangle_shares(
 
 
 class _SimplifiedPart(NamedTuple):
-    """A mesh part with fewer triangles."""
-
     vertices: Floats  # (v, 3)
     faces: Ints32  # (k, 3)
     face_indices: Indices  # (k,), index of the original face

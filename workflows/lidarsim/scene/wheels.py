@@ -84,9 +84,9 @@ def _check_names(wheels: Sequence[str], names: Sequence[str]) -> None:
 def _radii(
     meshes: Sequence[SceneMesh], wheels: Sequence[str]
 ) -> tuple[dict[int, float], list[str]]:
-    """Return the radii of round wheels by mesh index, and messages about other wheels.
+    """Return the radii of round wheels, keyed by mesh index, and messages about other wheels.
 
-    Radii are in meters.
+    The radii are in meters.
     """
     radii: dict[int, float] = {}
     notes: list[str] = []

@@ -103,7 +103,7 @@ def about(description: str, *examples: Any, **limits: Any) -> Any:
 
 
 def declared_values(instance: Any, base: type) -> dict[str, Any]:
-    """Return the values of those fields of an instance that are declared in a base class.
+    """Return an instance's values of the fields that a base class declares.
 
     The result maps field names to values.
     """

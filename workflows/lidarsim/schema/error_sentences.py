@@ -109,7 +109,6 @@ def _line(
 
 
 def _in_file(value: Any) -> str:
-    """Format a value as in a YAML file."""
     plain = str(value).lower() if isinstance(value, bool) else shown(value)
     return "empty" if value is None else plain
 

@@ -64,7 +64,6 @@ def owner_of_file(kind: Any) -> Owner:
 
 
 def _inner_sections(outer: Owner) -> Iterator[Owner]:
-    """Yield the sections in the fields of a section."""
     for name, field in fields_by_name(outer.kind).items():
         if any(isinstance(note, GetPydanticSchema) for note in field.metadata):
             continue  # the field is available only in Python

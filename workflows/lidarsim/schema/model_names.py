@@ -26,7 +26,7 @@ def model_names() -> tuple[str, ...]:
 
 
 def names_in(maker: Traversable) -> list[str]:
-    """Return the sorted names of the models in the folder of a maker."""
+    """Return the sorted model names in a maker's folder."""
     file_names = sorted(entry.name for entry in maker.iterdir())
     return [
         f"{maker.name}/{file.removesuffix('.yaml')}"

@@ -71,7 +71,7 @@ def states_compensation(frame_text: str) -> bool | None:
 
 
 def number_positions(positions: Floats) -> Ints:
-    """Return the number of each position in order of first occurrence, starting at 1.
+    """Assign numbers to positions in order of first occurrence, starting at 1.
 
     Equal positions have the same number. The positions have shape (n, 3), and the result has dtype
     int64 and shape (n,).

@@ -99,7 +99,7 @@ def _relative_spread(heights: Floats) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ScenePart:
-    """A part of a scene that maps each of its triangles to a triangle of the scene."""
+    """Triangles of a part of a scene, mapped to the triangles of the entire scene."""
 
     scene: Scene
     parents: Ints  # (f,) triangle of the uncut scene from which each triangle is cut

@@ -1,4 +1,4 @@
-"""Choose the colors of points by one of their columns, with a matching legend."""
+"""Choose point colors and a matching legend for a column."""
 
 from __future__ import annotations
 
@@ -46,7 +46,10 @@ _TIME_UNITS = (("s", 1e9), ("ms", 1e6), ("µs", 1e3))  # units for nanoseconds
 
 @dataclass(frozen=True, eq=False)
 class Coloring:
-    """Colors for the values of a column, with a limited scale or with labels."""
+    """Colors for the values of a column.
+
+    They are a scale between two limits, or one color per label.
+    """
 
     # Function that returns the colors (n, 3), from 0 to 1, of values (n,).
     paint: Callable[[AnyArray], Floats]

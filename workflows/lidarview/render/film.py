@@ -49,8 +49,6 @@ _NOISE = 0.02  # distance of a point from its surface, as a fraction of its rang
 
 
 class _Shape(NamedTuple):
-    """Triangles in a single color."""
-
     caster: RayCaster
     normals: Floats  # (f, 3)
     color: Floats  # (4,)
@@ -65,7 +63,6 @@ class _CameraPath(NamedTuple):
     focus: float  # distance from the camera to the center of the scene or to the platform
 
     def camera(self, number: int) -> Camera:
-        """Return the camera for a frame."""
         ahead = normalize((self.targets - self.eyes)[number, None])
         right = normalize(np.cross(ahead, [0.0, 0.0, 1.0]))
         axes = np.concatenate([right, np.cross(right, ahead), ahead])
@@ -81,14 +78,13 @@ class _FilmPoints:
     first_frame: Floats = field(default_factory=lambda: np.empty(0))
 
     def add(self, number: int, positions: Floats, colors: Floats) -> None:
-        """Add the points of a frame."""
         self.positions = np.vstack([self.positions, positions])
         self.colors = np.vstack([self.colors, colors])
         new = np.full(len(self.positions) - len(self.first_frame), number)
         self.first_frame = np.append(self.first_frame, new)
 
     def select(self, chosen: Bools) -> None:
-        """Keep only the points in a mask."""
+        """Keep only the points that a mask selects."""
         self.positions = self.positions[chosen]
         self.colors = self.colors[chosen]
         self.first_frame = self.first_frame[chosen]

@@ -106,7 +106,7 @@ def _corner_means(pieces: Floats32, areas: Floats, density: Floats) -> Floats:
 
 
 def hit_density(scene: Scene, hit_counts: AnyArray) -> Floats:
-    """Return the hits per square meter on triangles, given the hits on each triangle.
+    """Return the number of hits per square meter on each triangle.
 
     If most triangles are so small that they have at most one hit, neighbors share their hits. Each
     triangle passes a third of its hits to each corner, and each corner distributes them by area.
@@ -264,7 +264,6 @@ def _longest(pieces: Floats32) -> tuple[Indices, Floats32]:
 
 
 def _halved(pieces: Floats32) -> tuple[Floats32, Floats32]:
-    """Split each piece at the midpoint of its longest edge."""
     rows = np.arange(len(pieces))
     edge = _longest(pieces)[0]
     a, b, c = (pieces[rows, (edge + k) % 3] for k in range(3))

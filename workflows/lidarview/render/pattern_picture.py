@@ -121,7 +121,6 @@ def pattern_page(sensor: Sensor) -> Page:
 
 
 def _pattern_of(sensor: Sensor) -> _Pattern:
-    """Compute the scan pattern of a sensor."""
     per_second = _firings_per_second(sensor)
     per_frame = max(round(getattr(sensor.head, "firings_per_turn", per_second / 10)), 1)
     every = -(-per_frame * sensor.channels // _MAX_FRAME_RAYS)

@@ -371,7 +371,7 @@ class _Viewpoint:
         return RaySamples(triangle, distance.astype(np.float32), position, normal, light, weights)
 
     def light_map(self, samples: RaySamples) -> LightMap:
-        """Compute the light on a coarse grid of the samples of all pixels."""
+        """Compute the light for a coarse grid of pixel samples."""
         width, height = self.camera.size
         coarse = (slice(STRIDE // 2, None, STRIDE),) * 2
         position = samples.position.reshape(height, width, 3)[coarse]
@@ -395,14 +395,12 @@ def _choose_viewpoint(
 
 
 def _pixel_centers(size: tuple[int, int]) -> Floats:
-    """Return the coordinates of all pixel centers."""
     width, height = size
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     return np.asarray(grid.reshape(-1, 2) + 0.5)
 
 
 def _add_light(samples: RaySamples, pixels: Floats, light: LightMap) -> None:
-    """Set the light of samples at pixel coordinates."""
     lit = np.flatnonzero(samples.triangle != SKY)
     is_ground = samples.triangle[lit] == GROUND
     samples.light[lit] = light.brightness(

@@ -97,7 +97,7 @@ def make_axis(name: str, lower: float, upper: float, step: float, origin: float)
 
 
 def nice_step(length: float) -> float:
-    """Return the smallest multiple of a power of ten by 1, 2, or 5 that is at least `length`.
+    """Round a length up to 1, 2, or 5 times a power of ten.
 
     Examples
     --------

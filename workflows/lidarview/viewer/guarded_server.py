@@ -89,7 +89,6 @@ class _GuardedServer(HTTPServer):
         )
 
     def on_close(self, server_conn: object) -> None:
-        """Forget a closed connection."""
         self._forget(server_conn)
         super().on_close(server_conn)
 
@@ -98,7 +97,6 @@ class _GuardedServer(HTTPServer):
         self._open.discard(server_conn)
 
     def _finish(self, server_conn: object) -> None:
-        """Stop the time limit of a connection."""
         timer = self._unfinished.pop(server_conn, None)
         if timer is not None:
             timer.cancel()
@@ -132,16 +130,13 @@ class _GuardedRequest(HTTPMessageDelegate):
         return self._request.headers_received(start_line, headers)
 
     def data_received(self, chunk: bytes) -> Awaitable[None] | None:
-        """Pass a part of the body to the application."""
         return self._request.data_received(chunk)
 
     def finish(self) -> None:
-        """Let the application answer the request."""
         self._finished()
         self._request.finish()
 
     def on_connection_close(self) -> None:
-        """Notify the application that the client has disconnected."""
         if self._is_handed_over:
             self._request.on_connection_close()
 

@@ -132,7 +132,7 @@ Points = CloudFile | InMemoryPoints | JoinedPoints | StationPoints
 
 
 def _row_ranges(points: Points, scans: ScanRanges) -> list[tuple[int, int]]:
-    """Return the start and stop rows of the given ranges of scans."""
+    """Return the start and stop rows of each range of scans."""
     if isinstance(points, StationPoints):
         return _row_ranges(points.points, scans)
     if isinstance(points, JoinedPoints):
@@ -271,7 +271,6 @@ class BrowserCamera:
         return np.stack([x, y], axis=1) / np.where(inside, w, 1.0)[:, None], inside
 
     def _clip(self, points: AnyFloats) -> AnyFloats:
-        """Return the clip coordinates of points."""
         return np.asarray(self.matrix[:, :3] @ points.T + self.matrix[:, 3:])
 
     def tiles(self, points: AnyFloats) -> Ints:

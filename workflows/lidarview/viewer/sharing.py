@@ -164,7 +164,7 @@ class _FilmSource:
     top: float  # height above which the scene is cut open, meters
 
     def positions(self, max_points: int, scans: ScanRanges | None = None) -> Floats:
-        """Return the local positions of a sample of the points below `top`."""
+        """Sample the points below `top` and return their local positions."""
         rows, _ = self.finder.find(max_points, scans=scans)
         local = read_positions(self.view.points, rows) - self.view.origin
         return local[local[:, 2] <= self.top]
@@ -172,7 +172,7 @@ class _FilmSource:
     def points(
         self, box: Floats, max_points: int, scans: ScanRanges | None = None
     ) -> tuple[Floats, Floats]:
-        """Return the local positions and RGBA colors of a sample of the points.
+        """Sample the points and return their local positions and RGBA colors.
 
         The colors span the height of `box`, which has shape (2, 3).
         """
@@ -388,7 +388,7 @@ def _thinned(view: View, max_points: int) -> Answer:
 
 
 def _compact_order(columns: Mapping[str, AnyArray], count: int) -> Ints:
-    """Order the points by sensor and channel, which compresses well."""
+    """Sort the points by sensor and channel, which makes them compress well."""
     keys = [columns[name] for name in ("channel", "sensor") if name in columns]
     return np.lexsort(keys) if keys else np.arange(count)
 

@@ -590,7 +590,7 @@ class View:
         return {"low": lower / unit, "high": upper / unit, "unit": unit, "whole": is_integer}, {}
 
     def _label_counts(self, name: str, is_disconnected: Callable[[], bool]) -> Answer:
-        """Return the number of points with each value of a label column.
+        """Count the points with each value of a label column.
 
         If there are many points, the numbers are estimated from a sample, and "exact" is False.
         """
@@ -738,7 +738,6 @@ def _read_limits(text: str) -> tuple[float, float]:
 
 
 def _add_counts(counts: Counter[int], values: AnyArray) -> None:
-    """Add the number of occurrences of each value to the counts."""
     labels, numbers = np.unique(values, return_counts=True)
     counts.update(dict(zip(labels.astype(np.int64).tolist(), numbers.tolist(), strict=True)))
 
@@ -766,7 +765,7 @@ def _cloud_extent(points: Points) -> tuple[Floats, Floats, Floats]:
 
 
 class ProgressiveView:
-    """A view of a sample of points that is replaced by a view of all points after they are read.
+    """A view of sampled points that is replaced once all points have been read.
 
     Parameters
     ----------
@@ -813,7 +812,6 @@ class ProgressiveView:
         return header, arrays
 
     def _start(self) -> None:
-        """Start reading all points, unless reading has already started."""
         with self._lock:
             if self._reading is None:
                 self._reading = threading.Thread(target=self._grow, name="reading", daemon=True)

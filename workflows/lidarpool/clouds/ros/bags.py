@@ -232,7 +232,6 @@ def _latched_profile() -> Any:
 
 
 def _open_job(job: JobReader, file: str) -> Any:
-    """Open the bag of a job in a data set."""
     from lidarsim.columns.closing_bag import ClosingBag
 
     # AnyReader would parse the message definitions, which takes longer than reading a sweep.
@@ -345,8 +344,6 @@ def _stated_compensation(path: Path) -> bool | None:
 
 
 class _Header(NamedTuple):
-    """Header of a ROS message."""
-
     stamp_ns: int  # time of the measurement, which can be long before the recording time
     frame: str
 

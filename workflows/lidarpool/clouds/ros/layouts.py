@@ -75,7 +75,7 @@ class PointLayout(ABC):
 
     @abstractmethod
     def values(self, sweep: Sweep, traits: LidarTraits) -> dict[str, AnyArray]:
-        """Return the values of all fields except position, ring and time, by field name.
+        """Return the values of all fields except position, ring and time, keyed by field name.
 
         `traits` describes the sensor of the sweep.
         """

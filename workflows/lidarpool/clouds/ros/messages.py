@@ -211,7 +211,7 @@ class SurveyMessages:
         ]
 
     def _frames_within(self, sweep: int) -> Iterator[RosMessage]:
-        """Yield the frames of the vehicle and of actors after the start of a sweep."""
+        """Yield the frames of the vehicle and the actors after the start of a sweep."""
         sweeps = self._sweeps
         since_ns = self._pose_times(sweep)
         if not len(since_ns):
@@ -289,7 +289,7 @@ def _instruments(sweeps: Sweeps) -> list[tuple[str, str, SweepPoses, int]]:
 
 
 def sweep_topic(sweeps: Sweeps, sweep: int) -> str:
-    """Return the topic of the points of a sweep."""
+    """Return the topic for the points of a sweep."""
     sensor = sweeps.sensor[sweep]
     frames = frame_names(sweeps.sensors, sweeps.actors)
     return points_topic(sweeps.sensors[sensor], frames[sensor])
@@ -310,7 +310,6 @@ class _Messages:
         self._types = types
 
     def types_of(self, package: str, *names: str) -> list[Any]:
-        """Return message types from a package."""
         return [self._types[f"{package}/msg/{name}"] for name in names]
 
     def stamp(self, time_ns: int) -> Any:
@@ -397,7 +396,6 @@ class _Messages:
                 yield _sent("/gnss/position", message, time_ns)
 
     def laser_scan(self, rays: ScanRays, header: Any) -> Any:
-        """Return a LaserScan message with the rays of a sweep."""
         first = float(rays.angles[0])
         last = float(rays.angles[-1])
         (scan,) = self.types_of("sensor_msgs", "LaserScan")

@@ -65,7 +65,7 @@ _OF_COUNTRIES = re.compile(
 class GroundScale:
     """Range of ground lengths that correspond to one meter in a projected coordinate system.
 
-    The length depends on the direction.
+    The ground length depends on the direction.
     """
 
     shortest: float  # meters
@@ -136,7 +136,7 @@ class AreaOfUse:
 def has_registry() -> bool:
     """Return whether rasterio is installed.
 
-    It includes PROJ and the EPSG registry.
+    rasterio includes PROJ and the EPSG registry.
     """
     return find_spec("rasterio") is not None
 
@@ -348,7 +348,8 @@ def outside_system(epsg: int, x: float, y: float) -> str:
 
     Far means more than 5 degrees. The result is a phrase such as "the area of use of EPSG:2056
     (CH1903+ / LV95), which is Liechtenstein; Switzerland". It is an empty string if the location is
-    not far outside, if the code is unknown, if the system is not projected, and without rasterio.
+    not far outside, if the code is unknown, if the system is not projected, or if rasterio is not
+    installed.
     """
     if _is_in_zone(epsg, x, y) or not has_registry():
         return ""
@@ -507,7 +508,7 @@ def projection_kind(name: str) -> bool | None:
 
 
 def center_of(objects: Sequence[SceneMesh | SceneInstance]) -> Floats:
-    """Return the center of the bounding rectangle of all object centers.
+    """Return the center of the rectangle that encloses all object centers.
 
     The result contains x and y, which are zero if there are no objects.
     """
@@ -519,7 +520,7 @@ def center_of(objects: Sequence[SceneMesh | SceneInstance]) -> Floats:
 
 
 def _center(item: SceneMesh | SceneInstance) -> Floats:
-    """Return the center of the bounding box of an object in world coordinates."""
+    """Return the center of an object's bounding box in world coordinates."""
     if isinstance(item, SceneMesh):
         return np.asarray(item.bounds.mean(axis=0))
     middle = item.mesh.bounds.mean(axis=0)

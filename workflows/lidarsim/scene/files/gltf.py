@@ -156,10 +156,9 @@ class _NodeReader:
         return _matrix({**node, **animated})
 
     def node(self, index: int) -> Node:
-        """Return a node.
+        """Return a node, named after its mesh if it has no name.
 
-        A node without a name is named after its mesh. Hidden nodes are returned without meshes and
-        children.
+        Hidden nodes are returned without meshes and children.
         """
         data = self._file.part("nodes", index)
         name = str(data.get("name") or "")
@@ -389,7 +388,8 @@ class _NodeReader:
 def _matrix(node: dict[str, Any]) -> Floats:
     """Return the local transform of a node.
 
-    It is stated as a matrix in column-major order, or as translation, rotation and scale.
+    The transform is stated as a matrix in column-major order, or as translation, rotation and
+    scale.
     """
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
@@ -408,7 +408,7 @@ def _matrices(
 ) -> Floats | None:
     """Compose transforms from translations, quaternions and scales.
 
-    Their shapes are (k, 3), (k, 4) and (k, 3), and the result has shape (k, 4, 4).
+    The inputs have the shapes (k, 3), (k, 4) and (k, 3), and the result has shape (k, 4, 4).
     """
     rows = next((part for part in (translation, rotation, scale) if part is not None), None)
     if rows is None:

@@ -48,7 +48,7 @@ def find_animation(animations: list[dict[str, Any]], name: str) -> dict[str, Any
 def keyframe_range(
     animation: Mapping[str, Any], read: Callable[[Any], AnyArray]
 ) -> tuple[float, float]:
-    """Return the times of the first and the last keyframe of an animation.
+    """Return the first and the last keyframe time of an animation.
 
     `read` returns the values of an accessor.
 

@@ -245,7 +245,7 @@ def _decode_data_uri(uri: str) -> bytes:
 
 
 def extension(part: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return the data of an extension of a part, or an empty dictionary."""
+    """Return a part's data for an extension, or an empty dictionary."""
     content: dict[str, Any] = part.get("extensions", {}).get(name, {})
     return content
 

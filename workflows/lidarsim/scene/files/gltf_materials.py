@@ -107,7 +107,7 @@ class GltfMaterials:
     def _read_tinted(self, key: tuple[int, tuple[float, ...], Wrap, Wrap]) -> Texture:
         """Return the texture of a tinted image.
 
-        Keys are (image, linear tint, wrap along u, wrap along v).
+        Keys are tuples (image, linear tint, wrap mode along u, wrap mode along v).
         """
         image, light, wrap_u, wrap_v = key
         colors = self._file.image(image, partial(read_colors, notes=self.notes))
@@ -166,7 +166,8 @@ class GltfMaterials:
     def _read_mask(self, key: tuple[int, int, Wrap, Wrap]) -> Texture:
         """Return the mask of an image.
 
-        Keys are (image, minimum alpha that blocks light, wrap along u, wrap along v).
+        Keys are tuples (image, minimum alpha that blocks light, wrap mode along u, wrap mode along
+        v).
         """
         image, min_alpha, wrap_u, wrap_v = key
         opacity = self._opacity(image)
@@ -177,7 +178,7 @@ class GltfMaterials:
         return self._file.image(index, read_opacity)
 
     def _coordinates(self, info: dict[str, Any], primitive: dict[str, Any], mesh: Any) -> Any:
-        """Return the texture coordinates of a primitive that a texture info refers to.
+        """Return the texture coordinates to which a texture info of a primitive refers.
 
         The shape is (v, 2).
         """
@@ -199,10 +200,6 @@ class GltfMaterials:
         return uv
 
     def _attribute(self, name: str, primitive: dict[str, Any], mesh: Any) -> AnyArray:
-        """Return a vertex attribute of a primitive.
-
-        The shape is (v, width).
-        """
         accessor = primitive["attributes"][name]
         if mesh is None:
             return self._file.accessor(accessor)

@@ -42,9 +42,9 @@ def common_limits(limits: Sequence[Limits]) -> Sequence[Limits] | None:
     """Return the limits that convert the intensities of all scans to the same scale.
 
     Many programs write the lowest and highest measured intensity of each scan as its limits,
-    although all scans have the same scale. Different limits are therefore only interpreted as
-    different scales if they differ by a factor of 16, or if all of them are plain limits, such as 0
-    to 255, or start at the lowest value of Leica's scale.
+    although all scans have the same scale. Different limits are therefore interpreted as different
+    scales only in two cases: if they differ by a factor of 16, or if all of them are plain limits,
+    such as 0 to 255, or start at the lowest value of Leica's scale.
 
     Returns
     -------

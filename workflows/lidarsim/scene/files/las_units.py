@@ -128,7 +128,7 @@ class CoordinateUnits:
 
     @property
     def factors(self) -> tuple[float, float, float]:
-        """Lengths of the units of x, y and z in meters."""
+        """Factors that convert x, y and z to meters."""
         return self.horizontal.meters, self.horizontal.meters, self.vertical.meters
 
     @property
@@ -269,7 +269,6 @@ def _is_geocentric(system: _Node) -> bool:
 
 
 def _parse_wkt(text: str) -> _Node:
-    """Parse WKT and return the root node."""
     root = _Node("")
     open_nodes = [root]
     for match in _TOKENS.finditer(text):
@@ -295,7 +294,7 @@ def _parse_wkt(text: str) -> _Node:
 
 
 def _length_unit(system: _Node) -> CoordinateUnit | None:
-    """Return the unit of the first axis of a system.
+    """Return the unit of a system's first axis.
 
     WKT 2 can state the unit of each axis.
     """
@@ -343,7 +342,6 @@ def geo_keys(records: Mapping[int, bytes]) -> dict[int, float]:
 
 
 def _key_values(data: bytes, count: int, doubles: bytes) -> Iterator[tuple[int, float]]:
-    """Yield the numeric GeoTIFF keys and their values."""
     for number in range(count):
         key, location, _, value = struct.unpack_from("<4H", data, 8 + 8 * number)
         if location == 0:

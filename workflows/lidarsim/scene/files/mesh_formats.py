@@ -123,7 +123,7 @@ class MeshFormat:
 def _options_problem(options: type) -> str:
     """Explain why a class cannot define format-specific options.
 
-    The result is an empty string if it can.
+    The result is an empty string if the class is suitable.
     """
     if not is_dataclass(options):
         return "are not a dataclass"

@@ -325,7 +325,7 @@ def _report_axes(
 def _doubt_about_rotation(content: Content, meshes: Sequence[SceneMesh | SceneInstance]) -> str:
     """Explain why a file that was rotated from Y-up may actually be Z-up.
 
-    The result is an empty string if there is no such doubt.
+    The result is an empty string if the rotation is not in doubt.
     """
     if "trimesh" in content.generator:
         return ", but was written by trimesh, which does not convert axes"
@@ -509,7 +509,7 @@ def _mesh_at_start(actor: Actor) -> SceneMesh:
 
 
 def _corners(item: SceneMesh | SceneInstance) -> Floats:
-    """Return points in world coordinates that have the bounding box of an object."""
+    """Return world points with the same bounding box as an object."""
     if isinstance(item, SceneMesh):
         return (item.animation or item).bounds
     box = np.array(list(product(*item.mesh.bounds.T)))

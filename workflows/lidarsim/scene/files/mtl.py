@@ -82,8 +82,6 @@ class _Image:
 
 @dataclass
 class _Entry:
-    """Images and color of a material."""
-
     images: dict[bytes, _Image] = field(default_factory=dict)  # {b"map_d": image}
     color: Bytes | None = None  # uint8 (1, 1, 3)
 

@@ -26,9 +26,9 @@ _EXPECTED = (
 def read_npy_cloud(path: Path) -> list[Sweep]:
     """Read the points of a NumPy array.
 
-    The first three columns, or the fields of these names, are x, y and z. The other columns are
-    named `column_4`, `column_5` and so on. Range images of shape (rows, columns, 3 or more) are
-    flattened.
+    The coordinates x, y and z are the first three columns, or the fields with these names. The
+    other columns are named `column_4`, `column_5` and so on. Range images of shape (rows, columns,
+    3 or more) are flattened.
 
     Raises
     ------

@@ -52,8 +52,6 @@ _NO_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class _Field:
-    """A field declared in the header."""
-
     name: str
     kind: str  # NumPy type, such as "<f4"
     count: int  # numbers per point
@@ -65,8 +63,6 @@ class _Field:
 
 
 class _Header(NamedTuple):
-    """The header of a .pcd file."""
-
     fields: list[_Field]
     points: int
     encoding: str
@@ -163,7 +159,6 @@ def pcd_bytes(
 
 
 def _parse_header(data: bytes, encoding: str) -> _Header:
-    """Parse the header before the DATA line."""
     entries: dict[str, tuple[int, list[str]]] = {}  # {keyword: (line number, words)}
     lines = data.decode("latin-1").splitlines()
     for number, line in enumerate(lines, 1):

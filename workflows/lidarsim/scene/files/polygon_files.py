@@ -49,8 +49,6 @@ _MAX_COORDINATE = 1 << 62  # limit for the indices of texture coordinates
 
 
 class _ObjTriangles(NamedTuple):
-    """Triangles of an object."""
-
     vertices: Ints  # (t, 3), indices of vertices
     coordinates: Ints  # (t, 3), indices of texture coordinates
     materials: Ints  # (t,), indices of materials
@@ -134,7 +132,7 @@ def read_obj(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 def _parse_obj(text: bytes, stem: str, with_colors: bool, with_materials: bool) -> _ObjContent:
-    """Parse the lines of a file.
+    """Parse the lines of a Wavefront file.
 
     Polygons before the first named object belong to the object `stem`.
     """
@@ -215,7 +213,7 @@ def _obj_coordinates(value: bytes) -> list[float]:
 
 
 def _obj_coordinate_rows(value: bytes, count: int) -> list[int]:
-    """Return the indices of the texture coordinates of a face, or -1 for missing ones.
+    """Return the texture coordinate indices of a face, or -1 for missing ones.
 
     `count` is the number of texture coordinates that have been read so far.
     """
@@ -247,7 +245,7 @@ def _obj_corners(value: bytes, count: int) -> list[int]:
 def _obj_mistake(data: bytes, with_colors: bool) -> str | None:
     """Describe the first invalid line of a file, or return None if there is none.
 
-    Each line is only checked by itself.
+    Each line is checked without considering other lines.
     """
     total = len(re.findall(rb"^[ \t]*v[ \t]", data, re.MULTILINE))
     count = 0  # vertices read so far
@@ -516,7 +514,7 @@ class _Element:
 
 
 class _PlyColumn(NamedTuple):
-    """The values of a property in all rows of an element."""
+    """A property's values in all rows of an element."""
 
     numbers: AnyArray  # (sum of sizes,)
     sizes: Ints  # (rows,), number of values in each row

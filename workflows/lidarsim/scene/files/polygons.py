@@ -128,7 +128,7 @@ def _clip_ears(flat: Floats, sizes: list[int]) -> Ints:
 
 
 def unroll_strip(strip: Ints) -> Ints:
-    """Return the triangles of a triangle strip, all with the same orientation.
+    """Return the triangles of a triangle strip with a consistent orientation.
 
     `strip` has shape (t + 2,), and the result has shape (t, 3).
     """

@@ -78,7 +78,7 @@ class ReadOptions(NamedTuple):
 
 
 class RigidPart(NamedTuple):
-    """Objects that move as a rigid body, with the body's poses."""
+    """Objects that move as a rigid body, and the poses of this body."""
 
     name: str
     objects: Sequence[SceneMesh | SceneInstance]

@@ -72,8 +72,6 @@ Meters = tuple[float, float, float]  # units of x, y and z in meters
 
 
 class _TiffTag(NamedTuple):
-    """A TIFF tag."""
-
     number: int
     type: int  # 3 for 16 bits, 4 for 32 bits, 12 for doubles, 2 for text
     value_count: int
@@ -178,7 +176,8 @@ class StatedSystem:
     def crs(self) -> Any:
         """The `rasterio.crs.CRS`, or None if it is unknown.
 
-        It is unknown without rasterio, and if PROJ knows no such system on Earth.
+        The system is unknown if rasterio is not installed, or if PROJ knows no such system on
+        Earth.
         """
         if not has_registry():
             return None
@@ -363,8 +362,8 @@ def check_metric_format(system: StatedSystem | None, positions: Floats) -> list[
 def _scale_of(system: StatedSystem, positions: Floats) -> _Scale:
     """Determine the scale of a coordinate system at the median of the positions.
 
-    Without rasterio, or if PROJ cannot compute the scale, it is inferred from the name of the
-    projection.
+    If rasterio is not installed, or if PROJ cannot compute the scale, the scale is inferred from
+    the name of the projection.
     """
     middle = np.median(positions[:, :2], axis=0) if len(positions) else np.zeros(2)
     if system.is_in_utm_zone(positions):  # the registry takes half a second to load

@@ -134,7 +134,6 @@ class RowReader:
             ) from error
 
     def _wrong_width(self, line_number: int, cells: Sequence[str]) -> str:
-        """Return the error message for a line with the wrong number of cells."""
         names = printable(", ".join(self.names))
         message = (
             f"line {line_number} has {plural(len(cells), 'cell')}, but {len(self.names)} were "
