@@ -2,7 +2,7 @@
 
 from lidarsim.environment.notebook import register_drawers
 
-# Notebooks show these objects with a picture. The drawing code is imported for the first picture.
+# Notebooks show these objects with a plot. The drawing code is imported for the first plot.
 register_drawers(
     {
         name: f"lidarview.cell_pictures:draw_{name.lower()}"

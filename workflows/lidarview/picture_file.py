@@ -284,7 +284,7 @@ class PictureContent:
     def _planning_arrays(self) -> dict[str, Any]:
         """Return the path search and its best path as named arrays.
 
-        The mapping is empty if there is no path search.
+        The mapping is empty if there is no best path.
         """
         planning = self.planning
         if planning is None or planning.best is None:

@@ -63,7 +63,7 @@ def pack_arrays(arrays: Mapping[str, Any]) -> bytes:
 class StoredArray(NamedTuple):
     """Location and type of an array in an uncompressed archive.
 
-    They allow reading the array in pieces.
+    This information is sufficient to read the array in pieces.
     """
 
     dtype: np.dtype[Any]
@@ -146,7 +146,7 @@ def _npy_head(array: AnyArray) -> bytes:
 def _directory_end(count: int, size: int, offset: int) -> bytes:
     """Return the records that follow a central directory.
 
-    `count` is the number of its entries, and `size` and `offset` are in bytes.
+    `count` is the number of entries in the directory. `size` and `offset` are in bytes.
     """
     end = b""
     if max(size, offset) > _MAX_SIZE:

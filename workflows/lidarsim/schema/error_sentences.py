@@ -52,7 +52,7 @@ def convert_validation_errors(
     """Convert a pydantic ValidationError raised in the context into a LidarError.
 
     The message has one line per mistake, prefixed with `source`. `content` is the content of the
-    file, if known, which enables advice on unknown fields. `contradictory` returns True if the
+    file, if known, which enables advice on unknown fields. `contradictory` returns whether the
     fields in a content contradict each other.
     """
     try:

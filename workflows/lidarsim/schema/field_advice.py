@@ -45,7 +45,7 @@ class Owner(NamedTuple):
     def is_direct(self) -> bool:
         """Whether the path contains no list or mapping.
 
-        Field names then suffice to describe it.
+        In this case, the field names are sufficient to describe the path.
         """
         return all(form == "%s" for form in self.forms)
 

@@ -1,6 +1,6 @@
 """Choose the part of a scene to show.
 
-This is the part around trajectories and below a roof.
+The part surrounds trajectories and ends below a roof.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ def floor_and_cut_heights(
 ) -> tuple[float | None, float | None]:
     """Return the floor height below positions and the height at which to cut the scene.
 
-    `positions` has shape (p, 3), and all values are in meters. The cut opens the scene halfway up
-    to the roof. It is None if there is no roof. The floor is None if there is no surface below a
+    `positions` has shape (p, 3), and all values are in meters. The cut height is halfway up to the
+    roof, or None if there is no roof. The floor height is None if there is no surface below a
     position.
     """
     sampled = positions[

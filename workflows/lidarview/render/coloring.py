@@ -176,7 +176,7 @@ class _Range(NamedTuple):
     def has_large_factors(self) -> bool:
         """Whether a linear scale would hide differences between the numbers.
 
-        The numbers are then positive and differ by large factors.
+        This is the case if the numbers are positive and differ by large factors.
         """
         is_low = self.middle - self.lower < _SKEWED_MEDIAN * (self.upper - self.lower)
         is_skewed = self.upper > _SKEWED_RATIO * self.lower and is_low

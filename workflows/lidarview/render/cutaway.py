@@ -22,8 +22,9 @@ class Cutaway:
 
     A hit is removed if its object surrounds the sensors in plan view, the hit is in the outer shell
     of the object, and its plane has the camera on one side and most sensors on the other. Both
-    faces of the walls in front and the roof are therefore removed, while the walls at the back, the
-    floor, and objects inside are kept, regardless of the winding and grouping of triangles.
+    faces of the walls in front and the roof are therefore removed. The walls at the back, the
+    floor, and objects inside are kept. This does not depend on the winding and grouping of
+    triangles.
     """
 
     surface: RenderMesh

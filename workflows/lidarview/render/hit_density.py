@@ -94,8 +94,8 @@ def density_label(density: float) -> str:
 def _corner_means(pieces: Floats32, areas: Floats, density: Floats) -> Floats:
     """Return the mean density of all pieces around each corner.
 
-    This makes transitions smooth. `pieces` (k, 3, 3) are the corners, `areas` (k,) are in square
-    meters, and `density` (k, 3) is given at the corners, as is the result.
+    This makes transitions smooth. `pieces` (k, 3, 3) contains the corners, and `areas` (k,) is in
+    square meters. `density` and the result (k, 3) are given at the corners.
     """
     corner_keys = np.ascontiguousarray(pieces).view("V12").ravel()
     _, corner = np.unique(corner_keys, return_inverse=True)
@@ -180,8 +180,8 @@ def _divide(
 ) -> tuple[Floats32, Ints, Floats, Floats]:
     """Divide triangles with hits while their grid cells contain enough points.
 
-    Returns the pieces with their owners, areas, and points per square meter. The last are NaN for
-    undivided triangles.
+    Returns the pieces with their owners, areas, and points per square meter. The points per square
+    meter are NaN for undivided triangles.
     """
     owner = np.arange(len(pieces))
     areas = triangle_areas(pieces)

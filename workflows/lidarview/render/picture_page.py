@@ -35,11 +35,11 @@ DPI = 200
 FONT = "DejaVu Sans"  # included in Matplotlib
 MAX_LARGE_MARKERS = 40  # more sensors than this are drawn as small dots
 MAX_PATH_POINTS = 200  # maximum number of points on the drawn trajectory of a sensor
-# Areas of markers with one and two digits, in square points for a picture 1600 pixels wide.
+# Areas of markers with one and two digits, in square points for a plot 1600 pixels wide.
 _MARK = 62
 _MARK_OF_TWO_DIGITS = 92
 MAX_NAMES = 12  # actors are not named if there are more
-# All lengths below are in pixels for a picture 1600 pixels wide.
+# All lengths below are in pixels for a plot 1600 pixels wide.
 NAME_ABOVE = 26.0
 NAME_SIZE = (150.0, 26.0)
 LEGEND_ROWS = 30
@@ -345,9 +345,9 @@ class Page:
     ) -> None:
         """Draw a legend in the right margin.
 
-        `entries` are (name, color). If there are more than `LEGEND_ROWS`, the last line states the
-        number of omitted entries. `sensor` is the label of the sensor marker, which is omitted if
-        the label is empty. The options are passed to `key`.
+        `entries` contains tuples (name, color). If there are more than `LEGEND_ROWS`, the last line
+        states the number of omitted entries. `sensor` is the label of the sensor marker, which is
+        omitted if the label is empty. The options are passed to `key`.
         """
         rows = [("s", name, color) for name, color in entries[:LEGEND_ROWS]]
         if sensor:

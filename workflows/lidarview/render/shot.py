@@ -197,7 +197,7 @@ class SurfaceView:
         `is_visible` returns the pixel coordinates of points and a visibility mask. The result
         contains the pixel coordinates (2, 2) of the ends of each piece.
         """
-        # Steps have equal lengths in the picture, where 1 / depth is linear.
+        # Steps have equal lengths in the image, where 1 / depth is linear.
         start_depth, stop_depth = (
             (segments[:, end] - self.camera.eye) @ self.camera.axes[2] for end in (0, 1)
         )

@@ -314,9 +314,10 @@ class View:
     def _state(self) -> Answer:
         """Return a description of the view without points and surfaces.
 
-        In the header, "bounds" is the bounding box of the scene, and "box" is the part to show
-        first. In a large scene, this is the surroundings of the trajectories, and "cut" is the
-        local z of the top of the box. Lengths are in meters and times in seconds.
+        In the header, "bounds" is a box around the scene, the sensors, and the ends of a planned
+        path, and "box" is the part to show first. In a large scene, this is the surroundings of the
+        trajectories, and "cut" is the local z of the top of the box. Lengths are in meters and
+        times in seconds.
         """
         # None if the page shows the whole scene.
         shown_box = surrounding_box(
@@ -831,7 +832,7 @@ class ProgressiveView:
     def _show(self, points: Points, share: float) -> None:
         """Display the points that have been read so far.
 
-        `share` is the fraction of all points that they represent.
+        `share` is the fraction of all points that has been read.
         """
         self._share = share
         self._view.replace_points(points, keep_scales=True)

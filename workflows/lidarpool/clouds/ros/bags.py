@@ -305,7 +305,7 @@ def _open_bag(source: RecordingSource) -> Recording:
         return sweep_from_columns(columns_of(data), time_ns=float(stamp_ns))
 
     with reading(source.name):
-        # The stamp is zero if the recording program did not set it.
+        # The timestamp is zero if the recording program did not set it.
         is_stamped = any(_header_of(data).stamp_ns for _, _, data in islice(messages(), 2))
 
     def headers() -> Iterator[_Header]:
