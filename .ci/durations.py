@@ -1,7 +1,8 @@
-"""Print the seconds that tests take as JSON, by a JUnit report of pytest.
+"""Print test durations in seconds as JSON, given a JUnit report of pytest.
 
-A test with rows has the mean of its rows; tests below a tenth of a second are left out.
-`tests/conftest.py` starts the longest files first, so that no process is left with one in the end.
+The duration of a test with several parameter sets is their mean. Tests below a tenth of a second
+are omitted. `tests/conftest.py` starts the longest files first, so that no process runs a long file
+alone at the end.
 
 Usage: python .ci/durations.py REPORT >tests/durations.json
 """
@@ -16,7 +17,7 @@ SHORTEST_S = 0.1
 
 
 def main() -> None:
-    """Print {file: {test: seconds}}."""
+    """Print the durations as {file: {test: seconds}}."""
     rows: defaultdict[str, defaultdict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for case in ElementTree.parse(sys.argv[1]).iter("testcase"):
         path = f"{case.get('classname', '').replace('.', '/')}.py"

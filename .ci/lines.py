@@ -1,4 +1,7 @@
-"""Print the lines of each package, as information; there are no limits."""
+"""Print the number of lines of each package.
+
+The numbers are only for information: there are no limits.
+"""
 
 from pathlib import Path
 
@@ -7,7 +10,7 @@ ENDINGS = {".py", ".cu", ".js"}
 
 
 def main() -> None:
-    """Print a row per package of the source roots, tests, benchmarks, and the code of docs."""
+    """Print one row for each package, the tests, the benchmarks, and the code of docs."""
     packages = [path for root in ("kernels", "scheduler") for path in (ROOT / root).iterdir()]
     packages += (ROOT / "workflows").glob("*/*")
     packages += [ROOT / "tests", ROOT / "benchmarks", ROOT / "docs"]

@@ -1,6 +1,7 @@
-"""Check names in the sources: public classes are unique, and modules in comments exist.
+"""Check names in the sources.
 
-Prints each fault, and exits with status 1 if there is one.
+Public classes must have unique names, and modules named in comments must exist. The script prints
+each fault, and exits with status 1 if there is one.
 """
 
 import ast
@@ -32,7 +33,6 @@ def _files(folders: tuple[str, ...], pattern: str) -> list[Path]:
 
 
 def _repeated_classes(texts: dict[Path, str]) -> Iterator[str]:
-    """Yield public class names that are defined in several places."""
     places = defaultdict[str, list[str]](list)
     for path, text in texts.items():
         for node in ast.walk(ast.parse(text)):
@@ -44,7 +44,7 @@ def _repeated_classes(texts: dict[Path, str]) -> Iterator[str]:
 
 
 def _missing_modules(texts: dict[Path, str]) -> Iterator[str]:
-    """Yield modules that a comment or docstring names, but which do not exist."""
+    """Yield modules that comments or docstrings name but that do not exist."""
     paths = [*texts, *_files(OTHERS, "*.py"), *_files(SOURCES, "*.cu")]
     known = {"/".join(path.parts[-count:]) for path in paths for count in range(1, 5)}
     for path, text in texts.items():
@@ -54,7 +54,6 @@ def _missing_modules(texts: dict[Path, str]) -> Iterator[str]:
 
 
 def _notes(source: str) -> Iterator[str]:
-    """Yield the comments and docstrings of Python code."""
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
             yield token.string

@@ -1,7 +1,7 @@
 """Check that this commit can be released, and write the release notes.
 
-Prints every fault, and exits with status 1 if there is one. The release notes, which are a section
-of the changelog, are written to build/release-notes.md.
+The script prints each fault, and exits with status 1 if there is one. The release notes are a
+section of the changelog and are written to build/release-notes.md.
 """
 
 import re
@@ -60,7 +60,7 @@ def _changed_files() -> Iterator[str]:
 
 
 def _versions(version: str) -> Iterator[str]:
-    """Yield where another version than this one is stated."""
+    """Yield the places that state a version other than `version`."""
     if not re.fullmatch(r"\d+\.\d+\.\d+", version):
         yield f"{VERSION_FILES[-1]}: {version} is not a release version"
     for name in VERSION_FILES:
@@ -77,7 +77,7 @@ def _versions(version: str) -> Iterator[str]:
 
 
 def _changelog(version: str) -> Iterator[str]:
-    """Yield faults of the changelog, and write the release notes."""
+    """Yield faults in the changelog and write the release notes."""
     sections = re.split(r"^## ", _read("CHANGELOG.md"), flags=re.MULTILINE)[1:]
     titles = [section.partition("\n")[0] for section in sections]
     notes = {

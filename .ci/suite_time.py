@@ -1,7 +1,7 @@
 """Fail if `make test` takes much more processor time than it should.
 
-Machines differ, so its time is compared with that of `make demo` in the same run. A busy machine
-takes longer for a run, but little more processor time.
+Machines differ, so the time is compared with that of `make demo` in the same run. On a busy
+machine, a run takes longer, but hardly more processor time.
 
 Usage: python .ci/suite_time.py TEST_SECONDS DEMO_SECONDS    (files that .ci/timed has written)
 """
@@ -14,7 +14,10 @@ ALLOWED = 1.4 * MEASURED_RATIO
 
 
 def main() -> None:
-    """Print both times and their ratio; exit with 1 if the ratio is above the limit."""
+    """Print both times and their ratio.
+
+    The exit status is 1 if the ratio is above the limit.
+    """
     test_s, demo_s = (float(Path(name).read_text()) for name in sys.argv[1:])
     ratio = test_s / demo_s
     print(

@@ -61,7 +61,7 @@ LENGTH = 4 * (2 * (HALF - CORNER) + np.pi / 2 * CORNER)
 
 
 def raster(path: Path) -> None:
-    """Write the hills as a raster of 200 x 200 pixels of 2 m."""
+    """Write the hills as a raster of 200 x 200 pixels, each of which is 2 m wide."""
     coordinates = np.arange(-199.0, 200, 2)
     heights = height(coordinates[None, :], coordinates[::-1, None])
     transform = from_origin(EAST - 200, NORTH + 200, 2, 2)
@@ -150,7 +150,7 @@ class Block:
         return mesh.GetPrim()
 
     def color(self, prim: Usd.Prim, colors: list[tuple[float, ...]]) -> None:
-        """Set the color of a mesh, or of each of its polygons (linear RGB)."""
+        """Set the color of a mesh, or the color of each of its polygons (linear RGB)."""
         primvar = UsdGeom.Gprim(prim).CreateDisplayColorPrimvar(
             UsdGeom.Tokens.uniform if len(colors) > 1 else UsdGeom.Tokens.constant
         )
@@ -186,7 +186,10 @@ class Block:
         UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
 
     def strip(self, name: str, begin: float, end: float, step: float, lift: float) -> Usd.Prim:
-        """Add a section of the street. The texture of `Street` repeats every 12 m."""
+        """Add a section of the street.
+
+        The texture of `Street` repeats every 12 m.
+        """
         distance_m, aside = np.meshgrid(
             np.arange(begin, end + step / 2, step), np.linspace(-WIDTH / 2, WIDTH / 2, 5),
             indexing="ij",

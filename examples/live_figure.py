@@ -57,7 +57,10 @@ class LiveFigure:
         self.background = self.figure.canvas.copy_from_bbox(self.figure.bbox)
 
     def on_frame(self, frame) -> None:
-        """Draw a frame. `simulate` calls this method in scan order, at the given pace."""
+        """Draw a frame.
+
+        `simulate` calls this method in scan order, at the given pace.
+        """
         self.num_hits += frame.hit_counts()
         self.points = np.concatenate([self.points, frame.points().positions[::KEPT]])
         hit = np.flatnonzero(self.num_hits)

@@ -89,7 +89,10 @@ class Figure:
 
 
 def blend(*stops):
-    """Return a function from a coordinate to joints. Stops are (name, end, reach), descending."""
+    """Return a function that maps a coordinate to two joints and a weight.
+
+    Each stop consists of a joint's name, its end and its reach. Stops are in descending order.
+    """
 
     def held(coordinate):
         for (joint, below, reach), (next_joint, *_) in pairwise(stops):
@@ -185,9 +188,9 @@ def times(p, q):
 
 
 def ankle(phase):
-    """Return the position of an ankle and the pitch of its foot at a phase of the cycle.
+    """Return an ankle's position and the pitch of its foot at a given phase of the cycle.
 
-    The position consists of the distance forward of the hips and the height above the ground. The
+    The position consists of the forward distance from the hips and the height above the ground. The
     pitch is positive if the toes point up. The phase is 0 when the heel strikes the ground.
     """
     phase = np.asarray(phase) % 1
@@ -222,7 +225,10 @@ def ankle(phase):
 
 
 def walk(phase):
-    """Return joint rotations and hip positions at phases (k,), as {joint: (k, …)}."""
+    """Return joint rotations and hip positions at the given phases.
+
+    Phases have shape (k,), and the result has the form {joint: (k, …)}.
+    """
     cycle = 2 * np.pi * phase
     swing = np.cos(cycle)  # forward swing of the left leg
     yaw = np.radians(6) * -swing  # moves the left hip forward

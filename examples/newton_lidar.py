@@ -1,4 +1,4 @@
-"""Simulate a lidar that scans falling boxes in Newton, while the boxes move during each sweep."""
+"""Simulate a lidar in Newton that scans boxes while they fall."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Simulate a lidar that scans falling boxes in PyBullet, while the boxes move during each sweep."""
+"""Simulate a lidar in PyBullet that scans boxes while they fall."""
 
 import numpy as np
 
@@ -15,7 +15,10 @@ SIZE_M = 0.6
 
 
 def matrix(position, quaternion):
-    """Return the matrix (4, 4) of a PyBullet pose, from the body frame to the world frame."""
+    """Return a PyBullet pose as a transformation matrix from the body frame to the world frame.
+
+    The shape is (4, 4).
+    """
     result = np.eye(4)
     result[:3, :3] = np.reshape(bullet.getMatrixFromQuaternion(quaternion), (3, 3))
     result[:3, 3] = position

@@ -33,7 +33,10 @@ def scanner_of(scene, model):
 
 
 def message_of(cloud, begin_ns, header, kinds):
-    """Return a sweep as a PointCloud2 message; `kinds` is the module sensor_msgs.msg."""
+    """Convert a sweep to a PointCloud2 message.
+
+    `kinds` is the module sensor_msgs.msg.
+    """
     names, types, _, offsets = zip(*FIELDS, strict=True)
     row = {"names": names, "formats": types, "offsets": offsets, "itemsize": STEP}
     points = np.zeros(len(cloud), np.dtype(row))

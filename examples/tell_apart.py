@@ -1,9 +1,10 @@
-"""Classify ground, buildings and cars with a campaign of cities and a neural network in NumPy.
+"""Classify ground, buildings and cars with a NumPy neural network trained on generated cities.
 
     python tell_apart.py [FOLDER | stream]
 
 The script creates a data set of 30 cities, or streams the sweeps from the workers. It trains the
-network on some of the cities, evaluates it on the others, and draws the classes of one sweep."""
+network on some of the cities, evaluates it on the others, and draws the classes of one sweep.
+"""
 
 import sys
 from itertools import pairwise
@@ -51,7 +52,10 @@ def street(number, rng):
 
 
 def features(sweep):
-    """Return the inputs of the network for each point. Shape (n, 17)."""
+    """Return the inputs of the network for each point.
+
+    The shape is (n, 17).
+    """
     points = sweep.points.astype(float)
     range_m = np.linalg.norm(points, axis=1)
     z = points[:, 2]
@@ -63,7 +67,7 @@ def features(sweep):
 
 
 def column_features(points, side):
-    """Return the heights of points above the lowest and below the highest point near them."""
+    """Return the height of each point above the lowest and below the highest point nearby."""
     z = points[:, 2]
     cell = np.floor(points[:, :2] / side).astype(int)
     cell -= cell.min(axis=0) - 1  # leaves a border of empty cells
@@ -80,7 +84,7 @@ def column_features(points, side):
 
 
 def surface_features(points, side):
-    """Return features of normals and roughness from the covariance of the points in each cube."""
+    """Return normals and roughness as features, computed from the points in each cube."""
     _, cube = np.unique(np.floor(points / side), axis=0, return_inverse=True)
     count = np.bincount(cube)
     mean = np.stack([np.bincount(cube, axis) / count for axis in points.T], axis=1)
@@ -94,7 +98,10 @@ def surface_features(points, side):
 
 
 def sweeps_of(folder, split):
-    """Return the sweeps of a split, streamed or from a data set, which is created if needed."""
+    """Return the sweeps of a split.
+
+    They are streamed, or read from a data set that is created if necessary.
+    """
     campaign = lp.Campaign(street, 30, seed=1, splits={"train": 0.7, "test": 0.3})
     if folder == "stream":
         return campaign.stream(split=split)
@@ -104,7 +111,7 @@ def sweeps_of(folder, split):
 
 
 def read(folder, split, share):
-    """Return features and classes of a random share of the points in a split."""
+    """Return the features and classes of a random sample of the points in a split."""
     point_features = []
     classes = []
     for sweep in sweeps_of(folder, split):
@@ -115,7 +122,7 @@ def read(folder, split, share):
 
 
 class Network:
-    """Neural network with ReLU layers, which predicts the class with the highest output (n, 4)."""
+    """Neural network with ReLU layers that predicts the class with the highest output."""
 
     def __init__(self, features):
         self.mean = features.mean(axis=0)
@@ -126,7 +133,7 @@ class Network:
         self.slopes = [(np.zeros_like(w), np.zeros_like(w)) for w in self.weights]
 
     def layers(self, features):
-        """Yield the inputs of each layer, with a 1 for its bias, then the network outputs."""
+        """Yield the inputs of each layer, with a 1 for its bias, and then the network outputs."""
         inputs = (features - self.mean) / self.scale
         for weights in self.weights:
             yield (inputs := np.column_stack([inputs, np.ones(len(inputs))]))
@@ -138,7 +145,7 @@ class Network:
         return [*self.layers(features)][-1].argmax(axis=1)
 
     def learn(self, features, classes, weight, step, steps):
-        """Minimize the weighted cross-entropy by a step of Adam (Kingma and Ba, 2015)."""
+        """Reduce the weighted cross-entropy by one step of Adam (Kingma and Ba, 2015)."""
         *inputs, outputs = self.layers(features)
         error = np.exp(
             outputs - np.logaddexp.reduce(outputs, axis=1, keepdims=True)

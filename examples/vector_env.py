@@ -18,7 +18,10 @@ COLUMNS = np.random.default_rng(1).uniform(-0.6, 0.6, (49, 2)) + np.argwhere(np.
 
 
 def world(robots: int) -> str:
-    """Return the MJCF of a hall with columns, and robots that do not collide with each other."""
+    """Return the MJCF of a hall with columns and robots.
+
+    The robots do not collide with each other.
+    """
     geoms = [f'<geom type="cylinder" size=".3 1" pos="{x:.2f} {y:.2f} 1"/>' for x, y in COLUMNS]
     for k in (-2, 26):
         geoms += [f'<geom type="box" size=".1 14 1" pos="{k} 12 1"/>']

@@ -1,4 +1,4 @@
-"""What the site has that is no page of its own in docs/: README, reference, linked sources.
+"""Additional pages of the site: README, the reference, and the sources that pages link to.
 
 MkDocs calls the functions whose names begin with `on_`.
 """
@@ -45,13 +45,13 @@ _FETCHED = re.compile(
 
 
 def on_config(config: Any) -> Any:
-    """List the pages of each folder that the navigation names, `how-to/mesh-formats/`."""
+    """Replace the folders in the navigation, such as `how-to/mesh-formats/`, with their pages."""
     config["nav"] = _with_pages(config["nav"], Path(config["docs_dir"]))
     return config
 
 
 def _with_pages(nav: list[Any], docs: Path) -> list[Any]:
-    """Return a navigation with the pages of folders, by the names of files, for the folders."""
+    """Replace the folders in a navigation with their pages, sorted by file name."""
     entries: list[Any] = []
     for entry in nav:
         if isinstance(entry, str) and entry.endswith("/"):
@@ -69,7 +69,7 @@ def _with_pages(nav: list[Any], docs: Path) -> list[Any]:
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add README and the like, the reference, and the sources that pages link to."""
+    """Add README and similar files, the reference, and the sources that pages link to."""
     pages = {
         page: _relinked((ROOT / file).read_text("utf-8"), file, page, files, config)
         for file, page in _ELSEWHERE.items()
@@ -89,7 +89,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Lead links out of docs/ to where the site has what they name."""
+    """Redirect links that lead out of docs/ to the corresponding pages of the site."""
     if page.file.abs_src_path is None:  # generated: done already
         return markdown
     path = page.file.src_uri
@@ -97,7 +97,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
 
 
 def on_post_build(config: Any) -> None:
-    """Refuse a site that would fetch something from elsewhere when it is read."""
+    """Reject a site whose pages would load resources from elsewhere."""
     found = [
         f"{path.relative_to(config['site_dir'])}: {match}"
         for path in sorted(Path(config["site_dir"]).rglob("*.html"))
@@ -108,7 +108,7 @@ def on_post_build(config: Any) -> None:
 
 
 def _relinked(text: str, file: str, page: str, files: Files, config: Any) -> str:
-    """Text of a file of the repository with links as they are from a page of the site."""
+    """Adjust the links in a repository file for the page of the site that shows it."""
 
     def relink(match: re.Match[str]) -> str:
         target = match[2]
@@ -123,7 +123,10 @@ def _relinked(text: str, file: str, page: str, files: Files, config: Any) -> str
 
 
 def _page_of(path: str, files: Files, config: Any) -> str:
-    """Where the site has a file of the repository; sources get pages, input files are copied."""
+    """Return the location of a repository file on the site.
+
+    Sources get pages, and input files are copied.
+    """
     if shown := (_ELSEWHERE | _SHOWN).get(path):
         return shown
     if path.startswith("docs/"):

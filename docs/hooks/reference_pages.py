@@ -1,4 +1,4 @@
-"""Pages of the reference, made from what the packages say of themselves."""
+"""Pages of the reference, generated from the packages."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ _FIRST = {
 
 
 def members_page(package: str) -> str:
-    """Public names of a package, each with its docstring."""
+    """Generate a page with the public names of a package and their docstrings."""
     module = import_module(package)
     names = {name for name in module.__all__ if not name.startswith("__")}
     first = _FIRST[package]
@@ -96,7 +96,7 @@ def members_page(package: str) -> str:
 
 
 def _declared(member: Any) -> Iterator[str]:
-    """Table of the fields that a dataclass declares with a description, if there are any."""
+    """Yield a table of the fields that a dataclass declares with a description, if any."""
     hints = get_type_hints(member, include_extras=True) if is_dataclass(member) else {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnsupportedFieldAttributeWarning)  # an alias in scenarios
@@ -110,7 +110,7 @@ def _declared(member: Any) -> Iterator[str]:
 
 
 def command_page() -> str:
-    """`--help` of the command and of each of its commands."""
+    """Generate a page with the `--help` output of the command and its subcommands."""
     parts = ["# The command\n\nWhat `--help` prints.\n"]
     for path, command in _commands(cli, "lidarpool"):
         context = click.Context(command, info_name=path, max_content_width=88)
@@ -126,7 +126,7 @@ def _commands(command: click.Command, path: str) -> Iterator[tuple[str, click.Co
 
 
 def scenario_page() -> str:
-    """Tables of the fields of a scenario file, from its JSON Schema."""
+    """Generate tables of the fields of a scenario file from its JSON schema."""
     schema = scenario_schema()
     head = (
         "# Scenario files\n\n"
@@ -138,7 +138,7 @@ def scenario_page() -> str:
 
 
 def campaign_page() -> str:
-    """Tables of the fields of a campaign file, from its JSON Schema."""
+    """Generate tables of the fields of a campaign file from its JSON schema."""
     schema = campaign_schema()
     head = (
         f"# Campaign files\n\n{schema['description']}\n\nHow to write one: "
@@ -164,7 +164,7 @@ def _schema_page(head: str, schema: dict[str, Any], sections: dict[str, str]) ->
 
 
 def columns_page() -> str:
-    """Tables of the columns of a cloud, from the table that the package goes by."""
+    """Generate tables of a cloud's columns from the package's column table."""
     return "\n".join(
         [
             "# Columns of a cloud\n",
@@ -213,7 +213,7 @@ def _default(content: dict[str, Any]) -> str:
 
 
 def _kinds(content: dict[str, Any]) -> str:
-    """Say what a field takes."""
+    """Describe the values that a field accepts."""
     if "anyOf" in content:
         choices = [_kinds(choice) for choice in content["anyOf"] if choice.get("type") != "null"]
         # A list of things, or one of them without the list.
@@ -238,7 +238,7 @@ def _kinds(content: dict[str, Any]) -> str:
 
 
 def _section(name: str) -> str:
-    """Link to the table of a section of this page, by its name in the schema."""
+    """Link to the table of a section on this page, given its name in the schema."""
     both = _SECTIONS | _OF_CAMPAIGNS
     heading = next(heading for heading, section in both.items() if section == name)
     return f"[{heading}](#{heading.replace(': ', '-')})"

@@ -1,1 +1,4 @@
-"""Pictures and films of the documentation; each module runs with `python -m docs.pictures.NAME`."""
+"""Plots and films of the documentation.
+
+Each module runs with `python -m docs.pictures.NAME`.
+"""

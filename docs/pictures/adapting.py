@@ -1,8 +1,8 @@
 """Jobs, tasks and slots of two adaptive partitions on Slurm, recorded and drawn.
 
-`python -m docs.pictures.adapting docs/images/adapting.png` starts a Slurm of this user on this
-machine, whose node says that it has 2 GPUs: of four GPU jobs two run, and two wait. Tasks of GPU
-sleep for two seconds, those of IO for one. Slurm comes from Debian's packages, as in the tests.
+`python -m docs.pictures.adapting docs/images/adapting.png` starts Slurm as the current user on this
+machine. The Slurm node declares 2 GPUs, so two of four GPU jobs run and two wait. GPU tasks sleep
+for two seconds, and IO tasks for one. Slurm is installed from Debian packages, as in the tests.
 """
 
 from __future__ import annotations
@@ -42,7 +42,6 @@ Sample = dict[str, Any]  # "t" and, for each partition, jobs that wait and run, 
 
 
 def look(began: float, queue: Slurm, parts: Sequence[Partition]) -> Sample:
-    """Return a sample of the queue and the scheduler."""
     lines = queue.ask("squeue", "--noheader", "--format=%j %T").split("\n")
     sample: Sample = {"t": time.monotonic() - began}
     for part in parts:
@@ -58,7 +57,7 @@ def look(began: float, queue: Slurm, parts: Sequence[Partition]) -> Sample:
 
 
 def record(folder: Path) -> list[Sample]:
-    """Run the work on a Slurm cluster; return regular samples of queue and scheduler."""
+    """Run the workload on a Slurm cluster and return regular samples of queue and scheduler."""
     import dask_jobqueue
 
     samples: list[Sample] = []
@@ -122,7 +121,7 @@ def record(folder: Path) -> list[Sample]:
 
 
 def draw(samples: Sequence[Sample]) -> Page:
-    """Draw tasks, jobs and slots in three charts over the same time."""
+    """Draw tasks, jobs and slots in three charts with the same time axis."""
     page = Page((1600, 1240))
     unit = page.unit
     times = [sample["t"] for sample in samples]

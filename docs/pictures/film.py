@@ -1,8 +1,8 @@
-"""A film of what is real, in the sensor's own time: `python -m docs.pictures.film OUT.webp`.
+"""A film of a realistic simulation in real time: `python -m docs.pictures.film OUT.webp`.
 
-Sweeps of an OS1-64 amid moving cars, with sub-rays, noise and rain (`real` of
-`benchmarks.realism`), are cast on one core while another draws them, a frame for each. It prints
-the seconds that the sensor scans, and those that the film took.
+One core casts sweeps of an OS1-64 among moving cars, with sub-rays, noise and rain (`real` of
+`benchmarks.realism`). Another core draws one frame for each sweep. The module prints the scan time
+of the sensor and the time that making the film took.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ RAISED = 12.0  # meters above the ground with the last color
 
 
 def cast(sweeps: int, triangles: int, connection: Connection) -> None:
-    """Cast a sweep to compile, then send the points of `sweeps` sweeps."""
+    """Cast one sweep to compile the code, and then send the points of `sweeps` sweeps."""
     sweep = cases(city(triangles), "tiles", (100,), "ouster/os1-64")["real"]
     connection.send(len(sweep(0)))
     connection.recv()
@@ -42,7 +42,7 @@ def cast(sweeps: int, triangles: int, connection: Connection) -> None:
 
 
 def frame(camera: Camera, points: Any) -> Image.Image:
-    """Draw the points of a sweep, by height."""
+    """Draw the points of a sweep, colored by height."""
     pixels, distance = camera.project(points)
     inside = np.flatnonzero(((pixels >= 0) & (pixels < camera.size)).all(axis=1))
     rows = inside[np.argsort(-distance[inside])]
@@ -55,7 +55,7 @@ def frame(camera: Camera, points: Any) -> Image.Image:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Make the film, and return the exit status."""
+    """Make the film and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("film", type=Path, help="a .webp file")
     parser.add_argument("--sweeps", type=int, default=100)

@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/how-to/sensor-pictures.md: `python -m docs.pictures.sensors`."""
+"""Draw the plots of docs/how-to/sensor-pictures.md: `python -m docs.pictures.sensors`."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ QUALITY = 50  # of WebP
 
 
 def picture_name(model: str) -> str:
-    """Return the name of the picture of a model."""
+    """Return the file name of a model's plot."""
     return f"{model.replace('/', '-')}.webp"
 
 
 def draw(model: str, path: Path) -> None:
-    """Draw the pattern of a model, small."""
+    """Draw a small plot of a model's scan pattern."""
     image = Image.open(io.BytesIO(pattern_page(load_sensor(model)).png())).convert("RGB")
     height = round(image.height * WIDTH / image.width)
     small = image.resize((WIDTH, height), Image.Resampling.LANCZOS)
@@ -32,7 +32,6 @@ def draw(model: str, path: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Draw the pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", nargs="?", type=Path, default=IMAGES)
     parser.add_argument("--only", nargs="*", default=model_names(), help="names of models")

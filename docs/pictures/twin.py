@@ -1,8 +1,9 @@
-"""A film of a twin: a recorded drive, and the same drive with another sensor in its twin.
+"""A film of a recorded drive and of the same drive with another sensor in a digital twin.
 
-`python -m docs.pictures.twin OUT.webp` drives an OS1-64 through the generated city, amid cars that
-move, and rebuilds the place from its sweeps. On the left are the recorded sweeps, on the right
-sweeps of a Pandar128 in the twin, where nothing moves. It prints the figures of the twin.
+`python -m docs.pictures.twin OUT.webp` drives an OS1-64 through the generated city among moving
+cars, and reconstructs the scene from its sweeps. The left half shows the recorded sweeps. The right
+half shows sweeps of a Pandar128 in the twin, where nothing moves. The module prints statistics of
+the twin.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ CAPTIONS = ("recorded: OS1-64", "in the twin: Pandar128")
 
 
 def drive(sweeps: int) -> Cloud:
-    """Record a drive through the city, amid cars that move: a cloud in memory."""
+    """Record a drive through the city among moving cars as a cloud in memory."""
     end_s = (sweeps + 1) * SWEEP_S
     actors = [
         Actor(box(f"car {number}", (4.4, 1.8, 1.5)), Track([0, end_s], [(*start, 0), (*stop, 0)]))
@@ -66,7 +67,7 @@ def drive(sweeps: int) -> Cloud:
 
 
 def camera() -> Camera:
-    """Return the camera of both halves."""
+    """Return the camera that both halves share."""
     ahead = normalize((TARGET - EYE)[None])
     right = normalize(np.cross(ahead, [0.0, 0.0, 1.0]))
     axes = np.concatenate([right, np.cross(right, ahead), ahead])
@@ -74,7 +75,7 @@ def camera() -> Camera:
 
 
 def frames(cloud: Cloud, place: Twin, sweeps: int) -> list[Image.Image]:
-    """Draw the sweeps of the recording beside sweeps of another sensor in the twin."""
+    """Draw the recorded sweeps beside sweeps of another sensor in the twin."""
     view = camera()
     scanner = Scanner(place.scene, load_sensor("hesai/pandar128"))
     images = []
@@ -93,7 +94,7 @@ def frames(cloud: Cloud, place: Twin, sweeps: int) -> list[Image.Image]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Make the film, and return the exit status."""
+    """Make the film and return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("film", type=Path, help="a .webp file")
     parser.add_argument("--sweeps", type=int, default=40)

@@ -31,8 +31,7 @@ class LidarError(Exception):
     command line prints the message without a traceback and exits with code 2. Very long lines are
     shortened in the middle, and long lists of names are wrapped.
 
-    If a file does not exist, the error is also a FileNotFoundError. If an argument has an invalid
-    type or value, the error is also a ValueError.
+    MissingFileError is also a FileNotFoundError, and ArgumentError is also a ValueError.
     """
 
     def __init__(self, message: object = "") -> None:
@@ -48,14 +47,14 @@ class ArgumentError(LidarError, ValueError):
 
 
 def _cut(line: str) -> str:
-    """Remove the middle of a line that is too long to read."""
+    """Shorten a long line by removing its middle."""
     if len(line) <= _MAX_LETTERS:
         return line
     return f"{line[: _MAX_LETTERS - _END_LETTERS]} … {line[-_END_LETTERS:]}"
 
 
 def _wrap_list(line: str) -> str:
-    """Move a long list in a line, such as all columns, to separate indented lines."""
+    """Wrap a long list, such as the names of all columns, into separate indented lines."""
     names = _LONG_LIST.search(line)
     if names is None or len(names[0]) < _MIN_LIST_LETTERS or line.startswith(_INDENT):
         return line
@@ -78,7 +77,7 @@ class CutShortError(ValueError):
 
 
 def message_of(error: Exception) -> str:
-    """Return the message of an error as a sentence on a single line.
+    """Format an error message as a single-line sentence.
 
     Examples
     --------
@@ -92,7 +91,7 @@ def message_of(error: Exception) -> str:
 
 
 def reason_of(error: Exception) -> str:
-    """Describe why a file cannot be read, as a clause without a period.
+    """Describe in a clause without a period why a file cannot be read.
 
     `error` may be an exception of any class.
 
@@ -125,7 +124,7 @@ def as_sentence(advice: str) -> str:
 
 
 def unreadable(subject: object, error: Exception, advice: str = "") -> str:
-    """Return a message about a file that cannot be read.
+    """Return an error message for a file that cannot be read.
 
     `error` may be an exception of any class. The advice, if any, follows as a second sentence.
 
@@ -183,7 +182,7 @@ def converted(failure: str) -> Iterator[None]:
 
 @contextmanager
 def prefixed(subject: object) -> Iterator[None]:
-    """Prefix a LidarError raised in the context with its subject, for example "leg 3: …"."""
+    """Add a prefix such as "leg 3: " to the message of a LidarError raised in the context."""
     try:
         yield
     except LidarError as error:
@@ -192,7 +191,7 @@ def prefixed(subject: object) -> Iterator[None]:
 
 
 class Mistakes:
-    """Collector that reports several errors as a single one."""
+    """Collector that combines several errors into a single one."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -206,7 +205,7 @@ class Mistakes:
             self.lines.append(str(error))
 
     def tell(self) -> None:
-        """Raise LidarError with one line per distinct error if any errors were collected."""
+        """Raise a LidarError with one line per distinct error, if any errors were collected."""
         lines = list(dict.fromkeys(self.lines))
         if len(lines) > MAX_MISTAKES:
             lines[MAX_MISTAKES:] = [f"And {len(lines) - MAX_MISTAKES:,} more."]

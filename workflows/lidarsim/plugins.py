@@ -1,4 +1,4 @@
-"""Names that plug-ins for mesh formats and packet formats import.
+"""Public names for plug-ins that add mesh formats or packet formats.
 
 See docs/how-to/plugins.md for examples.
 """

@@ -85,7 +85,7 @@ def unit_of(name: str) -> str | None:
 
 
 def find_other_unit(name: str, candidates: Iterable[str]) -> str | None:
-    """Return the candidate that differs from a name only in its unit, or None.
+    """Return the candidate that differs from a name only in its unit, or None if there is none.
 
     Examples
     --------
@@ -109,7 +109,7 @@ def find_other_unit(name: str, candidates: Iterable[str]) -> str | None:
 
 
 def factor_between(name: str, candidate: str) -> float | None:
-    """Return the factor that converts from the unit of `name` to the unit of `candidate`.
+    """Return the factor that converts values from the unit of `name` to that of `candidate`.
 
     Returns None unless both names end with units that have the same dimension and different sizes.
 

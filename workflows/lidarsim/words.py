@@ -38,7 +38,7 @@ def did_you_mean(word: str, candidates: Iterable[str]) -> str:
 def did_you_mean_each(words: Sequence[str], candidates: Iterable[str]) -> str:
     """Suggest candidates for several misspelled words in a single question.
 
-    Like that of `did_you_mean`, the suggestion is empty if no candidate is similar.
+    The suggestion is empty if no candidate is similar.
 
     Examples
     --------
@@ -121,7 +121,7 @@ def format_as_python(note: str) -> str:
 
 
 def format_as_scenario(note: str) -> str:
-    """Format the settings in a note as in a scenario, for example `{file: …, up_axis: z}`."""
+    """Format the settings in a note as scenario YAML, for example `{file: …, up_axis: z}`."""
     form = {"file": "{{file: …, {}: {}}}"}
     return _SETTING.sub(lambda m: form.get(m[1], f"{{}}: {{}} in {m[1]}").format(m[2], m[4]), note)
 
@@ -178,7 +178,7 @@ def printable(text: str, max_letters: int = 200) -> str:
 
 
 def matches_pattern(name: str, pattern: str) -> bool:
-    """Return whether a name matches a pattern with `*` and `?`.
+    """Return whether a name matches a pattern with the wildcards `*` and `?`.
 
     Brackets in the pattern have no special meaning.
 
@@ -213,7 +213,7 @@ def _scalar_in_yaml(name: str) -> str:
 
 
 def make_distinct(names: Iterable[str]) -> list[str]:
-    """Make names distinct by appending a number to each name that occurs again.
+    """Make names unique by appending numbers to repeated names.
 
     Examples
     --------
@@ -284,7 +284,7 @@ def alternatives(names: Sequence[str]) -> str:
 
 
 def listed(names: Sequence[str], max_names: int = 3) -> str:
-    """Join the first names and state how many more there are.
+    """Join the first names and append the number of remaining names.
 
     Examples
     --------

@@ -1,8 +1,8 @@
-"""Draw pictures and films of scenes and point clouds, and serve them as browser pages."""
+"""Draw images and films of scenes and point clouds, and serve them as browser pages."""
 
 from lidarsim.environment.notebook import register_drawers
 
-# Notebooks show these objects with a picture. The drawing code is imported for the first picture.
+# Notebooks show these objects with a plot. The drawing code is imported for the first plot.
 register_drawers(
     {
         name: f"lidarview.cell_pictures:draw_{name.lower()}"

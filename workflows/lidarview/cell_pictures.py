@@ -1,4 +1,4 @@
-"""Draw the small pictures that notebooks show for scenes, sensors, surveys, and clouds.
+"""Draw the small plots that notebooks show for scenes, sensors, surveys, and clouds.
 
 `lidarview/__init__.py` registers each ``draw_CLASS`` function of this module by its name.
 """
@@ -44,10 +44,10 @@ _SPREAD = (1, 99)  # percentiles of the positions that the picture shows
 
 
 def compress_png(png: bytes) -> bytes:
-    """Return a PNG of at most `MAX_BYTES`.
+    """Reduce a PNG to at most `MAX_BYTES`.
 
-    The number of colors is reduced first, then the size is halved. If the result is still too
-    large, as it may be for a picture of noise, the smallest version is returned.
+    The number of colors is reduced first, and then the size is halved. An image of noise may still
+    be too large. In that case, the smallest version is returned.
     """
     image = Image.open(io.BytesIO(png)).convert("RGB")
     half = image.resize((image.width // 2, image.height // 2), Image.Resampling.BOX)
@@ -81,7 +81,7 @@ def draw_sensor(sensor: Sensor) -> bytes:
 
 
 def draw_survey(survey: Survey) -> bytes:
-    """Draw the sensor positions of a survey from above, with arrows along the sensors' x axes."""
+    """Draw a survey's sensor positions from above, with arrows along the sensors' x axes."""
     page = Page(PICTURE_SIZE)
     sensors = sensor_positions(survey)
     limits = _around(np.concatenate([sensor.positions for sensor in sensors])[:, :2])
@@ -113,7 +113,7 @@ def _headings(survey: Survey, count: int = 24) -> Floats:
 
 
 def _around(points: Floats) -> Floats:
-    """Return the limits of a chart around points, in the aspect ratio of the chart.
+    """Return chart limits around points, with the aspect ratio of the chart.
 
     `points` has shape (n, 2). The result has shape (2, 2) and contains the lower and the upper
     corner.
@@ -160,7 +160,6 @@ draw_storedcloud = draw_cloud
 
 
 def _sampled(cloud: CloudLike, step: int) -> Floats:
-    """Return the positions of every `step`-th point of a cloud."""
     pieces = [np.zeros((0, 3))]
     first = 0
     for piece in cloud.chunks():

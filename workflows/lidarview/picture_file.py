@@ -1,4 +1,7 @@
-"""Store the data for a result's pictures, except the cloud, in a separate file."""
+"""Store the data for a result's plots in a separate file.
+
+The cloud is not included.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +55,7 @@ class SensorPositions:
 
     @property
     def labels(self) -> list[str]:
-        """Label of each position, numbered in the same order as in the picture of stations.
+        """Label of each position, with the same numbers as in the plot of stations.
 
         A position that the sensor returns to keeps its first number. If the sensor stays at one
         position, the label is the name of the sensor. A moving sensor has no labels.
@@ -65,7 +68,7 @@ class SensorPositions:
         return [f"{self.name} {number}".strip() for number in numbers.tolist()]
 
     def position_at(self, time_ns: float) -> Floats:
-        """Return the position at a time."""
+        """Return the position at a given time."""
         if self.moves:
             return np.array([np.interp(time_ns, self.times_ns, x) for x in self.positions.T])
         last = int(np.searchsorted(self.times_ns, time_ns, "right")) - 1
@@ -94,7 +97,10 @@ class PlannedPath:
 
 @dataclass(frozen=True, eq=False)
 class PlanningPicture:
-    """A path search in the plane, in local coordinates in meters."""
+    """A path search in the plane.
+
+    Coordinates are local and in meters.
+    """
 
     start: tuple[float, float]
     target: tuple[float, float]
@@ -105,7 +111,7 @@ class PlanningPicture:
 
 @dataclass(frozen=True, eq=False)
 class PictureContent:
-    """The content of a result's pictures, except the points."""
+    """The data for a result's plots, except the points."""
 
     scene: Scene  # its actors have trajectories of at most `MAX_POSITIONS` positions
     sensors: Sequence[SensorPositions]
@@ -126,9 +132,9 @@ class PictureContent:
     def before_casting(
         cls, scene: Scene, survey: Survey, planning: PlanningPicture | None = None
     ) -> tuple[PictureContent, SimplifiedScene]:
-        """Return the content that is known before rays are cast, and the drawn scene.
+        """Return the data that is known before rays are cast, and the scene to draw.
 
-        The drawn scene converts hits on the triangles of the scene to `hit_counts`.
+        The scene to draw converts hits on the triangles of the original scene to `hit_counts`.
         """
         samples = samples_per_actor(scene.actors, MAX_POSITIONS)
         actors = tuple(_sampled(actor, survey.duration_ns, samples) for actor in scene.actors)
@@ -159,9 +165,9 @@ class PictureContent:
 
     @property
     def caption(self) -> str:
-        """Number of sensors and, if anything moves, the time that a picture shows.
+        """Caption with the number of sensors and, if anything moves, the displayed time.
 
-        Pictures show the middle of the survey.
+        Plots show the middle of the survey.
         """
         sensors = len(self.sensors)
         actors = len(self.scene.actors)
@@ -178,7 +184,7 @@ class PictureContent:
 
     @property
     def models(self) -> str:
-        """Sensor models, with the names of named sensors."""
+        """Sensor model names, including the names of named sensors."""
         models = [
             f"{sensor.name}: {sensor.model}" if sensor.name else sensor.model
             for sensor in self.sensors
@@ -189,7 +195,10 @@ class PictureContent:
         return " · ".join(models)
 
     def names_of(self, column: Column) -> Sequence[str]:
-        """Return the names of the values 0, 1, 2, … in a column, or nothing if they are unnamed."""
+        """Return the names of the values 0, 1, 2, … in a column.
+
+        The sequence is empty if the values have no names.
+        """
         if column.name == "sensor":
             return [sensor.name for sensor in self.sensors]
         if column == TABLE["cause"]:
@@ -202,9 +211,9 @@ class PictureContent:
         return names.get(column.name) or ()
 
     def save(self, path: Path) -> None:
-        """Write the content as a NumPy archive.
+        """Write the data to a NumPy archive.
 
-        The same content always results in the same bytes.
+        The same data always results in the same bytes.
         """
         names = {
             "objects": self.scene.names,
@@ -238,7 +247,7 @@ class PictureContent:
         path.write_bytes(pack_arrays(arrays))
 
     def _track_arrays(self) -> dict[str, Any]:
-        """Return the positions of sensors and the trajectories of actors as named arrays."""
+        """Return sensor positions and actor trajectories as named arrays."""
         arrays: dict[str, Any] = {}
         for number, sensor in enumerate(self.sensors):
             arrays[f"sensor{number}_times"] = sensor.times_ns
@@ -273,7 +282,10 @@ class PictureContent:
         return arrays
 
     def _planning_arrays(self) -> dict[str, Any]:
-        """Return the path search and its best path as named arrays, or nothing without a path."""
+        """Return the path search and its best path as named arrays.
+
+        The mapping is empty if there is no best path.
+        """
         planning = self.planning
         if planning is None or planning.best is None:
             return {}
@@ -298,13 +310,13 @@ class PictureContent:
 
     @classmethod
     def load_from(cls, folder: Path) -> PictureContent | None:
-        """Read the picture file in a result folder, or return None if there is none."""
+        """Read the plot data in a result folder, or return None if there is none."""
         path = folder / PICTURE_FILE
         return cls.load(path) if path.exists() else None
 
     @classmethod
     def _from_arrays(cls, arrays: Mapping[str, Any]) -> PictureContent:
-        """Build the content from the arrays in a file.
+        """Build the plot data from the arrays in a file.
 
         Raises ValueError if the file has another format version.
         """
@@ -372,12 +384,12 @@ def _planning(arrays: Mapping[str, Any]) -> PlanningPicture:
 
 
 def _colors(arrays: Mapping[str, Any], name: str) -> Colors | None:
-    """Return the colors of faces, or None if the file has none."""
+    """Return the face colors in a file, or None if it has none."""
     return Colors.from_face_colors(arrays[name]) if name in arrays else None
 
 
 def _animation(arrays: Mapping[str, Any], mesh: str) -> Animation | None:
-    """Return the animation of a mesh, or None if the file has none."""
+    """Return the animation of a mesh in a file, or None if it has none."""
     if (steps := arrays.get(f"{mesh}_steps")) is None:
         return None
     step_s, speed, repeat = arrays[f"{mesh}_played"].tolist()
@@ -385,7 +397,10 @@ def _animation(arrays: Mapping[str, Any], mesh: str) -> Animation | None:
 
 
 def sensor_positions(survey: Survey) -> list[SensorPositions]:
-    """Return the positions of each sensor, which are its stations or samples of its trajectory."""
+    """Return the positions of each sensor.
+
+    These are its stations, or samples of its trajectory.
+    """
     path = survey.path
     sensors: list[SensorPositions] = []
     first = 0
@@ -406,7 +421,7 @@ def sensor_positions(survey: Survey) -> list[SensorPositions]:
 def moving_positions(
     sensors: Sequence[SensorPositions], actors: Sequence[Actor], duration_ns: float
 ) -> list[Floats]:
-    """Return the positions that a picture of a survey with motion must show.
+    """Return the positions that a plot of a survey with motion must show.
 
     These are the positions of the moving sensors or, if only actors move, of all sensors and
     actors. The result is empty without motion.
@@ -420,7 +435,7 @@ def moving_positions(
 
 
 def _sampled(actor: Actor, duration_ns: float, count: int) -> Actor:
-    """Return an actor whose trajectory is sampled at `count` times of a survey."""
+    """Return an actor whose trajectory is sampled at `count` times during a survey."""
     times, positions, rotations = actor.samples(duration_ns, count)
     beyond: Beyond = "hold" if presence_ns(actor.trajectory) == ALWAYS else "absent"
     track = Track(times / 1e9, positions, rotations, start_s=0.0, beyond=beyond)

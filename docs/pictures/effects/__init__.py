@@ -1,1 +1,4 @@
-"""A module for each effect of docs/effects.md: its picture, and a survey with the effect."""
+"""Effects in docs/effects.md.
+
+Each module draws the plot of an effect and returns a survey with the effect.
+"""

@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/effects.md: `python -m docs.pictures.effects [--only rain]`."""
+"""Draw the plots of docs/effects.md: `python -m docs.pictures.effects [--only rain]`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ IMAGES = Path(__file__).parents[2] / "images"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Draw the pictures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", nargs="?", type=Path, default=IMAGES)
     parser.add_argument("--only", nargs="*", default=[], help="names of effects")

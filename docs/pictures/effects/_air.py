@@ -1,4 +1,4 @@
-"""Pictures of what the air returns: a street from above, beside closed forms."""
+"""Plots of returns from the air: a street from above, and comparisons with closed forms."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def in_weather(survey: Survey, **weather: Any) -> Survey:
 
 
 def points(scene: Scene, survey: Survey) -> dict[str, Real]:
-    """Return the positions, range, intensity and cause of all points of a survey."""
+    """Simulate a survey and return the position, range, intensity and cause of all points."""
     batches = list(Rig(scene, survey).cast(0, survey.scan_count))
     columns = {
         "cause": [
@@ -51,7 +51,10 @@ def points(scene: Scene, survey: Survey) -> dict[str, Real]:
 
 
 def page(title: str, weather: dict[str, Any], reach_m: float) -> tuple[Figure, Any]:
-    """Draw the street from above without and with the weather; return an empty third plot."""
+    """Draw the street from above, without and with the weather.
+
+    The third plot of the figure is returned empty.
+    """
     figure = Figure((13.5, 4.7), dpi=100, layout="constrained")
     clear, wet, right = figure.subplots(1, 3, width_ratios=[1, 1, 1.25])
     scene = city(20_000)
@@ -76,13 +79,16 @@ def page(title: str, weather: dict[str, Any], reach_m: float) -> tuple[Figure, A
 
 
 def sky() -> Scene:
-    """Nothing but a small triangle far away."""
+    """Create a scene that contains only a small, distant triangle."""
     corner = np.array([[0, 0, -900], [1, 0, -900], [0, 1, -900.0]])
     return Scene.from_meshes([SceneMesh("Nothing", corner, np.array([[0, 1, 2]]))])
 
 
 def counts(axes: Any, weather: dict[str, Any], farthest_m: float) -> None:
-    """Plot numbers of returns against range, of pulses into the open sky, and the closed form."""
+    """Plot the number of returns against range, with the closed form.
+
+    The pulses are fired into the open sky.
+    """
     separate = Returns("all", pulse_ns=0)
     survey = replace(in_weather(survey_without()), steps=TURNS * 36, returns=separate, **weather)
     cloud = points(sky(), survey)
@@ -112,7 +118,7 @@ def counts(axes: Any, weather: dict[str, Any], farthest_m: float) -> None:
 
 
 def energies(axes: Any, weather: dict[str, Any]) -> None:
-    """Plot energies against range, and the closed forms of surfaces and of the air."""
+    """Plot energies against range, with the closed forms for surfaces and for the air."""
     survey = replace(in_weather(survey_without()), **weather)
     cloud = points(city(20_000), survey)
     air = cloud["cause"] == 1
@@ -146,7 +152,7 @@ def energies(axes: Any, weather: dict[str, Any]) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a picture of few colors."""
+    """Write a plot as an image with few colors."""
     import io
 
     from PIL import Image

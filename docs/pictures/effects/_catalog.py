@@ -1,4 +1,4 @@
-"""The modules of effects by name."""
+"""Registry of the effect modules."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from lidarpool import Survey
 
 
 class Effect(Protocol):
-    """A module of an effect.
+    """Protocol of the effect modules.
 
-    A module may also have `with_actors(scene)`, which returns the scene with moving objects, for
-    runs with and without the effect.
+    A module may also have a function `with_actors(scene)`. It returns the scene with moving
+    objects, for runs with and without the effect.
     """
 
     DRAWS: str  # file name of the picture
@@ -30,7 +30,10 @@ class Effect(Protocol):
 
 
 def load_effects(only: Sequence[str] = ()) -> dict[str, Effect]:
-    """Import the modules of the named effects, by default all effects; return modules by name."""
+    """Import the modules of the named effects, or of all effects by default.
+
+    The result maps names to modules.
+    """
     names = [module.name for module in pkgutil.iter_modules(effects.__path__)]
     return {
         name: cast(Effect, import_module(f"{effects.__name__}.{name}"))

@@ -1,4 +1,4 @@
-"""Walls and rigs for the pictures of what receivers do."""
+"""Walls and rigs for plots of receiver effects."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def points(meshes: list[SceneMesh], survey: Survey) -> dict[str, NDArray[Any]]:
 def cast_scan(
     meshes: list[SceneMesh], sensor: Sensor, noise: Noise, **options: Any
 ) -> dict[str, Any]:
-    """Cast a scan of a sensor at the origin; return its columns."""
+    """Cast a scan with a sensor at the origin and return its columns."""
     common = {"columns": ("ray", "range", "intensity", "cause"), "keep_every": 1}
     survey = Survey(sensor, poses=[(0, 0, 0)], steps=1, noise=noise, **{**common, **options})
     return points(meshes, survey)

@@ -1,4 +1,4 @@
-"""The survey that pictures of effects start from."""
+"""The survey on which plots of effects are based."""
 
 from __future__ import annotations
 
@@ -8,6 +8,6 @@ SCANS = 36
 
 
 def survey_without() -> Survey:
-    """Return a turn of an OS1-64 in a street, every return kept, with intensities."""
+    """Return a survey of one OS1-64 revolution in a street, with all returns and intensities."""
     sensor = load_sensor("ouster/os1-64", max_range_m=120)
     return Survey(sensor, poses=[(0, 0, 2)], steps=SCANS, columns=["intensity", "range"])

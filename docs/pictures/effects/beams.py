@@ -1,4 +1,4 @@
-"""Gaussian and oval beams: footprints, light on an edge, and width against range."""
+"""Gaussian and oval beams: footprints, light on an edge, and beam width against range."""
 
 from __future__ import annotations
 
@@ -35,13 +35,15 @@ def with_effect(survey: Survey) -> Survey:
 
 
 def wall(name: str, x: float, y: tuple[float, float] = (-50.0, 50.0)) -> SceneMesh:
-    """Make a rectangle across the x axis."""
     corners = [[x, y[0], -50], [x, y[1], -50], [x, y[1], 50], [x, y[0], 50.0]]
     return SceneMesh(name, np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def footprint(returns: Returns, distance: float) -> NDArray[np.float64]:
-    """Return where the sub-rays of a beam hit a wall: (k, 2), meters across and up."""
+    """Return the positions at which the sub-rays of a beam hit a wall.
+
+    The shape is (k, 2), with meters across and up.
+    """
     scene = Scene.from_meshes([wall("Wall", distance)])
     rig = Rig(scene, Survey(SENSOR, poses=[(0, 0, 0)], steps=1, returns=returns), "numpy")
     beams = rig.pulse_casters[0].emitter.subrays_of(rig.pattern(0, 0, 1))
@@ -52,7 +54,10 @@ def footprint(returns: Returns, distance: float) -> NDArray[np.float64]:
 
 
 def share(returns: Returns, edge_m: float) -> float:
-    """Return the share of a pulse's light on a wall at 50 m with an edge, before a wall at 60 m."""
+    """Return the fraction of a pulse's light that hits a wall with an edge.
+
+    The wall is at 50 m, in front of another wall at 60 m.
+    """
     meshes = [wall("Near", 50, (-50, edge_m)), wall("Far", 60)]
     survey = Survey(
         SENSOR, poses=[(0, 0, 0)], steps=1, returns=returns, columns=["reflectance", "range"]
@@ -64,7 +69,7 @@ def share(returns: Returns, edge_m: float) -> float:
 
 
 def picture(path: Path) -> None:
-    """Plot beam footprints, the share of light at an edge, and the beam width against range."""
+    """Plot beam footprints, the fraction of light at an edge, and beam width against range."""
     figure = Figure((13.5, 4.5), dpi=100, layout="constrained")
     prints, edges, widths = figure.subplots(1, 3, width_ratios=[0.8, 1, 1])
     kinds = (

@@ -26,7 +26,7 @@ def with_effect(survey: Survey) -> Survey:
 
 
 def picture(path: Path) -> None:
-    """Plot a sign with and without stray light, and the share of rays that receive stray light."""
+    """Plot a sign with and without stray light, and the fraction of rays that receive it."""
     across = np.arange(-4, 4.01, STEP_DEG)
     up = np.arange(-3, 3.01, STEP_DEG)
     grid = np.meshgrid(np.radians(up), np.radians(across), indexing="ij")

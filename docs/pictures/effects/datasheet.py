@@ -1,4 +1,4 @@
-"""Data sheets: what sensors detect, and how precisely, as their makers state it."""
+"""Data sheets: detection and precision of sensors as stated by their manufacturers."""
 
 from __future__ import annotations
 
@@ -24,13 +24,12 @@ RAYS = 2000
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with the data sheet's noise and 7 sub-rays."""
     sheet = read_model("ouster/os1-64").datasheet()
     return replace(survey, noise=sheet.noise, returns=sheet.returns)
 
 
 def picture(path: Path) -> None:
-    """Plot simulated detection rates and range precision with the values stated in data sheets."""
+    """Compare simulated detection rates and range precision with data sheet values."""
     figure = Figure((9, 3.7), layout="constrained", dpi=110)
     shares, sigmas = figure.subplots(1, 2)
     dark = [Material("*", 0.1)]

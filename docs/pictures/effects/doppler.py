@@ -1,4 +1,4 @@
-"""Radial velocities: a turn of a car's lidar at a crossing, and what its own speed makes of it."""
+"""Radial velocities measured by a car's lidar at a crossing, with its own motion."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ REACH = 36.0
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with radial velocities; its sensor drives."""
+    """Return the survey with radial velocities and a moving sensor."""
     drive = Track([0, 1], [[0, 0, HEIGHT], [SPEED, 0, HEIGHT]])
     return replace(
         survey,

@@ -13,7 +13,6 @@ WEATHER = {"dust_mg_m3": 100.0}
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey in dust."""
     return _air.in_weather(survey, **WEATHER)
 
 

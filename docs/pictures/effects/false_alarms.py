@@ -29,7 +29,6 @@ LIGHT_M_S = 299_792_458.0
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with false alarms."""
     return replace(survey, noise=NOISE)
 
 

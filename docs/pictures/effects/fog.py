@@ -13,7 +13,6 @@ WEATHER = {"visibility_km": 0.05}
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey in fog."""
     return _air.in_weather(survey, **WEATHER)
 
 

@@ -1,4 +1,4 @@
-"""Ghosts: what panes and paint mirror."""
+"""Ghosts: reflections in window panes and paint."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DIRT = 0.1
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with cars and buildings that mirror weakly."""
+    """Return the survey with cars and buildings that reflect weakly like mirrors."""
     materials = [
         Material(["car-*", "building-*"], reflectance=0.3, specular_reflectance=PAINT),
         Material("*", reflectance=0.3),
@@ -28,13 +28,13 @@ def with_effect(survey: Survey) -> Survey:
 
 
 def upright(name: str, start: tuple[float, float], stop: tuple[float, float]) -> SceneMesh:
-    """Return a wall between two positions, 3 m below the sensor and 3 m above."""
+    """Return a wall between two positions, from 3 m below the sensor to 3 m above it."""
     lower, upper = ([[*position, z] for position in (start, stop)] for z in (-3.0, 3.0))
     return SceneMesh(name, np.array([*lower, *upper]), np.array([[0, 1, 3], [0, 3, 2]]))
 
 
 def picture(path: Path) -> None:
-    """Plot ghosts of a shop window from above, and energies against the angle of incidence."""
+    """Plot the ghosts of a shop window from above, and energies against angle of incidence."""
     figure = Figure((12, 4.4), layout="constrained", dpi=100)
     above, right = figure.subplots(1, 2, width_ratios=[1.5, 1])
     car, van = (

@@ -1,4 +1,4 @@
-"""Systematic errors: of channels, during warm-up, and of the encoder."""
+"""Systematic errors of channels, during warm-up, and of the encoder."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ NOISE = Noise(
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with lasting errors, and without noise."""
+    """Return the survey with systematic errors and without noise."""
     return replace(survey, noise=replace(NOISE, range_m=0.0))
 
 
 def errors(sensor: Sensor, noise: Noise, **options: object) -> dict[str, np.ndarray]:
-    """Return range errors at a wall 10 m ahead, with the channel and the time in seconds."""
+    """Return the range errors at a wall 10 m ahead, with the channels and times in seconds."""
     batches_by_noise = []
     for noise_of_run in (Noise(), noise):
         survey = Survey(
@@ -44,7 +44,7 @@ def errors(sensor: Sensor, noise: Noise, **options: object) -> dict[str, np.ndar
 
 
 def picture(path: Path) -> None:
-    """Plot errors by channel, time and azimuth, together with their closed forms."""
+    """Plot errors by channel, time and azimuth, with their closed forms."""
     figure = Figure((11, 3.6), layout="constrained", dpi=100)
     by_channel, by_time, by_azimuth = figure.subplots(1, 3)
     revolution = errors(
@@ -81,7 +81,7 @@ def picture(path: Path) -> None:
 
 
 def ripple(cycles: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return azimuths and their errors, degrees, computed from ranges of a slanted wall."""
+    """Return azimuths and azimuth errors in degrees, computed from ranges of a slanted wall."""
     noise = Noise(ripple_deg=NOISE.ripple_deg, ripple_cycles=cycles)
     corner = np.array([[-30, -8, -9], [30, -8, -9], [30, -8, 9], [-30, -8, 9.0]])
     azimuths = []

@@ -1,4 +1,4 @@
-"""Allan deviations of the IMU of a stationary vehicle, against their closed forms."""
+"""Allan deviations of a stationary vehicle's IMU, compared with their closed forms."""
 
 from __future__ import annotations
 
@@ -30,12 +30,18 @@ GNSS = Gnss(
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with instruments; stage 2 takes as long as without."""
+    """Return the survey with instruments.
+
+    Stage 2 takes as long as without instruments.
+    """
     return replace(survey, navigation=Navigation(imu=IMU, gnss=GNSS))
 
 
 def allan(values: np.ndarray, size: int) -> tuple[float, int]:
-    """Overlapping Allan deviation of samples (n, axes), and how many clusters are disjoint."""
+    """Compute the overlapping Allan deviation of samples and the number of disjoint clusters.
+
+    The samples have shape (n, axes).
+    """
     sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     means = (sums[size:] - sums[:-size]) / size
     steps = means[size:] - means[:-size]
@@ -43,7 +49,7 @@ def allan(values: np.ndarray, size: int) -> tuple[float, int]:
 
 
 def parts(tau: np.ndarray) -> dict[str, np.ndarray]:
-    """Allan deviations of the three processes (IEEE Std 952-1997, annex C)."""
+    """Compute the Allan deviations of the three processes (IEEE Std 952-1997, annex C)."""
     sigma = IMU.gyroscope_bias
     time = IMU.gyroscope_bias_time_s
     bracket = 1 - time / (2 * tau) * (3 - 4 * np.exp(-tau / time) + np.exp(-2 * tau / time))
@@ -55,7 +61,10 @@ def parts(tau: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def outage(axes: Any, still: SimpleNamespace) -> None:
-    """Draw errors of positions that an IMU bridges for 15 s, of many seeds, on the closed form."""
+    """Plot position errors of an IMU during a 15 s outage, with their closed form.
+
+    Each seed is a line.
+    """
     imu = Imu(accelerometer_bias=0.01, accelerometer_noise_density=0.02)
     gnss = Gnss(rate_hz=10, outages=[(10, 25)])
     for seed in range(40):

@@ -13,7 +13,6 @@ WEATHER = {"rain_mm_h": 50.0}
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey in rain."""
     return _air.in_weather(survey, **WEATHER)
 
 

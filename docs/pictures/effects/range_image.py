@@ -1,4 +1,4 @@
-"""Range images: rays that hit nothing, and rays whose return is lost, of a turn in a street."""
+"""Range images: rays that hit nothing, and rays whose return is lost."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ NOISE = Noise(detection_range_m=45, dropout=0.01)
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with the columns that range images need."""
+    """Return the survey with the columns that range images require."""
     return replace(survey, columns=(*survey.columns, "ray", "range"))
 
 

@@ -1,4 +1,4 @@
-"""Noise of ranges and range walk, by the energy of returns."""
+"""Range noise and range walk as functions of the energy of returns."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ RAYS = 4000
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with noise of ranges and range walk."""
     return replace(survey, noise=replace(NOISE, walk_m=0.02))
 
 

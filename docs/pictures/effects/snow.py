@@ -13,7 +13,6 @@ WEATHER = {"snow_mm_h": 1.0}
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey in snow."""
     return _air.in_weather(survey, **WEATHER)
 
 

@@ -40,12 +40,12 @@ def with_effect(survey: Survey) -> Survey:
 
 
 def with_actors(scene: Scene) -> Scene:
-    """Return the scene with two lorries that drive at 90 km/h."""
+    """Return the scene with two trucks that drive at 90 km/h."""
     return scene.with_actors([lorry("Near", (-20, 3.5)), lorry("Far", (-10, -3.5))])
 
 
 def lorry(name: str, start: tuple[float, float], height: float = 0.0) -> Actor:
-    """Make a lorry that drives along x."""
+    """Create a truck that drives along x."""
     drive = Track(
         [0, 2], [[*start, height], [start[0] + 2 * SPEED, start[1], height]], beyond="hold"
     )

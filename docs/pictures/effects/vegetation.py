@@ -1,4 +1,4 @@
-"""Leaves within crowns: a tree's points, gap fractions by leaf angle, and depths of returns."""
+"""Leaves in tree crowns: points of a tree, gap fractions by leaf angle, and return depths."""
 
 from __future__ import annotations
 
@@ -39,14 +39,13 @@ def with_effect(survey: Survey) -> Survey:
 def cast(
     meshes: list[SceneMesh], sensor: Sensor, position: Any, materials: list[Material], seed: int = 0
 ) -> Any:
-    """Cast a scan."""
     survey = Survey(sensor, poses=[position], steps=1, materials=materials, noise=Noise(seed=seed))
     (batch,) = Rig(Scene.from_meshes(meshes), survey).cast(0, 1)
     return batch
 
 
 def tree() -> list[SceneMesh]:
-    """Make a crown, its trunk, and the ground."""
+    """Create a tree crown, its trunk, and the ground."""
     crown = trimesh.creation.icosphere(4, 1.0)
     shaped = np.asarray(crown.vertices) * (2.4, 2.4, 3.0) + (0, 0, 5.5)
     trunk = trimesh.creation.cylinder(0.2, 7.0, sections=16)
@@ -58,7 +57,10 @@ def tree() -> list[SceneMesh]:
 
 
 def section(axes: Any, leaves: Material, title: str) -> None:
-    """Draw a slice of a tree from the side; the sensor is 9 m to the left."""
+    """Draw a slice of a tree from the side.
+
+    The sensor is 9 m to the left.
+    """
     head = Beams(np.radians(np.linspace(-14, 50, 160)))
     scan = cast(tree(), Sensor(head, Spin(2400, 360)), (-9, 0, 2), [leaves, Material("*", 0.3)])
     positions = scan.positions
@@ -75,7 +77,10 @@ def section(axes: Any, leaves: Material, title: str) -> None:
 
 
 def canopy(kind: str, zenith_deg: float) -> Real:
-    """Depths of leaves below the top of a canopy, in shares of the path; NaN through gaps."""
+    """Return the depths of leaf hits below the top of a canopy.
+
+    Depths are fractions of the canopy's height, or NaN for rays through gaps.
+    """
     meshes = [
         box("Leaves", (-90, -90, 0), (90, 90, HIGH)),
         box("Soil", (-99, -99, -2), (99, 99, -1)),

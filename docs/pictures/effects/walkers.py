@@ -1,4 +1,4 @@
-"""People who walk: one from aside at four moments, and the velocities of arms and legs."""
+"""Walking people: one from the side at four moments, and the velocities of arms and legs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DARK = "#3a3f47"
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with radial velocities, in which walking shows."""
+    """Return the survey with radial velocities, which reveal the motion of walking people."""
     return replace(survey, columns=(*survey.columns, "radial_velocity"))
 
 

@@ -31,7 +31,7 @@ _LANES = {
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with a Gaussian decomposition of beams of 19 sub-rays."""
+    """Return the survey with 19 sub-rays per beam and a Gaussian decomposition."""
     returns = Returns("all", subrays=19, waveform="gaussian")
     return replace(survey, returns=returns)
 
@@ -39,7 +39,7 @@ def with_effect(survey: Survey) -> Survey:
 def _pulse_points(
     scene: Scene, position: tuple[float, float], samples: int = 0, **returns: Any
 ) -> Cloud:
-    """Return the points of a pulse that looks straight down."""
+    """Return the points of a pulse that is fired straight down."""
     sensor = Sensor(Beams(np.zeros(1)), Spin(1, 360), optics=Optics(divergence_mrad=2.5))
     options = {"subrays": 217, "pulse_ns": _PULSE_NS, "mode": "all", **returns}
     survey = Survey(
@@ -65,7 +65,7 @@ def _flat(name: str, height: float, x: tuple[float, float]) -> SceneMesh:
 def _panel(
     axes: Any, scene: Scene, position: tuple[float, float], span: tuple[float, float]
 ) -> None:
-    """Draw the waveform of a pulse over height, its parts, and the returns of receivers."""
+    """Draw a pulse's waveform over height, its components, and the returns of the receivers."""
     hits = _pulse_points(scene, position, pulse_ns=0.001)
     clouds = {name: _pulse_points(scene, position, 160, waveform=name) for name in _LANES}
     waves = clouds["gaussian"].waveforms

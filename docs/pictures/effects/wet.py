@@ -1,4 +1,4 @@
-"""Wet ground: a film of water on what faces up."""
+"""Wet ground: a water film on surfaces that face up."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ ROAD = 0.2
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey on wet ground."""
     return replace(survey, wet=1.0)
 
 

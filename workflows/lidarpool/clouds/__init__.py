@@ -1,1 +1,1 @@
-"""Point cloud formats, each of which has a module that writes and reads it."""
+"""Point cloud formats, each of which is written and read by its own module."""

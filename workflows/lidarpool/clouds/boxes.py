@@ -1,4 +1,4 @@
-"""Bounding boxes of actors in a sweep, which are used for data set labels and markers."""
+"""Bounding boxes of actors in a sweep, for use in data set labels and markers."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
-    """Bounding boxes of all actors at the start of a sweep, which is its timestamp.
+    """Bounding boxes of all actors at the start of a sweep.
 
-    Each point is measured at its own time, so points of a moving actor can lie outside its box. The
-    size of a box is the same in all sweeps. The box of an actor that deforms contains the actor in
-    all its shapes.
+    The start is the timestamp of the sweep. Each point is measured at its own time, so points of a
+    moving actor can lie outside its box. The size of a box is the same in all sweeps. The box of an
+    actor that deforms contains the actor in all its shapes.
 
     The box of an actor that appears during the sweep is extrapolated back to the start of the
     sweep, using the actor's velocity when it appears. There is no box for an actor that has left
@@ -59,7 +59,7 @@ class Boxes:
 
 @dataclass(frozen=True, eq=False)
 class SweepBoxes:
-    """Bounding boxes of the k actors that are present in a sweep, at its start (see `Boxes`)."""
+    """Bounding boxes, at the start of a sweep, of the k actors that are present (see `Boxes`)."""
 
     names: tuple[str, ...]
     types: tuple[str, ...]  # names without numbers, for example "Car" for "Car 1"
@@ -113,12 +113,18 @@ class SweepBoxes:
 
     @property
     def yaw(self) -> Floats:
-        """Yaw angles about the z axis of the sensor in radians, from x to y. Shape (k,)."""
+        """Yaw angles about the sensor's z axis in radians, from x to y.
+
+        The shape is (k,).
+        """
         rotations = matrices(self.quaternions)
         angles: Floats = np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])
         return angles
 
     @property
     def rows(self) -> Floats32:
-        """Center, length, width, height and yaw of each box, float32. Shape (k, 7)."""
+        """Center, length, width, height and yaw of each box.
+
+        The shape is (k, 7), and the dtype is float32.
+        """
         return np.column_stack([self.centers, self.sizes, self.yaw]).astype(np.float32)

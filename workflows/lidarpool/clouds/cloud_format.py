@@ -47,10 +47,11 @@ class Entry:
 
 
 class CloudFormat(ABC):
-    """A point cloud that can be written in a format, which is defined by the subclass.
+    """A point cloud that can be written in the format that a subclass defines.
 
-    Class attributes and class methods state what the format can store, and read its files. The
-    attributes are available even if the packages that the format requires are not installed.
+    Class attributes and class methods state what the format can store, and class methods read its
+    files. The attributes are available even if the packages that the format requires are not
+    installed.
 
     Parameters
     ----------
@@ -143,7 +144,7 @@ class CloudFormat(ABC):
 
     @classmethod
     def survey_notes(cls, survey: Survey) -> list[str]:
-        """Return notes for the user on data of a survey that the format cannot store."""
+        """Return notes for the user on survey data that the format cannot store."""
         return []
 
     @classmethod
@@ -174,14 +175,14 @@ class CloudFormat(ABC):
 
     @classmethod
     def class_files(cls, classes: Mapping[int, str]) -> Mapping[str, bytes]:
-        """Return data set files with the class names of all jobs, as {name: content}."""
+        """Return data set files with the class names of all jobs, keyed by file name."""
         return {}
 
     @classmethod
     def merge_jobs(
         cls, storage: Storage, manifests: Iterable[Mapping[str, Any]]
     ) -> dict[str, list[int]]:
-        """Write the files that the jobs of a data set share, using the manifests of the jobs.
+        """Write the files that the jobs of a data set share, based on the jobs' manifests.
 
         Implementations must iterate over all manifests, because the iteration writes the index of
         the data set.
@@ -198,9 +199,9 @@ class CloudFormat(ABC):
     def renumber_labels(
         cls, name: str, read: Callable[[str], bytes], before: Sequence[int], after: Sequence[int]
     ) -> bytes | None:
-        """Return the content of a label file with renumbered labels, or None for other files.
+        """Renumber the labels in a label file and return its content, or None for other files.
 
-        Labels refer to positions in a list of classes, which is `before` in the file and `after` in
+        Labels are positions in a list of classes. This list is `before` in the file and `after` in
         the returned content.
         """
         return None

@@ -56,7 +56,7 @@ _MIN_QUATERNION = 1e-6  # norm below which a quaternion is considered zero
 class E57(CloudFormat):
     """An E57 file with one scan per sweep, except for sweeps without points.
 
-    A scan contains its pose, and the points with intensity, colors and normals:
+    A scan contains its pose and its points, which have intensity, colors and normals:
 
     - Points are in the sensor frame. Poses are in world coordinates, whose coordinate system is
       stored as WKT.
@@ -172,7 +172,7 @@ def _scan_name(sweeps: Sweeps, sweep: int) -> str:
 
 
 class _Scale(NamedTuple):
-    """Intensity limits with which the intensities of all scans are converted to the same scale."""
+    """Intensity limits that convert the intensities of all scans to the same scale."""
 
     limits: Sequence[Limits | None]  # None for scans whose intensities are used as stored
     notes: tuple[str, ...] = ()  # notes for the user, which continue the name of the file
@@ -223,7 +223,7 @@ def _open_e57(source: RecordingSource) -> Recording:
 
 
 def _read_scan(file: Any, header: Any, number: int, scale: _Scale) -> Sweep:
-    """Read the valid points of a scan from an open `pye57.E57`, in the scanner frame.
+    """Read the valid points of a scan, in the scanner frame, from an open `pye57.E57`.
 
     Colors and intensities that are marked as invalid are NaN, and a column is omitted if all its
     values are invalid. Other colors range from 0 to 255.
@@ -259,7 +259,7 @@ def _read_scan(file: Any, header: Any, number: int, scale: _Scale) -> Sweep:
 
 
 def _read_fields(file: Any, header: Any) -> dict[str, AnyArray]:
-    """Read the supported fields of a scan as {name: values}.
+    """Read the supported fields of a scan, keyed by name.
 
     This does not use the reading function of pye57, because its types are too small for some
     values: 8 bits for colors and 16 bits for row numbers.
@@ -289,12 +289,11 @@ def _read_fields(file: Any, header: Any) -> dict[str, AnyArray]:
 
 
 def _states(kind: str) -> list[str]:
-    """Return the fields that mark points as invalid, starting with the given coordinate kind."""
+    """Return the fields that mark points as invalid, starting with the coordinate field."""
     return [f"{of}InvalidState" for of in sorted(_COORDINATES, key=lambda of: of != kind)]
 
 
 def _positions(read: Mapping[str, AnyArray], kind: str) -> Floats:
-    """Return the positions in a scan as Cartesian coordinates."""
     first, second, third = (read[axis].astype(np.float64) for axis in _COORDINATES[kind])
     if kind == "cartesian":
         return np.stack([first, second, third], axis=1)
@@ -305,7 +304,10 @@ def _positions(read: Mapping[str, AnyArray], kind: str) -> Floats:
 
 
 def _color_columns(header: Any, columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
-    """Scale the colors of a scan to the range 0 to 255. They are uint8, or float32 with NaN."""
+    """Scale the colors of a scan to the range 0 to 255.
+
+    The columns are uint8, or float32 with NaN.
+    """
     values = [columns[name] for name in COLORS]
     full = _full_color(header, max(float(np.nanmax(color, initial=0)) for color in values))
     scaled = [np.rint(np.clip(color * (255 / full), 0, 255)) for color in values]
@@ -317,8 +319,8 @@ def _color_columns(header: Any, columns: Mapping[str, AnyArray]) -> dict[str, An
 def _full_color(header: Any, highest: float) -> float:
     """Return the color value that represents full intensity in a scan.
 
-    It is the limit that the scan declares, if this limit is plausible for 8 to 32 bits and not
-    below the highest color in the scan. Otherwise it is derived from the highest color.
+    This is the limit that the scan declares, provided that it is plausible for 8 to 32 bits and not
+    below the highest color in the scan. Otherwise, it is derived from the highest color.
     """
     from pye57 import libe57
 
@@ -338,7 +340,7 @@ def _full_color(header: Any, highest: float) -> float:
 
 
 def _scale(headers: Sequence[Any]) -> _Scale:
-    """Determine the common scale to which the intensities of all scans are converted.
+    """Determine the common scale for the intensities of all scans.
 
     Intensities are used as stored unless all scans that have them declare limits.
     """
@@ -373,7 +375,6 @@ def _limit(header: Any, group: str, name: str) -> float | None:
 
 
 def _number(node: Any) -> float:
-    """Return the value of a numeric node."""
     from pye57 import libe57
 
     is_scaled = isinstance(node, libe57.ScaledIntegerNode)
@@ -381,7 +382,7 @@ def _number(node: Any) -> float:
 
 
 def _name(header: Any, number: int) -> str:
-    """Return the name by which messages refer to a scan."""
+    """Return the name of a scan for messages."""
     name = _stated_name(header)
     return f"scan {number + 1}" + (f" ({name!r})" if name else "")
 
@@ -392,9 +393,9 @@ def _stated_name(header: Any) -> str:
 
 
 def _pose(header: Any, name: str) -> tuple[Floats | None, tuple[str, ...]]:
-    """Return the pose matrix of a scan, or None if it has no pose, and notes about the pose.
+    """Return the pose matrix of a scan and notes about the pose.
 
-    Raises ValueError if the pose is not finite.
+    The matrix is None if the scan has no pose. Raises ValueError if the pose is not finite.
     """
     node = header.node
     if not node.isDefined("pose"):

@@ -22,7 +22,10 @@ NORMAL_FIELDS = {f"nor:normal{name[-1].upper()}": name for name in NORMAL}  # {f
 
 
 class E57Writer(pye57.E57):
-    """A new E57 file with a coordinate system and a creation time, which pye57 leaves empty."""
+    """A new E57 file with a coordinate system and a creation time.
+
+    pye57 leaves both empty.
+    """
 
     def __init__(self, path: Path, system: str, sweeps: Sweeps) -> None:
         self._system = system
@@ -31,7 +34,7 @@ class E57Writer(pye57.E57):
         super().__init__(str(path), mode="w")
 
     def write_default_header(self) -> None:
-        """Write the header, with the coordinate system and the creation time."""
+        """Write the header with the coordinate system and the creation time."""
         self._in_header = True
         super().write_default_header()
         self._in_header = False
@@ -54,7 +57,10 @@ class E57Writer(pye57.E57):
 
 
 class E57WriterWithNormals(E57Writer):
-    """A new E57 file whose scans have normals, which pye57 does not support."""
+    """A new E57 file whose scans have normals.
+
+    pye57 does not support normals.
+    """
 
     def make_buffers(self, field_names: Sequence[str], *arguments: Any, **options: Any) -> Any:
         """Return the buffers of pye57, with normals added."""
@@ -84,7 +90,7 @@ def normal_fields() -> Iterator[None]:
 
 @contextmanager
 def content_guids(content: str) -> Iterator[None]:
-    """Patch pye57 so that it derives GUIDs from a text, instead of generating random GUIDs."""
+    """Patch pye57 to derive GUIDs from a text instead of generating random GUIDs."""
     numbers = count()
     uuid_module = pye57.e57.uuid
     pye57.e57.uuid = SimpleNamespace(

@@ -36,7 +36,7 @@ def flight_lines(survey: Survey) -> StraightLines | None:
 
 
 def summarize_flight_lines(survey: Survey) -> dict[str, float] | None:
-    """Summarize the flight lines on which at least one scanner fires, or return None.
+    """Summarize the flight lines on which at least one scanner fires.
 
     Returns
     -------
@@ -84,7 +84,7 @@ class LineFields:
 
     @classmethod
     def empty(cls, count: int) -> LineFields:
-        """Return default values for points whose survey is unknown."""
+        """Create default values for points from an unknown survey."""
         return cls(
             np.zeros(count),
             np.zeros(count, np.uint8),
@@ -95,20 +95,20 @@ class LineFields:
 
 
 class FlightLines:
-    """Computes the `LineFields` of the points in a survey.
+    """Calculation of the `LineFields` of a survey's points.
 
     The direction of flight is the direction in which the sensor moves, or the x axis of a static
-    sensor. Point sources are numbered by flight line or station, and by sensor if there are several
-    sensors.
+    sensor. Point sources are numbered by flight line or station. If there are several sensors, they
+    are also numbered by sensor.
     """
 
     def __init__(self, sweeps: Sweeps) -> None:
         self.sweeps = sweeps
 
     def with_fields(self, chunks: Iterable[Cloud]) -> Iterator[tuple[Cloud, LineFields]]:
-        """Yield chunks of points with their fields.
+        """Yield each chunk of points with its fields.
 
-        Points that are not sorted by scan are not marked as the edge of a scan line.
+        In points that are not sorted by scan, no point is marked as the edge of a scan line.
 
         Raises
         ------
@@ -130,7 +130,7 @@ class FlightLines:
             yield held
 
     def _fields(self, chunk: Cloud) -> LineFields:
-        """Return the fields of a chunk, assuming that its last line does not continue."""
+        """Return the fields of a chunk, assuming that its last line ends with it."""
         fields = LineFields.empty(len(chunk))
         if not len(self.sweeps) or "scan" not in chunk.columns:
             return fields
@@ -182,7 +182,10 @@ class FlightLines:
 
     @cached_property
     def _directions(self) -> Floats:
-        """Direction of flight in each sweep, as horizontal unit vectors. Shape (n, 3)."""
+        """Direction of flight in each sweep, as horizontal unit vectors.
+
+        The shape is (n, 3).
+        """
         axes = self.sweeps.pose.rotations[:, :, 0]
         knots = self.sweeps.knots
         moved = knots[:, -1, :3].astype(np.float64) if len(knots) else np.zeros_like(axes)
@@ -190,14 +193,20 @@ class FlightLines:
 
     @cached_property
     def _stations(self) -> Ints:
-        """Station of each sweep. Shape (n,)."""
+        """Station of each sweep.
+
+        The shape is (n,).
+        """
         sweeps = self.sweeps
         per_station = np.bincount(sweeps.sensor) // sweeps.stations
         return sweeps.numbers // np.maximum(per_station[sweeps.sensor], 1)
 
     @cached_property
     def _sources(self) -> Ints:
-        """Point source ID of each sweep, starting at 1. Shape (n,)."""
+        """Point source ID of each sweep, starting at 1.
+
+        The shape is (n,).
+        """
         sweeps = self.sweeps
         source = self._stations.copy()
         for sensor, lidar in enumerate(sweeps.lidars):

@@ -1,4 +1,7 @@
-"""Output folders for results and exports, with one writer at a time and without partial files."""
+"""Output folders for results and exports.
+
+A folder has one writer at a time, and never contains partial files.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,10 @@ LAST_FILE = "report.json"  # written last, so a result that contains this file i
 
 
 def output_destination(text: str | Path) -> Path | Storage:
-    """Return the destination for a result, which is remote storage if the text is a URL."""
+    """Return the destination for a result.
+
+    It is remote storage if the text is a URL.
+    """
     return Storage.at(text) if is_url(text) else Path(text)
 
 
@@ -77,7 +83,9 @@ def check_exists(place: Path | Storage, advice: str) -> None:
 
 @contextmanager
 def local_result(output: Path | Storage, names: Sequence[str]) -> Iterator[Path]:
-    """Yield the folder of a result, or a temporary local copy if the result is in storage.
+    """Yield the folder of a result.
+
+    For a result in storage, this is a temporary local copy.
 
     Parameters
     ----------
@@ -136,7 +144,10 @@ def upload(path: Path, output: Path | Storage) -> str:
 
 @contextmanager
 def local_folder(output: Path | Storage) -> Iterator[Path]:
-    """Yield the output folder, or for storage a temporary folder named like the end of its URL."""
+    """Yield a local folder for the output.
+
+    For storage, this is a temporary folder that is named like the end of its URL.
+    """
     if not isinstance(output, Storage):
         yield output
         return

@@ -44,7 +44,7 @@ class FormatRow:
 
     @property
     def missing_packages(self) -> list[str]:
-        """Required packages that are not installed in this environment."""
+        """Required packages that are not installed."""
         return [package for package in self.packages if find_spec(package) is None]
 
     def load(self, reading: str = "") -> type[Any]:

@@ -1,8 +1,8 @@
 """Table of the cloud formats, with their files, required packages and classes.
 
-The module is fast to import, because the command line reads it for help and completion. The class
-of a format is only imported by `FormatRow.load`. Other distributions add formats through entry
-points in the group `GROUP`, which are named after the format.
+The module is fast to import because the command line reads it for help and completion. Only
+`FormatRow.load` imports the class of a format. Other distributions add formats through entry points
+in the group `GROUP`, which are named after the format.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ _TABLE = PluginTable(GROUP, "cloud format", FORMATS, _row_of_plugin)
 
 
 def format_row(name: str) -> FormatRow:
-    """Return the row of a format that can be written, from the table or a plug-in.
+    """Return the row of a writable format from the table or a plug-in.
 
     Raises
     ------
@@ -138,9 +138,9 @@ def format_row(name: str) -> FormatRow:
 
 
 def load_format(name: str) -> type[CloudFormat]:
-    """Import the class of a format that can be written.
+    """Import the class of a writable format.
 
-    Raises LidarError as `format_row`.
+    Raises LidarError like `format_row`.
     """
     return format_row(name).load()
 
@@ -176,13 +176,13 @@ def format_of_path(path: Path, name: str) -> type[CloudFormat] | None:
 
 
 def point_suffixes() -> tuple[str, ...]:
-    """Return the extensions of the files from which scenes can be created."""
+    """Return the extensions of files from which scenes can be created."""
     rows = [row for row in _all_rows() if row.suffixes and row.load().for_scenes]
     return tuple(suffix for row in rows for suffix in row.suffixes)
 
 
 def plugin_formats(files: Collection[str]) -> list[str]:
-    """Return the formats of plug-ins whose file or folder is in `files`.
+    """Return plug-in formats whose file or folder is in `files`.
 
     Plug-ins that cannot be used are skipped.
     """

@@ -1,4 +1,4 @@
-"""Names of frames and topics, which are the same in ROS bags and in live views."""
+"""Names of frames and topics, which ROS bags and live views share."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ def points_topic(name: str, frame: str) -> str:
 
 
 def survey_start_ns(sweeps: Sweeps) -> int:
-    """Return the start of a survey in ns since 1970-01-01 UTC, or `START_NS` if it is unknown.
+    """Return the start of a survey in nanoseconds since 1970-01-01 UTC.
 
-    The default is not 0, because tf2 interprets time 0 as a request for the latest transform.
+    If the start is unknown, the result is `START_NS`. This default is not 0, because tf2 interprets
+    time 0 as a request for the latest transform.
     """
     return START_NS if sweeps.start_ns is None else sweeps.start_ns

@@ -9,7 +9,7 @@ _LEAP_S = 18  # GPS time minus UTC since 2017, the earliest start
 
 
 def gps_start_s(sweeps: Sweeps) -> float:
-    """Return the start of a survey in GPS time in seconds, or 0 if the start is unknown."""
+    """Return the GPS time at the start of a survey in seconds, or 0 if it is unknown."""
     if sweeps.start_ns is None:
         return 0.0
     return (sweeps.start_ns - GPS_NS) / 1e9 + _LEAP_S

@@ -1,4 +1,4 @@
-"""Range images, which contain all rays of a sweep by channel and firing.
+"""Range images that contain all rays of a sweep, by channel and firing.
 
 Rays without a return are included.
 """
@@ -65,7 +65,7 @@ class ImageFolder(MultiFileFormat):
         self.folders = self._folders_of(sweeps, entry)
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], Boxes | None]:
-        """Return the file of a sweep, and its boxes if there are actors."""
+        """Return the file of a sweep, and the sweep's boxes if there are actors."""
         sweeps = self.sweeps
         image = RayImage.from_points(sweeps, number, points)
         positions = sweeps.in_sensor(number, points.positions).astype(np.float32)
@@ -88,19 +88,18 @@ class ImageFolder(MultiFileFormat):
 
     @classmethod
     def _folders_of(cls, sweeps: Sweeps, entry: Entry | None) -> list[str]:
-        """Return the folder of each sensor."""
         names = make_identifiers(name or "lidar" for name in sweeps.sensors)
         return names if entry is None else [f"{cls.path_of_job(entry)}/{name}" for name in names]
 
     @classmethod
     def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
-        """Return the name of the archive with the images."""
+        """Return the name of the archive that contains the images."""
         folders = job.cached("folders", lambda: cls._folders_of(job.sweeps, job.entry))
         return [_file(job.sweeps, folders, sweep)]
 
     @classmethod
     def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
-        """Read points with all columns, including the time and angles of their rays.
+        """Read points with all columns, including the times and angles of their rays.
 
         Points are sorted by ray.
         """
@@ -110,7 +109,7 @@ class ImageFolder(MultiFileFormat):
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open the range images in a folder that has one subfolder per sensor."""
+        """Open the range images in a folder with one subfolder per sensor."""
         with reading(source.name):
             sensors = _sensors(source)
         return source.select_sensor(sensors)
@@ -134,7 +133,10 @@ def points_of_images(images: dict[str, AnyArray]) -> PointColumns:
 
 
 def _key(name: str, plane: int) -> str:
-    """Return the name of the image that contains a column for a return, numbered from 0."""
+    """Return the name of the image for a column and a return.
+
+    Returns are numbered from 0.
+    """
     return f"{name}{plane + 1}" if plane else name
 
 
@@ -143,7 +145,7 @@ def _file(sweeps: Sweeps, folders: Sequence[str], sweep: int) -> str:
 
 
 def _sensors(source: RecordingSource) -> dict[str, Recording]:
-    """Open the range images of each sensor, as {sensor: recording}."""
+    """Open the range images of each sensor, keyed by sensor name."""
     files_of_sensor = {
         inner.name: sort_by_number(inner.glob("*.npz"))
         for inner in sorted(source.path.iterdir())

@@ -1,4 +1,4 @@
-"""Access to the files of a data set job, from which formats read single sweeps."""
+"""Access to the files of a data set job, for formats that read individual sweeps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ T = TypeVar("T")
 
 
 class JobReader:
-    """Reads the files of one data set job, in any order, from a single thread."""
+    """Reader for the files of a data set job.
+
+    The files can be read in any order, but only from one thread.
+    """
 
     def __init__(
         self,
@@ -46,7 +49,7 @@ class JobReader:
         self._copies: Path | None = None
 
     def cached(self, key: str, make: Callable[[], T]) -> T:
-        """Return the value for a key, which is computed by `make` on the first call."""
+        """Return the cached value for a key, computing it with `make` on the first call."""
         if key not in self._cache:
             self._cache[key] = make()
         value: T = self._cache[key]
@@ -68,7 +71,7 @@ class JobReader:
                         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_WILLNEED)
 
     def close(self) -> None:
-        """Close open files, and remove local copies."""
+        """Close open files and remove local copies."""
         self.opened.close()
         if self._copies is not None:
             _remove(self._copies, os.getpid())
@@ -88,7 +91,7 @@ class JobReader:
         return path
 
     def read_rows(self, name: str, row: np.dtype[Any], count: int | None = None) -> AnyArray:
-        """Read a file that consists of rows, as a writable array.
+        """Read a file that consists of rows into a writable array.
 
         Raises ValueError if the last row is incomplete, or if the number of rows is not `count`.
         """
@@ -111,13 +114,13 @@ class JobReader:
         return rows  # PyTorch requires writable arrays
 
     def in_sensor(self, sweep: int, cloud: Cloud) -> PointColumns:
-        """Return the points of a cloud in the sensor frame, and all their columns."""
+        """Return the points of a cloud in the sensor frame, with all of their columns."""
         positions = self.sweeps.in_sensor(sweep, cloud.positions).astype(np.float32)
         columns = self.sweeps.columns_in_sensor(sweep, cloud)
         return positions, {name: np.array(array) for name, array in columns.items()}
 
 
 def _remove(folder: Path, process: int) -> None:
-    """Remove a folder, unless this process is a fork of its creator."""
+    """Remove a folder, unless this process is a fork of the process that created it."""
     if os.getpid() == process:
         shutil.rmtree(folder, ignore_errors=True)

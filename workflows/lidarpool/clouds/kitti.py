@@ -1,4 +1,4 @@
-"""Read and write KITTI folders with the labels of SemanticKITTI and bounding boxes of actors."""
+"""Read and write KITTI folders with SemanticKITTI labels and bounding boxes of actors."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class KITTI(MultiFileFormat):
         self.cameras = [_camera(sweeps, sensor) for sensor in range(len(sweeps.sensors))]
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, FileContent], Boxes | None]:
-        """Return the files of a sweep, and its boxes if there are actors."""
+        """Return the files of a sweep, and the sweep's boxes if there are actors."""
         sweeps = self.sweeps
         folder = self.sequences[sweeps.sensor[number]]
         name = f"{sweeps.numbers[number]:06}"
@@ -144,7 +144,7 @@ class KITTI(MultiFileFormat):
         return files
 
     def _tracks(self, numbers: Sequence[int], boxes: Sequence[Boxes | None]) -> bytes:
-        """Return the boxes of all sweeps of a sensor in the layout of KITTI tracking."""
+        """Format a sensor's boxes in all sweeps for KITTI tracking."""
         sweeps = self.sweeps
         lines = []
         for frame, number in enumerate(numbers):
@@ -196,7 +196,7 @@ class KITTI(MultiFileFormat):
 
 
 def kitti_intensity(points: Cloud) -> Floats32:
-    """Return the reflectivity of points scaled to 0 to 1, which KITTI stores as intensity."""
+    """Return the reflectivity of points from 0 to 1, which KITTI stores as intensity."""
     return np.asarray(points["reflectivity"] / np.float32(255), np.float32)
 
 
@@ -234,11 +234,11 @@ def _camera(sweeps: Sweeps, sensor: int) -> Floats:
 def _labels(
     sweeps: Sweeps, sweep: int, boxes: Boxes, camera: Floats
 ) -> Iterator[tuple[int, str, str]]:
-    """Yield the number, the type and the label values of each actor that has points.
+    """Yield the number, type and label values of each actor that has points.
 
     The label values start with the occlusion. There are no images, so the occlusion is 3 (unknown)
-    and the image box is zero. The position is the center of the bottom face, and boxes are only
-    rotated about the y axis of the camera.
+    and the image box is zero. The position is the center of the bottom face. Boxes are only rotated
+    about the y axis of the camera.
     """
     rotation = camera @ matrices(sweeps.pose.quaternions[sweep, None])[0].T
     forward = (rotation @ matrices(boxes.quaternions))[:, :, 0]  # headings of the actors
@@ -280,7 +280,7 @@ def _sequence(source: RecordingSource, folder: Path, inner: str, name: str = "")
     notes = []
 
     def of_frames(rows: Floats, table: str) -> Floats:
-        """Return the rows that belong to point files, and add a note about any other rows."""
+        """Return the rows that belong to point files, adding a note about any other rows."""
         indices = rows_of_frames(files, len(rows), table, "point files")
         if surplus := frames_without_file(files, len(rows)):
             notes.append(f"has no point file for {frames_in_words(surplus)} in {table}")
@@ -321,8 +321,8 @@ def lidar_poses(rows: Floats, calibration: Path) -> Floats:
     """Convert the matrices in `poses.txt` to lidar poses.
 
     The matrices have shape (n, 3, 4), and the poses have shape (n, 4, 4). The matrices are camera
-    poses. The file `calibration` contains the transformation from the lidar to the camera. If this
-    file does not exist, they are assumed to be lidar poses.
+    poses, and the file `calibration` contains the transformation from the lidar to the camera. If
+    this file does not exist, the matrices are assumed to be lidar poses.
     """
     camera = _calibration(calibration)
     return np.array([np.linalg.inv(camera) @ _square(row) @ camera for row in rows])
@@ -367,7 +367,7 @@ def _square(matrix_rows: Floats) -> Floats:
 
 
 def _read_sweep(path: Path, labels: Path, **fields: Any) -> Sweep:
-    """Read a sweep, with classes and objects if the label file exists."""
+    """Read a sweep, including classes and objects if the label file exists."""
     sweep = sweep_from_columns(read_float_columns(path, columns_by_name(path)), **fields)
     columns = dict(sweep.columns)
     if labels.exists():

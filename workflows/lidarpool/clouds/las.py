@@ -69,7 +69,10 @@ _MAX_STEPS = 2**31 - 1  # maximum distance from the offset in steps of the preci
 
 
 def _extra_bytes(column: Column) -> laspy.ExtraBytesParams:
-    """Return the extra bytes of a column, with its unit and meaning in 32 characters."""
+    """Return the extra bytes of a column.
+
+    The unit and meaning are limited to 32 characters.
+    """
     import laspy
 
     description = shorten(f"{column.unit} {column.meaning}", 32, placeholder="")
@@ -77,7 +80,7 @@ def _extra_bytes(column: Column) -> laspy.ExtraBytesParams:
 
 
 class LAS(CloudFormat):
-    """A .las file, which stores columns in fields of the format and in extra bytes.
+    """A .las file that stores columns in fields of the format and in extra bytes.
 
     The point format is 6, 7 with colors, 9 with waveforms (`_Packets`), or 10 with both. Its fields
     contain:
@@ -105,7 +108,7 @@ class LAS(CloudFormat):
     for_scenes = True
 
     def write(self, path: Path, spec: ExportSpec) -> float | None:
-        """Write the file, and return the intensity that is stored as 65,535."""
+        """Write the file and return the intensity that is stored as 65,535."""
         import laspy
         import lazrs
 
@@ -161,14 +164,14 @@ class LAZ(LAS):
 
 
 def _start_s(sweeps: Sweeps) -> float:
-    """Return the start of a survey in adjusted standard GPS time in seconds, or 0 if unknown."""
+    """Return the start of a survey as adjusted standard GPS time in seconds, or 0 if unknown."""
     if sweeps.start_ns is None:
         return 0.0
     return gps_start_s(sweeps) - _ADJUSTED_S
 
 
 def _as_integers(intensities: Floats32, full_scale: float) -> NDArray[np.uint16]:
-    """Return intensities as the integers that are stored in the format."""
+    """Convert intensities to the integers that are stored in the format."""
     fractions = np.clip(intensities.astype(np.float64) / full_scale, 0, 1)
     return np.round(fractions * _MAX_INTENSITY).astype(np.uint16)
 
@@ -176,7 +179,7 @@ def _as_integers(intensities: Floats32, full_scale: float) -> NDArray[np.uint16]
 def _header(
     columns: set[str], sweeps: Sweeps, packets: _Packets | None, intensity_full_scale: float | None
 ) -> laspy.LasHeader:
-    """Return the header of a file and its records, without the grid and the extra bytes."""
+    """Return the header of a file with its records, but without the grid and the extra bytes."""
     import laspy
     from laspy.vlrs.known import WktCoordinateSystemVlr
 
@@ -237,11 +240,11 @@ def _set_grid(header: laspy.LasHeader, cloud: CloudLike, precision_m: float, nam
 class _Packets:
     """Waveform packets of a LAS file, which follow its points in the same file.
 
-    Samples have 16 bits. There is one descriptor for each sampling interval and digitizer gain, and
-    all samples are multiples of the gain, which is a power of two. Returns of a pulse that have the
-    same window share a packet. The vector of a point is the path towards the sensor per picosecond.
-    The sample at time t is therefore located at the point plus (L - t) times the vector, where L is
-    the location of the return in the waveform.
+    Samples have 16 bits. There is one descriptor for each combination of sampling interval and
+    digitizer gain. All samples are multiples of the gain, which is a power of two. Returns of a
+    pulse that have the same window share a packet. The vector of a point is the path towards the
+    sensor per picosecond. The sample at time t is therefore located at the point plus (L - t) times
+    the vector, where L is the location of the return in the waveform.
     """
 
     def __init__(self, samples: int, kinds: list[tuple[int, int]]) -> None:
@@ -261,7 +264,10 @@ class _Packets:
 
     @classmethod
     def from_cloud(cls, cloud: CloudLike) -> _Packets | None:
-        """Return the packets of a cloud, which is read once, or None if it has no waveforms."""
+        """Create the packets of a cloud, or return None if it has no waveforms.
+
+        The cloud is read once.
+        """
         if not getattr(cloud, "has_waveforms", False):  # clouds in files never have any
             return None
         kinds: set[tuple[int, int]] = set()
@@ -274,7 +280,7 @@ class _Packets:
         return cls(samples, sorted(kinds)) if kinds else None
 
     def put(self, points: Any, chunk: Cloud, file: IO[bytes]) -> None:
-        """Write the packets of points to a file, and store their offsets in the points."""
+        """Write the packets of points to a file, storing the packets' offsets in the points."""
         rows = records(chunk.columns[WAVEFORM])
         starts_packet = np.ones(len(rows), np.bool_)
         starts_packet[1:] = (rows["samples"][1:] != rows["samples"][:-1]).any(axis=1)
@@ -290,7 +296,7 @@ class _Packets:
         points.x_t, points.y_t, points.z_t = rows["toward"].T
 
     def append(self, file: IO[bytes], packets: IO[bytes]) -> None:
-        """Append the packets to a complete point file, and store their offset in its header."""
+        """Append the packets to a complete point file, storing their offset in the header."""
         begin = file.seek(0, SEEK_END)
         size = self._end - _EVLR.size
         file.write(_EVLR.pack(0, b"LASF_Spec", 65_535, size, b"lidarpool"))
@@ -333,7 +339,10 @@ def _name(name: str) -> str:
 
 
 def _open_las(source: RecordingSource) -> Recording:
-    """Open a .las or .laz file, whose points are read in parts or as an evenly spread sample."""
+    """Open a .las or .laz file.
+
+    Its points are read in parts, or as an evenly spread sample.
+    """
     path = source.path
     with reading(source.name):
         system = las_system(path)

@@ -1,4 +1,4 @@
-"""Open LAS and LAZ files safely with laspy, and read their coordinate systems.
+"""Open LAS and LAZ files safely with laspy and read their coordinate systems.
 
 Headers are checked first, because damaged headers can make laspy allocate all memory or loop for
 hours.
@@ -72,7 +72,7 @@ def open_las(path: Path) -> Iterator[Any]:
 
 
 def noise_classes(header: Any) -> tuple[int, ...]:
-    """Return the classification codes for noise in a file, given its laspy header."""
+    """Return the classification codes for noise in the file with the given laspy header."""
     return NOISE_CLASSES if header.point_format.id >= 6 else LEGACY_NOISE_CLASSES
 
 
@@ -104,7 +104,7 @@ def _projection_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
 def _records(
     file: BinaryIO, start: int, count: int, head: struct.Struct
 ) -> Iterator[tuple[int, bytes]]:
-    """Search `count` records, beginning at byte `start`, for coordinate system records.
+    """Find the coordinate system records among `count` records, beginning at byte `start`.
 
     Yields the record ID and content of each record found. `head` is the layout of a record header.
     """
@@ -120,7 +120,7 @@ def _records(
 
 
 def _layout(file: BinaryIO) -> tuple[int, int, int]:
-    """Return the header size, the offset of the points and the number of VLRs.
+    """Return the header size, the point offset and the number of VLRs.
 
     Raises ValueError if these numbers are inconsistent with each other or with the file size.
     Without this check, laspy would try to read up to four billion records.
@@ -143,7 +143,7 @@ def _layout(file: BinaryIO) -> tuple[int, int, int]:
 
 
 def _unpacked(file: BinaryIO, layout: struct.Struct, offset: int) -> tuple[int, ...]:
-    """Unpack numbers at an offset in a file. Raises CutShortError if the file is too short."""
+    """Unpack numbers at an offset in a file, or raise CutShortError if the file is too short."""
     file.seek(offset)
     data = file.read(layout.size)
     if len(data) < layout.size:

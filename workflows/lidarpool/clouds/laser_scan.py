@@ -1,4 +1,4 @@
-"""Conversion of sweeps from 2D scanners to the fields of ROS LaserScan messages."""
+"""Conversion of 2D scanner sweeps to the fields of ROS LaserScan messages."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MAX_STEP_DIFFERENCE = 1e-6  # tolerated difference between angle steps in radia
 
 
 def is_planar(sensor: Sensor) -> bool:
-    """Return True if a sensor is a 2D scanner, whose only beam rotates in its x-y plane.
+    """Return whether a sensor is a 2D scanner, whose only beam rotates in its x-y plane.
 
     The rays of a 2D scanner start at its origin.
     """
@@ -31,18 +31,18 @@ def is_planar(sensor: Sensor) -> bool:
 
 
 def has_planar_sensors(survey: Survey) -> bool:
-    """Return True if a survey has at least one 2D scanner."""
+    """Return whether a survey has at least one 2D scanner."""
     return any(is_planar(carried.sensor) for carried in survey.carried)
 
 
 def has_laser_scans(sweeps: Sweeps) -> bool:
-    """Return True if a bag can contain LaserScan messages, provided that the cloud has ranges."""
+    """Return whether a bag can contain LaserScan messages, provided that the cloud has ranges."""
     return sweeps.fired is not None and any(map(is_planar, sweeps.fired.sensors))
 
 
 @dataclass(frozen=True, eq=False)
 class ScanRays:
-    """Rays in a sweep of a 2D scanner, as required for the fields of a LaserScan."""
+    """Rays in a sweep of a 2D scanner, with the values that a LaserScan message requires."""
 
     angles: Floats  # (n,): radians, evenly spaced and without jumps at ±pi
     time_increment_s: float  # time between consecutive rays

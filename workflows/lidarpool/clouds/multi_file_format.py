@@ -1,4 +1,7 @@
-"""Base class for formats with many files, which threads or workers can write in parallel."""
+"""Base class for formats with many files.
+
+Threads or workers can write the files in parallel.
+"""
 
 from __future__ import annotations
 
@@ -55,34 +58,39 @@ class MultiFileFormat(CloudFormat):
         return self.sweeps.points(self.cloud, first, stop)
 
     def files(self, number: int, points: Cloud) -> tuple[Mapping[str, FileContent], Any]:
-        """Return the files of a piece as {name: content}, and details for `shared_files`.
+        """Return the files of a piece, keyed by name, and details for `shared_files`.
 
         The type of the details depends on the format.
         """
         raise NotImplementedError
 
     def shared_files(self, details: Sequence[Any]) -> Mapping[str, bytes]:
-        """Return the files that all pieces share as {name: content}.
+        """Return the files that all pieces share, keyed by name.
 
-        `details` are the details that `files` returned for each piece.
+        `details` contains the details that `files` returned for each piece.
         """
         return {}
 
     def summary(self, details: Sequence[Any]) -> dict[str, Any]:
-        """Return a JSON-serializable summary of this job for the manifest of a data set."""
+        """Return a JSON-serializable summary of this job for the data set manifest."""
         return {}
 
     def write(
         self, path: Path, spec: ExportSpec, workers: RangeWorkers | None = None
     ) -> float | None:
-        """Write all files to a new folder, as described in `write_to`."""
+        """Write all files to a new folder.
+
+        The method `write_to` describes how they are written.
+        """
         self.write_to(Storage(str(path), durable=False), spec, workers)
         return None
 
     def write_to(
         self, storage: Storage, spec: ExportSpec, workers: RangeWorkers | None = None
     ) -> None:
-        """Write all files. Ranges that workers do not write are written by threads.
+        """Write all files.
+
+        Ranges that workers do not write are written by threads.
 
         Raises
         ------
@@ -107,7 +115,7 @@ class MultiFileFormat(CloudFormat):
         storage.tidy()
 
     def write_range(self, storage: Storage, first: int, stop: int) -> WrittenRange:
-        """Write the files of a range of pieces, with one piece in memory at a time.
+        """Write the files of a range of pieces, holding one piece in memory at a time.
 
         Raises OSError if a file cannot be written.
         """
@@ -122,14 +130,14 @@ class MultiFileFormat(CloudFormat):
         return count, details
 
     def spans(self, min_spans: int = 1) -> list[PieceRange]:
-        """Divide the pieces into ranges, at least `min_spans` if there are enough pieces."""
+        """Divide the pieces into at least `min_spans` ranges if there are enough pieces."""
         count = len(self)
         by_points = RANGE_POINTS * count // max(1, len(self.cloud))
         size = max(1, min(RANGE_PIECES, by_points, count // min_spans))
         return [(first, min(first + size, count)) for first in range(0, count, size)]
 
     def finish(self, storage: Storage, written: Iterable[WrittenRange]) -> list[Any]:
-        """Write the shared files, and return the details of all pieces.
+        """Write the shared files and return the details of all pieces.
 
         Raises LidarError if the points are not in order or do not belong to the sweeps, and OSError
         if a file cannot be written.
@@ -146,7 +154,7 @@ class MultiFileFormat(CloudFormat):
 
 @dataclass(frozen=True)
 class RangeWriter:
-    """Writes ranges of a cloud in a multi-file format, in any process with access to `storage`."""
+    """Writer of ranges of a cloud, for use in any process with access to `storage`."""
 
     format: str
     cloud: CloudLike
@@ -173,7 +181,10 @@ class RangeWriter:
 
     @property
     def plugins(self) -> tuple[Plugin, ...]:
-        """Plug-in that provides the format, which workers require, or an empty tuple."""
+        """Plug-in that provides the format.
+
+        Workers require it. The tuple is empty if no plug-in provides the format.
+        """
         plugin = format_row(self.format).plugin
         return () if plugin is None else (plugin,)
 
@@ -187,7 +198,7 @@ class RangeWriter:
 
 
 def as_bytes(array: AnyArray) -> FileContent:
-    """Return the bytes of an array without a copy."""
+    """Return the bytes of an array without copying them."""
     return array.data.cast("B") if array.size else b""
 
 

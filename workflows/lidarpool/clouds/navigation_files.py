@@ -1,4 +1,4 @@
-"""Measurement files for the IMU (imu.csv) and the GNSS receiver (gnss.csv) of a vehicle.
+"""Measurement files for a vehicle's IMU (imu.csv) and GNSS receiver (gnss.csv).
 
 The files are stored next to the cloud and contain one row per sample, sorted by time. Bags are
 created from these files, so that all formats contain the same values.
@@ -45,7 +45,7 @@ def instrument_bytes(survey: Survey, bags: int) -> int:
 
 
 def write_instruments(folder: Path, survey: Survey, origin: Floats) -> None:
-    """Write the files for the instruments of a survey, in blocks to limit memory use.
+    """Write the files for a survey's instruments, in blocks to limit memory use.
 
     Parameters
     ----------

@@ -102,7 +102,7 @@ class NuScenes(MultiFileFormat):
         self.label_of_class = _labels_of_classes(sweeps.classes)
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, FileContent], Boxes]:
-        """Return the point file and the label file of a sweep, and its boxes."""
+        """Return the point file and the label file of a sweep, and the sweep's boxes."""
         inside = self.sweeps.compensated(number, points)
         intensity = np.clip(points["intensity"], 0, 1) * 255
         rows = np.empty((len(points), 5), "<f4")
@@ -148,7 +148,10 @@ class NuScenes(MultiFileFormat):
 
     @classmethod
     def renaming_notes(cls, sensors: Sequence[str]) -> list[str]:
-        """Return a note if the first sensor is renamed, because readers expect a certain name."""
+        """Return a note if the first sensor is renamed.
+
+        Readers expect a certain name.
+        """
         if not sensors or sensors[0] in ("", FIRST_SENSOR):
             return []
         note = (
@@ -161,7 +164,7 @@ class NuScenes(MultiFileFormat):
 
     @classmethod
     def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
-        """Return the name of the point file and, if classes have names, the label file."""
+        """Return the name of the point file and, if classes have names, of the label file."""
         sweeps = job.sweeps
         names = job.cached(
             "names",
@@ -192,7 +195,7 @@ class NuScenes(MultiFileFormat):
     def merge_jobs(
         cls, storage: Storage, manifests: Iterable[Mapping[str, Any]]
     ) -> dict[str, list[int]]:
-        """Write the tables of a data set, and return the jobs whose labels must be renumbered."""
+        """Write the tables of a data set and return the jobs whose labels must be renumbered."""
         shared: set[str] = set()  # tokens of rows that are shared by several jobs
         with ExitStack() as stack:
             files = {
@@ -233,7 +236,7 @@ class NuScenes(MultiFileFormat):
     def renumber_labels(
         cls, name: str, read: Callable[[str], bytes], before: Sequence[int], after: Sequence[int]
     ) -> bytes | None:
-        """Return the content of a nuScenes-lidarseg file with labels for the classes `after`."""
+        """Renumber the labels in a nuScenes-lidarseg file to match the classes `after`."""
         if not name.startswith(LABELS):
             return None
         table = _labels_of_classes(after)[[0, *before]]
@@ -246,7 +249,7 @@ def _channels(sweeps: Sweeps) -> list[str]:
 
 
 def _samples(sweeps: Sweeps) -> tuple[Ints, Bools]:
-    """Return the sample of each sweep, and a mask of key frames.
+    """Return the sample of each sweep and a mask of key frames.
 
     A key frame is the first sweep of a sensor in a sample.
     """
@@ -256,7 +259,6 @@ def _samples(sweeps: Sweeps) -> tuple[Ints, Bools]:
 
 
 def _files(sweeps: Sweeps, channels: Sequence[str], first: Bools, entry: Entry | None) -> list[str]:
-    """Return the name of each sweep's point file."""
     below = "" if entry is None else f"{entry.name}/"
     return [
         f"{'samples' if key else 'sweeps'}/{channels[sensor]}/{below}{number:06}.pcd.bin"
@@ -265,7 +267,7 @@ def _files(sweeps: Sweeps, channels: Sequence[str], first: Bools, entry: Entry |
 
 
 def _labels_of_classes(classes: Collection[int]) -> Bytes:
-    """Return the label of each class number, which is 0 for classes without a name.
+    """Return the label of each class number, or 0 for classes without a name.
 
     Parameters
     ----------
@@ -330,7 +332,7 @@ def _spelled_alike(name: str) -> str:
 
 
 class _JobClasses:
-    """Collects the classes of all jobs in a data set."""
+    """Collection of the classes of all jobs in a data set."""
 
     def __init__(self) -> None:
         self._names: dict[int, dict[str, None]] = {}  # {class: its names in the jobs, in order}
@@ -345,13 +347,17 @@ class _JobClasses:
 
     @property
     def names(self) -> dict[int, str]:
-        """Class names by number. Different names for the same number are joined by semicolons."""
+        """Class names, keyed by number.
+
+        Different names for the same number are joined by semicolons.
+        """
         return {number: "; ".join(names) for number, names in self._names.items()}
 
     def relabeled_jobs(self) -> dict[str, list[int]]:
-        """Return the jobs whose labels must be renumbered, as {name of the job: all classes}.
+        """Return the jobs whose labels must be renumbered, with all classes of the data set.
 
-        These are the jobs that do not have all classes of the data set.
+        The result maps the name of each of these jobs to the classes. The jobs do not have all of
+        these classes themselves.
         """
         numbers = sorted(self._names)
         _labels_of_classes(numbers)  # raises LidarError if there are too many
@@ -367,7 +373,7 @@ def _no_map() -> bytes:
 
 
 class _Tables:
-    """Builds the nuScenes tables of a survey.
+    """Builder of the nuScenes tables of a survey.
 
     The tokens of the rows are derived from the survey and the job, so they are reproducible.
     """
@@ -524,7 +530,7 @@ def _open_data_set(source: RecordingSource) -> Recording:
 
 
 class _DataSet:
-    """Tables of a nuScenes data set, from which the sweeps of its lidars are read.
+    """Tables of a nuScenes data set with the sweeps of its lidars.
 
     File names in the tables are relative to the parent of the folder that contains the tables.
     """
@@ -550,9 +556,10 @@ class _DataSet:
         return {row["token"]: row for row in rows}
 
     def lidars(self) -> dict[str, Recording]:
-        """Return a recording for each lidar channel, whose sweeps are sorted by time.
+        """Return one recording per lidar channel.
 
-        If there are several scenes, the name of the scene precedes the name of the channel.
+        The sweeps of a recording are sorted by time. If there are several scenes, the name of the
+        scene precedes the name of the channel.
         """
         sensors = self._table("sensor")
         scenes = self._table("scene")

@@ -124,30 +124,29 @@ class _EncodedMessage:
 
     @property
     def timestamp(self) -> Any:
-        """Timestamp in the message."""
         return self.message.timestamp
 
     @property
     def version(self) -> Any:
-        """OSI version in the message."""
         return self.message.version
 
     def has_field(self, name: str) -> bool:
-        """Return True if the message has a field."""
         return bool(self.message.has_field(name))
 
     def desc(self) -> Any:
-        """Return the descriptor of the message's type."""
         return self.message.desc()
 
     def to_binary(self) -> bytes:
-        """Encode all fields. Their order does not matter in the wire format."""
+        """Encode all fields.
+
+        Their order does not matter in the wire format.
+        """
         data: bytes = self.message.to_binary()
         return data + self.encoded_fields
 
 
 class _OSIMessages:
-    """Creates the messages for sweeps.
+    """Conversion of sweeps to OSI messages.
 
     Object identifiers are the numbers in the column `object`. The host vehicle is the vehicle that
     carries the sensors. Its identifier is the next number.
@@ -278,7 +277,7 @@ class _OSIMessages:
 
 
 def _type_fields(osi: Any, name: str) -> Mapping[str, Any]:
-    """Return the type fields of a moving object, which are derived from the name of an actor."""
+    """Return the type fields of a moving object, derived from an actor's name."""
     kind = osi.MovingObject.Type
     words = [name.lower(), *re.findall("[a-z]+", name.lower())]
     if not _PERSONS.isdisjoint(words):
@@ -292,7 +291,6 @@ def _type_fields(osi: Any, name: str) -> Mapping[str, Any]:
 
 
 def _vector(osi: Any, vector: Floats) -> Any:
-    """Convert a vector to a message."""
     x, y, z = vector.tolist()
     return osi.Vector3d(x=x, y=y, z=z)
 
@@ -309,7 +307,7 @@ def _orientation(osi: Any, quaternion: Floats) -> Any:
 
 
 def encode_detections(positions: Floats, points: Cloud) -> bytes:
-    """Encode the detections of points as fields of LidarDetectionData.
+    """Encode points as fields of LidarDetectionData.
 
     As defined by Spherical3d in OSI, azimuth and elevation are right-handed rotations about the z
     axis and the rotated y axis. Points above the sensor therefore have a negative elevation.
@@ -348,14 +346,16 @@ def encode_detections(positions: Floats, points: Cloud) -> bytes:
 
 
 class _Record:
-    """Encodes many messages with the same fields and lengths at once, field by field."""
+    """Encoder for many messages with the same fields and lengths.
+
+    Each field is encoded for all messages at once.
+    """
 
     def __init__(self) -> None:
         # Bytes that differ between messages, as uint8 with shape (n, k), or common bytes.
         self._parts: list[AnyArray | bytes] = []
 
     def add_double(self, number: int, values: Floats) -> None:
-        """Add a field with one floating-point number per message."""
         self._parts.append(_key(number, _FIXED64))
         self._parts.append(np.ascontiguousarray(values, "<f8").view(np.uint8).reshape(-1, 8))
 
@@ -373,7 +373,6 @@ class _Record:
         self._parts.append(groups.astype(np.uint8))
 
     def add_record(self, number: int, record: _Record) -> None:
-        """Add a field with one submessage per message."""
         rows = record.rows()
         self._parts.append(_key(number, _LENGTH) + _varint(rows.shape[1]))
         self._parts.append(rows)
@@ -401,7 +400,6 @@ def _key(number: int, wire_type: int) -> bytes:
 
 
 def _field(number: int, content: bytes) -> bytes:
-    """Encode a field that contains a message."""
     return _key(number, _LENGTH) + _varint(len(content)) + content
 
 

@@ -1,4 +1,4 @@
-"""Read and write captures of sensor packets in the protocols of the manufacturers."""
+"""Read and write captures of sensor packets in the manufacturers' protocols."""
 
 from __future__ import annotations
 

@@ -121,13 +121,15 @@ class Parquet(MultiFileFormat):
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open a .parquet file or a folder of such files, whose row groups are read separately."""
+        """Open a .parquet file or a folder of such files.
+
+        Row groups are read separately.
+        """
         with reading(source.name):
             return _parts(source)
 
 
 def _dataset(storage: Storage, folder: str) -> Any:
-    """Open the partition of a job as a pyarrow data set."""
     import pyarrow.dataset
 
     if storage.is_local:
@@ -137,12 +139,14 @@ def _dataset(storage: Storage, folder: str) -> Any:
 
 
 def _size_of(table: Any) -> int:
-    """Return the total size of the files in a partition in bytes."""
     return sum(info.size for info in table.filesystem.get_file_info(table.files))
 
 
 def _group(fragment: Any, allowance: Allowance, cache: dict[tuple[str, int], Any]) -> Any:
-    """Read a row group. The last two are cached, because neighboring sweeps share row groups."""
+    """Read a row group.
+
+    The last two row groups are cached, because neighboring sweeps share row groups.
+    """
     key = fragment.path, fragment.row_groups[0].id
     if key not in cache:
         rows = read_group(fragment, number_columns(fragment.physical_schema), allowance)

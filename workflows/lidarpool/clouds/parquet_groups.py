@@ -50,7 +50,7 @@ def group_allowance(size: int) -> Allowance:
 
 
 def read_group(group: Any, columns: Sequence[str], allowance: Allowance) -> Any:
-    """Read columns of a row group. Raises LidarError if they exceed the allowance."""
+    """Read columns of a row group, or raise LidarError if they exceed the allowance."""
     allowance.take(_bytes_of(group, columns))
     # Data loaders already use several worker processes, so more threads would not help.
     return group.to_table(columns=list(columns), use_threads=False)

@@ -54,7 +54,7 @@ class PCD(MultiFileFormat):
         return {f"{number:06}.pcd": pcd_bytes(fields, position, (w, x, y, z), comment)}, None
 
     def _fields(self, number: int, points: Cloud, *, as_fired: bool) -> list[tuple[str, AnyArray]]:
-        """Return the names and values of the fields of a sweep, as fired or compensated."""
+        """Return the names and values of a sweep's fields, as fired or compensated."""
         sweeps = self.sweeps
         positions_of = sweeps.as_fired if as_fired else sweeps.compensated
         columns_of = sweeps.columns_as_fired if as_fired else sweeps.columns_compensated
@@ -102,7 +102,7 @@ def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
 
 
 def _stated_compensation(path: Path) -> bool | None:
-    """Return whether a file states that it is motion-compensated, or None if it states neither."""
+    """Return whether a file is motion-compensated, or None if it does not state this."""
     try:
         with open_input(path) as file:
             comment = file.readline(_COMMENT_BYTES).decode(errors="replace")

@@ -80,18 +80,18 @@ class PLY(CloudFormat):
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open a .ply file, or the folder of a result, whose cloud has sweeps."""
+        """Open a .ply file or a result folder, whose cloud has sweeps."""
         if source.path.is_dir():
             source = replace(source, path=source.path / FILE)
         return _open_file(source)
 
 
 class PlyAppender:
-    """A binary PLY file to which points are appended. It is complete after `finish`.
+    """A binary PLY file to which points are appended.
 
-    The bytes are the same as if Open3D wrote all points at once, but without holding all points in
-    memory. Open3D writes the first points to a temporary file. Its header and rows determine the
-    layout in which further points are appended.
+    The file is complete after `finish`. The bytes are the same as if Open3D wrote all points at
+    once, but without holding all points in memory. Open3D writes the first points to a temporary
+    file. Its header and rows determine the layout in which further points are appended.
 
     After the first points, several threads can write rows at the same time. One thread reserves
     space with `extend`, in the order of the points, and any thread can then write the rows at the
@@ -149,7 +149,7 @@ class PlyAppender:
 
     @property
     def has_layout(self) -> bool:
-        """Whether the first points were written, so that `row` is the row type in the file."""
+        """Whether the first points have been written, which determines the row type `row`."""
         return bool(self._start)
 
     def check_disk_space(self, count: int) -> None:
@@ -254,7 +254,6 @@ class PlyAppender:
         self._start = len(head)
 
     def _write(self, data: bytes | memoryview) -> None:
-        """Append bytes to the file."""
         view = memoryview(data)
         while view:  # Linux writes at most 2 GiB in one call
             view = view[self._file.write(view) :]
@@ -273,7 +272,6 @@ def _comments(table: Sequence[Column], sweeps: Sweeps) -> str:
 
 
 def _write_at(file: int, data: memoryview, offset: int) -> None:
-    """Write bytes at an offset in a file."""
     while data:  # Linux writes at most 2 GiB in one call
         count = os.pwrite(file, data, offset)
         data = data[count:]
@@ -281,7 +279,10 @@ def _write_at(file: int, data: memoryview, offset: int) -> None:
 
 
 def _move_bytes(file: int, start: int, stop: int, new_start: int) -> None:
-    """Move the bytes from `start` to `stop` to `new_start`, and truncate the file after them."""
+    """Move a range of bytes to `new_start` and truncate the file after them.
+
+    The range is from `start` to `stop`.
+    """
     offsets = range(start, stop, _BLOCK_BYTES)
     distance = new_start - start
     for offset in reversed(offsets) if distance > 0 else offsets:
@@ -315,7 +316,7 @@ def read_cloud(path: str | Path) -> Cloud:
     beside = path.with_name(SWEEPS_FILE)
 
     def load_sweeps() -> Sweeps:
-        """Return the sweeps of the survey, which are stored next to the cloud."""
+        """Return the survey's sweeps, which are stored next to the cloud."""
         return Sweeps.load(beside)
 
     return Cloud(positions, columns, sweeps=load_sweeps if beside.exists() else None)
@@ -405,7 +406,7 @@ def _open_file(source: RecordingSource) -> Recording:
 
 
 def _open_foreign(source: RecordingSource) -> Recording:
-    """Open a .ply file that is a text file or comes from another program.
+    """Open a .ply text file, or a .ply file from another program.
 
     Positions are in the units of the coordinate system that the file declares.
     """
@@ -430,7 +431,7 @@ def _open_foreign(source: RecordingSource) -> Recording:
 
 
 def _open_own(source: RecordingSource, cloud: CloudFile) -> Recording:
-    """Open a .ply file that lidarpool has written, with sweeps if it belongs to a result."""
+    """Open a .ply file written by lidarpool, with sweeps if it belongs to a result."""
     if not (sweeps_path := source.path.with_name(SWEEPS_FILE)).exists():
         return open_cloud(source.name, cloud, None, source.sensor, source.intensity)
     try:

@@ -1,4 +1,4 @@
-"""Compiled loop that creates the rows of a PLY file from the columns of a part."""
+"""Compiled loop that converts the columns of a part to rows of a PLY file."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -13,7 +13,6 @@ TILE_ROWS = 512  # rows per tile, which stays in the L1 cache while all columns 
 
 @noinline
 def _scatter(values, fields):
-    """Write values to a field of all rows."""
     for k in range(len(fields)):
         fields[k] = values[k]
 
@@ -31,7 +30,7 @@ def _round_positions(cells, scale, origin, positions):
 
 @compiled()
 def make_rows(columns, copied, axes, scale, rows, positions, tile):
-    """Write the columns and positions of points to the rows of a file.
+    """Write point columns and positions to the rows of a file.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Conversion of the columns of a part to rows of a PLY file, in a single compiled pass."""
+"""Conversion of part columns to rows of a PLY file, in a single compiled pass."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ _SIZES = (1, 2, 4, 8)  # sizes of integers in bytes
 
 
 class Scale(NamedTuple):
-    """Converts cells to positions: `round((cell * precision_m + origin) * factor) / factor`."""
+    """Conversion of cells to positions.
+
+    A position is `round((cell * precision_m + origin) * factor) / factor`.
+    """
 
     precision_m: float  # size of a cell in meters
     origin: Floats  # (3,): position of the cell (0, 0, 0) in world coordinates, in meters
@@ -46,7 +49,7 @@ class _Rows(NamedTuple):
 
 
 class PlyRowEncoder:
-    """Creates rows of a PLY file in memory that is reused.
+    """Encoder that creates rows of a PLY file in reused memory.
 
     Columns that have a different type in the file are converted by NumPy.
 
@@ -97,13 +100,15 @@ class PlyRowEncoder:
         self._tile = np.zeros(TILE_ROWS, self._positions.dtype)
 
     def _fields_of(self, dtype: np.dtype[Any]) -> AnyArray:
-        """Return an overlapping view of the rows with a type, indexed by row and byte offset."""
+        """View the rows as overlapping values of a dtype, indexed by row and byte offset."""
         row_bytes = self._rows.itemsize
         shape = (len(self._rows), row_bytes - dtype.itemsize + 1)
         return np.ndarray(shape, dtype, self._rows.view(np.uint8), strides=(row_bytes, 1))
 
     def encode(self, columns: Mapping[str, AnyArray]) -> memoryview:
-        """Return the rows of a block as bytes, which are valid until the next call.
+        """Encode the rows of a block as bytes.
+
+        The bytes are valid until the next call.
 
         Parameters
         ----------
@@ -128,6 +133,5 @@ class PlyRowEncoder:
 
 
 def _offset(row: np.dtype[np.void], name: str) -> int:
-    """Return the offset of a field in a row, in bytes."""
     assert row.fields is not None, "named fields"
     return row.fields[name][1]

@@ -49,7 +49,7 @@ class PointTimes(NamedTuple):
     def from_sweeps(
         cls, sweeps: Sequence[Columns], stamps_s: Sequence[float] | Floats | None = None
     ) -> PointTimes | None:
-        """Find the unit and the clock of the times in the columns of several sweeps.
+        """Find the unit and the clock of the point times in several sweeps.
 
         `stamps_s` are the timestamps of these sweeps in seconds, or None if they are unknown.
         Returns None if the sweeps have no times.
@@ -78,10 +78,10 @@ class PointTimes(NamedTuple):
         return cls(unit_s, sweep_s)
 
     def relative_times(self, columns: Columns, stamp_s: float | None = None) -> Floats | None:
-        """Return the times of a sweep's points relative to its timestamp in seconds. Shape (n,).
+        """Return a sweep's point times in seconds relative to its timestamp.
 
-        Returns None if times are missing, or if they are too far from each other or from the
-        timestamp.
+        The shape is (n,). Returns None if times are missing, or if they are too far from each other
+        or from the timestamp.
         """
         times = _stored_times(columns)
         since_s = times.since * self.unit_s
@@ -98,7 +98,7 @@ class PointTimes(NamedTuple):
         return since_s + first_s
 
     def note(self, name: str) -> str:
-        """Return a note if the times come from a different clock, otherwise an empty string."""
+        """Return a note if the times come from a different clock, or an empty string."""
         if self.clock is not PointClock.OTHER:
             return ""
         return (
@@ -108,7 +108,10 @@ class PointTimes(NamedTuple):
 
 
 class _StoredTimes(NamedTuple):
-    """Point times of a sweep in the unit of their column, which are empty if there are none."""
+    """Point times of a sweep in the unit of their column.
+
+    They are empty if the sweep has none.
+    """
 
     since: Floats  # (n,), times since the first point, without loss of precision
     first: float = 0.0  # time of the first point

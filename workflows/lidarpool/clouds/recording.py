@@ -41,7 +41,7 @@ _REFERENCE_SWEEPS = 5  # number of sweeps that determine rings and point times
 
 
 class SeveralSensorsError(LidarError):
-    """Raised if a recording has several sensors or topics, and none was chosen.
+    """Error raised if a recording has several sensors or topics and none was chosen.
 
     `contents` is a sentence that lists them, and `option` is the option that chooses one of them.
     """
@@ -65,8 +65,8 @@ class Recording:
     count
         Number of sweeps or parts.
     read
-        Function that returns a sweep, given its number, with the units and column names in the
-        file.
+        Function that returns the sweep with a given number. The sweep has the units and column
+        names of the file.
     is_cloud
         Whether the items are parts of a cloud without sweeps.
     point_count
@@ -76,11 +76,11 @@ class Recording:
     read_stamps
         Function that returns the timestamps of all sweeps in nanoseconds, or None.
     read_poses
-        Function that returns the poses of all sweeps in the world, of shape (count, 4, 4), or None
-        if some are unknown. It is faster than reading every sweep.
+        Function that returns the poses of all sweeps in the world frame, with shape (count, 4, 4).
+        It returns None if a pose is unknown. It is faster than reading every sweep.
     fired
-        Function that returns a sweep as fired, with its `firing_poses`, given its number. None if
-        the firing poses are unknown, as in most recordings from real sensors.
+        Function that returns the sweep with a given number as fired, including its `firing_poses`.
+        None if the firing poses are unknown, as in most recordings from real sensors.
     sample
         Function that returns approximately the given number of points, which are evenly distributed
         in the file.
@@ -156,7 +156,7 @@ class Recording:
         return self.count
 
     def __getitem__(self, number: int) -> Sweep:
-        """Read a sweep, or a part of a cloud.
+        """Read a sweep or a part of a cloud.
 
         Raises LidarError if the recording cannot be read, and IndexError if the item does not
         exist.
@@ -170,7 +170,7 @@ class Recording:
             return self._resolved(number, self.read(number))
 
     def read_fired(self, number: int) -> Sweep:
-        """Read the returns of a sweep as fired if possible, otherwise as they are stored."""
+        """Read the returns of a sweep as fired if possible, or as stored otherwise."""
         if self.fired is None:
             return self[number].returns()
         with reading(self.name):
@@ -273,7 +273,10 @@ class Recording:
 
     @cached_property
     def stamps_ns(self) -> Floats | None:
-        """Timestamps of the sweeps in nanoseconds, float64, or None. Shape (count,)."""
+        """Timestamps of the sweeps in nanoseconds, or None if they are unknown.
+
+        The shape is (count,), and the dtype is float64.
+        """
         if self.read_stamps is None:
             return None
         with reading(self.name):
@@ -319,7 +322,7 @@ class Recording:
         return rings
 
     def times_of(self, sweep: Sweep) -> Floats | None:
-        """Return the time of each point relative to the timestamp of its sweep, in seconds.
+        """Return each point's time in seconds relative to the timestamp of its sweep.
 
         Returns None if the times are unknown, otherwise an array with shape (n,).
         """
@@ -376,8 +379,8 @@ class RecordingSource:
     ) -> tuple[Meters, tuple[str, ...]]:
         """Return the units of x, y and z in meters, and notes for the user.
 
-        `positions` are points in the file, or a sample of them, in the units of the file. Raises
-        LidarError in the same cases as `lidarsim.scene.files.stated_system.stated_meters`.
+        `positions` contains points in the file, or a sample of them, in the units of the file.
+        Raises LidarError in the same cases as `lidarsim.scene.files.stated_system.stated_meters`.
         """
         if self.as_stored:
             return METERS, ()
@@ -450,7 +453,7 @@ class RecordingSource:
 
 @dataclass
 class _StreamPosition:
-    """Position of a process in a stream, which is protected by a lock."""
+    """Lock-protected position of a process in a stream."""
 
     next_number: int = 0  # number of the next sweep, or 0 to start again
     remaining: Iterator[Any] = field(default_factory=lambda: iter(()))  # from `next_number`

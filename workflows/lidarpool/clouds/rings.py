@@ -47,7 +47,7 @@ class Rings:
     are_cones
         Whether the rings were determined from elevation angles.
     note
-        How the rings were determined, or why they are unknown.
+        Description of how the rings were determined, or of why they are unknown.
     """
 
     name: str
@@ -58,7 +58,10 @@ class Rings:
 
     @classmethod
     def from_sweeps(cls, name: str, sweeps: Sequence[Sweep]) -> Rings:
-        """Find the rings in the returns of some sweeps, which should not be motion-compensated."""
+        """Find the rings in the returns of several sweeps.
+
+        The sweeps should not be motion-compensated.
+        """
         if not sweeps:
             return cls(name)
         if all("channel" in sweep.columns for sweep in sweeps):
@@ -205,7 +208,7 @@ def _clusters(points: Floats) -> Floats | None:
 
 
 def _runs(points: Floats) -> tuple[Ints, Bools]:
-    """Return the starts of runs with monotonic azimuths, and a mask of the runs that are rings."""
+    """Return the starts of runs with monotonic azimuths and a mask of the runs that are rings."""
     azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
     steps = np.diff(azimuth)
     direction = np.sign(np.sum(np.sign(steps)))
@@ -215,7 +218,6 @@ def _runs(points: Floats) -> tuple[Ints, Bools]:
 
 
 def _medians(values: Floats, starts: Ints) -> Floats:
-    """Return the median of each run of values."""
     return np.array([np.median(run) for run in np.split(values, starts[1:])])
 
 

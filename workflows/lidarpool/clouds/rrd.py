@@ -130,7 +130,7 @@ def _copy(source: int, file: BinaryIO) -> None:
 
 
 class RerunLog:
-    """Logs surroundings and sweeps to a Rerun recording."""
+    """Logger of surroundings and sweeps to a Rerun recording."""
 
     def __init__(self, recording: Any) -> None:
         self._rr: Any = import_module("rerun")
@@ -176,7 +176,7 @@ class RerunLog:
         self._log_static(f"{WORLD}/path", self._line(path, _GREEN))
 
     def show_sweep(self, shown: ShownSweep) -> None:
-        """Log the points of a sweep, its frames and the boxes of actors."""
+        """Log the points, the frames and the actors' boxes of a sweep."""
         since_ns = np.timedelta64(shown.start_ns - self._start_ns, "ns")
         self._recording.set_time(SURVEY_TIME, duration=since_ns)
         if self._start_ns != START_NS:

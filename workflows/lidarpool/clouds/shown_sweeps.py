@@ -1,4 +1,4 @@
-"""Surroundings and sweeps in the form that live views and viewer recordings show."""
+"""Surroundings and sweeps, prepared for live views and viewer recordings."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class Surroundings:
     def from_content(
         cls, content: PictureContent, trajectories: Mapping[str, Floats] = MappingProxyType({})
     ) -> Surroundings:
-        """Create surroundings with the scene and the planned path of a picture."""
+        """Create surroundings with the scene and the planned path from a result's plot data."""
         best = None if content.planning is None else content.planning.best
         return cls(
             Surface.from_scene(content.scene),
@@ -130,9 +130,9 @@ def path_in_world(corners: Floats, origin: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class ActorBoxes:
-    """Boxes of the actors in a sweep as in `Boxes`, with the names of the actors.
+    """Boxes of the actors in a sweep, with the names of the actors.
 
-    Positions and sizes are in meters, in world coordinates.
+    The boxes are defined as in `Boxes`. Positions and sizes are in meters, in world coordinates.
     """
 
     names: Sequence[str]
@@ -173,7 +173,7 @@ class ShownSweep:
 
 
 class SweepSequence:
-    """Converts the sweeps of a survey for viewers."""
+    """Sequence of a survey's sweeps, converted for viewers."""
 
     def __init__(self, sweeps: Sweeps) -> None:
         self.sweeps = sweeps

@@ -19,10 +19,11 @@ class TextFormats(CloudFormat):
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open the scans in a .ptx file, or a cloud in another format, which is read as a whole.
+        """Open the scans in a .ptx file, or a cloud in another format.
 
-        Scans are in their scanner frames. If the user chose a unit, it overrides the units in the
-        header of a cloud. If a file contains several clouds, only their common columns are read.
+        A cloud is read as a whole. Scans are in their scanner frames. If the user chose a unit, it
+        overrides the units in the header of a cloud. If a file contains several clouds, only their
+        common columns are read.
         """
         read_scans = SCAN_READERS[source.path.suffix.lower()]
         if read_scans is read_ptx or source.as_stored:

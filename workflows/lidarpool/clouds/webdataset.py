@@ -79,7 +79,7 @@ class WebDataset(MultiFileFormat):
         return super().spans()
 
     def write_range(self, storage: Storage, first: int, stop: int) -> WrittenRange:
-        """Write the tar files of ranges that start in a range, with one file in memory at a time.
+        """Write the tar files that begin in a range of sweeps, with one file in memory at a time.
 
         Raises OSError if a file cannot be written.
         """
@@ -161,7 +161,10 @@ class WebDataset(MultiFileFormat):
 
     @classmethod
     def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
-        """Read points with all columns. Only the bytes of the sweep are read."""
+        """Read points with all columns.
+
+        Only the bytes of the sweep are read.
+        """
         _, first, stop = _offsets(job)[sweep].tolist()
         sample = job.storage.read(cls.sweep_files(job, sweep)[0], first, stop)
         if len(sample) < stop - first:
@@ -189,7 +192,7 @@ class WebDataset(MultiFileFormat):
 
 
 def _offsets(job: JobReader) -> Ints:
-    """Return the offsets of a job's sweeps, as described in `WebDataset`."""
+    """Return the offset table of a job's sweeps (see `WebDataset`)."""
 
     def read() -> Ints:
         name = f"offsets/{job.entry.name}.npz"
@@ -216,7 +219,7 @@ def _shard(entry: Entry | None, start: int) -> str:
 
 
 def _sensors(source: RecordingSource, files: list[Path]) -> dict[str, Recording]:
-    """Open the samples in tar files, as {sensor: recording}.
+    """Open the samples in tar files, keyed by sensor.
 
     A sample consists of ``KEY.points.npy``, and optionally ``KEY.json`` and further arrays. Raises
     LidarError if no sample has points.
@@ -270,7 +273,6 @@ def _samples(path: Path) -> dict[str, dict[str, tuple[int, int]]]:
 
 
 def _slice(path: Path, offset: int, size: int) -> bytes:
-    """Read `size` bytes of a file, starting at an offset."""
     with path.open("rb") as file:
         file.seek(offset)
         return file.read(size)

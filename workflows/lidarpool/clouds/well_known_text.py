@@ -31,7 +31,7 @@ _ETRS89 = _Geodetic(
 
 
 def wkt(epsg: int) -> str:
-    """Return the WKT 1 for an EPSG code.
+    """Return the WKT 1 string for an EPSG code.
 
     UTM zones of WGS 84 and ETRS89 are supported directly. Other systems require rasterio.
 
@@ -58,8 +58,6 @@ def wkt(epsg: int) -> str:
 
 
 def _utm(epsg: int, zone: int, south: bool, system: _Geodetic) -> str:
-    """Return the WKT 1 for a UTM zone."""
-
     def code(number: int) -> str:
         return f'AUTHORITY["EPSG","{number}"]'
 

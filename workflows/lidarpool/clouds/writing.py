@@ -47,7 +47,7 @@ _NAMES: dict[str, Any] = {"anyOf": [{"enum": [*FORMATS]}, {"type": "string"}]}  
 
 @dataclass(frozen=True)
 class ExportSpec(FileSection):
-    """A format to which a cloud is exported, with its options.
+    """An export format with its options.
 
     In YAML, the name of the format is sufficient.
     """
@@ -159,7 +159,7 @@ class ExportSpec(FileSection):
         return self.cloud_format.required_columns(self)
 
     def configure_sweeps(self, sweeps: Sweeps) -> Sweeps:
-        """Return sweeps that position their points according to the options of the format."""
+        """Configure sweeps to position their points according to the format's options."""
         return replace(sweeps, actors_at_start=True) if self.compensated_actors else sweeps
 
     def unsupported_columns(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
@@ -204,7 +204,6 @@ class ExportSpec(FileSection):
         return notes + self.cloud_format.renaming_notes(sweeps.sensors)
 
     def _is_missed(self, name: str, requested: Collection[str] | None) -> bool:
-        """Return whether the omission of a column should be noted."""
         if name in ("scan", "sensor"):  # sweeps and sensors are separate files, scans or topics
             return False
         if requested is not None:

@@ -50,14 +50,14 @@ class BagMessage(NamedTuple):
 
 
 def is_bag(path: Path) -> bool:
-    """Return True if a path is an .mcap file, a .db3 file, or the folder of a bag."""
+    """Return whether a path is an .mcap file, a .db3 file or a bag folder."""
     if path.is_dir():
         return (path / "metadata.yaml").exists()
     return path.suffix.lower() in BAG_FILES
 
 
 def open_bag(path: Path, name: str) -> Reader:
-    """Open a bag that is closed once it is no longer used.
+    """Open a bag that closes itself when it is no longer used.
 
     Raises
     ------

@@ -11,7 +11,7 @@ from rosbags.rosbag2 import Reader
 class ClosingBag(Reader):
     """A bag reader that closes its files when it is garbage-collected.
 
-    Recordings and data sets read their bags lazily and are never closed explicitly. `Reader` leaves
+    Recordings and data sets read their bags lazily and never close them explicitly. `Reader` leaves
     the files open, which causes a ResourceWarning.
     """
 

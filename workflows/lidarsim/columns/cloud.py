@@ -28,7 +28,10 @@ SHOWN_POINTS = 5
 
 
 class CloudLike(Protocol):
-    """A cloud, in memory or in parts, whose points can be read sequentially in chunks."""
+    """Interface of clouds whose points can be read sequentially in chunks.
+
+    The points can be in memory or in parts.
+    """
 
     def __len__(self) -> int: ...
 
@@ -36,15 +39,15 @@ class CloudLike(Protocol):
     def bounds(self) -> AnyFloats:
         """Minimum and maximum coordinates in meters, with the dtype of the positions.
 
-        Shape (2, 3).
+        The shape is (2, 3).
         """
 
     @property
     def table(self) -> tuple[Column, ...]:
-        """Columns other than the positions, in the order in which files store them."""
+        """Columns other than the positions, in file order."""
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
-        """Yield the points in order, starting at row `first`, in clouds of at most `points`."""
+        """Yield clouds of at most `points` consecutive points, starting at row `first`."""
 
     def row_of(self, scan: int) -> int:
         """Return the row of the first point in a scan.
@@ -62,7 +65,7 @@ class CloudDisplay:
         return f"<{type(self).__name__} of {len(self):,} points: {shown_names}>"
 
     def _repr_html_(self: CloudLike) -> str:
-        """Return an HTML table of the columns and first points, followed by a picture."""
+        """Return an HTML table of the columns and first points, followed by a plot."""
         first = next(self.chunks(SHOWN_POINTS), None)
         values = {} if first is None else first.by_name
         kinds = [array.dtype for array in values.values()]
@@ -270,7 +273,7 @@ class Cloud(CloudDisplay):
 
 
 def require_packages(*packages: str) -> None:
-    """Raise LidarError if packages are not installed."""
+    """Raise a LidarError if any of the given packages is not installed."""
     # `find_spec` fails for modules without a spec, such as modules that a program creates itself.
     missing = [
         name for name in packages if sys.modules.get(name) is None and find_spec(name) is None

@@ -48,21 +48,21 @@ class CloudFile:
 
     @property
     def bounds(self) -> AnyFloats:
-        """Minimum and maximum coordinates in meters. Shape (2, 3).
+        """Minimum and maximum coordinates in meters.
 
-        Computing them reads all points.
+        The shape is (2, 3). Computing the bounds reads all points.
         """
         chunk_bounds = [chunk.bounds for chunk in self.chunks()] or [np.zeros((2, 3))]
         lows, highs = zip(*chunk_bounds, strict=True)
         return np.stack([np.min(lows, axis=0), np.max(highs, axis=0)])
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
-        """Yield the points in order, starting at row `first`, in clouds of at most `points`."""
+        """Yield clouds of at most `points` consecutive points, starting at row `first`."""
         for start in range(first, len(self), points):
             yield self._cloud(self._rows[start : start + points])
 
     def choose(self, max_points: int) -> Cloud:
-        """Return at most `max_points` evenly spaced points in order, without nonfinite ones."""
+        """Select at most `max_points` evenly spaced points, omitting those that are not finite."""
         rows = self._rows[even_indices(len(self), max_points)]
         finite = np.isfinite(_positions(rows)).all(axis=1)
         return self._cloud(rows if finite.all() else rows[finite], np.float64)
@@ -75,7 +75,7 @@ class CloudFile:
         return bisect_left(self._rows["scan"], scan)
 
     def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
-        """Return the start and stop row of a range of scans, given its first and last scan.
+        """Return the start and stop rows of an inclusive range of scans.
 
         If the points are not ordered by scan, the range covers all rows.
         """
@@ -94,13 +94,13 @@ class CloudFile:
         return np.asarray(self._rows[files.get(name, name)][row_selection])
 
     def _cloud(self, rows: Records, dtype: Any = None) -> Cloud:
-        """Convert rows to a cloud whose positions have `dtype` (default: as in the file)."""
+        """Convert rows to a cloud whose positions have `dtype` (default: dtype in the file)."""
         columns = {column.name: rows[column.in_files] for column in self.table}
         return Cloud(_positions(rows, dtype), columns, self.table)
 
 
 def _positions(rows: Records, dtype: Any = None) -> AnyArray:
-    """Return the positions of rows, converted to `dtype` (default: as in the file)."""
+    """Return the positions in rows, converted to `dtype` (default: dtype in the file)."""
     return np.stack([rows[axis] for axis in AXES], axis=1, dtype=dtype)
 
 

@@ -87,12 +87,12 @@ def _standard_names(names: tuple[str, ...], among: frozenset[str] | None) -> tup
 def with_standard_names(
     columns: Mapping[str, AnyArray], among: Collection[str] | None = None
 ) -> dict[str, AnyArray]:
-    """Rename columns to their standard names; see `standard_names`."""
+    """Rename columns to their standard names as `standard_names` defines them."""
     return dict(zip(standard_names(columns, among), columns.values(), strict=True))
 
 
 def columns_for(columns: Mapping[str, AnyArray], name: str) -> dict[str, AnyArray]:
-    """Return the columns with a standard name or one of its aliases.
+    """Return the columns whose name is a standard name or one of its aliases.
 
     The standard name is first, and its aliases follow in the order of `ALIASES`.
     """

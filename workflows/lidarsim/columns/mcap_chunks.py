@@ -123,7 +123,7 @@ def check_packed(path: Path) -> None:
 
 
 def _records(data: mmap) -> Iterator[tuple[int, int, int]]:
-    """Yield the type of each complete record and the start and stop of its content."""
+    """Yield the type, content start and content stop of each complete record."""
     position = _MAGIC_BYTES
     while position + _RECORD.size <= len(data):
         kind, length = _RECORD.unpack_from(data, position)

@@ -23,7 +23,7 @@ _BLOCK_CELLS = 1 << 13  # cells converted to positions at a time
 
 @dataclass(frozen=True)
 class PartColumns:
-    """Contents of a part."""
+    """Point columns that are stored in a part."""
 
     first: int  # number of the first scan
     counts: Ints  # (scans,), rows per scan
@@ -42,12 +42,15 @@ class PartColumns:
 
     @property
     def stop(self) -> int:
-        """Number of the scan after the last scan."""
+        """Number of the scan after the last one."""
         return self.first + len(self.counts)
 
     @property
     def cell_box(self) -> Ints | None:
-        """Minimum and maximum cells, or None if the part has no rows. Shape (2, 3)."""
+        """Minimum and maximum cells, or None if the part has no rows.
+
+        The shape is (2, 3).
+        """
         if not len(self):
             return None
         axes = [self.columns[axis.name] for axis in AXES]
@@ -66,7 +69,7 @@ class PartColumns:
         row_selection: Integers | slice = slice(None),
         sweeps: Callable[[], Any] | None = None,
     ) -> Cloud:
-        """Convert the part, or selected rows, to a cloud.
+        """Convert the part, or a selection of its rows, to a cloud.
 
         Parameters
         ----------

@@ -49,12 +49,12 @@ class PlyLayout(NamedTuple):
 
 
 def file_type(column: Column) -> np.dtype[Any]:
-    """Return the dtype with which a column is stored in a file."""
+    """Return the dtype in which a column is stored in a file."""
     return np.dtype(_FILE_TYPES.get(np.dtype(column.dtype).str[1:], "<f8"))
 
 
 def as_file_type(column: Column, values: AnyArray) -> AnyArray:
-    """Convert the values of a column to the dtype with which the column is stored in a file.
+    """Convert column values to the dtype in which the column is stored in a file.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def as_file_type(column: Column, values: AnyArray) -> AnyArray:
 
 
 def row_type(position_type: np.dtype[np.floating], table: Sequence[Column]) -> np.dtype[np.void]:
-    """Return the dtype of a row in a file, with the columns in the order of the table.
+    """Return the dtype of a file row for the columns of a table, in table order.
 
     Rows written by Open3D have the same size, but the columns are in the order of a hash table.
     """
@@ -82,7 +82,7 @@ def row_type(position_type: np.dtype[np.floating], table: Sequence[Column]) -> n
 
 
 def header(row: np.dtype[np.void], count: int, comments: str = "") -> bytes:
-    """Return the header of a file with `count` points, as Open3D would write it.
+    """Return the header of a file with `count` points, in the format that Open3D writes.
 
     `comments` contains additional comment lines, each of which ends with a newline.
     """

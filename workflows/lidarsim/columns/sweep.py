@@ -152,7 +152,7 @@ class Sweep:
     def pose(self) -> Floats | None:
         """Transformation from the sensor frame to the world frame, or None if it is unknown.
 
-        Shape (4, 4).
+        The shape is (4, 4).
         """
         pose: Floats | None = self._pose() if callable(self._pose) else self._pose
         return pose
@@ -181,7 +181,7 @@ class Sweep:
     def times_s(self) -> Floats | None:
         """Point times in seconds relative to the timestamp of the sweep, or None if unknown.
 
-        Shape (n,).
+        The shape is (n,).
         """
         if self._origin is not None:
             sweep, rows = self._origin
@@ -190,10 +190,10 @@ class Sweep:
 
     @property
     def intensity(self) -> AnyArray | None:
-        """Intensity of each point, or None if it is unknown. Shape (n,).
+        """Intensity of each point, or None if it is unknown.
 
         This is the `intensity` column, or the `reflectivity` column if there is no `intensity`
-        column. In lidarpool results, the intensity is the received energy.
+        column. In lidarpool results, the intensity is the received energy. The shape is (n,).
         """
         return next((self.columns[name] for name in STRENGTHS if name in self.columns), None)
 
@@ -208,14 +208,17 @@ class Sweep:
 
     @property
     def objects(self) -> Ints32 | None:
-        """Index of each point's object in `object_names`, or None if it is unknown. Shape (n,)."""
+        """Index of each point's object in `object_names`, or None if it is unknown.
+
+        The shape is (n,).
+        """
         return self.columns.get("object")
 
     @property
     def has_return(self) -> Bools:
-        """Boolean mask of the points that have a return. Shape (n,).
+        """Boolean mask of the points that have a return.
 
-        Drivers store NaN or zeros for pulses without a return.
+        Drivers store NaN or zeros for pulses without a return. The shape is (n,).
         """
         return np.asarray(np.isfinite(self.points).all(axis=1) & self.points.any(axis=1))
 
@@ -242,8 +245,8 @@ class Sweep:
     def with_columns(self, **columns: AnyArray | None) -> Self:
         """Return a copy of the sweep that has only the given columns.
 
-        Columns that are None are omitted.
-        The copy no longer has rings and times that its recording determines.
+        Columns that are None are omitted. The copy loses rings and times that were derived by its
+        recording.
         """
         return self.replace(
             columns={name: values for name, values in columns.items() if values is not None},
@@ -282,7 +285,10 @@ class Sweep:
 
 
 class _RingsAndTimes(NamedTuple):
-    """Precomputed rings and times of a sweep, which replace its recording in other processes."""
+    """Precomputed rings and times of a sweep.
+
+    They replace the recording of the sweep in other processes.
+    """
 
     rings: AnyArray | None
     times_s: Floats | None

@@ -51,7 +51,7 @@ class Column:
     meaning
         Description in a few words, without a period.
     source
-        Source of the values. Either the name of an attribute of
+        Source of the values. It is either the name of an attribute of
         `lidarsim.simulator.points.batch_points.BatchPoints`, which contains the returns in a batch,
         or a function that receives this object and returns an array of shape (n,). The function
         runs on the worker that casts the rays. By default, the attribute with the same name as the
@@ -300,10 +300,10 @@ TABLE = {column.name: column for column in (SCAN, *ALWAYS, *OPTIONAL)}
 
 
 def optional_columns(columns: Iterable[str | Column]) -> tuple[Column, ...]:
-    """Resolve a selection of columns to the optional columns that it contains.
+    """Return the optional columns in a selection of columns.
 
-    Names may be those in `TABLE` or those in files. Duplicates, and columns that every part has,
-    are removed.
+    Columns can be selected by their names in `TABLE` or in files. Duplicates are removed, and so
+    are columns that every part has.
 
     Raises
     ------

@@ -17,8 +17,8 @@ FAINTEST = -126  # exponent of the weakest waveforms; 2**FAINTEST is a normal fl
 def record(samples: int) -> np.dtype[np.void]:
     """Return the dtype of a waveform record with the given number of samples.
 
-    The value of a sample is `(samples - ZERO) * 2.0**exponent` in units of energy, scaled such that
-    the peak of an echo that is as narrow as the emitted pulse equals its energy. Sample 0 is taken
+    The value of a sample is `(samples - ZERO) * 2.0**exponent` in units of energy. It is scaled so
+    that an echo as narrow as the emitted pulse has a peak equal to its energy. Sample 0 is taken
     `begin` sample steps after firing, and the return follows `location_ps` after sample 0. `toward`
     is the direction to the sensor in the frame of the points, multiplied by half the distance in
     meters that light travels in a picosecond.
@@ -45,7 +45,7 @@ def column_type(samples: int) -> str:
 
 
 def records(column: AnyArray) -> Records:
-    """View a waveform column as records; see `record`."""
+    """View a waveform column as records of the dtype that `record` returns."""
     return column.view(record((column.dtype.itemsize - _RECORD_BYTES) // 2))
 
 

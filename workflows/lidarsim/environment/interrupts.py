@@ -30,7 +30,7 @@ _WEAK = {weakref.__file__, weakref.WeakSet.add.__code__.co_filename}
 
 
 class _Interrupt:
-    """Signal handler that raises KeyboardInterrupt first and ends the process the second time."""
+    """Signal handler that first raises KeyboardInterrupt, and then ends the process."""
 
     def __init__(self) -> None:
         self.first_at: float | None = None
@@ -51,7 +51,7 @@ class _Interrupt:
 
 
 def _drops_errors(frame: FrameType | None) -> bool:
-    """Return True if a finalizer or weak reference callback is running.
+    """Return whether a finalizer or weak reference callback is running.
 
     Python ignores exceptions that are raised there.
     """
@@ -64,7 +64,10 @@ def _drops_errors(frame: FrameType | None) -> bool:
 
 
 def exit_on_signals() -> None:
-    """End the process immediately on a signal. Use this function before any work has started."""
+    """End the process immediately on a signal.
+
+    Use this function before any work has started.
+    """
     _on_signals(lambda number, frame: _exit_at_once(f"lidarpool: {UNTOUCHED}\n".encode()))
 
 
@@ -82,7 +85,6 @@ def _on_signals(handler: Callable[[int, FrameType | None], object]) -> None:
 
 
 def _exit_at_once(message: bytes) -> NoReturn:
-    """End the process immediately with a message on stderr."""
     with suppress(OSError):  # the terminal may already be closed
         os.write(2, message)
     os._exit(INTERRUPTED)

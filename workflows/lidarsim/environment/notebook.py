@@ -1,4 +1,4 @@
-"""Display of objects in notebooks as HTML tables and pictures."""
+"""Display of objects in notebooks as HTML tables and images."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def register_drawers(drawers: Mapping[str, str]) -> None:
 
 
 def html_table(rows: Iterable[tuple[str, str]]) -> str:
-    """Return an HTML table of names and values in the color theme of the notebook."""
+    """Return an HTML table of names and values that follows the notebook's color theme."""
     from html import escape
 
     left = " style='text-align:left'"
@@ -45,7 +45,7 @@ def html_table(rows: Iterable[tuple[str, str]]) -> str:
 
 
 def html_picture(instance: object) -> str:
-    """Return a picture of an instance as HTML, or "" if no function draws its class."""
+    """Return an image of an instance as HTML, or an empty string if no function draws its class."""
     from importlib import import_module
 
     from ..errors import LidarError
@@ -63,7 +63,7 @@ def html_picture(instance: object) -> str:
 
 
 def html_image(png: bytes, name: str) -> str:
-    """Return a PNG as an HTML image that is at most as wide as the PNG."""
+    """Return a PNG as an HTML image that is displayed at most at its original width."""
     from base64 import b64encode
     from html import escape
 

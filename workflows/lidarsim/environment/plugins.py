@@ -74,7 +74,7 @@ class Plugin:
 
 @cache
 def _imported(plugin: Plugin) -> Any:
-    """Import the value of a plug-in. Raise LidarError if the import fails."""
+    """Import the value of a plug-in, or raise LidarError if the import fails."""
     from importlib.metadata import EntryPoint
 
     try:

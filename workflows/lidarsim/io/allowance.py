@@ -1,4 +1,7 @@
-"""Memory limits for the content of input files, because a small file can expand to any size."""
+"""Memory limits for the content of input files.
+
+Without a limit, a small file could expand to any size.
+"""
 
 from __future__ import annotations
 
@@ -57,11 +60,11 @@ least 2.70 GiB, and the limit is 256.00 MiB. Export it again.
         return limit if self._in_parts else min(limit, memory_share())
 
     def grow(self, size: int) -> None:
-        """Raise the limit because the file has more data, with the given size in bytes."""
+        """Raise the limit for `size` additional bytes of file data."""
         self._size += size
 
     def add_file(self, file: Path) -> None:
-        """Raise the limit because the file refers to another file.
+        """Raise the limit for another file to which the file refers.
 
         Each file is counted only once.
         """
@@ -70,7 +73,7 @@ least 2.70 GiB, and the limit is 256.00 MiB. Export it again.
             self.grow(file.stat().st_size)
 
     def fits(self, count: int) -> bool:
-        """Return True if `count` more bytes are within the limit."""
+        """Return whether `count` more bytes are within the limit."""
         return self.used_bytes + count <= self.limit
 
     def take(self, count: int) -> None:
@@ -142,7 +145,10 @@ def _control_group_limits() -> list[int]:
 
 
 def _resident_limit() -> list[int]:
-    """Return the limit on resident memory (`ulimit -m`) in bytes, or an empty list if unlimited."""
+    """Return the limit on resident memory (`ulimit -m`) in bytes.
+
+    The list is empty if there is no limit.
+    """
     try:
         import resource
     except ImportError:  # not available on Windows

@@ -51,14 +51,20 @@ Piece = bytes | memoryview  # a piece of a file that is written in pieces
 
 
 def pack_arrays(arrays: Mapping[str, Any]) -> bytes:
-    """Create a compressed archive of arrays. Equal arrays result in equal bytes."""
+    """Create a compressed archive of arrays.
+
+    Equal arrays result in equal bytes.
+    """
     memory = io.BytesIO()  # NumPy leaves a file open if writing fails
     np.savez_compressed(memory, **arrays)
     return memory.getvalue()
 
 
 class StoredArray(NamedTuple):
-    """Location and type of an array in an uncompressed archive, for reading it in pieces."""
+    """Location and type of an array in an uncompressed archive.
+
+    This information is sufficient to read the array in pieces.
+    """
 
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
@@ -68,8 +74,6 @@ class StoredArray(NamedTuple):
 
 
 class _StoredFile(NamedTuple):
-    """An uncompressed file in an archive."""
-
     name: bytes
     flags: int
     crc: int
@@ -106,7 +110,7 @@ class _StoredFile(NamedTuple):
 
 
 def archive_pieces(arrays: Mapping[str, AnyArray]) -> list[Piece]:
-    """Create an uncompressed archive of arrays, and return it in pieces to be written in order.
+    """Create an uncompressed archive of arrays as pieces to be written in order.
 
     Contiguous arrays are not copied. Their pieces are views, which must be written before the
     arrays change. Equal arrays result in equal bytes, which are the same as those that zipfile
@@ -140,9 +144,9 @@ def _npy_head(array: AnyArray) -> bytes:
 
 
 def _directory_end(count: int, size: int, offset: int) -> bytes:
-    """Return the records after a central directory with the given entry count, size and offset.
+    """Return the records that follow a central directory.
 
-    The size and offset are in bytes.
+    `count` is the number of entries in the directory. `size` and `offset` are in bytes.
     """
     end = b""
     if max(size, offset) > _MAX_SIZE:
@@ -157,7 +161,7 @@ def _directory_end(count: int, size: int, offset: int) -> bytes:
 def open_archive(
     path: Path | str, read: Callable[[], bytes] | None = None
 ) -> Iterator[dict[str, Any]]:
-    """Read an archive without unpickling objects, and provide its arrays.
+    """Read the arrays of an archive without unpickling objects.
 
     Exceptions raised while the archive is read or in the context are converted to LidarError. If
     `read` is set, it is called to obtain the content of the file, and the path is used only in
@@ -283,8 +287,6 @@ def read_npy(content: bytes | memoryview, name: str) -> AnyArray:
 
 
 class _ArrayType(NamedTuple):
-    """Contents of an NPY header."""
-
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
     is_fortran: bool

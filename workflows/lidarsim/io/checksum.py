@@ -6,8 +6,8 @@ from isal import isal_zlib
 
 
 def crc32(data: bytes | memoryview, crc: int = 0) -> int:
-    """Update a CRC-32 checksum with more bytes, starting from 0 at the start of a file.
+    """Update a CRC-32 checksum with more bytes.
 
-    The function releases the GIL.
+    The initial checksum is 0. The function releases the GIL.
     """
     return isal_zlib.crc32(data, crc)

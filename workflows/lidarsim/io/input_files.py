@@ -74,7 +74,7 @@ def open_input(path: str | Path) -> BufferedReader:
 
 
 def not_found(path: str | Path, endings: Collection[str] = ()) -> str:
-    """Return a message about a file that does not exist, suggesting a similar name in its folder.
+    """Return a message about a missing file that suggests a similar name in its folder.
 
     Suggested names end with one of `endings` (default: the suffix of the file).
     """

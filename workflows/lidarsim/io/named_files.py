@@ -39,7 +39,7 @@ _MAX_LETTERS = 200  # maximum length of a name in a message
 
 
 def is_inside(file: Path, folders: Iterable[Path]) -> bool:
-    """Return True if a file is in one of the given folders or their subfolders.
+    """Return whether a file is in one of the given folders or their subfolders.
 
     Symbolic links in the path of the file are resolved. `folders` must already be resolved.
 
@@ -53,12 +53,12 @@ def is_inside(file: Path, folders: Iterable[Path]) -> bool:
 
 
 def is_plain(name: str) -> bool:
-    """Return True if a name is a plain file name, which is neither a path nor `..`."""
+    """Return whether a name is a plain file name, which is neither a path nor `..`."""
     return name not in ("", ".", "..") and not any(letter in name for letter in "/\\\0")
 
 
 def leads_outside(name: str | PurePath) -> bool:
-    """Return True if a name is an absolute path or contains `..`.
+    """Return whether a name is an absolute path or contains `..`.
 
     The file need not exist.
     """

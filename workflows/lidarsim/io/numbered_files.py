@@ -60,8 +60,8 @@ def rows_of_frames(files: Sequence[Path], row_count: int, table: str, kind: str)
     Raises
     ------
     ValueError
-        If a file has no row. Also if rows have no file, unless gaps in the file numbers show that
-        the numbers are those of the table.
+        If a file has no row, or if a row has no file. Rows may lack files only if gaps in the file
+        numbers show that these are row numbers.
     """
     count = len(files)
     if not all(file.stem.isdecimal() and len(file.stem) <= _FRAME_DIGITS for file in files):

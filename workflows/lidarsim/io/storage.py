@@ -39,7 +39,7 @@ def final_name(name: str) -> str:
 
 
 def is_url(location: str | Path) -> bool:
-    """Return True if a location is a URL rather than a path."""
+    """Return whether a location is a URL rather than a path."""
     return "://" in str(location)
 
 
@@ -149,7 +149,10 @@ class Storage:
         return path
 
     def _target(self, name: str) -> Path:
-        """Return the path of a file or folder to be replaced or removed, without following it."""
+        """Return the local path of a file or folder to replace or remove.
+
+        A link at this path is not followed.
+        """
         path = Path(name)
         return self.local(path.parent) / path.name
 
@@ -189,7 +192,7 @@ class Storage:
         return os.getpid(), system, folder
 
     def file_system(self) -> tuple[Any, str]:
-        """Return the fsspec file system and the folder, for libraries that open files."""
+        """Return the fsspec file system and the folder for libraries that open files."""
         with self._remote() as opened:
             return opened
 
@@ -249,9 +252,10 @@ class Storage:
 
     @contextmanager
     def writing(self, name: str) -> Iterator[IO[bytes]]:
-        """Open a file for writing that becomes visible when the context exits without an error.
+        """Open a file for atomic writing.
 
-        Subfolders in the name are created.
+        The file becomes visible when the context exits without an error. Subfolders in its name are
+        created.
         """
         if self.is_local:
             target = self._target(name)
@@ -342,7 +346,7 @@ class Storage:
             shutil.copyfileobj(source_file, file, _BLOCK_BYTES)
 
     def has_content(self, name: str, data: bytes) -> bool:
-        """Return True if a file has the given content.
+        """Return whether a file has the given content.
 
         Use this method to check whether this process has access to the same storage as another
         process, which wrote the file.

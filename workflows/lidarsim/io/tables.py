@@ -188,8 +188,9 @@ def find_header(
     """Find the header of a table, or return None if the table has no header.
 
     The header is the first line that is neither empty nor a comment, unless all its cells are
-    numbers. In that case, the header is the last comment before the rows that has as many names as
-    the first row has cells, provided that `is_known` is true for at least half or four of them.
+    numbers. In that case, the header is the last comment before the rows with as many names as the
+    first row has cells. `is_known` must be true for at least half of these names, or for at least
+    four of them.
     """
     body = next((i for i, line in enumerate(lines) if not _is_remark(line)), len(lines))
     if body < len(lines) and not _all_numbers(lines[body]):
@@ -208,18 +209,18 @@ def find_header(
 
 
 def _is_remark(line: str) -> bool:
-    """Return True if a line is empty or a comment."""
+    """Return whether a line is empty or a comment."""
     return not line.strip() or line.lstrip().startswith("#")
 
 
 def _all_numbers(line: str) -> bool:
-    """Return True if every cell in a line is empty or a number."""
+    """Return whether every cell in a line is empty or a number."""
     cells = [cell for cell in _cells(line, _separator_of(line)) if cell]
     return all(map(_is_number, cells))
 
 
 def _is_number(cell: str) -> bool:
-    """Return True if a cell is a number, which may be infinite or NaN."""
+    """Return whether a cell is a number, which may be infinite or NaN."""
     try:
         float(cell)
     except ValueError:
@@ -341,7 +342,7 @@ class _UnitMissingError(ValueError):
 
 
 class _ColumnReader:
-    """Assigns the columns in a header to quantities."""
+    """Assignment of header columns to quantities."""
 
     def __init__(
         self,
@@ -370,7 +371,6 @@ class _ColumnReader:
         return None if quantity is None else (quantity, name.unit)
 
     def choose(self, columns: Mapping[str, str] | None) -> None:
-        """Assign the columns that the user specified."""
         self.can_choose = columns is not None
         faults: list[str] = []
         for name, file_name in (columns or {}).items():
@@ -381,7 +381,6 @@ class _ColumnReader:
         _refuse(faults)
 
     def _choose(self, name: str, file_name: str) -> None:
-        """Assign a single column that the user specified."""
         match = self.quantity_of(name)
         if match is None:
             raise ValueError(
@@ -413,7 +412,6 @@ class _ColumnReader:
         self._add(quantity, matches[0], unit)
 
     def leave_out(self, ignore: Sequence[str]) -> None:
-        """Skip the columns that the user ignores."""
         self.left_out |= ignored_columns(self.cells, ignore)
 
     def assign(
@@ -458,7 +456,6 @@ class _ColumnReader:
         _refuse(faults)
 
     def _unknown(self, cells: Sequence[str]) -> str:
-        """Return a message about unknown columns."""
         columns = "columns" if len(cells) > 1 else "column"
         pronoun = "them" if len(cells) > 1 else "it"
         hint = did_you_mean_each(cells, [quantity.name for quantity in self.quantities])
@@ -486,7 +483,6 @@ class _ColumnReader:
         )
 
     def _unit_missing(self, quantity: Quantity, cell: str) -> _UnitMissingError:
-        """Return the error to raise for a column without a unit."""
         first, *other_units = quantity.units
         stem = quantity.name.removesuffix(f"_{first}")
         choice = f", or set `columns: {{{quantity.name}: {printable(cell)}}}`" * self.can_choose
@@ -575,7 +571,7 @@ class _ColumnReader:
 
 
 def _refuse(faults: Sequence[str]) -> None:
-    """Raise ValueError if there are faults, with a message that lists all of them."""
+    """Raise a ValueError that lists all faults, if there are any."""
     if faults:
         first, *others = faults
         raise ValueError(". ".join([first, *(fault[0].upper() + fault[1:] for fault in others)]))
@@ -587,7 +583,6 @@ def _listed(cells: Sequence[str]) -> str:
 
 
 def _ignoring(cells: Sequence[str]) -> str:
-    """Return the scenario setting that ignores columns."""
     return f"{{file: …, ignore: {format_yaml_list(cells)}}}"
 
 

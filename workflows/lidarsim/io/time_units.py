@@ -1,4 +1,4 @@
-"""Time units in files, and detection of times whose stated unit is implausible."""
+"""Time units in files, and detection of times with an implausible unit."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def arccos(x: ArrayLike) -> Floats:
 
 
 def log1p(x: ArrayLike) -> Floats:
-    """Return the logarithms of 1 + x, which are also accurate for small x (Kahan 1982)."""
+    """Return log(1 + x), which is also accurate for small x (Kahan 1982)."""
     x = np.asarray(x, np.float64)
     argument = 1 + x
     rounded = argument - 1
@@ -102,7 +102,10 @@ def cbrt(x: ArrayLike) -> Floats:
 
 
 def geomspace(start: float, stop: float, count: int) -> Floats:
-    """Return `count` geometrically spaced numbers from `start` to `stop`, both positive."""
+    """Return `count` geometrically spaced numbers from `start` to `stop`, inclusive.
+
+    Both limits must be positive.
+    """
     numbers = start * exp(np.linspace(0, float(log(stop / start)), count))
     numbers[-1] = stop
     return numbers
@@ -122,14 +125,17 @@ def interp(x: ArrayLike, knots: Floats, values: Floats) -> Floats:
 
 
 def decade(x: float) -> int:
-    """Return the decimal exponent of a positive number, rounded to 16 digits."""
+    """Return the decimal exponent of a positive number after rounding it to 16 digits."""
     return int(f"{x:.15e}".partition("e")[2])
 
 
 def _apply(
     name: str, function: Callable[..., Any], results: int, *arguments: ArrayLike
 ) -> tuple[Floats, ...]:
-    """Apply a function elementwise. The results have the shape of the first argument."""
+    """Apply a function elementwise.
+
+    The results have the shape of the first argument.
+    """
     arrays = [np.asarray(array, np.float64) for array in arguments]
     shape = arrays[0].shape
     output = np.empty((results, arrays[0].size))

@@ -30,7 +30,7 @@ def rotate(vectors: Floats, rotation: Floats | None) -> Floats:
 
 
 def rotate_into_frames(vectors: Floats, rotations: Floats | None) -> Floats:
-    """Rotate each vector from the scene frame to the frame with the corresponding rotation.
+    """Rotate each vector from the scene frame into its own frame.
 
     The vectors have shape (m, 3), and the rotations have shape (m, 3, 3). If `rotations` is None,
     the vectors are returned unchanged.

@@ -92,7 +92,7 @@ class Actor:
             self._check_first_pose()
 
     def _check_first_pose(self) -> None:
-        """Check the first rotation of a trajectory whose class can be user-defined."""
+        """Check the initial rotation, since the trajectory's class can be user-defined."""
         first_ns = max(presence_ns(self.trajectory)[0], 0.0)
         try:
             _, rotations = full_poses(self.trajectory, 0, np.array([first_ns]))
@@ -123,7 +123,7 @@ class Actor:
 
     @property
     def bounds(self) -> Floats:
-        """Bounding box of the mesh in all animation frames, in the frame of the actor, in meters.
+        """Bounding box of the mesh over all animation frames, in the actor frame and in meters.
 
         The shape is (2, 3).
         """
@@ -203,7 +203,8 @@ class Actor:
     def samples(self, duration_ns: float, count: int) -> ActorSamples:
         """Return `count` poses that are evenly spaced in time, for drawing the trajectory.
 
-        They cover the part of a survey of `duration_ns` nanoseconds in which the actor is present.
+        The poses cover the time during which the actor is present in a survey of `duration_ns`
+        nanoseconds.
         """
         appears, leaves = presence_ns(self.trajectory)
         first = max(appears, 0.0)
@@ -249,7 +250,7 @@ def samples_per_actor(actors: Sequence[Actor], max_samples: int) -> int:
 
 
 def distinct_meshes(actors: Iterable[Actor]) -> tuple[list[SceneMesh], Indices]:
-    """Return the distinct meshes of actors, and the index of the mesh of each actor.
+    """Return the distinct meshes of the actors and the mesh index of each actor.
 
     Two meshes are the same if they share their arrays. Pickling preserves this.
     """
@@ -300,7 +301,7 @@ def join_meshes(name: str, objects: Iterable[SceneMesh | SceneInstance]) -> Scen
 
 
 def _join_animated(name: str, meshes: Sequence[SceneMesh]) -> SceneMesh:
-    """Merge meshes, each of which is either static or part of the same animation."""
+    """Merge meshes that are static or belong to the same animation."""
     first = next(mesh.animation for mesh in meshes if mesh.animation)
     repeats = (len(first.vertices), 1, 1)
     poses = [

@@ -20,7 +20,7 @@ MAX_PICTURED_VERTICES = 500_000
 
 @dataclass(frozen=True, eq=False)
 class Animation:
-    """Evenly spaced keyframes of a mesh, between which its vertices move linearly.
+    """A mesh animation with evenly spaced keyframes and linear interpolation.
 
     Actors with the same mesh share the animation, but each actor plays it at its own rate
     (`Actor.frames_at`).
@@ -70,11 +70,11 @@ class Animation:
 
     @property
     def duration_s(self) -> float:
-        """Time from the first to the last keyframe in seconds."""
+        """Duration from the first to the last keyframe in seconds."""
         return (len(self.vertices) - 1) * self.step_s
 
     def frames(self, seconds: Floats) -> Floats:
-        """Return the frame numbers at given times.
+        """Return the frame numbers at the given times.
 
         Times are in seconds since the first keyframe. Frame numbers can be fractional: frame 1.5 is
         halfway between the second and the third keyframe.
@@ -86,7 +86,7 @@ class Animation:
     def vertices_at(
         self, frames: Floats, vertex: Indices | slice = slice(None)
     ) -> tuple[Floats, Floats]:
-        """Return interpolated vertices, and their displacements between adjacent keyframes.
+        """Return interpolated vertices and their displacements between adjacent keyframes.
 
         Frame numbers have shape (n,), and both results have shape (n, k, 3). To select vertices for
         each frame, pass their indices as `vertex` with shape (n, k).
@@ -100,7 +100,7 @@ class Animation:
 
     @cached_property
     def pictured(self) -> Animation:
-        """Animation for pictures, which has fewer keyframes if the mesh has many vertices.
+        """Animation for rendering, with fewer keyframes if the mesh has many vertices.
 
         Coordinates are rounded to 1/1024 m.
         """

@@ -1,4 +1,4 @@
-"""Colors of triangles, from images, plain colors, and vertex colors."""
+"""Triangle colors from images, plain colors and vertex colors."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ _EDGES = (LINEAR[:-1] + LINEAR[1:]) / 2
 
 
 def as_srgb(linear: ArrayLike) -> Bytes:
-    """Convert linear light from 0 to 1 to the nearest sRGB bytes."""
+    """Convert linear light values between 0 and 1 to the nearest sRGB bytes."""
     return np.searchsorted(_EDGES, np.asarray(linear, np.float64)).astype(np.uint8)
 
 
 def as_bytes(shares: ArrayLike) -> Bytes:
-    """Convert sRGB values from 0 to 1 to bytes.
+    """Convert sRGB values between 0 and 1 to bytes.
 
     NaN becomes 0.
     """
@@ -45,7 +45,7 @@ def as_bytes(shares: ArrayLike) -> Bytes:
 
 @dataclass(frozen=True, eq=False)
 class Colors:
-    """Colors of the faces of a mesh in sRGB.
+    """The sRGB colors of mesh faces.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Colors:
 
     @classmethod
     def plain(cls, color: Bytes, faces: int) -> Colors:
-        """Create a single color for all faces.
+        """Create colors that are the same for all faces.
 
         `color` has shape (1, 1, 3).
         """
@@ -79,7 +79,7 @@ class Colors:
 
     @classmethod
     def from_vertex_colors(cls, corners: Bytes) -> Colors:
-        """Create vertex colors for each face.
+        """Create colors from the corner colors of each face.
 
         `corners` has shape (f, 3, 3).
         """
@@ -87,20 +87,20 @@ class Colors:
 
     @classmethod
     def from_face_colors(cls, colors: Bytes) -> Colors:
-        """Create a plain color for each face.
+        """Create colors from one color per face.
 
         `colors` has shape (f, 3).
         """
         return cls.from_vertex_colors(colors[:, None].repeat(3, axis=1))
 
     def take(self, face_selection: Integers | slice) -> Colors:
-        """Return the colors of selected faces."""
+        """Return the colors of the selected faces."""
         uv = None if self.uv is None else self.uv[face_selection]
         corners = None if self.corners is None else self.corners[face_selection]
         return Colors(self.images, self.image[face_selection], uv, corners)
 
     def subdivide(self, face_indices: Integers, weights: Floats) -> Colors:
-        """Return the colors of pieces of faces.
+        """Return the colors of the pieces into which faces were divided.
 
         Parameters
         ----------
@@ -237,7 +237,7 @@ class Lookup:
 
 
 class _Planes(NamedTuple):
-    """Values on faces that are linear functions of the position."""
+    """Linear functions of position that define values on faces."""
 
     slope_rows: Ints32  # (f,), row of `slopes` for each face, or -1 for faces without values
     slopes: Floats  # (k, 4 w), slopes along x, y and z and the value at zero for each of w values
@@ -245,9 +245,9 @@ class _Planes(NamedTuple):
 
     @classmethod
     def joined(cls, has_values: Bools, blocks: list[Floats]) -> _Planes | None:
-        """Concatenate blocks of slopes for the faces that have values.
+        """Concatenate the slopes of all faces that have values.
 
-        Blocks have shape (k, 4 w). The result is None if no face has values.
+        Each block has shape (k, 4 w). The result is None if no face has values.
         """
         if not has_values.any():
             return None
@@ -255,10 +255,11 @@ class _Planes(NamedTuple):
         return cls(slope_rows, np.concatenate(blocks), bool(has_values.all()))
 
     def values_at(self, face_indices: Integers, points: Floats) -> tuple[Any, Floats]:
-        """Return the values at points on given faces, and the selection of the points with values.
+        """Return the values at points on the given faces, and a selection of those points.
 
-        The selection is a slice for all points, or indices of shape (m,). Face indices have shape
-        (n,), points have shape (3, n), and values have shape (w, m).
+        The selection contains the points that have values. It is a slice for all points, or indices
+        of shape (m,). Face indices have shape (n,), points have shape (3, n), and values have shape
+        (w, m).
         """
         selected: Any = slice(None)
         slope_rows = self.slope_rows.take(face_indices)
@@ -278,7 +279,7 @@ class _Planes(NamedTuple):
 
 
 def _fit_planes(corners: Floats, values: Floats) -> Floats:
-    """Return the slopes of `_Planes` for values at the corners of faces.
+    """Fit the slopes of `_Planes` to values at the corners of faces.
 
     Degenerate triangles, which rays never hit, have the value of their first corner. Corners have
     shape (k, 3, 3), values have shape (k, 3, w), and slopes have shape (k, 4 w).
@@ -298,7 +299,7 @@ def _fit_planes(corners: Floats, values: Floats) -> Floats:
 
 
 def _texel_index(coordinate: Floats, size: Ints) -> Ints:
-    """Return the row or column of a repeating image that contains a texture coordinate."""
+    """Return the texel row or column at a texture coordinate of a repeating image."""
     position = coordinate - np.floor(coordinate)
     position *= size
     return np.minimum(position.astype(np.int64), size - 1)
@@ -323,7 +324,7 @@ def unpack_colors(colors: UInts32) -> Bytes:
 
 
 def pack_as_float(red: Bytes, green: Bytes, blue: Bytes) -> Floats32:
-    """Encode colors as in the `rgb` field of PCL and ROS.
+    """Encode colors in the format of the `rgb` field in PCL and ROS.
 
     The bits 0x00RRGGBB of each color are interpreted as a float. All arrays have shape (n,).
     """

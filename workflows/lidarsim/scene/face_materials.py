@@ -14,7 +14,7 @@ from .colors import are_valid_indices
 
 @dataclass(frozen=True, eq=False)
 class FaceMaterials:
-    """Material names of the faces of a mesh.
+    """Material names of mesh faces.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class FaceMaterials:
         return cls((name,)) if name else None
 
     def take(self, face_selection: Integers | slice) -> FaceMaterials:
-        """Return the materials of selected faces without removing unused names."""
+        """Return the materials of the selected faces, keeping unused names."""
         return self if self.index is None else FaceMaterials(self.names, self.index[face_selection])
 
     def check(self, name: str, faces: int) -> None:

@@ -1,4 +1,4 @@
-"""Material images, which are colors and masks that define where triangles block light."""
+"""Material images, which provide colors and opacity masks."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ V = TypeVar("V")
 
 
 class MaskError(Exception):
-    """An error whose message is a clause that states why an image cannot be read."""
+    """An error whose message is a clause that explains why an image cannot be read."""
 
 
 def read_opacity(image: Path | bytes, allowance: Allowance, *, gray: bool = False) -> Bytes | None:
     """Return the opacity of an image from its alpha channel.
 
-    If `gray` is set, images without an alpha channel, and images that are opaque everywhere, use
-    their brightness as opacity. Otherwise, None is returned for these images.
+    If `gray` is set, the brightness of an image becomes its opacity if the image has no alpha
+    channel or is opaque everywhere. Otherwise, the result is None for such images.
 
     Returns
     -------
@@ -94,7 +94,7 @@ def read_heights(image: Path, allowance: Allowance, bytes_per_pixel: int) -> Flo
     """Return the brightness of a height map.
 
     Values are nonnegative. The shape is (h, w), and the type is float64. Before the image is
-    decoded, the memory for the result and another `bytes_per_pixel` bytes per pixel is deducted
+    decoded, memory for the result and for another `bytes_per_pixel` bytes per pixel is deducted
     from the allowance. The additional bytes are for the mesh that is created from the pixels.
 
     Raises
@@ -116,7 +116,10 @@ def read_heights(image: Path, allowance: Allowance, bytes_per_pixel: int) -> Flo
 
 @contextmanager
 def _open_image(image: Path | bytes) -> Iterator[Image.Image]:
-    """Open an image, and convert all errors, including those in the body, to MaskError."""
+    """Open an image, converting all errors to MaskError.
+
+    Errors in the body of the context are converted too.
+    """
     name = image.name if isinstance(image, Path) else "its image"
     try:
         # Pillow warns about images that it can read nevertheless, and about images that are too
@@ -166,7 +169,10 @@ def cache_with_errors(read: Callable[[K], V]) -> Callable[[K], V]:
 
 
 def _as_8_bit(image: Image.Image) -> Image.Image:
-    """Convert an image with 16 bits per channel to 8 bits, where Pillow would clip the values."""
+    """Convert an image with 16 bits per channel to 8 bits.
+
+    Pillow would clip the values.
+    """
     if not image.mode.startswith("I;16"):
         return image
     return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
@@ -196,14 +202,14 @@ class Texture:
         self._image = image
 
     def cutout(self, coordinates: AnyArray, corners: Ints) -> Cutout:
-        """Return the texture as the mask of triangles.
+        """Create the mask that results from mapping the texture to triangles.
 
         `map_to_triangles` describes the parameters.
         """
         return Cutout(*self.map_to_triangles(coordinates, corners))
 
     def colors(self, coordinates: AnyArray, corners: Ints) -> Colors:
-        """Return the texture as the colors of triangles.
+        """Create the colors that result from mapping the texture to triangles.
 
         `map_to_triangles` describes the parameters.
         """
@@ -211,7 +217,7 @@ class Texture:
         return Colors((image,), np.zeros(len(uv), np.int32), uv)
 
     def map_to_triangles(self, coordinates: AnyArray, corners: Ints) -> tuple[AnyArray, Floats32]:
-        """Return a repeating image and the texture coordinates of the corners of triangles.
+        """Return a repeating image and the texture coordinates of triangle corners.
 
         Coordinates are defined as in glTF. Their shape is (k, 3, 2).
 
@@ -244,7 +250,7 @@ class Texture:
         return image, uv.astype(np.float32)
 
     def _extend(self, image: AnyArray, coordinates: Floats, axis: int, black: bool) -> AnyArray:
-        """Extend an image until it covers all texture coordinates, with its edges or with black.
+        """Extend an image with its edges or with black until it covers all texture coordinates.
 
         The coordinates are modified in place to match the extended image. Their shape is (k, 3).
         Coordinates up to a hundredth of a texel outside the image are moved to its edge, because
@@ -277,7 +283,7 @@ class Texture:
 
 
 def _deduct(allowance: Allowance, count: int) -> None:
-    """Deduct bytes from the allowance, or raise MaskError if there are not enough left."""
+    """Deduct bytes from the allowance, or raise MaskError if too few are left."""
     if not allowance.fits(count):
         raise MaskError("its image would be too large")
     allowance.take(count)
@@ -294,15 +300,21 @@ class MaskNotes:
         self.missing_files: list[str] = []  # material files that cannot be read
 
     def record_mask_error(self, material: str) -> AbstractContextManager[None]:
-        """Catch errors of the body, record them for a material, and make its triangles opaque."""
+        """Record mask errors in the context instead of raising them.
+
+        The triangles of the material become opaque.
+        """
         return _record_error(self.mask_errors, material)
 
     def record_color_error(self, material: str) -> AbstractContextManager[None]:
-        """Catch errors of the body, record them for a material, and ignore its colors."""
+        """Record color errors in the context instead of raising them.
+
+        The colors of the material are ignored.
+        """
         return _record_error(self.color_errors, material)
 
     def lines(self) -> list[str]:
-        """Return the notes as clauses that follow the name of the file."""
+        """Return the notes as clauses that follow the file name."""
         notes = []
         if self.missing_files:
             files = _listed(self.missing_files)
@@ -336,7 +348,7 @@ class MaskNotes:
 
 @contextmanager
 def _record_error(reasons: dict[str, str], material: str) -> Iterator[None]:
-    """Record errors of the body, unless an error is already recorded for the material."""
+    """Record errors in the context, unless an error is already recorded for the material."""
     try:
         yield
     except MaskError as error:
@@ -346,7 +358,7 @@ def _record_error(reasons: dict[str, str], material: str) -> Iterator[None]:
 
 
 def _listed(names: list[str]) -> str:
-    """Return the first names, separated by commas, with an ellipsis if there are more."""
+    """Join the first names with commas, adding an ellipsis if there are more."""
     return ", ".join(printable(name) for name in names[:_MAX_NAMED]) + ", …" * (
         len(names) > _MAX_NAMED
     )

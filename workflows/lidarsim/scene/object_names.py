@@ -20,7 +20,7 @@ def resolve_same_names(
     same_names: SameNames,
     tell: Callable[[str], None],
 ) -> list[SceneMesh | SceneInstance]:
-    """Merge objects with the same name if `same_names` is "join".
+    """Merge objects with the same name, or report duplicate names.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Scenes, which hold the triangles of all objects in coordinates relative to a local origin."""
+"""Scenes, which hold the triangles of all objects relative to a local origin."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A scene, which consists of triangles that belong to named objects.
+    """A scene of named objects that consist of triangles.
 
-    Coordinates are local, so world coordinates are `vertices` + `origin`. The origin is zero unless
+    Coordinates are local: world coordinates are `vertices` + `origin`. The origin is zero unless
     the scene is more than 10 km away from zero, as in georeferenced data. In that case, the origin
     is near the center of the scene, in whole meters, so that single precision is sufficient for
     local coordinates.
@@ -104,7 +104,7 @@ class Scene:
         return f"<Scene: {objects}, {plural(self.triangles, 'triangle')}, {sides} m>"
 
     def _repr_html_(self) -> str:
-        """Return an HTML table of the main properties, with a picture if a plug-in draws scenes."""
+        """Return an HTML table of the main properties, and an image if a plug-in draws scenes."""
         sides = " × ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0))
         rows = {
             "scene": f"{plural(len(self.object_names), 'object')}: {listed(self.object_names, 8)}",
@@ -152,7 +152,7 @@ class Scene:
 
     @classmethod
     def seed(cls) -> Scene:
-        """Return the demo scene of six surfaces of revolution, which have 76,800 triangles.
+        """Return the demo scene of six surfaces of revolution with 76,800 triangles.
 
         Examples
         --------
@@ -303,7 +303,7 @@ class Scene:
         )
 
     def with_actors(self, actors: Iterable[Actor]) -> Scene:
-        """Return a copy of the scene in which other actors replace the existing actors.
+        """Return a copy of the scene with its actors replaced.
 
         Both scenes share the static triangles.
 
@@ -347,7 +347,7 @@ class Scene:
         return scene
 
     def moved(self, instance_indices: Indices, positions: Floats, rotations: Floats) -> Scene:
-        """Return a copy of the scene in which some instances have other poses.
+        """Return a copy of the scene in which some instances are moved to new poses.
 
         Instances keep their scales.
 
@@ -380,7 +380,7 @@ class Scene:
 
     @property
     def surface_kinds(self) -> SurfaceKinds:
-        """Surface kinds of all objects, one for each material of each object.
+        """Surface kinds of all objects, with one per material of each object.
 
         The surface kinds of actors come last.
         """
@@ -512,7 +512,7 @@ class Scene:
         )
 
     def solid(self, time_ns: float) -> Scene:
-        """Return a scene in which the actors are static objects with their poses at a given time.
+        """Return a scene in which the actors are static objects at their poses at a given time.
 
         The returned scene has no instances. However, a scene without actors is returned unchanged,
         including its instances.
@@ -577,7 +577,7 @@ class Scene:
         )
 
     def _mesh_of_shared_part(self, instances: Instances, index: int) -> SceneMesh:
-        """Return a part of the instances as a mesh in the frame of the part.
+        """Return a part that instances share as a mesh in the frame of the part.
 
         The mesh is named after the first object that contains the part.
         """
@@ -674,8 +674,6 @@ def local_origin(vertices: Floats) -> Floats:
 
 
 class _PlacedPart(NamedTuple):
-    """A mesh part and its pose in the scene."""
-
     owner: int  # index of the object
     part: int  # index of the part
     matrix: Floats  # (4, 4), from the frame of the part to world coordinates
@@ -683,7 +681,7 @@ class _PlacedPart(NamedTuple):
 
 @dataclass
 class _SplitObjects:
-    """Objects of a scene, split into meshes to copy and mesh parts to instantiate.
+    """Objects of a scene, split into meshes to copy and parts to instantiate.
 
     Meshes are in world coordinates. Parts are in the frame of their mesh. The owner of a mesh or
     part is the index of its object.
@@ -723,7 +721,7 @@ def _check_objects(objects: Sequence[object]) -> None:
 
 
 def _split_by_kind(objects: Sequence[SceneMesh | SceneInstance]) -> _SplitObjects:
-    """Split objects into meshes to copy and mesh parts to instantiate.
+    """Split objects into meshes to copy and parts to instantiate.
 
     A `SceneMesh` without masks and voxels is copied. All other meshes are divided into one part for
     each mask and one part for the opaque triangles. The parts of a `SceneInstance` all become

@@ -1,4 +1,4 @@
-"""Instances, which place the same mesh in a scene any number of times."""
+"""Instances, which place the same mesh in a scene several times."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ BLOCK_POINTS = 1 << 15  # points that are transformed at a time, so that they fi
 
 @dataclass(frozen=True, eq=False)
 class SceneInstance:
-    """A mesh that is placed in the world.
+    """A placement of a mesh in the world.
 
     Any number of instances can share a mesh.
 
@@ -72,7 +72,7 @@ class SceneInstance:
 
     @classmethod
     def from_matrices(cls, mesh: SceneMesh, transforms: Floats, name: str) -> list[SceneInstance]:
-        """Create an instance of a mesh for each of several transformation matrices.
+        """Create one instance of a mesh for each transformation matrix.
 
         Validating the matrices together is faster than creating the instances one by one.
 
@@ -107,7 +107,7 @@ class SceneInstance:
         return np.asarray(self.transform)
 
     def moved(self, name: str, linear: Floats, offset: Floats) -> SceneInstance:
-        """Return an instance with another name, transformed by p -> linear @ p + offset."""
+        """Return a renamed instance that is transformed by p -> linear @ p + offset."""
         position = matvec(linear, self.matrix[:3, 3]) + offset
         return SceneInstance(self.mesh, affine(matmul(linear, self.matrix[:3, :3]), position), name)
 
@@ -126,7 +126,10 @@ def check_coordinate(position: Floats) -> None:
 
 
 class MeshPart(NamedTuple):
-    """Triangles that instances share, which are either all opaque or have the same mask."""
+    """Triangles shared by instances.
+
+    They are either all opaque or have the same mask.
+    """
 
     vertices: Floats  # (v, 3), in the frame of the mesh
     faces: Ints32  # (f, 3)
@@ -138,7 +141,7 @@ class MeshPart(NamedTuple):
 
 
 def split_by_masks(mesh: SceneMesh) -> Iterator[MeshPart]:
-    """Divide a mesh by its masks, and yield the parts in the order of the triangles."""
+    """Divide a mesh by its masks and yield the parts in triangle order."""
     start = len(mesh.faces) - sum(len(cut.uv) for cut in mesh.cutouts)
 
     def part(first: int, stop: int, cut: Cutout | None = None) -> MeshPart:
@@ -237,7 +240,7 @@ class Instances:
         return self.owner[fulfilled[self.part]]
 
     def placed(self) -> Iterator[tuple[Indices, Floats]]:
-        """Yield blocks of instances of the same part, and their vertices in local coordinates.
+        """Yield the instances of each part in blocks, with their vertices in local coordinates.
 
         Instance indices have shape (k,), and vertices have shape (k, 3, v).
         """
@@ -279,7 +282,7 @@ class Instances:
         return corners
 
     def reach(self, centers: Floats) -> Floats:
-        """Return the horizontal radius of each instance around a given center.
+        """Return each instance's horizontal radius around the given center.
 
         `centers` has shape (n, 2), and the result has shape (n,).
         """
@@ -315,7 +318,7 @@ class Instances:
         return np.asarray(scales[instance_indices])
 
     def moved(self, instance_indices: Indices, positions: Floats, rotations: Floats) -> Instances:
-        """Return the instances with new poses for some of them.
+        """Return the instances with some of them moved to new poses.
 
         Moved instances keep their scales.
 
@@ -364,7 +367,7 @@ class _Scales(NamedTuple):
 
 
 def polar_scales(matrices: Floats) -> Floats:
-    """Return the scaling, including mirroring, of each matrix by polar decomposition.
+    """Compute the scaling, including mirroring, of each matrix by polar decomposition.
 
     Matrices and scales have shape (m, 3, 3). The rotation is computed by Newton's method (Higham
     1986). The result is rounded to 12 digits, so that a scale factor of 1.4 remains 1.4 no matter

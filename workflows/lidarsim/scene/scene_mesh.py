@@ -1,4 +1,4 @@
-"""Triangle meshes with a name, which come from mesh files or are generated."""
+"""Named triangle meshes, which are read from mesh files or generated."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAX_LEAF_DENSITY = 1e4  # leaf area density, m²/m³
 
 @dataclass(frozen=True, eq=False)
 class Cutout:
-    """An opacity mask for faces that block light only in part, such as leaves or a wire fence.
+    """An opacity mask for faces that block light only partly, such as leaves or a wire fence.
 
     Attributes
     ----------
@@ -165,7 +165,7 @@ class SceneMesh:
         return self.animation is not None or any(np.cross(*e.swapaxes(0, 1)).any() for e in edges)
 
     def moved(self, name: str, linear: Floats, offset: Floats) -> SceneMesh:
-        """Return a copy of the mesh with another name, transformed by p -> linear @ p + offset."""
+        """Return a renamed copy of the mesh that is transformed by p -> linear @ p + offset."""
         faces = self.faces
         cutouts = self.cutouts
         colors = self.colors
@@ -218,7 +218,7 @@ def _check_cutouts(name: str, cutouts: tuple[Cutout, ...], faces: int) -> None:
 
 
 def stack_meshes(meshes: Iterable[tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyArray]:
-    """Concatenate pairs of vertices and faces, and renumber the faces accordingly.
+    """Concatenate the vertices and faces of meshes, renumbering the faces accordingly.
 
     Vertices have shape (v, 3), and faces have shape (f, 3).
     """
@@ -233,7 +233,7 @@ def stack_meshes(meshes: Iterable[tuple[AnyArray, AnyArray]]) -> tuple[AnyArray,
 
 
 def drop_unused_vertices(vertices: AnyArray, faces: Integers) -> tuple[AnyArray, Ints]:
-    """Remove unused vertices and renumber the faces accordingly.
+    """Remove unused vertices, renumbering the faces accordingly.
 
     The order of the remaining vertices does not change.
     """
@@ -248,7 +248,7 @@ def drop_unused_vertices(vertices: AnyArray, faces: Integers) -> tuple[AnyArray,
 
 
 def points_array(name: str, points: ArrayLike) -> Floats:
-    """Return points as a contiguous float64 array of finite numbers.
+    """Convert points to a contiguous float64 array and check that all coordinates are finite.
 
     The shape is (n, 3). The object `name` appears in error messages.
 

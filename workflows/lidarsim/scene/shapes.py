@@ -1,4 +1,4 @@
-"""Generated meshes, which are surfaces of revolution and the six objects of the demo scene."""
+"""Generated meshes: surfaces of revolution and the six objects of the demo scene."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def revolve(profile: ArrayLike, segments: int, name: str = "Revolved") -> SceneM
 
 
 def capsule(radius: float, height: float, segments: int, name: str) -> SceneMesh:
-    """Create an upright capsule around zero.
+    """Create an upright capsule centered at zero.
 
     The height in meters is the length of the cylindrical part. A height of zero creates a sphere.
     """
@@ -121,9 +121,10 @@ def cylinder(radius: float, height: float, segments: int, name: str) -> SceneMes
 
 
 def _revolved_faces(rings: int, segments: int) -> Ints:
-    """Return the faces of a surface of `rings` circles with `segments` vertices each.
+    """Return the faces of a surface of revolution.
 
-    The last two vertices are the lower pole and the upper pole.
+    The surface has `rings` circles with `segments` vertices each. The last two vertices are the
+    lower pole and the upper pole.
     """
     grid = np.arange(rings * segments).reshape(rings, segments)
     following = np.roll(grid, -1, axis=1)
@@ -158,7 +159,7 @@ def smooth(outline: ArrayLike, rounds: int = 5) -> Floats:
 
 
 def resample(line: ArrayLike, count: int) -> Floats:
-    """Place equidistant points along a polyline, including both ends.
+    """Place equidistant points along a polyline, including both of its ends.
 
     The polyline has shape (n, d), and the points have shape (count, d).
     """

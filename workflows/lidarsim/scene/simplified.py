@@ -1,4 +1,4 @@
-"""Simplified scenes for pictures and plans, in which instances are replaced by triangles.
+"""Simplified scenes for plots and plans, with triangles instead of instances.
 
 If a scene has many instances, they are drawn with fewer triangles.
 """
@@ -27,7 +27,7 @@ _MAX_POSITIONS = 200  # maximum number of positions to which distances are measu
 
 @dataclass(frozen=True, eq=False)
 class SimplifiedScene:
-    """A scene without instances, and the hit counter of each of its triangles.
+    """A scene without instances, with the hit counter of each triangle.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class SimplifiedScene:
         max_triangles: int = DRAWN_TRIANGLES,
         near_positions: Sequence[Floats] = (),
     ) -> SimplifiedScene:
-        """Replace the instances of a scene by copies of their triangles.
+        """Replace the instances of a scene with copies of their triangles.
 
         The copies have about `max_triangles` triangles or fewer in total. Instances close to
         `near_positions` keep more of their triangles. Each array in `near_positions` contains local
@@ -81,7 +81,7 @@ class SimplifiedScene:
 
 
 class _DrawnPart(NamedTuple):
-    """A mesh part as it is drawn, with fewer triangles if necessary."""
+    """A mesh part for drawing, with fewer triangles if necessary."""
 
     vertices: Floats  # (v, 3)
     faces: Ints32  # (f, 3)
@@ -90,7 +90,7 @@ class _DrawnPart(NamedTuple):
 
 
 class _CopiedInstances:
-    """A collection of the triangles of a scene and of copies of its instances."""
+    """Collector of a scene's triangles and of copies of its instances."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -138,7 +138,10 @@ class _CopiedInstances:
 
 
 def _simplify_for_drawing(part: MeshPart, share: float) -> _DrawnPart:
-    """Return a part with the given share of its triangles, each of which has its mean color."""
+    """Simplify a part to the given fraction of its triangles.
+
+    Each triangle has its mean color.
+    """
     vertices = part.vertices
     faces = part.faces
     rows = np.arange(len(part.faces))
@@ -151,7 +154,7 @@ def _simplify_for_drawing(part: MeshPart, share: float) -> _DrawnPart:
 
 
 def cut_masks(scene: Scene) -> Scene:
-    """Replace masked triangles by small opaque triangles, for pictures.
+    """Replace masked triangles with small opaque triangles, for drawing.
 
     The hit counters of the scene do not change.
     """
@@ -168,7 +171,7 @@ def cut_masks(scene: Scene) -> Scene:
 
 
 def _cut_part(part: MeshPart, max_pieces: float) -> MeshPart:
-    """Divide the triangles of a masked part into pieces, and return the opaque pieces.
+    """Divide the triangles of a masked part into pieces and return the opaque pieces.
 
     There are about `max_pieces` pieces in total. The mask is sampled at one random point in each
     piece, so that the proportion of opaque pieces is correct for arbitrarily fine masks.
@@ -197,7 +200,7 @@ def _cut_part(part: MeshPart, max_pieces: float) -> MeshPart:
 
 
 def _piece_corners(steps: int) -> Floats:
-    """Return the barycentric coordinates of the corners of the pieces of a triangle.
+    """Return the barycentric coordinates of the corners of a triangle's pieces.
 
     Each edge of the triangle is divided into `steps` segments. The shape is (steps², 3, 3).
     """
@@ -213,7 +216,7 @@ def _piece_corners(steps: int) -> Floats:
 def _triangle_shares(
     shared: Instances, max_triangles: int, near_positions: Sequence[Floats]
 ) -> Floats:
-    """Return the share of its triangles that each instance keeps when it is drawn.
+    """Return the fraction of its triangles that each instance keeps for drawing.
 
     Half of the triangles are distributed evenly. The other half is distributed by the squared
     distance to the nearest position, so that all triangles appear about equally large from there.
@@ -239,8 +242,6 @@ def _triangle_shares(
 
 
 class _SimplifiedPart(NamedTuple):
-    """A mesh part with fewer triangles."""
-
     vertices: Floats  # (v, 3)
     faces: Ints32  # (k, 3)
     face_indices: Indices  # (k,), index of the original face
@@ -279,7 +280,7 @@ def _simplify_part(part: MeshPart, max_triangles: int) -> _SimplifiedPart:
 
 
 def simplify_scene(scene: Scene, max_triangles: int) -> tuple[Scene, Ints]:
-    """Reduce a scene to at most `max_triangles`, and map the original triangles to the new ones.
+    """Reduce a scene to at most `max_triangles` and map the original triangles to the new ones.
 
     Returns
     -------
@@ -338,7 +339,7 @@ def _face_at_vertex(faces: Ints32, vertex_count: int) -> Ints:
 
 
 def _grid_cells(points: Floats, cell: float) -> tuple[Ints, Ints]:
-    """Return the grid cell of each point, and the number of points in each cell.
+    """Return the grid cell of each point and the number of points in each cell.
 
     Only cells that contain points are numbered.
     """
@@ -348,7 +349,7 @@ def _grid_cells(points: Floats, cell: float) -> tuple[Ints, Ints]:
 
 
 def _sort_keys(rows: AnyArray) -> Ints:
-    """Return numbers that sort in the same order as rows of nonnegative integers.
+    """Return numbers that have the same order as rows of nonnegative integers.
 
     Sorting the numbers is faster than sorting the rows. Rows have shape (n, 3), and the result has
     shape (n,).
@@ -362,7 +363,10 @@ def _sort_keys(rows: AnyArray) -> Ints:
 
 
 def _compact(numbers: Ints) -> Ints:
-    """Map numbers to values below 2³¹ in the same order, so that a product of two fits 64 bits."""
+    """Renumber integers in the same order with values below 2³¹.
+
+    A product of two such values fits into 64 bits.
+    """
     if numbers.max(initial=0) >= 1 << 31:
         return np.unique(numbers, return_inverse=True)[1]
     return numbers

@@ -84,7 +84,10 @@ def _check_names(wheels: Sequence[str], names: Sequence[str]) -> None:
 def _radii(
     meshes: Sequence[SceneMesh], wheels: Sequence[str]
 ) -> tuple[dict[int, float], list[str]]:
-    """Return the radii of round wheels in meters by mesh index, and messages about other wheels."""
+    """Return the radii of round wheels, keyed by mesh index, and messages about other wheels.
+
+    The radii are in meters.
+    """
     radii: dict[int, float] = {}
     notes: list[str] = []
     for index, mesh in enumerate(meshes):
@@ -101,7 +104,7 @@ def _radii(
 
 
 def _rotated_vertices(mesh: SceneMesh, revolutions: int, steps: int) -> Floats:
-    """Return the vertices of a mesh in all steps of a rotation about its center.
+    """Return the vertices of a mesh at each step of a rotation about its center.
 
     The axis is parallel to y. The shape is (steps + 1, v, 3).
     """

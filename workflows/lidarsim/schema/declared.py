@@ -49,7 +49,7 @@ Triple = Three[Coordinate]
 
 
 def _in_order(value: Any, handler: Callable[[Any], Any]) -> Any:
-    """Validate a pair of finite numbers in ascending order."""
+    """Check that a pair of finite numbers is in ascending order."""
     limits = handler(value)
     if not 0 <= limits[1] - limits[0] < inf:
         raise not_allowed_error("[least, largest]")
@@ -60,7 +60,7 @@ MinMax = Annotated[Two[T], WrapValidator(_in_order)]  # minimum and maximum
 
 
 def _upright(value: Any, handler: Callable[[Any], Any]) -> Any:
-    """Validate a rectangle whose minimum x and y come first."""
+    """Check that a rectangle states its minimum x and y first."""
     sides = handler(value)
     if sides[0] >= sides[2] or sides[1] >= sides[3]:
         raise not_allowed_error("[x0, y0, x1, y1] with the lower corner first")
@@ -103,7 +103,7 @@ def about(description: str, *examples: Any, **limits: Any) -> Any:
 
 
 def declared_values(instance: Any, base: type) -> dict[str, Any]:
-    """Return the values of those fields of an instance that are declared in a base class.
+    """Return an instance's values of the fields that a base class declares.
 
     The result maps field names to values.
     """
@@ -128,7 +128,7 @@ def accept_short_form(
 
 
 def accept_text(field: str, kind: Any) -> Any:
-    """Accept a string such as "hall.glb" in place of a section, as the value of one field."""
+    """Accept a string such as "hall.glb" as a short form of a section with one field."""
     return accept_short_form(is_text, lambda value: {field: value}, Text | kind)
 
 
@@ -159,7 +159,7 @@ def allowed(words: str) -> WrapValidator:
 
 
 def not_allowed_error(words: str) -> PydanticCustomError:
-    """Return the error for a validator to raise if a value is not allowed.
+    """Return the error that a validator raises for a value that is not allowed.
 
     `words` describes the allowed values. In the message for the user, it follows the location of
     the value and "must be".
@@ -168,7 +168,7 @@ def not_allowed_error(words: str) -> PydanticCustomError:
 
 
 def is_text(value: Any) -> bool:
-    """Return True if a value is a string."""
+    """Return whether a value is a string."""
     return isinstance(value, str)
 
 

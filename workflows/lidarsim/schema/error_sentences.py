@@ -52,7 +52,7 @@ def convert_validation_errors(
     """Convert a pydantic ValidationError raised in the context into a LidarError.
 
     The message has one line per mistake, prefixed with `source`. `content` is the content of the
-    file, if known, which enables advice on unknown fields. `contradictory` returns True if the
+    file, if known, which enables advice on unknown fields. `contradictory` returns whether the
     fields in a content contradict each other.
     """
     try:
@@ -109,13 +109,12 @@ def _line(
 
 
 def _in_file(value: Any) -> str:
-    """Format a value as in a YAML file."""
     plain = str(value).lower() if isinstance(value, bool) else shown(value)
     return "empty" if value is None else plain
 
 
 def _sentence(path: FieldPath, detail: ErrorDetails, hint: Any, advice: str) -> str:
-    """Return a sentence that states the location, the value, the allowed values and the advice."""
+    """Compose a sentence from the location, the value, the allowed values and the advice."""
     location = dotted(path)
     kind = detail["type"]
     value = detail["input"]

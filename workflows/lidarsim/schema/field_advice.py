@@ -1,8 +1,8 @@
-"""Advice for correcting a file, such as the section to which an unknown field belongs.
+"""Advice for correcting a file.
 
-The advice recommends moving a field to a different section only if the file would then be valid. If
-the name of that section does not show how to write the field, the advice contains the smallest
-valid example.
+An example is the section to which an unknown field belongs. The advice recommends moving a field to
+a different section only if the file would then be valid. If the name of that section does not show
+how to write the field, the advice contains the smallest valid example.
 """
 
 from __future__ import annotations
@@ -43,12 +43,15 @@ class Owner(NamedTuple):
 
     @property
     def is_direct(self) -> bool:
-        """Whether the path contains no list or mapping, so that field names suffice."""
+        """Whether the path contains no list or mapping.
+
+        In this case, the field names are sufficient to describe the path.
+        """
         return all(form == "%s" for form in self.forms)
 
 
 def owners_by_level(name: str, start: Owner) -> Iterator[list[Owner]]:
-    """Yield lists of the sections that have a field, one per nesting level below `start`."""
+    """Yield the sections that have a field as one list per nesting level below `start`."""
     level = [start]
     for _ in range(_MAX_DEPTH):
         yield [owner for owner in level if name in fields_by_name(owner.kind)]
@@ -61,7 +64,6 @@ def owner_of_file(kind: Any) -> Owner:
 
 
 def _inner_sections(outer: Owner) -> Iterator[Owner]:
-    """Yield the sections in the fields of a section."""
     for name, field in fields_by_name(outer.kind).items():
         if any(isinstance(note, GetPydanticSchema) for note in field.metadata):
             continue  # the field is available only in Python
@@ -71,7 +73,7 @@ def _inner_sections(outer: Owner) -> Iterator[Owner]:
 
 
 def _forms_of(annotation: Any, key: str, form: str = "%s") -> Iterator[tuple[str, Any]]:
-    """Yield the sections in an annotation together with their formats.
+    """Yield the sections in an annotation together with their forms.
 
     `key` is an example of a name in a mapping.
     """
@@ -147,7 +149,7 @@ def _known_place(name: str, value: Any, field_names: Collection[str], file: Any)
 
 
 def _similar_name(name: str, value: Any, field_names: Collection[str]) -> str:
-    """Suggest a similar field, with a converted value if only the unit differs."""
+    """Suggest a similar field, converting the value if only the unit differs."""
     similar = most_similar(name, field_names)
     factor = None if similar is None else factor_between(name, similar)
     right = None if factor is None else convert_value(value, factor)
@@ -191,7 +193,7 @@ def _in_words(
 
 
 def _right_value(kind: Any, name: str, value: Any) -> Any:
-    """Return the value if it is valid for a field, a correction if it is misspelled, or None."""
+    """Return the value if it is valid for a field, or else its corrected spelling, or None."""
     fields = fields_by_name(kind)
     if value is None:
         return None
@@ -210,7 +212,10 @@ def _right_value(kind: Any, name: str, value: Any) -> Any:
 
 
 def _with_field(content: Any, names: Sequence[str], kind: Any, field: Mapping[str, Any]) -> Any:
-    """Add a field to a section of a content. Return None if the section is invalid as a result."""
+    """Add a field to a section of a file's content.
+
+    The result is None if this makes the section invalid.
+    """
     if not isinstance(content, Mapping):  # the content is in its short form
         return None
     if not names:
@@ -221,7 +226,7 @@ def _with_field(content: Any, names: Sequence[str], kind: Any, field: Mapping[st
 
 
 def _error(annotation: Any, value: Any) -> ValidationError | None:
-    """Validate a value for an annotation, and return the error or None."""
+    """Return the error from validating a value against an annotation, or None."""
     from pydantic import TypeAdapter  # slow to import
 
     try:
@@ -264,13 +269,16 @@ def _example(owner: Owner, name: str, value: Any) -> str:
 
 
 def list_advice(annotation: Any, value: Any) -> str:
-    """Suggest writing a value as a list with a single entry, or return "" if that is invalid."""
+    """Suggest writing a value as a list with one entry.
+
+    The result is an empty string if such a list is invalid.
+    """
     is_plain = isinstance(value, (str, int, float))
     return f" Write [{value}]." if is_plain and _error(annotation, [value]) is None else ""
 
 
 def name_advice(path: FieldPath, file: Any) -> str:
-    """Return an example for a mapping whose entries lack names, or "".
+    """Return an example of a mapping with names for its entries, or an empty string.
 
     For instance, `sensors: {model: …, mount: …}` lacks the name of the sensor.
     """

@@ -26,7 +26,7 @@ def model_names() -> tuple[str, ...]:
 
 
 def names_in(maker: Traversable) -> list[str]:
-    """Return the sorted names of the models in the folder of a maker."""
+    """Return the sorted model names in a maker's folder."""
     file_names = sorted(entry.name for entry in maker.iterdir())
     return [
         f"{maker.name}/{file.removesuffix('.yaml')}"
@@ -53,7 +53,7 @@ def plugin_model_names(start: str = "") -> tuple[str, ...]:
 
 
 def _may_begin(folder: str, start: str) -> bool:
-    """Return True if names in a folder such as "acme/" may begin with `start`."""
+    """Return whether names in a folder such as "acme/" may begin with `start`."""
     return folder.startswith(start) or start.startswith(folder)
 
 
@@ -73,6 +73,6 @@ def maker_folder(plugin: Plugin) -> Traversable:
 
 
 def full_name(name: str) -> str:
-    """Add the maker to the name of a model, such as "riegl-vz400", if it is unambiguous."""
+    """Add the maker to a model name such as "riegl-vz400" if the maker is unambiguous."""
     matches = [model for model in model_names() if model.partition("/")[2] == name]
     return matches[0] if len(matches) == 1 else name

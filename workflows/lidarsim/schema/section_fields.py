@@ -18,7 +18,7 @@ LIMITS = tuple(_LIMIT_WORDS)  # limits of numbers, with the names used by `pydan
 
 
 def fields_by_name(hint: Any) -> Fields:
-    """Return the fields of all sections in an annotation, including all kinds of each section.
+    """Return the fields of all sections in an annotation, including every kind of each section.
 
     The result maps names in files to fields.
     """
@@ -28,11 +28,11 @@ def fields_by_name(hint: Any) -> Fields:
 
 
 def kinds_of(section: Any) -> Sequence[Any]:
-    """Return the more specific sections that a section may become, depending on its content.
+    """Return the kinds of a section, which are more specific sections that depend on its content.
 
-    For example, the section for a file has a kind for each format with options. A section declares
-    its kinds in a function `kinds`, which is called only for messages and schemas because it
-    imports the modules that declare their fields.
+    For example, the section for a file has one kind for each format with options. A section
+    declares its kinds in a function `kinds`. This function is called only for messages and schemas
+    because it imports the modules that declare the fields of the kinds.
     """
     return section.kinds() if "kinds" in vars(section) else ()
 
@@ -50,7 +50,7 @@ def _dataclass_fields(section: Any) -> Fields:
 
 
 def is_section(kind: Any) -> bool:
-    """Return True if a class is a section, which is a pydantic model or a dataclass."""
+    """Return whether a class is a section, which is a pydantic model or a dataclass."""
     return hasattr(kind, "model_fields") or is_dataclass(kind)
 
 
@@ -68,7 +68,7 @@ def classes_in(annotation: Any) -> Iterator[type]:
 
 
 def own_limits(notes: Iterable[Any]) -> dict[str, Any]:
-    """Return the limits in the metadata of an annotation, with the names used by `pydantic.Field`.
+    """Return the limits in an annotation's metadata, keyed by their names in `pydantic.Field`.
 
     Nested annotations are not searched.
     """
@@ -82,7 +82,7 @@ def own_limits(notes: Iterable[Any]) -> dict[str, Any]:
 
 
 def limits_of(hint: Any) -> dict[str, Any]:
-    """Return a mapping from names to limits for the numbers in an annotation."""
+    """Return the limits for the numbers in an annotation, keyed by name."""
     inner = get_args(hint)[:1] if get_origin(hint) is Annotated else get_args(hint)
     limits = {name: limit for arg in inner for name, limit in limits_of(arg).items()}
     own = own_limits(getattr(hint, "__metadata__", ()))

@@ -59,7 +59,6 @@ def one_line(instance: Any) -> str:
 
 
 def _short(value: Any) -> str:
-    """Return a short text representation of the value of a field."""
     if isinstance(value, np.ndarray):
         return f"{value.dtype}{value.shape}"
     if is_dataclass(value) and (name := getattr(value, "name", "")):

@@ -1,1 +1,1 @@
-"""Times, poses and instruments of the sweeps in a survey, which complement its points."""
+"""Times, poses and instruments of a survey's sweeps."""

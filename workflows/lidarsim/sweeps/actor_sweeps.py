@@ -36,7 +36,7 @@ class ActorSweeps(NamedTuple):
 
     @classmethod
     def from_scene(cls, scene: Scene, starts_ns: Floats, stops_ns: Floats) -> ActorSweeps:
-        """Compute the poses of the actors in a scene during sweeps.
+        """Compute the poses of a scene's actors during the given sweeps.
 
         The sweeps are specified by the times of their starts and last beams, with shape (n,). If an
         actor is not present at the start of a sweep, its pose is extrapolated from the time at

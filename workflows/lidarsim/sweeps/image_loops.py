@@ -1,4 +1,4 @@
-"""Compiled loop that locates points in range images; see `ray_image`."""
+"""Compiled loop that locates points in the range images of `ray_image`."""
 
 # mypy: disable-error-code="no-untyped-def"
 

@@ -31,7 +31,10 @@ class MirrorLines:
     leftward: bool
 
     def numbers(self, times_ns: Floats) -> Ints:
-        """Return the line number at each time, in nanoseconds since the start of the station."""
+        """Return the line number at each of the given times.
+
+        Times are in nanoseconds since the start of the station.
+        """
         per_second = self.rate_hz * (2 if self.swings else 1)
         # Times are rounded to 1 ns, so a line must start up to 1 ns before its first firing.
         return np.floor((times_ns - self.start_ns + 1) * (per_second / 1e9)).astype(np.int64)

@@ -143,7 +143,7 @@ class RayImage:
 
 
 def require_fired_rays(sweeps: Sweeps) -> FiredRays:
-    """Return the description of all rays in a survey. Raise LidarError if there is none."""
+    """Return the survey's ray description, or raise LidarError if there is none."""
     if sweeps.fired is None:
         raise LidarError(
             "Range images and organized clouds require all returns of a survey. Run it with "

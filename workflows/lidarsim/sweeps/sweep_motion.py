@@ -36,11 +36,14 @@ class FiringPoses:
 
     @property
     def positions(self) -> Floats:
-        """World coordinates in meters. Shape (k, 3), or (3,) if the sensor is static."""
+        """World coordinates in meters.
+
+        The shape is (k, 3), or (3,) if the sensor is static.
+        """
         return self.position if self.offsets is None else self.position + self.offsets.T
 
     def select(self, rows: Any) -> FiringPoses:
-        """Return the poses of selected points."""
+        """Return the poses of the selected points."""
         if self.offsets is None:
             return self
         parts = (self.offsets, self.quaternions, self.steps)
@@ -69,7 +72,7 @@ class FiringPoses:
         return positions, rotations
 
     def move_to_start(self, points: Floats) -> Floats:
-        """Move points with the body to the start of the sweep.
+        """Move points with the body from the time of each point to the start of the sweep.
 
         The points are in world coordinates before and after.
         """
@@ -77,7 +80,7 @@ class FiringPoses:
         return at_start
 
     def rotate_to_start(self, vectors: Floats) -> Floats:
-        """Rotate vectors with the body to the start of the sweep.
+        """Rotate vectors with the body from the time of each vector to the start of the sweep.
 
         The vectors are in the world frame before and after.
         """

@@ -57,7 +57,7 @@ _JSON_FIELDS = (
 
 
 def states_compensation(frame_text: str) -> bool | None:
-    """Return whether the description of a frame states that motion is compensated.
+    """Return whether a frame description states that motion is compensated.
 
     Returns None if the description does not mention motion compensation.
 
@@ -71,7 +71,7 @@ def states_compensation(frame_text: str) -> bool | None:
 
 
 def number_positions(positions: Floats) -> Ints:
-    """Return the number of each position in order of first occurrence, starting at 1.
+    """Assign numbers to positions in order of first occurrence, starting at 1.
 
     Equal positions have the same number. The positions have shape (n, 3), and the result has dtype
     int64 and shape (n,).
@@ -96,23 +96,27 @@ class SweepPoses:
 
     @cached_property
     def rotations(self) -> Floats:
-        """Rotation matrices from the body frame to the world frame. Shape (n, 3, 3)."""
+        """Rotation matrices from the body frame to the world frame.
+
+        The shape is (n, 3, 3).
+        """
         return matrices(self.quaternions)
 
     @cached_property
     def quaternion_matrices(self) -> Floats:
-        """Matrices that convert quaternions to the body frame. Shape (n, 4, 4).
+        """Matrices that convert quaternions to the body frame.
 
-        Multiplying quaternions with these matrices is much faster than composing rotation matrices.
+        The shape is (n, 4, 4). Multiplying quaternions by these matrices is much faster than
+        composing rotation matrices.
         """
         x, y, z, w = self.quaternions.T
         rows = [[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]]
         return np.moveaxis(np.array(rows), -1, 0)
 
     def matrix(self, sweep: int) -> Floats:
-        """Return the transformation from the body frame at the start of a sweep to the world frame.
+        """Return the transformation from the body frame to the world frame at the start of a sweep.
 
-        Shape (4, 4).
+        The shape is (4, 4).
         """
         return affine(self.rotations[sweep], self.positions[sweep])
 
@@ -189,7 +193,7 @@ class Sweeps:
         return exact if self.coordinates == "sensor" else self.pose.to_body_frame(sweep, exact)
 
     def columns_in_sensor(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
-        """Return the columns of a sweep with vectors in the same frame as `in_sensor`."""
+        """Return the columns of a sweep, with vectors in the frame of `in_sensor`."""
         if self.coordinates == "sensor":
             return dict(points.columns)
         return _with_vectors(
@@ -199,14 +203,14 @@ class Sweeps:
         )
 
     def columns_as_fired(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
-        """Return the columns of a sweep with vectors in the same frame as `as_fired`."""
+        """Return the columns of a sweep, with vectors in the frame of `as_fired`."""
         if self.coordinates == "sensor":
             return dict(points.columns)
         poses = self.firing_poses(sweep, points)
         return _with_vectors(points, poses.rotate_to_body_frame, poses.to_body_frame)
 
     def columns_compensated(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
-        """Return the columns of a sweep with vectors in the same frame as `compensated`."""
+        """Return the columns of a sweep, with vectors in the frame of `compensated`."""
         if self.coordinates != "sensor":
             return self.columns_in_sensor(sweep, points)
         poses = self.firing_poses(sweep, points)
@@ -242,7 +246,7 @@ class Sweeps:
         return self._sensor_firing_poses(sweep, self._shares(sweep, points))
 
     def span_ns(self, sweep: int) -> float:
-        """Return the time in nanoseconds from the start of a sweep to its last beam."""
+        """Return the duration from the start of a sweep to its last beam, in nanoseconds."""
         firing_ns = self.lidars[self.sensor[sweep]].firing_ns if self.lidars else 0.0
         return float(self.ends_ns[sweep] - self.begins_ns[sweep]) + firing_ns
 
@@ -251,21 +255,21 @@ class Sweeps:
         return np.clip(self.since_ns(sweep, points) / max(self.span_ns(sweep), 1.0), 0, 1)
 
     def _sensor_firing_poses(self, sweep: int, shares: Floats) -> FiringPoses:
-        """Return the sensor poses at fractions of a sweep."""
+        """Return the sensor poses at the given fractions of a sweep."""
         knots = self.knots[sweep] if len(self.knots) else _NO_KNOTS
         return interpolate_poses(
             knots, self.pose.positions[sweep], self.pose.rotations[sweep], shares
         )
 
     def _actor_firing_poses(self, actor: int, sweep: int, shares: Floats) -> FiringPoses:
-        """Return the poses of an actor at fractions of a sweep."""
+        """Return the poses of an actor at the given fractions of a sweep."""
         row = self.actor_rows[actor, sweep] if len(self.actor_rows) else -1
         knots = self.actor_knots[row] if row >= 0 else _NO_KNOTS
         (rotation,) = matrices(self.actor_poses.quaternions[actor, [sweep]])
         return interpolate_poses(knots, self.actor_poses.positions[actor, sweep], rotation, shares)
 
     def platform_poses_at(self, sweep: int, shares: Floats) -> SweepPoses:
-        """Return the platform poses at fractions of a sweep.
+        """Return the platform poses at the given fractions of a sweep.
 
         `shares` has shape (k,). Values slightly greater than 1 are extrapolated.
         """
@@ -276,7 +280,7 @@ class Sweeps:
         return _poses_of(positions - rotations @ self.mounts.positions[number], rotations)
 
     def actor_poses_at(self, actor: int, sweep: int, shares: Floats) -> SweepPoses:
-        """Return the poses of an actor at fractions of a sweep.
+        """Return the poses of an actor at the given fractions of a sweep.
 
         `shares` has shape (k,). Values slightly greater than 1 are extrapolated.
         """
@@ -360,7 +364,7 @@ class Sweeps:
         return np.asarray(since_begin, np.float64)
 
     def frame_text(self, *, compensated: bool) -> str:
-        """Return the description of the coordinate frame of points that is written to files."""
+        """Return the description of the points' coordinate frame for files."""
         text = COMPENSATED if compensated else AS_FIRED
         return text + _ACTORS_AT_START if self.actors_at_start else text
 
@@ -389,7 +393,7 @@ class Sweeps:
     def station_numbers(self) -> Ints:
         """Station number of each sweep, starting at 1, or 0 if the survey has only one station.
 
-        If a sensor returns to a station, the station keeps its number. Shape (n,).
+        If a sensor returns to a station, the station keeps its number. The shape is (n,).
         """
         numbers = np.zeros(len(self), np.int64)
         if self.stations > 1:
@@ -400,12 +404,18 @@ class Sweeps:
 
     @cached_property
     def numbers(self) -> Ints:
-        """Index of each sweep among the sweeps from its sensor, starting at 0. Shape (n,)."""
+        """Index of each sweep among the sweeps from its sensor, starting at 0.
+
+        The shape is (n,).
+        """
         return np.arange(len(self)) - np.searchsorted(self.sensor, self.sensor)
 
     @classmethod
     def unknown(cls) -> Sweeps:
-        """Return an empty object for points from an unknown survey, with a precision of 1 mm."""
+        """Create placeholder sweeps for points from an unknown survey.
+
+        The precision is 1 mm.
+        """
         none = SweepPoses(np.empty((0, 3)), np.empty((0, 4)))
         return cls(
             scans=np.zeros(1, np.int64),
@@ -565,7 +575,10 @@ class Sweeps:
         path.write_bytes(self.to_bytes())
 
     def to_bytes(self) -> bytes:
-        """Serialize the sweeps as an NPZ archive. Equal sweeps result in equal bytes."""
+        """Serialize the sweeps as an NPZ archive.
+
+        Equal sweeps result in equal bytes.
+        """
         values = {"format": _FORMAT, **{name: getattr(self, name) for name in _JSON_FIELDS}}
         values["lidars"] = [lidar.to_json() for lidar in self.lidars]
         if self.instruments is not None:
@@ -591,7 +604,7 @@ class Sweeps:
 
     @classmethod
     def load(cls, path: Path | str, read: Callable[[], bytes] | None = None) -> Sweeps:
-        """Read sweeps from a file that `save` has written, without unpickling objects.
+        """Read sweeps from a file written by `save`, without unpickling objects.
 
         `read` is a function that returns the content of the file (default: read `path`).
 
@@ -702,7 +715,10 @@ def _fired_rays(survey: Survey, first_steps: list[Ints]) -> FiredRays | None:
 
 
 def _poses_of(positions: Floats, rotations: Floats) -> SweepPoses:
-    """Create poses from positions and rotation matrices, using quaternions with nonnegative w."""
+    """Create poses from positions and rotation matrices.
+
+    The w component of each quaternion is nonnegative.
+    """
     quaternions = quaternions_of(rotations)
     quaternions[quaternions[:, 3] < 0] *= -1  # q and -q represent the same rotation
     return SweepPoses(np.array(positions), quaternions)
@@ -713,7 +729,7 @@ def _with_vectors(
     turn_normals: Callable[[Floats], Floats],
     move_origins: Callable[[Floats], Floats],
 ) -> dict[str, AnyArray]:
-    """Return the columns of points with normals and ray origins converted to a different frame."""
+    """Return the columns of points, converting normals and ray origins to another frame."""
     columns = dict(points.columns)
     for names, convert in ((NORMAL, turn_normals), (ORIGIN, move_origins)):
         if not columns.keys() >= {*names}:

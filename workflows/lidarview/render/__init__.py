@@ -1,1 +1,1 @@
-"""Render scenes with the project's own ray caster, and draw points over them."""
+"""Render scenes with the project's own ray caster and draw points over them."""

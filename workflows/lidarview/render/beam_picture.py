@@ -19,7 +19,7 @@ MAX_FIRINGS = 8  # number of firings that are drawn for sensors with several cha
 
 
 class _BeamPlot(NamedTuple):
-    """Directions and times of rays, and the labels of the axes."""
+    """Ray directions and times with axis labels."""
 
     x_values: Floats  # (n,)
     y_values: Floats  # (n,)
@@ -29,8 +29,8 @@ class _BeamPlot(NamedTuple):
 def beam_page(sensor: Sensor, size: tuple[int, int] = SIZE) -> Page:
     """Draw the directions of a sensor's first rays, colored by time.
 
-    For a sensor with several channels, `MAX_FIRINGS` firings are drawn, and for a sensor with a
-    single channel one frame. For a sensor that looks down, two mirror cycles are drawn. Its rays
+    For a sensor with several channels, `MAX_FIRINGS` firings are drawn. For a sensor with a single
+    channel, one frame is drawn. For a sensor that looks down, two mirror cycles are drawn. Its rays
     lie in a plane, so their angle is plotted over time.
     """
     page = Page(size)
@@ -68,7 +68,7 @@ def beam_page(sensor: Sensor, size: tuple[int, int] = SIZE) -> Page:
 
 
 def _plot_angle(directions: Floats, times: Floats, unit: str) -> _BeamPlot:
-    """Plot the angles of directions in a vertical plane over times."""
+    """Plot the angles of directions in a vertical plane over time."""
     _, y, z = directions.T
     return _BeamPlot(times, np.degrees(np.arctan2(y, -z)), (f"time, {unit}", "angle, degrees"))
 

@@ -25,15 +25,15 @@ class Camera:
     size: tuple[int, int]  # width and height in pixels
 
     def rays(self, pixels: ArrayLike) -> Floats:
-        """Return unit direction vectors through pixel coordinates."""
+        """Return the unit direction vectors of rays through pixel coordinates."""
         plane = (np.asarray(pixels, dtype=np.float64) - self.center) / self.focal
         rays = plane[:, :1] * self.axes[0] - plane[:, 1:] * self.axes[1] + self.axes[2]
         return rays / np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None]
 
     def project(self, points: ArrayLike) -> tuple[Floats, Floats]:
-        """Return the pixel coordinates of points, and their distances from the eye.
+        """Return the pixel coordinates of points and their distances from the eye.
 
-        Points beside or behind the eye have the coordinates NaN.
+        Points beside or behind the eye have NaN as coordinates.
         """
         offset = np.asarray(points, dtype=np.float64) - self.eye
         side, up, ahead = (offset @ self.axes.T).T
@@ -42,7 +42,7 @@ class Camera:
         return pixels, np.sqrt(np.einsum("ij,ij->i", offset, offset))
 
     def sample_image(self, image: AnyArray, pixels: ArrayLike, outside: float) -> AnyArray:
-        """Return the values of an image at pixels.
+        """Return the values of an image at pixel coordinates.
 
         Pixels outside the image have the value `outside`.
         """
@@ -52,7 +52,10 @@ class Camera:
         return np.where(inside, image[row, column], outside)
 
     def footprint(self, distance: ArrayLike) -> Floats:
-        """Return the width in meters that a pixel covers on a facing surface at a distance."""
+        """Return the width in meters that a pixel covers on a surface facing the camera.
+
+        `distance` is the distance to the surface in meters.
+        """
         return np.asarray(distance, dtype=np.float64) / self.focal
 
 
@@ -94,7 +97,10 @@ def fit_camera(
 
 
 def _camera_axes(azimuth: float, elevation: float) -> Floats:
-    """Return `Camera.axes` for a camera in a direction from the scene, given in radians."""
+    """Return `Camera.axes` for a camera at an azimuth and elevation from the scene.
+
+    Both angles are in radians.
+    """
     horizontal = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     back = horizontal * np.cos(elevation) + np.array([0.0, 0.0, np.sin(elevation)])
     right = np.array([-horizontal[1], horizontal[0], 0.0])

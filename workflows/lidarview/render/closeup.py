@@ -1,4 +1,7 @@
-"""Choose the part of a scene to show, around trajectories and below a roof."""
+"""Choose the part of a scene to show.
+
+The part surrounds trajectories and ends below a roof.
+"""
 
 from __future__ import annotations
 
@@ -53,10 +56,10 @@ def surrounding_box(bounds: Floats, trajectories: Sequence[Floats]) -> Floats | 
 def floor_and_cut_heights(
     scene: Scene, caster: RayCaster, positions: Floats
 ) -> tuple[float | None, float | None]:
-    """Return the height of the floor below positions, and the height at which to cut the scene.
+    """Return the floor height below positions and the height at which to cut the scene.
 
-    `positions` has shape (p, 3), and all values are in meters. The cut opens the scene halfway up
-    to the roof. It is None if there is no roof. The floor is None if there is no surface below a
+    `positions` has shape (p, 3), and all values are in meters. The cut height is halfway up to the
+    roof, or None if there is no roof. The floor height is None if there is no surface below a
     position.
     """
     sampled = positions[
@@ -96,7 +99,7 @@ def _relative_spread(heights: Floats) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ScenePart:
-    """A part of a scene, with the origin of each triangle in the scene."""
+    """Triangles of a part of a scene, mapped to the triangles of the entire scene."""
 
     scene: Scene
     parents: Ints  # (f,) triangle of the uncut scene from which each triangle is cut
@@ -108,7 +111,7 @@ class ScenePart:
         return cls(scene, np.arange(len(scene.faces)), np.ones(len(scene.faces)))
 
     def cut(self, box: Floats) -> ScenePart:
-        """Return the part inside a box, or this part if nothing is inside.
+        """Return the part inside a box, or the entire part if the inside is empty.
 
         Objects narrower than the box are kept completely if their center is inside. Wider objects,
         such as the ground, are cut at the sides of the box. All objects are cut at the top, because
@@ -183,9 +186,9 @@ def _clip_triangles(
 
 
 def _crossing(vertices: Floats, beyond: Floats, start: Ints, stop: Ints) -> Floats:
-    """Return the points where the edges between vertices cross a plane.
+    """Return the points where edges cross a plane.
 
-    `beyond` (v,) are the signed distances of all vertices from the plane.
+    `beyond` (v,) contains the signed distances of all vertices from the plane.
     """
     share = beyond[start] / (beyond[start] - beyond[stop])
     return vertices[start] + share[:, None] * (vertices[stop] - vertices[start])

@@ -1,4 +1,4 @@
-"""Choose the colors of points by one of their columns, with a matching legend."""
+"""Choose point colors and a matching legend for a column."""
 
 from __future__ import annotations
 
@@ -46,7 +46,10 @@ _TIME_UNITS = (("s", 1e9), ("ms", 1e6), ("µs", 1e3))  # units for nanoseconds
 
 @dataclass(frozen=True, eq=False)
 class Coloring:
-    """Colors for the values of a column, with a scale between two limits or with labels."""
+    """Colors for the values of a column.
+
+    They are a scale between two limits, or one color per label.
+    """
 
     # Function that returns the colors (n, 3), from 0 to 1, of values (n,).
     paint: Callable[[AnyArray], Floats]
@@ -63,7 +66,7 @@ class Coloring:
 
 
 def add_composed_columns(columns: Mapping[str, Column]) -> dict[str, Column]:
-    """Add `RGB` and `NORMALS` to columns that include all of their components."""
+    """Add `RGB` and `NORMALS` to columns that contain all of their components."""
     composed = {
         name: column
         for name, (column, parts) in _COMPOSED.items()
@@ -87,14 +90,14 @@ def column_values(column: Column, read: Callable[[str], AnyArray]) -> AnyArray:
 def normal_colors(normals: AnyArray) -> Bytes:
     """Return the colors of unit normals, with gray for NaN.
 
-    Points that are not on a surface have the normal NaN.
+    Points that are not on a surface have NaN as their normal.
     """
     known = np.isfinite(normals).all(axis=1, keepdims=True)
     return np.asarray(np.where(known, 127.5 * (1 + normals), 127.5).round().astype(np.uint8))
 
 
 def label_text(value: int, column: Column, names: Sequence[str] = ()) -> str:
-    """Return the text for a label value.
+    """Format a label value as text.
 
     `names` are the names of the values 0, 1, 2, ….
     """
@@ -113,10 +116,10 @@ def make_coloring(
 ) -> Coloring:
     """Choose colors for the values of a column.
 
-    Each label gets its own color. Labels without names that are too many for a legend are shown on
-    a scale, as numbers are. A scale is logarithmic if `Column.scale` is "logarithmic" and the
-    values differ by large factors. Velocities are blue below 0 and red above. NaN is gray, as are
-    labels of points that are not on a surface.
+    Each label gets its own color. If there are too many labels without names for a legend, they are
+    shown on a scale, like numbers. A scale is logarithmic if `Column.scale` is "logarithmic" and
+    the values differ by large factors. Velocities are blue below 0 and red above. NaN is gray, and
+    so are labels of points that are not on a surface.
 
     Parameters
     ----------
@@ -127,7 +130,7 @@ def make_coloring(
     names
         Names of the values 0, 1, 2, … of a label column.
     limits
-        Ends of a scale, in its unit. By default, they are percentiles of the values.
+        Limits of the scale, in its unit. By default, they are percentiles of the values.
     """
     if column in (RGB, NORMALS):
         return Coloring(lambda packs: unpack_colors(packs) / 255, column.name, "", column.meaning)
@@ -144,7 +147,7 @@ def make_coloring(
 
 
 def _label_coloring(labels: Ints, column: Column, names: Sequence[str]) -> Coloring:
-    """Return a color for each label, in the order of the legend."""
+    """Choose a color for each label, in legend order."""
     count = max(len(names), int(labels.max(initial=0)) + 1)
     colors = object_colors(min(count, MAX_COLORS))
     gray = len(colors)
@@ -171,7 +174,10 @@ class _Range(NamedTuple):
 
     @property
     def has_large_factors(self) -> bool:
-        """Whether the numbers are positive and differ by factors that a linear scale would hide."""
+        """Whether a linear scale would hide differences between the numbers.
+
+        This is the case if the numbers are positive and differ by large factors.
+        """
         is_low = self.middle - self.lower < _SKEWED_MEDIAN * (self.upper - self.lower)
         is_skewed = self.upper > _SKEWED_RATIO * self.lower and is_low
         is_wide = self.upper > _WIDE_RATIO * self.lower
@@ -184,7 +190,7 @@ def _number_coloring(
     percentiles: tuple[float, float],
     chosen_limits: tuple[float, float] | None,
 ) -> Coloring:
-    """Return a scale for values between two percentiles or between given limits."""
+    """Create a scale for values between two percentiles or between given limits."""
     finite = np.isfinite(values)
     lower = 0.0
     middle = 0.5

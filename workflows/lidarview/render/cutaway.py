@@ -18,12 +18,13 @@ HIDDEN = 0.65  # a cutaway is made if the camera sees a smaller fraction of the 
 
 @dataclass(frozen=True, eq=False)
 class Cutaway:
-    """The rule that selects which surfaces are removed.
+    """A rule that selects the surfaces to remove.
 
     A hit is removed if its object surrounds the sensors in plan view, the hit is in the outer shell
     of the object, and its plane has the camera on one side and most sensors on the other. Both
-    faces of the walls in front and the roof are therefore removed, while the walls at the back, the
-    floor, and objects inside are kept, regardless of the winding and grouping of triangles.
+    faces of the walls in front and the roof are therefore removed. The walls at the back, the
+    floor, and objects inside are kept. This does not depend on the winding and grouping of
+    triangles.
     """
 
     surface: RenderMesh
@@ -34,7 +35,7 @@ class Cutaway:
 
     @classmethod
     def from_sensors(cls, surface: RenderMesh, sensors: Floats, eye: Floats) -> Cutaway:
-        """Determine the surfaces that hide sensors at positions from a camera at `eye`."""
+        """Determine the surfaces that hide the given sensor positions from a camera at `eye`."""
         core = surface.scene.object_bounds.copy()
         flat = sensors[:, None, :2]
         inside = ((flat > core[None, :, 0, :2]) & (flat < core[None, :, 1, :2])).all(axis=2)
@@ -50,7 +51,7 @@ class Cutaway:
         return cls(surface, sensors, eye, (inside.mean(axis=0) >= 0.5) & ~ground, core)
 
     def is_removed(self, points: Floats, triangle: Ints) -> Bools:
-        """Return a mask of the hits at points on triangles that are removed."""
+        """Return a mask of the removed hits, given their points and triangles."""
         owner = self.surface.scene.face_object[triangle]
         lower = self.core[owner, 0]
         upper = self.core[owner, 1]
@@ -66,7 +67,7 @@ class Cutaway:
 
 
 def plan_cutaway(surface: RenderMesh, poses: Floats, eye: Floats) -> Cutaway | None:
-    """Return a cutaway that lets a camera see the surroundings of sensors at positions.
+    """Plan a cutaway that lets a camera see the surroundings of the given sensor positions.
 
     Returns None if the sensors are outdoors, or if the camera sees enough without a cutaway.
     """
@@ -88,7 +89,7 @@ def plan_cutaway(surface: RenderMesh, poses: Floats, eye: Floats) -> Cutaway | N
 
 
 def _probes(sensors: Floats, count: int, low_deg: float, high_deg: float) -> tuple[Floats, Floats]:
-    """Return origins and directions of rays from sensors between two elevations."""
+    """Return the origins and directions of rays from sensors between two elevations."""
     rays = golden_spiral(count, *np.sin(np.radians([low_deg, high_deg])))
     return np.repeat(sensors, count, axis=0), np.tile(rays, (len(sensors), 1))
 

@@ -1,4 +1,7 @@
-"""Render a film of points as they are scanned, over the scene on a dark background."""
+"""Render a film of points as they are scanned.
+
+The film also shows the scene, on a dark background.
+"""
 
 from __future__ import annotations
 
@@ -46,15 +49,13 @@ _NOISE = 0.02  # distance of a point from its surface, as a fraction of its rang
 
 
 class _Shape(NamedTuple):
-    """Triangles in a single color."""
-
     caster: RayCaster
     normals: Floats  # (f, 3)
     color: Floats  # (4,)
 
 
 class _CameraPath(NamedTuple):
-    """Positions and targets of the camera in all frames, in meters."""
+    """Camera positions and targets in all frames, in meters."""
 
     eyes: Floats  # (k, 3)
     targets: Floats  # (k, 3)
@@ -62,7 +63,6 @@ class _CameraPath(NamedTuple):
     focus: float  # distance from the camera to the center of the scene or to the platform
 
     def camera(self, number: int) -> Camera:
-        """Return the camera for a frame."""
         ahead = normalize((self.targets - self.eyes)[number, None])
         right = normalize(np.cross(ahead, [0.0, 0.0, 1.0]))
         axes = np.concatenate([right, np.cross(right, ahead), ahead])
@@ -78,14 +78,13 @@ class _FilmPoints:
     first_frame: Floats = field(default_factory=lambda: np.empty(0))
 
     def add(self, number: int, positions: Floats, colors: Floats) -> None:
-        """Add the points of a frame."""
         self.positions = np.vstack([self.positions, positions])
         self.colors = np.vstack([self.colors, colors])
         new = np.full(len(self.positions) - len(self.first_frame), number)
         self.first_frame = np.append(self.first_frame, new)
 
     def select(self, chosen: Bools) -> None:
-        """Discard all points except those in a mask."""
+        """Keep only the points that a mask selects."""
         self.positions = self.positions[chosen]
         self.colors = self.colors[chosen]
         self.first_frame = self.first_frame[chosen]
@@ -134,13 +133,13 @@ class Film:
             points.select(is_old | (random.random(len(is_old)) < self.keep_share))
 
     def _actor_shapes(self, moment_ns: float) -> list[_Shape]:
-        """Return the triangles of the actors that are present at a time."""
+        """Return the triangles of the actors that are present at a given time."""
         meshes = [actor.placed(moment_ns) for actor in self.actors]
         present = [mesh.vertices[mesh.faces] for mesh in meshes if np.ptp(mesh.vertices, 0).any()]
         return [_shape(np.concatenate(present), ACTOR)] if present else []
 
     def _camera_path(self) -> _CameraPath:
-        """Choose the position and the target of the camera in each frame."""
+        """Choose the camera position and target in each frame."""
         count = len(self.moments_ns)
         if self.platform_trajectory is None:
             azimuth = 2 * np.pi * np.arange(count) / count - 1.1
@@ -190,7 +189,7 @@ def _draw_points(
 
 
 def _draw_trajectory(frame: Image.Image, camera: Camera, positions: Floats) -> None:
-    """Draw the positions of the platform as a line that ends in a disc."""
+    """Draw the platform positions as a line that ends in a disc."""
     pen = ImageDraw.Draw(frame)
     pixels, _ = camera.project(positions)
     line = [(float(x), float(y)) for x, y in pixels if max(abs(x), abs(y)) < _MAX_PIXEL]
@@ -200,7 +199,7 @@ def _draw_trajectory(frame: Image.Image, camera: Camera, positions: Floats) -> N
 
 
 def _shape(corners: AnyFloats, color: Floats) -> _Shape:
-    """Prepare triangles with corners for ray casting."""
+    """Prepare triangles for ray casting, given their corners."""
     normals = normalize(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
     return _Shape(RayCaster(corners.reshape(-1, 3), faces), normals, color)
@@ -209,7 +208,7 @@ def _shape(corners: AnyFloats, color: Floats) -> _Shape:
 def _draw_surfaces(
     shapes: Sequence[_Shape], camera: Camera, focus: float, top: float
 ) -> tuple[AnyFloats, Floats]:
-    """Draw surfaces, and return the RGBA image and the depth.
+    """Draw surfaces and return the RGBA image and the depth.
 
     The depth is in meters.
     """
@@ -236,9 +235,10 @@ def _draw_surfaces(
 
 
 def _edges(inverse_depth: Floats) -> Floats:
-    """Return the strength of the edges between surfaces. Shape (height, width, 1).
+    """Return the strength of the edges between surfaces.
 
     The inverse depth of a plane is linear in the image. Beyond an edge, it falls below this line.
+    The shape is (height, width, 1).
     """
     padded = np.pad(inverse_depth, 1, mode="edge")
     sides = (

@@ -1,4 +1,4 @@
-"""Color the surfaces of a scene by hits per square meter."""
+"""Color the surfaces of a scene by the number of hits per square meter."""
 
 from __future__ import annotations
 
@@ -51,7 +51,8 @@ def hit_colors(
     colors
         (k, 3, 3) colors at the corners.
     limits
-        Ends of the logarithmic scale in hits per square meter. The colors of the scale are `TURBO`.
+        Limits of the logarithmic scale in hits per square meter. The colors of the scale are
+        `TURBO`.
     """
     triangle_density = hit_density(scene, hit_counts)
     pieces, owner, areas, point_density = _divide(corners, hit_counts > 0, points, max_pieces)
@@ -86,15 +87,15 @@ def hits_title(limits: tuple[float, float]) -> str:
 
 
 def density_label(density: float) -> str:
-    """Return hits per square meter as a label."""
+    """Format a hit density as a label."""
     return f"{density:.2g}" if density < 10 else f"{density:,.0f}"
 
 
 def _corner_means(pieces: Floats32, areas: Floats, density: Floats) -> Floats:
-    """Return the mean density of all pieces around each corner, for smooth transitions.
+    """Return the mean density of all pieces around each corner.
 
-    `pieces` (k, 3, 3) are the corners, `areas` (k,) are in square meters, and `density` (k, 3) is
-    given at the corners, as is the result.
+    This makes transitions smooth. `pieces` (k, 3, 3) contains the corners, and `areas` (k,) is in
+    square meters. `density` and the result (k, 3) are given at the corners.
     """
     corner_keys = np.ascontiguousarray(pieces).view("V12").ravel()
     _, corner = np.unique(corner_keys, return_inverse=True)
@@ -105,7 +106,7 @@ def _corner_means(pieces: Floats32, areas: Floats, density: Floats) -> Floats:
 
 
 def hit_density(scene: Scene, hit_counts: AnyArray) -> Floats:
-    """Return the hits per square meter on triangles, given the hits on each triangle.
+    """Return the number of hits per square meter on each triangle.
 
     If most triangles are so small that they have at most one hit, neighbors share their hits. Each
     triangle passes a third of its hits to each corner, and each corner distributes them by area.
@@ -131,7 +132,7 @@ def _rounds(hit_counts: Floats) -> int:
 
 
 def _share(faces: Ints32, hit_counts: Floats, area: Floats, vertices: int) -> Floats:
-    """Distribute hits over the triangles that share a corner, in proportion to area."""
+    """Distribute hits by area over the triangles that share a corner."""
     corner_hits = np.zeros(vertices)
     corner_areas = np.zeros(vertices)
     for corner in faces.T:
@@ -146,9 +147,9 @@ def _share(faces: Ints32, hit_counts: Floats, area: Floats, vertices: int) -> Fl
 
 
 def _density_range(density: Floats, areas: Floats) -> tuple[float, float]:
-    """Choose the ends of a logarithmic scale for densities on areas.
+    """Choose the limits of a logarithmic density scale.
 
-    Few hits are on surfaces below the scale, and little area is above it.
+    Few hits are on surfaces below the lower limit, and little area is above the upper limit.
     """
     lower = 1.0
     upper = 10.0
@@ -177,10 +178,10 @@ def _density_colors(density: Floats, hit: Bools, limits: tuple[float, float]) ->
 def _divide(
     pieces: Floats32, hit: Bools, points: Floats32, max_pieces: int
 ) -> tuple[Floats32, Ints, Floats, Floats]:
-    """Divide triangles with hits as long as the grid cells contain enough points.
+    """Divide triangles with hits while their grid cells contain enough points.
 
-    Returns the pieces, their owners, their areas, and their points per square meter, which are NaN
-    for undivided triangles.
+    Returns the pieces with their owners, areas, and points per square meter. The points per square
+    meter are NaN for undivided triangles.
     """
     owner = np.arange(len(pieces))
     areas = triangle_areas(pieces)
@@ -224,7 +225,7 @@ def _divide(
 
 
 class _WeightGrid:
-    """Sums of the weights of positions in the cells of a grid."""
+    """Sums of position weights in the cells of a grid."""
 
     def __init__(self, positions: Floats32, weights: Floats, width: float, lower: Floats32) -> None:
         self._width = width
@@ -234,7 +235,7 @@ class _WeightGrid:
         self._sums = np.bincount(cells, weights)
 
     def interpolate(self, positions: Floats32) -> Floats:
-        """Return sums at positions, interpolated between the eight nearest cells."""
+        """Return the sums at positions, interpolated between the eight nearest cells."""
         offsets = (positions - self._lower) / self._width - 0.5
         total = np.zeros(len(positions))
         cells = np.floor(offsets).astype(np.int64)
@@ -254,13 +255,15 @@ def _keys(cells: Ints) -> Ints:
 
 
 def _longest(pieces: Floats32) -> tuple[Indices, Floats32]:
-    """Return the index and the length of the longest edge of each piece. Shape (k,)."""
+    """Return the index and the length of each piece's longest edge.
+
+    Both arrays have shape (k,).
+    """
     lengths = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2)
     return lengths.argmax(axis=1), lengths.max(axis=1)
 
 
 def _halved(pieces: Floats32) -> tuple[Floats32, Floats32]:
-    """Split each piece at the midpoint of its longest edge."""
     rows = np.arange(len(pieces))
     edge = _longest(pieces)[0]
     a, b, c = (pieces[rows, (edge + k) % 3] for k in range(3))

@@ -1,4 +1,4 @@
-"""Compute the light on surfaces from the visible parts of the sky and the sun."""
+"""Compute the light on surfaces from the visible fractions of sky and sun."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SUN = 0.36
 
 @dataclass(frozen=True, eq=False)
 class LightMap:
-    """The light at a grid of pixels, and the surfaces in these pixels."""
+    """The light at a grid of pixels, with the surfaces that these pixels show."""
 
     camera: Camera
     sun: Floats  # (3,) unit vector toward the sun
@@ -42,7 +42,7 @@ class LightMap:
     def brightness(
         self, pixels: Floats, position: Floats32, normal: Floats32, ground: Bools
     ) -> Floats32:
-        """Return the brightness of points by Lambert's law and the visible part of the sky.
+        """Return the brightness of points by Lambert's law and the visible fraction of the sky.
 
         `pixels` (n, 2) are the pixel coordinates of the points, and `position` and `normal` (n, 3)
         their positions and normals. `ground` (n,) marks points on the ground, which keep their
@@ -79,7 +79,7 @@ class LightMap:
 def surface_similarity(
     position: Floats32, normal: Floats32, spot: Floats32, facing: Floats32, tolerance: Floats32
 ) -> Floats32:
-    """Return the similarity of points to the surface at other points, from 0 to 0.4.
+    """Return the similarity, from 0 to 0.4, between points and the surface at other points.
 
     `spot` and `facing` (n, 3) are the positions and normals of the other points. Points on the same
     surface lie within `tolerance` (n,) meters of each other's plane.
@@ -90,7 +90,7 @@ def surface_similarity(
 
 
 def plane_tolerance(camera: Camera, position: Floats32, stride: int) -> Floats32:
-    """Return the tolerance in meters for points on a plane that are `stride` pixels apart."""
+    """Return the tolerance in meters for points that are `stride` pixels apart on a plane."""
     offset = position - camera.eye.astype(np.float32)
     distance = np.sqrt(dot(offset, offset))
     return (3 * stride * camera.footprint(distance)).astype(np.float32)
@@ -114,7 +114,7 @@ def make_light_map(
     normal: Floats32,
     reach: float,
 ) -> LightMap:
-    """Cast rays from a grid of surface points to lights in the sky and in the sun.
+    """Cast rays from a grid of surface points to lights in the sky and the sun.
 
     All points use the same lights, because small steps in brightness are invisible, while random
     directions would cause noise. Surfaces that the cutaway removes cast no shadow, and neither do
@@ -149,16 +149,16 @@ def make_light_map(
 
 
 def _quarters(has_surface: Bools) -> Ints:
-    """Return the number (0 to 3) of each grid point with a surface in its block of two by two.
+    """Return which quarter of its two-by-two block each grid point with a surface occupies.
 
-    `has_surface` has shape (rows, columns).
+    Quarters are numbered from 0 to 3. `has_surface` has shape (rows, columns).
     """
     row, column = np.nonzero(has_surface)
     return np.asarray(row % 2 + 2 * (column % 2))
 
 
 def _rotated(direction: Floats, rotation: float) -> Floats:
-    """Return a direction in four rotations about z, `rotation` radians apart."""
+    """Rotate a direction about z, returning four directions that are `rotation` radians apart."""
     x, y, z = direction
     angles = rotation * np.arange(4)
     cos = np.cos(angles)
@@ -167,10 +167,10 @@ def _rotated(direction: Floats, rotation: float) -> Floats:
 
 
 def _lights(sun: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return directions, strengths, and rotations of lights in the sky and the sun.
+    """Return the directions, strengths, and rotations of lights.
 
-    The directions (k, 3) are evenly spread. The strengths (k,) add up to 1 on level ground. The
-    rotations (k,) are in radians.
+    The lights represent the sky and the sun. The directions (k, 3) are evenly spread. The strengths
+    (k,) add up to 1 on level ground. The rotations (k,) are in radians.
     """
     n = np.arange(SUN_LIGHTS)
     azimuth = 2 * np.pi * 0.6180339887 * n

@@ -1,4 +1,4 @@
-"""Draw a sensor's scan pattern, with a frame and the coverage of the field of view over time."""
+"""Draw a sensor's scan pattern: one frame, and the field of view's coverage over time."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _NARROW_SIZE = (1600, 640)
 
 
 class _Pattern(NamedTuple):
-    """Ray directions in a frame, and the first time at which each direction cell is hit.
+    """Ray directions in a frame, and the time at which each direction cell is first hit.
 
     Attributes
     ----------
@@ -43,7 +43,8 @@ class _Pattern(NamedTuple):
     times_s
         (n,) times of the rays in seconds.
     met_s
-        (rows, columns) time of the first ray in each cell, in seconds, or infinity.
+        (rows, columns) time at which each cell is first hit, in seconds, or infinity for cells that
+        are never hit.
     every
         The frame contains only one out of this many firings.
     """
@@ -56,7 +57,7 @@ class _Pattern(NamedTuple):
 
 
 class _Window(NamedTuple):
-    """The part of the cell grid that has rays."""
+    """The part of the cell grid that contains rays."""
 
     row_range: slice
     column_range: slice
@@ -64,9 +65,9 @@ class _Window(NamedTuple):
 
 
 def draw_pattern(path: Path, sensor: Sensor) -> None:
-    """Write the picture of `pattern_page` as a .png file.
+    """Draw a sensor's scan pattern in a .png file.
 
-    Raises LidarError if the file cannot be written.
+    The image is that of `pattern_page`. Raises LidarError if the file cannot be written.
     """
     pattern_page(sensor).save(path)
 
@@ -120,7 +121,6 @@ def pattern_page(sensor: Sensor) -> Page:
 
 
 def _pattern_of(sensor: Sensor) -> _Pattern:
-    """Compute the scan pattern of a sensor."""
     per_second = _firings_per_second(sensor)
     per_frame = max(round(getattr(sensor.head, "firings_per_turn", per_second / 10)), 1)
     every = -(-per_frame * sensor.channels // _MAX_FRAME_RAYS)
@@ -145,25 +145,25 @@ def _firings_per_second(sensor: Sensor) -> float:
 
 
 def _angles_deg(sensor: Sensor, firings: Ints) -> tuple[Floats, Floats]:
-    """Return the azimuths and elevations of the rays in firings."""
+    """Return the azimuths and elevations of the rays in the given firings."""
     x, y, z = sensor.directions(firings).reshape(-1, 3).T
     return np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(np.clip(z, -1, 1)))
 
 
 def _times_s(sensor: Sensor, firings: Ints) -> Floats:
-    """Return the times of the rays in firings, relative to the start of the sensor."""
+    """Return the times of the rays in the given firings, relative to the start of the sensor."""
     times_ns = sensor.times_ns(firings).reshape(-1).astype(np.float64)
     return (times_ns - sensor.start_ns) / 1e9
 
 
 def _cells(azimuths_deg: Floats, elevations_deg: Floats) -> tuple[Ints, Ints]:
-    """Return the rows and columns of the cells that contain directions."""
+    """Return the rows and columns of the cells that contain the given directions."""
     rows = ((elevations_deg + 90) / CELL_DEG).astype(np.int64)
     return rows, ((azimuths_deg + 180) / CELL_DEG).astype(np.int64)
 
 
 def _window(pattern: _Pattern) -> _Window:
-    """Return the part of the grid that has rays, with a margin of one cell."""
+    """Return the part of the grid that contains rays, with a margin of one cell."""
     met = np.isfinite(pattern.met_s)
     met[_cells(pattern.azimuths_deg, pattern.elevations_deg)] = True
     edges = []
@@ -197,7 +197,10 @@ def _coverages(met_s: Floats, has_shares: bool) -> list[tuple[str, Bools]]:
 
 
 def _charts(page: Page, count: int, is_wide: bool, window: _Window) -> list[Axes]:
-    """Add charts to a page, stacked if the field of view is wide, otherwise side by side."""
+    """Add charts to a page.
+
+    They are stacked if the field of view is wide, and side by side otherwise.
+    """
     left, right, bottom, top = window.extent
     limits = {"xlim": (left, right), "ylim": (bottom, top)}
     charts = []
@@ -218,7 +221,7 @@ def _charts(page: Page, count: int, is_wide: bool, window: _Window) -> list[Axes
 
 
 class _TimeScale(NamedTuple):
-    """The time unit of a picture, and its color scale."""
+    """The time unit and color scale of a plot."""
 
     unit: str
     per_s: float
@@ -266,7 +269,7 @@ def _draw_rays(
     scale: _TimeScale,
     area: float,
 ) -> None:
-    """Draw rays as dots with an area, colored by their times."""
+    """Draw rays as dots of a given area, colored by time."""
     axes.scatter(
         *angles_deg,
         s=area * page.unit**2,

@@ -1,4 +1,4 @@
-"""Compose a picture from a rendered image, axes, a legend, a color bar, and a title."""
+"""Compose a plot from a rendered image, axes, a legend, a color bar, and a title."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ DPI = 200
 FONT = "DejaVu Sans"  # included in Matplotlib
 MAX_LARGE_MARKERS = 40  # more sensors than this are drawn as small dots
 MAX_PATH_POINTS = 200  # maximum number of points on the drawn trajectory of a sensor
-# Areas of markers with one and two digits, in square points for a picture 1600 pixels wide.
+# Areas of markers with one and two digits, in square points for a plot 1600 pixels wide.
 _MARK = 62
 _MARK_OF_TWO_DIGITS = 92
 MAX_NAMES = 12  # actors are not named if there are more
-# All lengths below are in pixels for a picture 1600 pixels wide.
+# All lengths below are in pixels for a plot 1600 pixels wide.
 NAME_ABOVE = 26.0
 NAME_SIZE = (150.0, 26.0)
 LEGEND_ROWS = 30
@@ -54,7 +54,10 @@ MIN_AXIS = 36.0  # a shorter height axis has no tick labels
 
 
 class Page:
-    """A picture under construction, whose size is its width and height in pixels."""
+    """A plot under construction.
+
+    Its size is the width and height in pixels.
+    """
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
@@ -62,9 +65,9 @@ class Page:
         self.unit = size[0] / 1600  # fonts and lines scale with the picture
 
     def show(self, shot: SurfaceView, image: AnyFloats) -> Axes:
-        """Draw a colored view with the grid on its ground, its axes, sensors, and actor names.
+        """Draw a colored view with grid, axes, sensors, and actor names.
 
-        The returned axes use the pixel coordinates of the view.
+        The grid is on the ground. The returned axes use the pixel coordinates of the view.
         """
         colors = image[..., :3]
         opacity = image[..., 3:]
@@ -82,7 +85,7 @@ class Page:
         return axes
 
     def _label_axes(self, axes: Axes, shot: SurfaceView) -> None:
-        """Write tick labels and titles along the front edges and up the left corner."""
+        """Write tick labels and axis titles along the front edges and the left corner."""
         label_positions: list[Floats] = []
         for k, (start, end, outward) in enumerate(_axis_edges(shot)):
             axis = shot.stage.axes[k]
@@ -139,7 +142,7 @@ class Page:
         text_artist.set_parse_math(False)  # names come from files
 
     def _draw_sensors(self, axes: Axes, shot: SurfaceView) -> None:
-        """Draw the paths of sensors, and a marker on a stem for each sensor.
+        """Draw the sensors' paths, and a marker on a stem for each sensor.
 
         Markers of hidden sensors are hollow.
         """
@@ -250,7 +253,7 @@ class Page:
     def draw_lines(
         self, axes: Axes, shot: SurfaceView, segments: Floats, width: float, alpha: float
     ) -> None:
-        """Draw the visible parts of line segments in the color of sensors."""
+        """Draw the visible parts of line segments in the sensor color."""
         runs = shot.visible_segments(segments, shot.project_visible)
         axes.add_collection(
             LineCollection(
@@ -316,7 +319,7 @@ class Page:
         return axes
 
     def title(self, text: str, *details: str) -> None:
-        """Write a title at the top left, above lines with details."""
+        """Write a title at the top left, with details in the lines below."""
         line = 0.05 * self.size[0] / self.size[1] / 1.6
         position = 0.03, 1 - line
         self._text(self.figure, position, text, 11, theme.INK, ha="left", weight="bold")
@@ -342,9 +345,9 @@ class Page:
     ) -> None:
         """Draw a legend in the right margin.
 
-        `entries` are (name, color). If there are more than `LEGEND_ROWS`, the last line states the
-        number of omitted entries. `sensor` is the label of the sensor marker, which is omitted if
-        the label is empty. The options are passed to `key`.
+        `entries` contains tuples (name, color). If there are more than `LEGEND_ROWS`, the last line
+        states the number of omitted entries. `sensor` is the label of the sensor marker, which is
+        omitted if the label is empty. The options are passed to `key`.
         """
         rows = [("s", name, color) for name, color in entries[:LEGEND_ROWS]]
         if sensor:
@@ -405,7 +408,7 @@ class Page:
         title: str,
         frame: tuple[float, float, float, float] = (0.862, 0.27, 0.014, 0.46),
     ) -> None:
-        """Draw a color bar with colors and a title in the right margin."""
+        """Draw a color bar with a title in the right margin."""
         axes = self.figure.add_axes(frame)
         bar = self.figure.colorbar(ScalarMappable(norm, ListedColormap(colors)), cax=axes)
         bar.outline.set_visible(False)
@@ -434,7 +437,7 @@ class Page:
             _label_in_full(axes.yaxis)
 
     def save(self, path: Path) -> None:
-        """Write the page as a PNG file in its light colors, replacing an existing file or link.
+        """Write the page as a PNG file in light colors, replacing an existing file or link.
 
         Raises
         ------
@@ -446,7 +449,7 @@ class Page:
             Storage.at(path.parent, durable=False).write(path.name, self.png())
 
     def png(self) -> bytes:
-        """Return the page as PNG data in its light colors."""
+        """Return the page as PNG data in light colors."""
         image = io.BytesIO()
         self.figure.savefig(image, dpi=DPI, format="png")
         return image.getvalue()
@@ -470,7 +473,10 @@ class Page:
 
 
 def label_logarithms(axis: Axis, is_narrow: bool) -> None:
-    """Label a logarithmic axis with 1, 2, 5, 10, … if narrow, otherwise with powers of ten."""
+    """Label a logarithmic axis.
+
+    A narrow axis has the labels 1, 2, 5, 10, …, and any other axis has powers of ten.
+    """
     axis.set_major_locator(LogLocator(subs=(1, 2, 5) if is_narrow else (1,)))
     axis.set_major_formatter(lambda value, _: f"{value:,.12g}")
     axis.set_minor_formatter(NullFormatter())
@@ -487,7 +493,10 @@ def _label_in_full(axis: Axis) -> None:
 
 
 def _grid(shot: SurfaceView) -> Floats:
-    """Return the border of the ground, and a line at each tick. Shape (n, 2, 3)."""
+    """Return the border of the ground and a line at each tick.
+
+    The shape is (n, 2, 3).
+    """
     (x0, y0), (x1, y1) = shot.stage.ground.tolist()
     level = shot.stage.level
     x_ticks, y_ticks = (axis.ticks.tolist() for axis in shot.stage.axes[:2])
@@ -515,6 +524,6 @@ def _axis_edges(shot: SurfaceView) -> list[tuple[Floats, Floats, Floats]]:
 
 
 def robot_name(name: str) -> str:
-    """Return the robot of a link named ROBOT/LINK, or the name of any other actor."""
+    """Return the robot's name for a link named ROBOT/LINK, or the name of any other actor."""
     # Names of traffic actors contain a file name in parentheses, which may include a slash.
     return name if "(" in name else name.partition("/")[0]

@@ -1,4 +1,4 @@
-"""Draw pictures of the objects, the hit density, and the points of a scene."""
+"""Draw the objects, the hit density, and the points of a scene."""
 
 from __future__ import annotations
 
@@ -80,8 +80,8 @@ def draw_hits(
     points
         (n, 3) evenly spaced sample of the hits, local, in meters. It may have gaps.
     sample_rays
-        (n, 2, 3) start and end points of rays, local, in meters. Some of the rays that end in the
-        picture are drawn.
+        (n, 2, 3) start and end points of rays, local, in meters. Some of the rays that end inside
+        the plot are drawn.
     """
     hits = hit_counts[shot.part.parents] * shot.part.shares
     corners = shot.scene.vertices[shot.scene.faces].astype(np.float32)
@@ -108,7 +108,7 @@ def _sensor_label(shot: SurfaceView) -> str:
 
 
 def _choose_rays(shot: SurfaceView, sample_rays: AnyFloats) -> AnyFloats:
-    """Select some of the rays that end in the picture."""
+    """Select some of the rays that end inside the plot."""
     slack = 1e-3 * shot.stage.size
     lowest, highest = shot.stage.bounds
     ray_ends = sample_rays[:, 1]
@@ -126,7 +126,7 @@ def draw_cloud(
     names: Sequence[str] = (),
     solid: bool = False,
 ) -> Page:
-    """Draw a cloud colored by a column over the scene in pale colors.
+    """Draw a cloud, colored by a column, over the scene in pale colors.
 
     Parameters
     ----------
@@ -190,9 +190,10 @@ def _group_objects(names: Sequence[str], actors: int) -> tuple[Ints, list[str]]:
 
 
 def _object_colors(scene: Scene, kinds: Ints) -> Floats:
-    """Return the colors of a scene's objects, one color for each group.
+    """Return the colors of a scene's objects.
 
-    Floors and halls are gray, so that the objects inside stand out.
+    All objects in a group have the same color. Floors and halls are gray, so that the objects
+    inside stand out.
     """
     width = scene.object_bounds[:, 1] - scene.object_bounds[:, 0]
     scene_size = np.maximum(scene.bounds[1] - scene.bounds[0], 1e-9)

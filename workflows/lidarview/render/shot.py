@@ -1,4 +1,4 @@
-"""Determine the surface and the light in each pixel of a picture, before coloring."""
+"""Determine the surface and the light in each pixel of an image before it is colored."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _PIECE_GAP = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class RaySamples:
-    """Hits of camera rays.
+    """Samples of camera rays, with the hit of each ray.
 
     Every array has a row for each ray.
     """
@@ -54,9 +54,9 @@ class RaySamples:
     weights: Floats32  # (n, 3) weights of the triangle's corners
 
     def scatter(self, which: Ints, count: int) -> RaySamples:
-        """Return `count` samples of the sky in which these samples replace those at given indices.
+        """Spread these samples over `count` samples, the rest of which show the sky.
 
-        `which` (n,) are the indices of the samples.
+        `which` (n,) contains the new indices of these samples.
         """
         result = RaySamples(
             np.full(count, SKY),
@@ -109,14 +109,14 @@ class SurfaceView:
 
     @property
     def scene(self) -> Scene:
-        """Scene with the drawn triangles."""
+        """Scene with the triangles to draw."""
         return self.part.scene
 
     @property
     def depth(self) -> Floats32:
-        """Distance from the camera to the surface in meters. Shape (height, width).
+        """Distance from the camera to the surface in meters.
 
-        Pixels without a surface have an infinite distance.
+        The shape is (height, width). Pixels without a surface have an infinite distance.
         """
         return self.pixel_samples.distance.reshape(self.camera.size[::-1])
 
@@ -142,10 +142,10 @@ class SurfaceView:
         return np.clip(image, 0, 1).reshape(*self.camera.size[::-1], 4)
 
     def subdivide(self, pieces: Floats32, owner: Ints) -> SurfaceView:
-        """Return the same view with triangles divided into pieces that can be colored.
+        """Return the same view with triangles divided into separately colored pieces.
 
-        `pieces` (k, 3, 3) are the corners of the pieces, and `owner` (k,) is the triangle of each
-        piece. The first piece of each triangle has the number of the triangle.
+        `pieces` (k, 3, 3) contains the corners of the pieces, and `owner` (k,) is the triangle of
+        each piece. The first piece of each triangle keeps the number of the triangle.
         """
         is_divided = np.append(np.bincount(owner) > 1, [False, False])
         back = _PIECE_GAP * self.stage.size
@@ -172,7 +172,7 @@ class SurfaceView:
         )
 
     def project_visible(self, points: ArrayLike) -> tuple[Floats, Bools]:
-        """Return the pixel coordinates of local points, and a mask of the visible points.
+        """Return the pixel coordinates of local points and a mask of the visible points.
 
         The points have shape (n, 3), the pixel coordinates (n, 2), and the mask (n,).
         """
@@ -181,7 +181,7 @@ class SurfaceView:
         return pixels, distance <= depth + 2 * self.camera.footprint(distance)
 
     def project_ground(self, points: ArrayLike) -> tuple[Floats, Bools]:
-        """Return the pixel coordinates of points on the ground, and a mask of the visible points.
+        """Return the pixel coordinates of ground points and a mask of the visible points.
 
         The points have shape (n, 3), the pixel coordinates (n, 2), and the mask (n,).
         """
@@ -197,7 +197,7 @@ class SurfaceView:
         `is_visible` returns the pixel coordinates of points and a visibility mask. The result
         contains the pixel coordinates (2, 2) of the ends of each piece.
         """
-        # Steps have equal lengths in the picture, where 1 / depth is linear.
+        # Steps have equal lengths in the image, where 1 / depth is linear.
         start_depth, stop_depth = (
             (segments[:, end] - self.camera.eye) @ self.camera.axes[2] for end in (0, 1)
         )
@@ -248,11 +248,11 @@ def take_shot(
     actors
         Number of actors, which are the last objects of the scene.
     caption
-        Caption of the picture, by default the number of sensors.
+        Caption of the plot. The default is the number of sensors.
     models
         Sensor models, for a second caption.
     size
-        Width and height of the picture in pixels.
+        Width and height of the plot in pixels.
     backend
         Backend of the ray caster.
     """
@@ -290,7 +290,7 @@ def take_shot(
 
 
 class _OpenScene(NamedTuple):
-    """The displayed part of a scene, cut open above sensors in a building."""
+    """The displayed part of a scene, which is cut open above sensors in a building."""
 
     part: ScenePart
     surface: RenderMesh  # surface of the part
@@ -301,7 +301,10 @@ class _OpenScene(NamedTuple):
 
     @property
     def remark(self) -> str:
-        """Remark on the displayed part for a caption, or an empty string for the whole scene."""
+        """Caption remark about the displayed part.
+
+        It is an empty string if the entire scene is displayed.
+        """
         if self.box is None:
             return ""
         width, depth, _ = np.ptp(self.box, axis=0)
@@ -314,7 +317,7 @@ class _OpenScene(NamedTuple):
 def _open_scene(
     scene: Scene, positions: Floats, trajectories: Sequence[Floats], backend: str
 ) -> _OpenScene:
-    """Select the part of a scene around trajectories, and remove the roof above the sensors."""
+    """Select the part of a scene around trajectories and remove the roof above the sensors."""
     box = surrounding_box(scene.bounds, trajectories)
     part = ScenePart.from_scene(scene)
     if box is not None:
@@ -368,7 +371,7 @@ class _Viewpoint:
         return RaySamples(triangle, distance.astype(np.float32), position, normal, light, weights)
 
     def light_map(self, samples: RaySamples) -> LightMap:
-        """Compute the light on a coarse grid of the samples of all pixels."""
+        """Compute the light for a coarse grid of pixel samples."""
         width, height = self.camera.size
         coarse = (slice(STRIDE // 2, None, STRIDE),) * 2
         position = samples.position.reshape(height, width, 3)[coarse]
@@ -379,7 +382,7 @@ class _Viewpoint:
 def _choose_viewpoint(
     surface: RenderMesh, stage: PlotBox, positions: Floats, size: tuple[int, int], has_motion: bool
 ) -> _Viewpoint:
-    """Place a camera, and remove the walls and roofs that hide sensors at positions."""
+    """Place a camera and remove the walls and roofs that hide the given sensor positions."""
     # Moving objects are on the ground between other objects, so the camera looks down more steeply.
     camera = _camera(stage, size, 48.0 if has_motion else 33.0)
     cutaway = plan_cutaway(surface, positions, camera.eye)
@@ -392,14 +395,12 @@ def _choose_viewpoint(
 
 
 def _pixel_centers(size: tuple[int, int]) -> Floats:
-    """Return the coordinates of all pixel centers."""
     width, height = size
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     return np.asarray(grid.reshape(-1, 2) + 0.5)
 
 
 def _add_light(samples: RaySamples, pixels: Floats, light: LightMap) -> None:
-    """Set the light of samples at pixel coordinates."""
     lit = np.flatnonzero(samples.triangle != SKY)
     is_ground = samples.triangle[lit] == GROUND
     samples.light[lit] = light.brightness(
@@ -408,7 +409,7 @@ def _add_light(samples: RaySamples, pixels: Floats, light: LightMap) -> None:
 
 
 def _stage(bounds: Floats, sensors: Floats, origin: Floats) -> PlotBox:
-    """Return a plot box around the scene and the sensors close to it."""
+    """Return a plot box around the scene and the nearby sensors."""
     lower, upper = bounds
     reach = 2 * max(float(np.linalg.norm(upper - lower)), 1e-3)
     close_sensors = sensors[((sensors > lower - reach) & (sensors < upper + reach)).all(axis=1)]
@@ -417,7 +418,7 @@ def _stage(bounds: Floats, sensors: Floats, origin: Floats) -> PlotBox:
 
 
 def _camera(stage: PlotBox, size: tuple[int, int], elevation_deg: float) -> Camera:
-    """Place a camera so that the wider side of the scene runs across the picture."""
+    """Place a camera so that the wider side of the scene runs across the image."""
     is_wide = np.ptp(stage.ground[:, 0]) >= np.ptp(stage.ground[:, 1])
     top = stage.corners.copy()
     top[:, 2] = stage.bounds[1, 2]
@@ -439,7 +440,7 @@ def _outline(stage: PlotBox, camera: Camera) -> Bools:
 
 
 def _ground_distance(stage: PlotBox, eye: Floats, directions: Floats) -> Floats:
-    """Return the distances in meters from the eye to the ground along directions."""
+    """Return the distances in meters from the eye to the ground along the given directions."""
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (stage.level - eye[2]) / directions[:, 2]
         position = eye[:2] + distance[:, None] * directions[:, :2]

@@ -1,4 +1,7 @@
-"""Define the plot box around a scene, with the ground below it and ticks along its axes."""
+"""Define the plot box around a scene.
+
+The ground is at the bottom of the box, and there are ticks along its axes.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ MAX_DIGITS = 5
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """The ticks of an axis."""
+    """An axis with its ticks."""
 
     title: str  # name, offset of the labels, and unit
     ticks: Floats  # (n,) local, in meters, at round world coordinates
@@ -38,7 +41,10 @@ class PlotBox:
 
     @property
     def corners(self) -> Floats:
-        """Corners of the ground, counterclockwise from the lowest x and y. Shape (4, 3)."""
+        """Corners of the ground, counterclockwise from the lowest x and y.
+
+        The shape is (4, 3).
+        """
         (x0, y0), (x1, y1) = self.ground
         return np.array([[x, y, self.level] for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))])
 
@@ -91,7 +97,7 @@ def make_axis(name: str, lower: float, upper: float, step: float, origin: float)
 
 
 def nice_step(length: float) -> float:
-    """Return the smallest of 1, 2, and 5 times a power of ten that is at least `length`.
+    """Round a length up to 1, 2, or 5 times a power of ten.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Prepare the triangles of a scene for rendering, with closest hits and smooth normals."""
+"""Prepare the triangles of a scene for rendering, with ray casting and smooth normals."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class RenderMesh:
         return cls(scene, caster, normalize(doubled), normalize(at_vertices))
 
     def normals(self, triangle: Ints, u: Floats, v: Floats, toward: Floats) -> Floats:
-        """Return the shading normals at hits, on the side that the ray comes from.
+        """Return the shading normals at hits, facing the side from which the ray comes.
 
         The normals are interpolated between the corners (Phong 1975). At creases, the normal of the
         face replaces that of the corner. `toward` (n, 3) are the directions of the rays.
@@ -56,7 +56,7 @@ class RenderMesh:
 
 
 def separate_objects(scene: Scene, objects: Integers, step: float) -> Scene:
-    """Move surfaces inward slightly, so that touching objects do not show through each other.
+    """Move surfaces inward slightly so that touching objects do not show through each other.
 
     Each vertex moves against the angle-weighted mean of the surrounding normals (Thürmer and
     Wüthrich, 1998), so that the sides of a box all move by the same distance. The distance varies
@@ -90,9 +90,10 @@ def separate_objects(scene: Scene, objects: Integers, step: float) -> Scene:
 
 
 def _shared_corners(scene: Scene, objects: Integers) -> Ints:
-    """Return a number for each vertex, equal for vertices of an object at the same position.
+    """Return a number for each vertex.
 
-    Files such as .stl store separate vertices for each triangle, which must not come apart.
+    Vertices of an object at the same position have the same number. In files such as .stl, each
+    triangle has its own vertices, and these triangles must stay connected.
     """
     key = np.zeros(len(scene.vertices), np.uint64)
     key[scene.faces] = objects[:, None]

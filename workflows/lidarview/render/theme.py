@@ -1,4 +1,4 @@
-"""Define the colors of all pictures."""
+"""Define the colors of all plots."""
 
 from __future__ import annotations
 
@@ -36,15 +36,18 @@ OBJECT_COLORS = (
 
 
 def rgb(color: str) -> Floats:
-    """Return a color as an array of shape (3,) with values from 0 to 1."""
+    """Return a color as an array of values from 0 to 1.
+
+    The shape is (3,).
+    """
     return np.array(to_rgb(color))
 
 
 def object_colors(count: int) -> Floats:
-    """Return distinct colors for objects, with values from 0 to 1. Shape (count, 3).
+    """Return distinct colors for objects, with values from 0 to 1.
 
     The first twelve colors come from `OBJECT_COLORS`. Further colors are spread over the hues by
-    the golden angle, with three levels of lightness.
+    the golden angle, with three levels of lightness. The shape is (count, 3).
     """
     chosen = [to_rgb(color) for color in OBJECT_COLORS[:count]]
     further = [
@@ -55,5 +58,5 @@ def object_colors(count: int) -> Floats:
 
 
 def apply_colormap(name: str, fraction: ArrayLike) -> Floats:
-    """Return the colors of a Matplotlib colormap at fractions from 0 to 1."""
+    """Return the colors of a Matplotlib colormap at the given fractions from 0 to 1."""
     return np.asarray(matplotlib.colormaps[name](np.asarray(fraction)), dtype=np.float64)[..., :3]

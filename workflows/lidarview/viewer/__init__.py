@@ -1,1 +1,1 @@
-"""Show points on a browser page, and serve the page."""
+"""Show points on a browser page and serve the page."""

@@ -33,8 +33,8 @@ MAX_PIECES = 60_000  # maximum number of additional triangles from dividing larg
 class DisplayMesh:
     """The triangles of a scene, simplified to a maximum number, in selectable colors.
 
-    Vertices in the same grid cell are merged (Rossignac and Borrel, 1993). Hits on a triangle that
-    vanishes are counted for a neighbor.
+    Vertices in the same grid cell are merged (Rossignac and Borrel, 1993). If this removes a
+    triangle, its hits are counted for a neighboring triangle.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class DisplayMesh:
     def color_by(
         self, by: str, hit_counts: AnyArray, points: Floats32
     ) -> tuple[dict[str, AnyArray], Legend | None]:
-        """Return the arrays for a coloring, and its legend.
+        """Return the arrays for a coloring and its legend.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Serve HTTP requests that pass a check of their headers, over a limited number of connections.
+"""Serve HTTP requests after checking their headers, over a limited number of connections.
 
 A request is refused before its body is read, so programs that do not know the address of the page
 cannot make the server store data. Each request must arrive within a time limit. If too many
@@ -71,7 +71,7 @@ class _GuardedServer(HTTPServer):
     def start_request(
         self, server_conn: object, request_conn: HTTPConnection
     ) -> HTTPMessageDelegate:
-        """Start the time limit of a request, and return the delegate that receives the request."""
+        """Start a request's time limit and return the delegate that receives the request."""
         self._open.add(server_conn)
         stream = cast(HTTP1ServerConnection, server_conn).stream
         timer = asyncio.get_running_loop().call_later(REQUEST_WITHIN_S, stream.close)
@@ -89,7 +89,6 @@ class _GuardedServer(HTTPServer):
         )
 
     def on_close(self, server_conn: object) -> None:
-        """Forget a closed connection."""
         self._forget(server_conn)
         super().on_close(server_conn)
 
@@ -98,14 +97,13 @@ class _GuardedServer(HTTPServer):
         self._open.discard(server_conn)
 
     def _finish(self, server_conn: object) -> None:
-        """Stop the time limit of a connection."""
         timer = self._unfinished.pop(server_conn, None)
         if timer is not None:
             timer.cancel()
 
 
 class _GuardedRequest(HTTPMessageDelegate):
-    """A request that is passed to the application once its headers have been checked."""
+    """A request that is passed to the application after its headers have been checked."""
 
     def __init__(
         self,
@@ -123,7 +121,7 @@ class _GuardedRequest(HTTPMessageDelegate):
     def headers_received(
         self, start_line: RequestStartLine | ResponseStartLine, headers: HTTPHeaders
     ) -> Awaitable[None] | None:
-        """Refuse the request, or start passing it to the application."""
+        """Refuse the request or start passing it to the application."""
         start_line = cast(RequestStartLine, start_line)
         refusal = self._check(start_line, headers) or _too_large(headers)
         if refusal is not None:
@@ -132,16 +130,13 @@ class _GuardedRequest(HTTPMessageDelegate):
         return self._request.headers_received(start_line, headers)
 
     def data_received(self, chunk: bytes) -> Awaitable[None] | None:
-        """Pass a part of the body to the application."""
         return self._request.data_received(chunk)
 
     def finish(self) -> None:
-        """Let the application answer the request."""
         self._finished()
         self._request.finish()
 
     def on_connection_close(self) -> None:
-        """Notify the application that the client has disconnected."""
         if self._is_handed_over:
             self._request.on_connection_close()
 

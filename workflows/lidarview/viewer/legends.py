@@ -19,9 +19,9 @@ Legend = dict[str, Any]  # sent to the page as JSON
 
 
 def make_legend(coloring: Coloring) -> Legend:
-    """Return the legend of a coloring.
+    """Build the legend of a coloring.
 
-    The legend is a scale with numbers, or labels with their values.
+    The legend is a scale with numbers, or a list of labels with their values.
     """
     if coloring.name in (RGB.name, NORMALS.name):
         return scale_legend(coloring.meaning, (), np.empty((0, 3)))
@@ -50,7 +50,7 @@ def make_legend(coloring: Coloring) -> Legend:
 
 
 def scale_legend(title: str, marks: Sequence[str], colors: Floats = TURBO[::15]) -> Legend:
-    """Return the legend of a color scale with evenly spaced marks.
+    """Build the legend of a color scale with evenly spaced marks.
 
     `colors` has shape (n, 3), with values from 0 to 1.
     """

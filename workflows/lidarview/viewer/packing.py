@@ -1,4 +1,4 @@
-"""Pack point columns for a page in a single file, so that they compress well.
+"""Pack point columns for a page into a single file that compresses well.
 
 The values of a column are mapped to integers. The differences between neighbors are zigzag-encoded
 (0, -1, 1, -2, … become 0, 1, 2, 3, …) and stored as byte planes, the lowest byte first. The page
@@ -22,9 +22,9 @@ _STEPS = 50_000  # steps along the longest side of the points
 class PackedColumn(NamedTuple):
     """A column as byte planes, with the parameters to restore its values.
 
-    The value of a code is ``base + step * code``. If `fractions` is set, code 0 is NaN and the
-    other values are ``base + step * (code - 1)``. If `logarithmic` is set as well, the result is
-    the natural logarithm of the value.
+    A code represents the value ``base + step * code``. If `fractions` is set, code 0 represents
+    NaN, and any other code represents ``base + step * (code - 1)``. If `logarithmic` is set as
+    well, the result is the natural logarithm of the value.
     """
 
     planes: Bytes  # (planes * n,)

@@ -1,4 +1,4 @@
-"""Select points of a cloud for display by scan, by column values, and for a camera."""
+"""Select the points of a cloud to display, by scans, column values, and camera."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _KEEP_SHARE = 0.8  # fraction of the points that is kept whenever there are too 
 
 
 class InMemoryPoints:
-    """Points in memory, in any order of their scans."""
+    """Points in memory that are not ordered by scan."""
 
     def __init__(self, cloud: Cloud) -> None:
         self._cloud = cloud
@@ -39,7 +39,7 @@ class InMemoryPoints:
         return len(self._cloud)
 
     def values(self, name: str, row_selection: Ints | slice) -> AnyArray:
-        """Return the values of a column at selected rows.
+        """Return the values of a column in the selected rows.
 
         The columns x, y, and z are world coordinates.
         """
@@ -48,15 +48,15 @@ class InMemoryPoints:
         return self._cloud[name][row_selection]
 
     def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
-        """Return the range of all rows, because the scans are in no particular order."""
+        """Return the range of all rows, because the points are not ordered by scan."""
         return 0, len(self)
 
 
 class ScanOrderedPoints(InMemoryPoints):
-    """Points in memory, in the order of their scans."""
+    """Points in memory that are ordered by scan."""
 
     def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
-        """Return the range of rows, start and stop, that contains the scans from first to last.
+        """Return the start and stop rows of the scans from first to last.
 
         Without a scan column, the range contains all rows.
         """
@@ -88,7 +88,7 @@ class JoinedPoints:
         return int(self._firsts[-1])
 
     def values(self, name: str, row_selection: Ints | slice) -> AnyArray:
-        """Return the values of a column at selected rows, which must be in ascending order.
+        """Return the values of a column in the selected rows, which must be in ascending order.
 
         The columns x, y, and z are world coordinates.
         """
@@ -105,7 +105,7 @@ class JoinedPoints:
 
 @dataclass(frozen=True, eq=False)
 class StationPoints:
-    """Points with an additional column for the station from which each point was scanned."""
+    """Points with an additional column for the station of each point."""
 
     points: CloudFile | InMemoryPoints | JoinedPoints
     scans: Ints  # (n,) first scan of each sweep, ascending
@@ -120,7 +120,7 @@ class StationPoints:
         return len(self.points)
 
     def values(self, name: str, row_selection: Ints | slice) -> AnyArray:
-        """Return the values of a column at selected rows."""
+        """Return the values of a column in the selected rows."""
         if name != STATION.name:
             return self.points.values(name, row_selection)
         scans = self.points.values("scan", row_selection)
@@ -132,7 +132,7 @@ Points = CloudFile | InMemoryPoints | JoinedPoints | StationPoints
 
 
 def _row_ranges(points: Points, scans: ScanRanges) -> list[tuple[int, int]]:
-    """Return the ranges of rows, start and stop, that contain the given ranges of scans."""
+    """Return the start and stop rows of each range of scans."""
     if isinstance(points, StationPoints):
         return _row_ranges(points.points, scans)
     if isinstance(points, JoinedPoints):
@@ -148,8 +148,8 @@ def _row_ranges(points: Points, scans: ScanRanges) -> list[tuple[int, int]]:
 class PointFilter:
     """A filter that keeps points whose column values are within limits.
 
-    Several limits on a column are combined when a filter is parsed, so a long filter takes no
-    longer to apply than a single limit per column.
+    If a column has several limits, they are combined when the filter is parsed. A long filter
+    therefore takes no longer to apply than a single limit per column.
 
     Attributes
     ----------
@@ -207,7 +207,10 @@ class PointFilter:
         )
 
     def mask(self, points: Points, row_selection: Ints | slice) -> Bools:
-        """Return a mask of the selected rows with finite positions that pass the filter."""
+        """Return a mask of those selected rows that pass the filter.
+
+        Rows with nonfinite positions do not pass.
+        """
         x, y, z = (points.values(axis, row_selection) for axis in AXES)
         is_kept = np.asarray(np.isfinite(x + y + z))
         for name, lower, upper in self.limits:
@@ -219,7 +222,7 @@ class PointFilter:
 
 
 def parse_scans(text: str) -> ScanRanges:
-    """Parse ranges of scans in the query of a URL, such as ``4-6,0-1``, and merge adjacent ranges.
+    """Parse ranges of scans such as ``4-6,0-1`` in a URL query, merging adjacent ranges.
 
     Raises
     ------
@@ -243,7 +246,7 @@ def parse_scans(text: str) -> ScanRanges:
 
 @dataclass(frozen=True, eq=False)
 class BrowserCamera:
-    """The camera of a page, which is a 4 x 4 matrix from local coordinates to clip coordinates."""
+    """The camera of a page, as a 4 x 4 matrix from local coordinates to clip coordinates."""
 
     matrix: Floats
 
@@ -261,14 +264,13 @@ class BrowserCamera:
     def project(self, points: AnyFloats) -> tuple[AnyFloats, Bools]:
         """Project points to image coordinates from -1 to 1.
 
-        Returns the coordinates (n, 2), and a mask (n,) of the points inside the image.
+        Returns the coordinates (n, 2) and a mask (n,) of the points inside the image.
         """
         x, y, z, w = self._clip(points)
         inside = (np.abs(x) < w) & (np.abs(y) < w) & (z > -w)
         return np.stack([x, y], axis=1) / np.where(inside, w, 1.0)[:, None], inside
 
     def _clip(self, points: AnyFloats) -> AnyFloats:
-        """Return the clip coordinates of points."""
         return np.asarray(self.matrix[:, :3] @ points.T + self.matrix[:, 3:])
 
     def tiles(self, points: AnyFloats) -> Ints:
@@ -280,14 +282,20 @@ class BrowserCamera:
         return np.where(inside, row * _TILE_COLUMNS + column, -1)
 
     def may_see(self, box: Floats) -> bool:
-        """Return False if a box is certainly outside the image."""
+        """Return whether a box may be inside the image.
+
+        The result is False only if the box is certainly outside.
+        """
         x, y, z, w = self._clip(box_corners(box))
         outside = (x > w, x < -w, y > w, y < -w, z < -w)
         return not any(bool(beyond.all()) for beyond in outside)
 
 
 def box_corners(box: Floats) -> Floats:
-    """Return the corners of a box. Shape (8, 3)."""
+    """Return the corners of a box.
+
+    The shape is (8, 3).
+    """
     return np.array(list(itertools.product(*box.T)))
 
 
@@ -305,17 +313,17 @@ def even_shares(counts: AnyArray, max_points: int) -> Floats:
 
 
 def read_positions(points: Points, row_selection: Ints | slice) -> Floats:
-    """Return the positions at selected rows as float64 world coordinates."""
+    """Return the positions in the selected rows as float64 world coordinates."""
     # The matrix product in a camera is fastest on contiguous columns.
     return np.stack([points.values(axis, row_selection) for axis in AXES], dtype=np.float64).T
 
 
 class ClientDisconnected(Exception):  # noqa: N818 - not an error
-    """Raised when the client that requested an answer has disconnected."""
+    """Error raised when the client that requested an answer has disconnected."""
 
 
 class PointFinder:
-    """Finds points of a cloud that pass a filter.
+    """Search for points of a cloud that pass a filter.
 
     The finder stores the bounding boxes of the blocks that it has read, which takes 48 bytes per
     block, or 150 kB for a hundred million points.
@@ -412,7 +420,7 @@ class PointFinder:
         camera: BrowserCamera | None = None,
         shares: Floats | None = None,
     ) -> tuple[Ints, int]:
-        """Read blocks one after another, and thin out the points whenever there are too many.
+        """Read blocks one after another, thinning out the points whenever there are too many.
 
         `ranges` are ranges of rows, start and stop. `shares` (tiles,) are the fractions of points
         to keep in each tile of the camera's image. The other parameters and the results are the

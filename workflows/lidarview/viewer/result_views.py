@@ -26,7 +26,7 @@ from .view import CLOUD, IN_SENSOR_AXES, DownloadFormats, ProgressiveView, View
 def result_page(
     view: View | ProgressiveView, *, port: int = PORT, browser: bool = True
 ) -> Iterator[PageServer]:
-    """Serve a view while the body runs, and announce its address."""
+    """Serve a view while the context is active, and announce its address."""
     count = view.total if isinstance(view, ProgressiveView) else len(view.points)
     shows = f"shows {plural(count, 'point')}"
     shows += "" if cell_display() else ". Press Ctrl-C to stop."
@@ -55,7 +55,7 @@ def show_view(view: View | ProgressiveView, *, port: int, browser: bool = True) 
 
 
 def open_results(paths: Sequence[Path], downloads: DownloadFormats | None = None) -> View:
-    """Open the results of surveys of the same scene as a single view.
+    """Open the results of several surveys of the same scene as a single view.
 
     The scene, the sensors, and the actors come from the first result. The view can be played over
     time if the sweeps of all results start at the same times.
@@ -72,7 +72,7 @@ def open_results(paths: Sequence[Path], downloads: DownloadFormats | None = None
 def join_views(
     paths: Sequence[Path], views: Sequence[View], downloads: DownloadFormats | None = None
 ) -> View:
-    """Combine the views of several results, as `open_results` does.
+    """Combine the views of several results for `open_results`.
 
     `paths` are the results of the views. Messages and labels use their names.
     """

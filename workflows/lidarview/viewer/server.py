@@ -98,7 +98,7 @@ def pack_answer(header: dict[str, Any], arrays: Mapping[str, AnyArray]) -> list[
 
 
 def is_large(question: str, arguments: Arguments) -> bool:
-    """Return True if the answer may contain millions of points.
+    """Return whether the answer may contain millions of points.
 
     Such an answer occupies memory until it is sent. Raises ValueError if the requested number of
     points is not a number.
@@ -108,17 +108,17 @@ def is_large(question: str, arguments: Arguments) -> bool:
 
 
 def is_search(question: str, arguments: Arguments) -> bool:
-    """Return True if the answer may take seconds because all points are searched."""
+    """Return whether the answer may take seconds because all points are searched."""
     long_lists = len(arguments.get("scans", "")) > LONG_TEXT
     return question.rpartition("/")[2] == "points" and (bool(arguments.get("filter")) or long_lists)
 
 
 class SlowRequestSlots:
-    """Slots that limit how many slow requests of a kind are answered at a time.
+    """Slots that limit the number of slow requests that are answered at the same time.
 
     A request holds its slot until the client has received the answer, so only a few large answers
-    are in memory. Large answers and searches use separate slots, so clients that do not read their
-    answers cannot delay searches.
+    are in memory. Large answers and searches use separate slots. Clients that do not read their
+    answers therefore cannot delay searches.
     """
 
     def __init__(self) -> None:
@@ -128,7 +128,7 @@ class SlowRequestSlots:
 
     @asynccontextmanager
     async def slot(self) -> AsyncIterator[None]:
-        """Wait for a slot, and hold it while the body runs.
+        """Wait for a slot and hold it while the context is active.
 
         Raises HTTPError if too many requests are pending.
         """
@@ -146,7 +146,7 @@ class SlowRequestSlots:
 
 
 class _Guarded(RequestHandler):
-    """A handler of requests that `_Guard` has accepted."""
+    """Base class of handlers for requests that `_Guard` has accepted."""
 
     def set_default_headers(self) -> None:
         self.clear_header("Server")
@@ -164,14 +164,14 @@ class _Guarded(RequestHandler):
 
 
 class _File(_Guarded, StaticFileHandler):
-    """Sends one of the files of the page."""
+    """Handler that sends the files of the page."""
 
 
 class _Question(_Guarded):
-    """Answers a data request or a command.
+    """Handler that answers a data request or a command.
 
-    Answers are computed in threads, because they may take long. Slow requests wait for a slot,
-    while all other requests are answered at once.
+    Answers are computed in threads because they may take long. Slow requests wait for a slot. All
+    other requests are answered immediately.
     """
 
     def initialize(self, source: AnswerSource, stop: Callable[[], None] | None) -> None:
@@ -200,7 +200,7 @@ class _Question(_Guarded):
     async def _answer(
         self, threads: ThreadPoolExecutor | None, question: str, arguments: Arguments
     ) -> None:
-        """Compute an answer in a thread, and send it.
+        """Compute an answer in a thread and send it.
 
         Raises ClientDisconnected if the client has disconnected or stopped reading.
         """
@@ -253,14 +253,15 @@ class PageServer:
     def single_use_url(self) -> str:
         """Return a URL that leads to the page only once.
 
-        It is used to start a browser, because other users of the machine can see the command line.
+        The URL is used to start a browser, because other users of the machine can see the command
+        line.
         """
         self.single_use_tokens.append(secrets.token_urlsafe())
         return f"{self._root}{self.single_use_tokens[-1]}/"
 
 
 class _Guard:
-    """Checks the URL and the headers of a request before its body is read."""
+    """Check of a request's URL and headers before its body is read."""
 
     def __init__(self, page: PageServer) -> None:
         self._page = page
@@ -301,7 +302,7 @@ def page_server(
     index: str = VIEWER,
     host: str = HOST,
 ) -> Iterator[PageServer]:
-    """Serve a page in a thread while the body runs.
+    """Serve a page in a thread while the context is active.
 
     Parameters
     ----------
@@ -373,7 +374,7 @@ def _open_socket(host: str, port: int) -> socket.socket:
 def announce_page(
     page: PageServer, words: str, browser: bool, *, on_stdout: bool = False
 ) -> Iterator[None]:
-    """Print the URL of a page, or show the page in the cell of a notebook, while the body runs.
+    """Print the URL of a page or display the page in a notebook while the context is active.
 
     The URL is printed to stderr, or to stdout if `on_stdout` is set. If `browser` is set and there
     is a desktop, a browser opens the page.
@@ -393,7 +394,7 @@ def announce_page(
 
 
 def notebook_html(page: PageServer, words: str) -> str:
-    """Return HTML for the cell of a notebook, with a link and with the page in a frame."""
+    """Return HTML for a notebook cell that contains a link to the page and the page in a frame."""
     url = page.url
     words = escape(words)
     if hub := os.environ.get(_HUB):  # 127.0.0.1 would be the machine of the user's browser

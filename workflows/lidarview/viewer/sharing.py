@@ -1,4 +1,7 @@
-"""Export a view as a single file to share, which is a film or a page that needs no server."""
+"""Export a view as a single file to share.
+
+The file is a film or a page that needs no server.
+"""
 
 from __future__ import annotations
 
@@ -130,9 +133,9 @@ def render_film(view: View, suffix: str, show: WritingProgress = _show_nothing) 
 
 
 def _encode(frames: list[Image.Image], suffix: str, width: int, quality: int) -> bytes:
-    """Encode frames with a width in pixels.
+    """Encode frames, scaled to a width in pixels.
 
-    `quality` is the number of colors for .gif and the quality of the compression for .webp.
+    `quality` is the number of colors for .gif and the compression quality for .webp.
     """
     scaled = [f.resize((width, width * 9 // 16), Image.Resampling.LANCZOS) for f in frames]
     if suffix == ".gif":  # a palette per frame would make the colors flicker
@@ -161,7 +164,7 @@ class _FilmSource:
     top: float  # height above which the scene is cut open, meters
 
     def positions(self, max_points: int, scans: ScanRanges | None = None) -> Floats:
-        """Return the local positions of a sample of the points below `top`."""
+        """Sample the points below `top` and return their local positions."""
         rows, _ = self.finder.find(max_points, scans=scans)
         local = read_positions(self.view.points, rows) - self.view.origin
         return local[local[:, 2] <= self.top]
@@ -169,7 +172,7 @@ class _FilmSource:
     def points(
         self, box: Floats, max_points: int, scans: ScanRanges | None = None
     ) -> tuple[Floats, Floats]:
-        """Return local positions and RGBA colors of a sample of the points.
+        """Sample the points and return their local positions and RGBA colors.
 
         The colors span the height of `box`, which has shape (2, 3).
         """
@@ -188,7 +191,6 @@ class _FilmSource:
 
 
 def _never_disconnected() -> bool:
-    """Return False, because an export waits for every answer."""
     return False
 
 
@@ -232,7 +234,7 @@ def _follow(
 ) -> Film:
     """Return the film with a camera that follows a sensor.
 
-    `spans` are the scans in each frame.
+    `spans` contains the scans in each frame.
     """
     middle = len(spans) // 2
     position = sensor.position_at(film.moments_ns[middle])
@@ -259,7 +261,7 @@ def _scans_between(sweeps: Sweeps, start_ns: float, stop_ns: float) -> ScanRange
 
 
 def render_page(view: View, show: WritingProgress = _show_nothing) -> bytes:
-    """Render a page of at most 25 MB that contains the answers to all its requests.
+    """Render a page of at most 25 MB that contains the answers to all of its requests.
 
     `show` reports the number of packed answers.
 
@@ -283,7 +285,7 @@ def render_page(view: View, show: WritingProgress = _show_nothing) -> bytes:
 
 
 def _page_with_modules() -> str:
-    """Return the viewer's page with inlined style sheets and modules and a matching content policy.
+    """Return the viewer's page with inlined style sheets and modules, and a content policy.
 
     The policy allows scripts and styles by their hashes and blocks everything else.
     """
@@ -310,7 +312,7 @@ def _page_with_modules() -> str:
 
 
 def _hash_source(text: str) -> str:
-    """Return the source expression of a content policy that allows an inline script or style."""
+    """Return the content policy source that allows an inline script or style."""
     digest = hashlib.sha256(text.encode()).digest()
     return f"'sha256-{base64.b64encode(digest).decode()}'"
 
@@ -319,8 +321,8 @@ def bundle_modules(folder: Traversable, name: str) -> str:
     """Combine a JavaScript module and its imports into a single script.
 
     Each module becomes a function that returns its exports. A page in a single file cannot use
-    imports, because a content policy can allow inline scripts by their hashes, but imported modules
-    only by their addresses.
+    imports: a content policy can allow inline scripts by their hashes, but imported modules only by
+    their addresses.
     """
     modules: dict[str, str] = {}  # {file: script}, imported modules first
 
@@ -364,7 +366,10 @@ def _packed(header: dict[str, Any], arrays: dict[str, AnyArray]) -> str:
 
 
 def _thinned(view: View, max_points: int) -> Answer:
-    """Sample points, fewer of them where they are dense, and pack all their columns."""
+    """Sample points and pack all their columns.
+
+    The sample contains a smaller fraction of the points where they are dense.
+    """
     points = view.shown_points
     rows, _ = PointFinder(points, view.origin).find(_SAMPLE_POINTS)
     world = read_positions(points, rows)
@@ -383,13 +388,13 @@ def _thinned(view: View, max_points: int) -> Answer:
 
 
 def _compact_order(columns: Mapping[str, AnyArray], count: int) -> Ints:
-    """Return an order of the points by sensor and channel, which compresses well."""
+    """Sort the points by sensor and channel, which makes them compress well."""
     keys = [columns[name] for name in ("channel", "sensor") if name in columns]
     return np.lexsort(keys) if keys else np.arange(count)
 
 
 def _packed_points(view: View, local: Floats, columns: Mapping[str, AnyArray]) -> Answer:
-    """Return the packed columns of points, with the colors and the legend of each column."""
+    """Pack the columns of points, with the colors and the legend of each column."""
     packed_columns = dict(zip("xyz", pack_positions(local), strict=True))
     packed_columns |= {name: pack_column(values) for name, values in columns.items()}
     arrays: dict[str, AnyArray] = {name: c.planes for name, c in packed_columns.items()}

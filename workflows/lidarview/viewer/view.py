@@ -86,7 +86,7 @@ CLOUD = "cloud.ply"
 
 @dataclass(frozen=True)
 class DownloadFormats:
-    """File formats in which a page offers points for download."""
+    """File formats that a page offers for downloading points."""
 
     formats: Sequence[str]  # file extensions without a dot, such as "las"
     save: Callable[[Cloud, Path], object]  # writes points in the format of the path's extension
@@ -138,10 +138,7 @@ class View:
         self.replace_points(self.points)
 
     def replace_points(self, points: Points, *, keep_scales: bool = False) -> None:
-        """Replace the points.
-
-        With `keep_scales`, the color scales of the previous points are kept.
-        """
+        """Replace the points, optionally keeping the color scales of the previous points."""
         self.points = points
         self._finder = PointFinder(self._with_stations(points), self.origin)
         other_columns = {
@@ -166,7 +163,7 @@ class View:
 
     @property
     def shown_points(self) -> Points:
-        """Points with all columns that the page shows."""
+        """Points with all columns that the page displays."""
         return self._finder.points
 
     # -- properties of the survey ---------------------------------------------------------
@@ -175,9 +172,9 @@ class View:
     def sensors(self) -> Sequence[SensorPositions]:
         """Positions of the sensors in local coordinates.
 
-        The positions come from the picture file if there is one, otherwise from the starts of the
-        sweeps. In the latter case, a sensor counts as moving if it has at least three sweeps and a
-        new position in more than half of them.
+        The positions come from the plot file if there is one, and otherwise from the starts of the
+        sweeps. In the latter case, a sensor is considered moving if it has at least three sweeps
+        and a new position in more than half of them.
         """
         if self.pictured is not None:
             return self.pictured.sensors
@@ -197,7 +194,7 @@ class View:
 
     @property
     def epsg(self) -> int | None:
-        """EPSG code of the coordinates from the survey or the file, or None if unknown."""
+        """EPSG code that the survey or the file states for the coordinates, or None."""
         sweeps = self.sweeps
         if sweeps is None:
             return self.stated_epsg
@@ -222,14 +219,20 @@ class View:
 
     @property
     def _station_names(self) -> Sequence[str]:
-        """Names of the stations 1, 2, … after an empty name for 0, or nothing without stations."""
+        """Names of the stations 1, 2, … after an empty name for 0.
+
+        The sequence is empty without stations.
+        """
         if self.sweeps is None or not self.sweeps.station_numbers.any():
             return ()
         names = self.names.get(STATION.name) or [""] * (1 + self.sweeps.station_numbers.max())
         return ["", *(name or f"station {k}" for k, name in enumerate(names[1:], 1))]
 
     def _names(self, column: str) -> Sequence[str]:
-        """Return the names of the values 0, 1, 2, … in a column, or nothing if they are unnamed."""
+        """Return the names of the values 0, 1, 2, … in a column.
+
+        The sequence is empty if the values have no names.
+        """
         if column == RESULT.name and self.results:
             return self.results
         if column == STATION.name:
@@ -250,7 +253,7 @@ class View:
         return CAUSES if self.columns.get(column) == TABLE["cause"] else ()
 
     def _extent(self) -> tuple[Floats, Floats, Floats]:
-        """Return the local origin, the bounding box, and points that the first view must show.
+        """Return the local origin, the bounding box, and the points that the first view must show.
 
         The origin (3,) is in world coordinates, and the box (2, 3) and the points (k, 3) are local.
         The points are the corners of the scene, the ends of a planned path, and the sensor
@@ -309,11 +312,12 @@ class View:
         return answers[question](arguments, is_disconnected)
 
     def _state(self) -> Answer:
-        """Return the description of the view, without points and surfaces.
+        """Return a description of the view without points and surfaces.
 
-        In the header, "bounds" contain the scene, and "box" is the part to show first. In a large
-        scene, this is the surroundings of the trajectories, and "cut" is the local z of the top of
-        the box. Lengths are in meters and times in seconds.
+        In the header, "bounds" is a box around the scene, the sensors, and the ends of a planned
+        path, and "box" is the part to show first. In a large scene, this is the surroundings of the
+        trajectories, and "cut" is the local z of the top of the box. Lengths are in meters and
+        times in seconds.
         """
         # None if the page shows the whole scene.
         shown_box = surrounding_box(
@@ -389,8 +393,8 @@ class View:
     def _actor_arrays(self) -> dict[str, AnyArray]:
         """Return the meshes and trajectories of the actors.
 
-        Distinct meshes are numbered ``mesh0``, ``mesh1``, …. Animated meshes have the vertices (p,
-        v, 3) of each pose, and their actors the fractional pose number at each time
+        Distinct meshes are numbered ``mesh0``, ``mesh1``, …. An animated mesh has the vertices (p,
+        v, 3) of each pose. Its actors have the fractional pose number at each time
         (``actor0_frames``). Coordinates are local, and times are in seconds.
         """
         meshes, mesh_indices = distinct_meshes(self.actors)
@@ -422,14 +426,18 @@ class View:
 
     @property
     def displayed_rays(self) -> Floats32:
-        """Local start and end points of at most `MAX_RAYS` sample rays. Shape (n, 2, 3)."""
+        """Local start and end points of at most `MAX_RAYS` sample rays.
+
+        The shape is (n, 2, 3).
+        """
         return self.rays[:: len(self.rays) // MAX_RAYS + 1]
 
     @property
     def planned_path(self) -> dict[str, Any] | None:
-        """Corners of the planned path, and obstacles as discs, or None without a path.
+        """Corners of the planned path, and obstacles as discs.
 
-        A disc is (x, y, radius). All values are local, in meters.
+        The value is None if there is no path. A disc is (x, y, radius). All values are local, in
+        meters.
         """
         planning = None if self.pictured is None else self.pictured.planning
         if self.path is None or planning is None:
@@ -438,7 +446,7 @@ class View:
         return {"corners": self.path.tolist(), "discs": discs.tolist()}
 
     def _classes_of_objects(self) -> dict[int, int]:
-        """Return the class of each object, according to one of its points in a sample."""
+        """Return the class of each object, taken from one of its points in a sample."""
         if not {"object", "class"} <= self.columns.keys():
             return {}
         rows, _ = self._finder.find(_SAMPLE)
@@ -446,10 +454,10 @@ class View:
         return dict(zip(*columns, strict=True))
 
     def _export(self, arguments: Arguments, is_disconnected: Callable[[], bool]) -> Answer:
-        """Return a file with the points that pass a filter.
+        """Export the points that pass a filter as a file.
 
-        If the format consists of several files, they are returned as a ZIP archive. If there are
-        too many points, or if the format cannot store them, the answer contains an error instead.
+        If the format consists of several files, the answer is a ZIP archive. If there are too many
+        points, or if the format cannot store them, the answer contains an error instead.
         """
         ending = arguments["format"]
         if self.downloads is None or ending not in self._export_formats:
@@ -483,7 +491,10 @@ class View:
 
     @property
     def _export_formats(self) -> Sequence[str]:
-        """Formats offered for download, or none if the points are a sample or a preview."""
+        """Formats offered for download.
+
+        There are none if the points are a sample or a preview.
+        """
         is_sample = isinstance(self.points, InMemoryPoints) and not isinstance(
             self.points, ScanOrderedPoints
         )
@@ -492,15 +503,16 @@ class View:
         return self.downloads.formats
 
     def _read_selection(self, arguments: Arguments) -> tuple[PointFilter, ScanRanges | None]:
-        """Parse the filter and the ranges of scans in the arguments of a request."""
+        """Parse the filter and the ranges of scans in a request's arguments."""
         point_filter = PointFilter.parse(arguments.get("filter", ""), list(self.columns))
         return point_filter, parse_scans(arguments["scans"]) if "scans" in arguments else None
 
     def _points(self, arguments: Arguments, is_disconnected: Callable[[], bool]) -> Answer:
-        """Return points with their colors, optionally for a filter, ranges of scans, and a camera.
+        """Return points with their colors.
 
-        Positions are local, and "rows" are row indices. "count" is the number of points that pass
-        the filter before they are thinned out.
+        The points can be restricted by a filter, ranges of scans, and a camera. Positions are
+        local, and "rows" are row indices. "count" is the number of points that pass the filter
+        before they are thinned out.
         """
         finder = self._finder
         version = self.version
@@ -541,7 +553,7 @@ class View:
     ) -> Coloring:
         """Return the color scale of a column for the points that pass a filter.
 
-        The limits are estimated from a sample unless they are given. The scale is the same for all
+        If no limits are given, they are estimated from a sample. The scale is the same for all
         scans.
         """
         colorings = self._colorings
@@ -560,7 +572,7 @@ class View:
         return coloring
 
     def _column(self, name: str) -> Answer:
-        """Return the limits of a column, or its labels, for the filters of the page."""
+        """Return the limits or the labels of a column for the page's filters."""
         column = self.columns[name]
         values = self._finder.points.values(name, self._finder.find(_SAMPLE)[0])
         values = values[np.isfinite(values)]
@@ -579,7 +591,7 @@ class View:
         return {"low": lower / unit, "high": upper / unit, "unit": unit, "whole": is_integer}, {}
 
     def _label_counts(self, name: str, is_disconnected: Callable[[], bool]) -> Answer:
-        """Return the number of points with each value of a label column.
+        """Count the points with each value of a label column.
 
         If there are many points, the numbers are estimated from a sample, and "exact" is False.
         """
@@ -607,7 +619,7 @@ class View:
         return self._label_counts_of[key], {}
 
     def _point(self, row: int) -> Answer:
-        """Return the world position of a point, and all its columns as text."""
+        """Return the world position of a point, and all of its columns as text."""
         points = self.shown_points
         if not 0 <= row < len(points):
             raise KeyError(row)
@@ -621,7 +633,7 @@ class View:
         return {"place": position, "columns": shown}, {}
 
     def _in_words(self, column: Column, value: Any) -> str:
-        """Return a column value as text with its unit."""
+        """Format a column value as text with its unit."""
         names = self._names(column.name)
         if column == OBJECT and value < 0:
             return NO_SURFACE
@@ -668,9 +680,9 @@ class View:
 
     @cached_property
     def _floor_and_roof_cut(self) -> dict[str, float | None]:
-        """Local heights of the floor below the sensors and of a cut that removes the roof.
+        """Local floor height below the sensors, and height of a cut that removes the roof.
 
-        A height is None without sensors, floor, or roof. `_surface` must be set before.
+        Each height is None without sensors, floor, or roof. `_surface` must be set before.
         """
         surface = self._surface
         pictured = self.pictured
@@ -683,7 +695,7 @@ class View:
         return {"floor": floor, "roof_cut": cut}
 
     def _range(self, sweep: int) -> Answer:
-        """Return the range image of a sweep, as `range_image` draws it.
+        """Return the range image of a sweep, as drawn by `range_image`.
 
         "low" and "high" are the ends of the color scale in meters, which all sweeps of a sensor
         share.
@@ -712,14 +724,13 @@ class View:
 
 
 def _never_disconnected() -> bool:
-    """Return False, because the caller waits for the answer."""
     return False
 
 
 def _read_limits(text: str) -> tuple[float, float]:
-    """Parse the ends of a color scale, ``lowest,highest``.
+    """Parse the limits of a color scale, ``lowest,highest``.
 
-    Raises ValueError if the ends are not finite or not in ascending order.
+    Raises ValueError if the limits are not finite or not in ascending order.
     """
     lower, upper = map(float, text.split(","))
     if not -math.inf < lower < upper < math.inf:
@@ -728,17 +739,16 @@ def _read_limits(text: str) -> tuple[float, float]:
 
 
 def _add_counts(counts: Counter[int], values: AnyArray) -> None:
-    """Add the number of occurrences of each value to the counts."""
     labels, numbers = np.unique(values, return_counts=True)
     counts.update(dict(zip(labels.astype(np.int64).tolist(), numbers.tolist(), strict=True)))
 
 
 def _cloud_extent(points: Points) -> tuple[Floats, Floats, Floats]:
-    """Return a local origin for points, their box without outliers, and their outermost points.
+    """Return points' local origin, their box without outliers, and their outermost points.
 
-    The origin (3,) is in world coordinates, and the box (2, 3) and the points (k, 3) are local. A
-    coordinate of the origin is 0 unless the points are more than 10 km from 0, in which case it is
-    rounded to whole meters.
+    The origin (3,) is in world coordinates, and the box (2, 3) and the outermost points (k, 3) are
+    local. A coordinate of the origin is 0 unless the points are more than 10 km from 0. In that
+    case, it is rounded to whole meters.
     """
     sample = read_positions(points, PointFinder(points, np.zeros(3)).find(_SAMPLE)[0])
     if not len(sample):
@@ -756,7 +766,7 @@ def _cloud_extent(points: Points) -> tuple[Floats, Floats, Floats]:
 
 
 class ProgressiveView:
-    """A view of a sample of points, which is replaced by a view of all points once they are read.
+    """A view of sampled points that is replaced once all points have been read.
 
     Parameters
     ----------
@@ -786,9 +796,10 @@ class ProgressiveView:
     def answer(
         self, question: str, arguments: Arguments, is_disconnected: Callable[[], bool]
     ) -> Answer:
-        """Answer a request of the page, as `View.answer` does.
+        """Answer a request of the page.
 
-        The request "growth" returns the fraction of the points that has been read.
+        Requests are the same as for `View.answer`. In addition, the request "growth" returns the
+        fraction of the points that has been read.
         """
         if question == "growth":
             header = {"complete": self._complete, "error": self._error, "share": self._share}
@@ -802,14 +813,13 @@ class ProgressiveView:
         return header, arrays
 
     def _start(self) -> None:
-        """Start reading all points, unless reading has already started."""
         with self._lock:
             if self._reading is None:
                 self._reading = threading.Thread(target=self._grow, name="reading", daemon=True)
                 self._reading.start()
 
     def _grow(self) -> None:
-        """Read all points, and replace the sample."""
+        """Read all points and replace the sample."""
         try:
             view = self._read(self._show)
         except LidarError as error:
@@ -820,6 +830,9 @@ class ProgressiveView:
         self._complete = True
 
     def _show(self, points: Points, share: float) -> None:
-        """Display the points that have been read so far, which are a fraction of all points."""
+        """Display the points that have been read so far.
+
+        `share` is the fraction of all points that has been read.
+        """
         self._share = share
         self._view.replace_points(points, keep_scales=True)

@@ -215,7 +215,7 @@ class MCAP(Rosbag2):
 
 
 def _latched_profile() -> Any:
-    """Return the QoS profile with which late subscribers receive messages that are sent once."""
+    """Return the QoS profile that delivers one-time messages to late subscribers."""
     from rosbags import interfaces as ros
 
     return ros.Qos(
@@ -232,7 +232,6 @@ def _latched_profile() -> Any:
 
 
 def _open_job(job: JobReader, file: str) -> Any:
-    """Open the bag of a job in a data set."""
     from lidarsim.columns.closing_bag import ClosingBag
 
     # AnyReader would parse the message definitions, which takes longer than reading a sweep.
@@ -243,7 +242,7 @@ def _open_job(job: JobReader, file: str) -> Any:
 
 
 def _point_cloud(job: JobReader, sweep: int, file: str) -> Any:
-    """Return the PointCloud2 of a sweep. Raises ValueError if the bag does not contain it."""
+    """Return the PointCloud2 of a sweep, or raise ValueError if the bag does not contain it."""
     from .messages import sweep_topic
 
     bag = job.cached("bag", lambda: _open_job(job, file))
@@ -261,9 +260,9 @@ def _point_cloud(job: JobReader, sweep: int, file: str) -> Any:
 
 
 def _at_start(job: JobReader, sweep: int, points: Floats32, times: AnyArray) -> Floats32:
-    """Transform points as fired to the sensor frame at the start of the sweep.
+    """Transform points from their firing times to the sensor frame at the start of the sweep.
 
-    `times` are the times of the points in the layout of the job.
+    `times` contains the times of the points in the layout of the job.
     """
     sweeps = job.sweeps
     since_ns = LAYOUTS[job.layout].since_ns(times, message_stamp_ns(sweeps, sweep))
@@ -275,10 +274,11 @@ def _at_start(job: JobReader, sweep: int, points: Floats32, times: AnyArray) -> 
 
 
 def _open_bag(source: RecordingSource) -> Recording:
-    """Open a topic of a bag, in which each message is a sweep in the frame of its header.
+    """Open a topic of a bag.
 
-    The topic contains PointCloud2 messages. A topic with Livox CustomMsg messages is read if the
-    user chose it, or if the bag has no PointCloud2 messages.
+    Each message is a sweep in the frame of its header. The topic contains PointCloud2 messages. A
+    topic with Livox CustomMsg messages is read if the user chose it, or if the bag has no
+    PointCloud2 messages.
     """
     bags = PerProcess(partial(open_bag, source.path, source.name))
     bag = bags()
@@ -305,7 +305,7 @@ def _open_bag(source: RecordingSource) -> Recording:
         return sweep_from_columns(columns_of(data), time_ns=float(stamp_ns))
 
     with reading(source.name):
-        # The stamp is zero if the recording program did not set it.
+        # The timestamp is zero if the recording program did not set it.
         is_stamped = any(_header_of(data).stamp_ns for _, _, data in islice(messages(), 2))
 
     def headers() -> Iterator[_Header]:
@@ -332,7 +332,7 @@ def _open_bag(source: RecordingSource) -> Recording:
 
 
 def _stated_compensation(path: Path) -> bool | None:
-    """Return whether a bag states that it is motion-compensated, or None if it states neither.
+    """Return whether a bag is motion-compensated, or None if it does not state this.
 
     This does not use rosbags, which only reads custom data from folders.
     """
@@ -344,8 +344,6 @@ def _stated_compensation(path: Path) -> bool | None:
 
 
 class _Header(NamedTuple):
-    """Header of a ROS message."""
-
     stamp_ns: int  # time of the measurement, which can be long before the recording time
     frame: str
 

@@ -39,7 +39,9 @@ EXTRA_FIELDS = {
 
 
 class PointLayout(ABC):
-    """Layout in which a driver publishes points, with the fields of a point and their values.
+    """Layout in which a driver publishes points.
+
+    It defines the fields of a point and their values.
 
     Attributes
     ----------
@@ -73,9 +75,9 @@ class PointLayout(ABC):
 
     @abstractmethod
     def values(self, sweep: Sweep, traits: LidarTraits) -> dict[str, AnyArray]:
-        """Return the values of all fields except position, ring and time, by field name.
+        """Return the values of all fields except position, ring and time, keyed by field name.
 
-        `traits` describe the sensor of the sweep.
+        `traits` describes the sensor of the sweep.
         """
 
     @abstractmethod
@@ -85,14 +87,14 @@ class PointLayout(ABC):
         Parameters
         ----------
         since_ns
-            Firing times in nanoseconds since the stamp of the message.
+            Firing times in nanoseconds since the timestamp of the message.
         stamp_ns
-            Stamp of the message in nanoseconds since 1970.
+            Timestamp of the message in nanoseconds since 1970.
         """
 
     @abstractmethod
     def since_ns(self, times: AnyArray, stamp_ns: int) -> Floats:
-        """Convert values of the time field to nanoseconds since the stamp (inverse of `times`)."""
+        """Convert time field values to nanoseconds since the timestamp (inverse of `times`)."""
 
     def rings(self, channels: Ints, traits: LidarTraits) -> Ints:
         """Convert channels, where 0 is the lowest beam, to values of the ring field."""
@@ -121,7 +123,7 @@ class PointLayout(ABC):
 
 
 class VelodyneLayout(PointLayout):
-    """Layout of velodyne_pointcloud, with times in seconds since the stamp."""
+    """Layout of velodyne_pointcloud, with times in seconds since the timestamp."""
 
     columns: ClassVar[tuple[str, ...]] = ("intensity", "time")
     fields = np.dtype([*_XYZI, ("ring", "<u2"), ("time", "<f4")])
@@ -136,24 +138,27 @@ class VelodyneLayout(PointLayout):
         return {"intensity": sweep.columns["intensity"]}
 
     def times(self, since_ns: Floats, stamp_ns: int) -> AnyArray:
-        """Convert nanoseconds to seconds since the stamp."""
+        """Convert nanoseconds to seconds since the timestamp."""
         del stamp_ns
         return since_ns / 1e9
 
     def since_ns(self, times: AnyArray, stamp_ns: int) -> Floats:
-        """Convert seconds to nanoseconds since the stamp."""
+        """Convert seconds to nanoseconds since the timestamp."""
         del stamp_ns
         return times.astype(np.float64) * 1e9
 
 
 class ImagesLayout(VelodyneLayout):
-    """Layout of velodyne_pointcloud with range images, which require all returns."""
+    """Layout of velodyne_pointcloud with range images.
+
+    Range images require all returns.
+    """
 
     columns = ("intensity", "time", "ray", "range")
 
 
 class _CountedNanoseconds(PointLayout):
-    """Base class for layouts with times in nanoseconds since the stamp, as 32-bit integers."""
+    """Base class for layouts with times in nanoseconds since the timestamp, as 32-bit integers."""
 
     def times(self, since_ns: Floats, stamp_ns: int) -> AnyArray:
         """Clip times to 32 bits, because sweeps of non-rotating sensors can exceed this range."""
@@ -161,7 +166,6 @@ class _CountedNanoseconds(PointLayout):
         return np.clip(since_ns, 0, 2**32 - 1)
 
     def since_ns(self, times: AnyArray, stamp_ns: int) -> Floats:
-        """Return the times as floats."""
         del stamp_ns
         return times.astype(np.float64)
 
@@ -239,17 +243,16 @@ class _Reflectivities(PointLayout):
     unit_ns: ClassVar[float] = 1e9  # unit of the time field in nanoseconds
 
     def values(self, sweep: Sweep, traits: LidarTraits) -> dict[str, AnyArray]:
-        """Return the intensity, which is the reflectivity."""
         del traits
         return {"intensity": sweep.columns["reflectivity"]}
 
     def times(self, since_ns: Floats, stamp_ns: int) -> AnyArray:
-        """Convert times relative to the stamp to times since 1970."""
+        """Convert times relative to the timestamp to times since 1970."""
         # Times are added as integers, because the resolution of float64 near 1e18 is 128 ns.
         return (np.rint(since_ns).astype(np.int64) + stamp_ns) / self.unit_ns
 
     def since_ns(self, times: AnyArray, stamp_ns: int) -> Floats:
-        """Convert times since 1970 to nanoseconds since the stamp."""
+        """Convert times since 1970 to nanoseconds since the timestamp."""
         return (times - stamp_ns / self.unit_ns) * self.unit_ns
 
 
@@ -363,13 +366,13 @@ def encode_points(
 
 
 def since_stamp_ns(points: Cloud, sweeps: Sweeps, sweep: int) -> AnyArray:
-    """Return the firing times of points in nanoseconds since the stamp of their message."""
+    """Return the firing times of points in nanoseconds since their message's timestamp."""
     begin_ns = sweeps.begins_ns[sweep]
     return points["time"] - (begin_ns + sweeps.stamp_ns(sweep) - round(begin_ns))
 
 
 def message_stamp_ns(sweeps: Sweeps, sweep: int) -> int:
-    """Return the stamp of the message of a sweep, in nanoseconds since 1970."""
+    """Return the timestamp of a sweep's message in nanoseconds since 1970."""
     return survey_start_ns(sweeps) + sweeps.stamp_ns(sweep)
 
 
@@ -389,10 +392,11 @@ def _maker_numbers(traits: LidarTraits) -> Ints:
 
 
 def _return_types(columns: Mapping[str, AnyArray], mode: str) -> AnyArray:
-    """Return the Autoware type of each return in a sweep, whose returns are sorted by pulse.
+    """Return the Autoware return type of each point in a sweep.
 
-    The first of two returns is the nearer one, and the strongest is the brighter one. If both are
-    equally bright, the farther return is the strongest. A single return has the type IDENTICAL.
+    The points are sorted by pulse. The first of two returns is the nearer one, and the strongest is
+    the brighter one. If both are equally bright, the farther return is the strongest. A single
+    return has the type IDENTICAL.
     """
     number = columns["return_number"]
     returns = columns["returns"]

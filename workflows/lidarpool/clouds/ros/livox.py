@@ -52,9 +52,9 @@ def custom_message(
     header
         Header of the message.
     stamp_ns
-        Stamp of the message in nanoseconds since 1970.
+        Timestamp of the message in nanoseconds since 1970.
     since_ns
-        Firing times of the points in nanoseconds since the stamp.
+        Firing times of the points in nanoseconds since the timestamp.
     rows
         Points in the layout `livox`.
     """

@@ -83,7 +83,7 @@ def survey_messages(
 
 
 class SurveyMessages:
-    """Creates the messages of a survey.
+    """Conversion of a survey to ROS messages.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ class SurveyMessages:
         return _sent("/clock", clock(self._make.stamp(time_ns)), time_ns)
 
     def sweep_messages(self, sweep: int, points: Cloud) -> Iterator[RosMessage]:
-        """Yield the messages that are sent at the start of a sweep, and the frames during it."""
+        """Yield the messages at the start of a sweep and the frames during the sweep."""
         sweeps = self._sweeps
         time_ns = self.sweep_start_ns(sweep)
         yield _sent("/tf", self._make.transforms(self._frames_in_world(sweep), time_ns), time_ns)
@@ -172,7 +172,7 @@ class SurveyMessages:
         yield from self._frames_within(sweep)
 
     def _measured(self, sweep: int, points: Cloud) -> dict[str, Any]:
-        """Return the sensor messages of a sweep, by the last part of their topics."""
+        """Return the sensor messages of a sweep, keyed by the last part of their topics."""
         sweeps = self._sweeps
         stamp_ns = message_stamp_ns(sweeps, sweep)
         header = self._make.header(self._frames[sweeps.sensor[sweep]], stamp_ns)
@@ -211,7 +211,7 @@ class SurveyMessages:
         ]
 
     def _frames_within(self, sweep: int) -> Iterator[RosMessage]:
-        """Yield the frames of the vehicle and of actors after the start of a sweep."""
+        """Yield the frames of the vehicle and the actors after the start of a sweep."""
         sweeps = self._sweeps
         since_ns = self._pose_times(sweep)
         if not len(since_ns):
@@ -267,7 +267,7 @@ def _numbered(name: str, plane: int) -> str:
 
 
 def _instruments(sweeps: Sweeps) -> list[tuple[str, str, SweepPoses, int]]:
-    """Return the frames of the instruments on the vehicle, as for `_Messages.transforms`."""
+    """Return the instrument frames on the vehicle in the form that `_Messages.transforms` takes."""
     instruments = sweeps.instruments
     if instruments is None or instruments.folder is None:
         return []
@@ -289,14 +289,14 @@ def _instruments(sweeps: Sweeps) -> list[tuple[str, str, SweepPoses, int]]:
 
 
 def sweep_topic(sweeps: Sweeps, sweep: int) -> str:
-    """Return the topic of the points of a sweep."""
+    """Return the topic for the points of a sweep."""
     sensor = sweeps.sensor[sweep]
     frames = frame_names(sweeps.sensors, sweeps.actors)
     return points_topic(sweeps.sensors[sensor], frames[sensor])
 
 
 def _sent(topic: str, content: Any, time_ns: int) -> RosMessage:
-    """Serialize a message that is sent on a topic at a time."""
+    """Serialize a message that is sent on a topic at a given time."""
     if isinstance(content, Serialized):
         return RosMessage(topic, content.kind, time_ns, content.cdr)
     kind = content.__msgtype__
@@ -304,21 +304,18 @@ def _sent(topic: str, content: Any, time_ns: int) -> RosMessage:
 
 
 class _Messages:
-    """Creates messages and the parts that they have in common."""
+    """Factory for messages and their common parts."""
 
     def __init__(self, types: Any) -> None:
         self._types = types
 
     def types_of(self, package: str, *names: str) -> list[Any]:
-        """Return message types from a package."""
         return [self._types[f"{package}/msg/{name}"] for name in names]
 
     def stamp(self, time_ns: int) -> Any:
-        """Return a Time message."""
         return self._types["builtin_interfaces/msg/Time"](*divmod(time_ns, 1_000_000_000))
 
     def header(self, frame: str, time_ns: int) -> Any:
-        """Return a Header message."""
         return self._types["std_msgs/msg/Header"](self.stamp(time_ns), frame)
 
     def transforms(self, frames: list[tuple[str, str, SweepPoses, int]], time_ns: int) -> Any:
@@ -399,7 +396,6 @@ class _Messages:
                 yield _sent("/gnss/position", message, time_ns)
 
     def laser_scan(self, rays: ScanRays, header: Any) -> Any:
-        """Return a LaserScan message with the rays of a sweep."""
         first = float(rays.angles[0])
         last = float(rays.angles[-1])
         (scan,) = self.types_of("sensor_msgs", "LaserScan")
@@ -418,7 +414,6 @@ class _Messages:
         )
 
     def image(self, values: Floats32, header: Any) -> Any:
-        """Return an Image message with float32 values."""
         height, width = values.shape
         data = np.ascontiguousarray(values, "<f4").view(np.uint8).ravel()
         image = self._types["sensor_msgs/msg/Image"]
@@ -433,7 +428,10 @@ class _Messages:
         )
 
     def markers(self, boxes: Boxes, actors: list[str], time_ns: int) -> Any:
-        """Return a MarkerArray with the boxes of actors, which replaces earlier markers."""
+        """Return a MarkerArray with the actors' boxes.
+
+        It replaces earlier markers.
+        """
         types = self._types
         names = ("Point", "Quaternion", "Pose", "Vector3")
         point, quaternion, pose, vector = self.types_of("geometry_msgs", *names)

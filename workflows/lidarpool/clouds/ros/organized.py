@@ -1,4 +1,4 @@
-"""Organized clouds, which have a point for each ray, with NaN for rays without a return."""
+"""Organized clouds with one point per ray, which is NaN if the ray has no return."""
 
 from __future__ import annotations
 
@@ -67,7 +67,10 @@ def _rays(
     sweeps: Sweeps,
     sweep: int,
 ) -> Records:
-    """Return points for all rays as if none had a return. Shape (channels, firings)."""
+    """Return points for all rays as if no ray had a return.
+
+    The shape is (channels, firings).
+    """
     layout = message_layout.layout
     channels = np.arange(image.sensor.channels)
     rays = np.zeros((len(channels), len(image.firings)), row)
@@ -83,7 +86,7 @@ def _rays(
 
 
 def _looking_ahead(image: RayImage) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:
-    """Return the firing for each pixel such that all pixels in a column have the same direction.
+    """Return the firings of all pixels such that the pixels in a column have the same direction.
 
     The shape is (channels, firings).
     """

@@ -1,4 +1,4 @@
-"""Readers of point cloud files by file extension."""
+"""Mapping from file extensions to readers of point cloud files."""
 
 from __future__ import annotations
 

@@ -15,10 +15,10 @@ def find_named_file(
 ) -> Path | None:
     """Return the path of a file that a mesh file refers to, or None if the file does not exist.
 
-    The name can be escaped like a URI, since the standard requires it but not all programs comply.
-    It can also contain backslashes, or be a path on another machine. In this case, if `allow_moved`
-    is set, the last component of the path is looked up in the folder of the mesh file and in the
-    asset folders. Pipes do not count as files because reading a pipe can block forever.
+    The name may be escaped like a URI: the standard requires it, but not all programs comply. It
+    can also contain backslashes, or be a path on another machine. In this case, if `allow_moved` is
+    set, the last component of the path is looked up in the folder of the mesh file and in the asset
+    folders. Pipes do not count as files because reading a pipe can block forever.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Coordinate reference systems, and how much they distort lengths on the ground.
+"""Coordinate reference systems and their distortion of lengths on the ground.
 
 All map projections distort lengths. National grids and UTM zones do so by less than 1 % within
 their area of use. Web Mercator (EPSG:3857) stretches horizontal lengths by 47 % in Zurich, but not
@@ -63,9 +63,9 @@ _OF_COUNTRIES = re.compile(
 
 @dataclass(frozen=True)
 class GroundScale:
-    """The range of ground lengths to which one meter in a projected system corresponds.
+    """Range of ground lengths that correspond to one meter in a projected coordinate system.
 
-    The length depends on the direction.
+    The ground length depends on the direction.
     """
 
     shortest: float  # meters
@@ -134,7 +134,10 @@ class AreaOfUse:
 
 
 def has_registry() -> bool:
-    """Return whether rasterio is installed, which includes PROJ and the EPSG registry."""
+    """Return whether rasterio is installed.
+
+    rasterio includes PROJ and the EPSG registry.
+    """
     return find_spec("rasterio") is not None
 
 
@@ -181,18 +184,21 @@ def crs_from_code(epsg: int) -> Any:
 
 
 def projjson(crs: Any) -> dict[str, Any]:
-    """Return the PROJJSON of a coordinate system, or of the source system if it is bound."""
+    """Return the PROJJSON of a coordinate system.
+
+    For a bound system, this is the PROJJSON of its source system.
+    """
     return _unbound(crs.to_dict(projjson=True))
 
 
 def _unbound(described: dict[str, Any]) -> dict[str, Any]:
-    """Return the PROJJSON of the source system if a system is bound to a datum."""
+    """Return a bound coordinate system's source system, or any other system unchanged."""
     source: dict[str, Any] = described.get("source_crs", described)
     return source
 
 
 def horizontal_part(crs: Any) -> tuple[Any, float | None]:
-    """Return the horizontal part of a coordinate system, and its height unit in meters.
+    """Return the horizontal part of a coordinate system and its height unit in meters.
 
     The height unit is None if the system has no heights.
     """
@@ -215,10 +221,10 @@ def is_local(crs: Any) -> bool:
 
 
 def linear_unit(crs: Any) -> tuple[str, float] | None:
-    """Return the name of the unit of x and y and its length in meters, or None for angles.
+    """Return the name and the length in meters of the horizontal unit.
 
-    `crs` must not be compound. PROJJSON is used because GDAL reports the unit only for projected
-    systems.
+    The result is None if the unit is an angle. `crs` must not be compound. PROJJSON is used because
+    GDAL reports the unit only for projected systems.
     """
     axes = projjson(crs).get("coordinate_system", {}).get("axis", ())
     unit = axes[0].get("unit") if axes else None
@@ -239,7 +245,10 @@ def is_geocentric(crs: Any) -> bool:
 
 
 def crs_key(crs: Any) -> tuple[str, int | None]:
-    """Return a string that identifies a coordinate system, and its EPSG code if it is certain."""
+    """Return a string that identifies a coordinate system, and its EPSG code.
+
+    The code is None if it is uncertain.
+    """
     if crs is None:
         return "", None
     code = crs.to_epsg(confidence_threshold=90)  # 70 would guess an unknown datum
@@ -247,7 +256,7 @@ def crs_key(crs: Any) -> tuple[str, int | None]:
 
 
 def crs_name(crs: Any) -> str:
-    """Return the code and the name of a coordinate system for messages."""
+    """Return the code and name of a coordinate system, as shown in messages."""
     _, code = crs_key(crs)
     name = str(projjson(crs)["name"])[:80]
     if not code:
@@ -256,7 +265,7 @@ def crs_name(crs: Any) -> str:
 
 
 def describe_system(epsg: int) -> str:
-    """Return an EPSG code, with the name of the system if rasterio is installed and knows it."""
+    """Format an EPSG code, with the name of the coordinate system if rasterio knows it."""
     crs = crs_from_code(epsg) if has_registry() else None
     return f"EPSG:{epsg}" if crs is None else crs_name(crs)
 
@@ -277,7 +286,7 @@ def transform_coordinates(source: Any, target: Any, points: Floats) -> Floats:
 
 
 def longitude_latitude(crs: Any, x: float, y: float) -> tuple[float, float] | None:
-    """Return the WGS 84 longitude and latitude of a location in degrees.
+    """Return the WGS 84 longitude and latitude of a location, in degrees.
 
     The result is None if the location is outside the domain of the system.
     """
@@ -312,10 +321,10 @@ def area_of_use(crs: Any) -> AreaOfUse | None:
 def missed_area(
     crs: Any, x: float, y: float, margin_deg: float = _ELSEWHERE_DEG
 ) -> AreaOfUse | None:
-    """Return the area of use of a system if a location is outside it, or None otherwise.
+    """Return a coordinate system's area of use if a location is outside the area.
 
-    Locations within `margin_deg` of the area are not considered outside. The result is also None if
-    the area is unknown.
+    Locations within `margin_deg` of the area are not considered outside. The result is None if the
+    location is not outside, or if the area is unknown.
 
     Parameters
     ----------
@@ -339,7 +348,8 @@ def outside_system(epsg: int, x: float, y: float) -> str:
 
     Far means more than 5 degrees. The result is a phrase such as "the area of use of EPSG:2056
     (CH1903+ / LV95), which is Liechtenstein; Switzerland". It is an empty string if the location is
-    not far outside, if the code is unknown, if the system is not projected, and without rasterio.
+    not far outside, if the code is unknown, if the system is not projected, or if rasterio is not
+    installed.
     """
     if _is_in_zone(epsg, x, y) or not has_registry():
         return ""
@@ -366,10 +376,10 @@ def _is_in_zone(epsg: int, x: float, y: float) -> bool:
 
 
 def zone_in_area(epsg: int, x: float, y: float) -> int | None:
-    """Return the UTM zone in which a location would be in the area of use of a system.
+    """Find a UTM zone whose coordinates may have been mistaken for those of another system.
 
-    This identifies coordinates in a UTM zone that were mistaken for coordinates in the system. The
-    zone is an EPSG code. The result is None if no zone or several zones fit, and without rasterio.
+    Returns the EPSG code of the zone in which the location would be within the area of use of the
+    system. The result is None if no zone or several zones fit, or if rasterio is not installed.
     """
     crs = crs_from_code(epsg) if has_registry() else None
     area = None if crs is None else area_of_use(horizontal_part(crs)[0])
@@ -384,10 +394,10 @@ def zone_in_area(epsg: int, x: float, y: float) -> int | None:
 
 
 def ground_scale(crs: Any, x: float, y: float) -> GroundScale | None:
-    """Return the scale of a projected system at a location.
+    """Return the ground scale of a projected coordinate system at a location.
 
-    The scale is computed from the ellipsoidal lengths of steps along x and y, which has the same
-    result as PROJ's factors. rasterio does not provide them. The result is None if the location is
+    The scale is computed from the ellipsoidal lengths of steps along x and y. This is equivalent to
+    the scale factors of PROJ, which rasterio does not expose. The result is None if the location is
     outside the domain of the system, or if the system is not projected.
 
     Parameters
@@ -415,7 +425,7 @@ def ground_scale(crs: Any, x: float, y: float) -> GroundScale | None:
 
 
 def _tissot_axes(steps: Floats) -> GroundScale:
-    """Return the semi-axes of Tissot's indicatrix, which are the singular values of the steps.
+    """Compute the semi-axes of Tissot's indicatrix as the singular values of the steps.
 
     The shape of the steps is (2, 2).
     """
@@ -430,7 +440,7 @@ def _tissot_axes(steps: Floats) -> GroundScale:
 
 
 def _degrees_per_unit(base: dict[str, Any]) -> float:
-    """Return the angular unit of a geographic system in degrees.
+    """Return the angular unit of a geographic coordinate system, in degrees.
 
     Old French grids use gradians.
     """
@@ -440,7 +450,7 @@ def _degrees_per_unit(base: dict[str, Any]) -> float:
 
 
 def _degree_lengths_m(base: dict[str, Any], latitude_deg: float) -> tuple[float, float]:
-    """Return the ellipsoidal lengths of a degree of longitude and of latitude in meters."""
+    """Return the ellipsoidal lengths of one degree of longitude and latitude in meters."""
     datum = base.get("datum") or base.get("datum_ensemble") or {}
     ellipsoid = datum.get("ellipsoid", {})
     axis, inverse = _WGS84_ELLIPSOID
@@ -462,8 +472,8 @@ def _degree_lengths_m(base: dict[str, Any], latitude_deg: float) -> tuple[float,
 def utm_code(longitude: float, latitude: float) -> int:
     """Return the EPSG code of the WGS 84 UTM zone that contains a location.
 
-    At latitudes of 84 degrees and more, return the code of the universal polar stereographic
-    system, which has a scale of 0.994 to 0.997 there.
+    At latitudes of 84 degrees and more, the result is the code of the universal polar stereographic
+    system. Its scale is 0.994 to 0.997 there.
     """
     if abs(latitude) >= _POLAR_DEG:
         return POLAR_EPSG[0] if latitude > 0 else POLAR_EPSG[1]
@@ -472,10 +482,11 @@ def utm_code(longitude: float, latitude: float) -> int:
 
 
 def suggested_epsg(crs: Any, x: float, y: float) -> int | None:
-    """Return the EPSG code of a system that is true to scale at a location, or None.
+    """Suggest the EPSG code of a coordinate system that is true to scale at a location.
 
-    The result is None if the location cannot be transformed, or if it is far outside the area of
-    use of its system, since its coordinates probably belong to another system then.
+    The result is None if the location cannot be transformed. It is also None if the location is far
+    outside the area of use of its system, because its coordinates then probably belong to another
+    system.
     """
     horizontal = horizontal_part(crs)[0]
     if missed_area(horizontal, x, y) is not None:
@@ -485,7 +496,7 @@ def suggested_epsg(crs: Any, x: float, y: float) -> int | None:
 
 
 def projection_kind(name: str) -> bool | None:
-    """Return whether a projection with a given name preserves lengths, or None if it is unknown.
+    """Return whether the named projection preserves lengths, or None if this is unknown.
 
     The name is used where PROJ cannot compute the scale. The result is False for Mercator
     projections.
@@ -497,7 +508,7 @@ def projection_kind(name: str) -> bool | None:
 
 
 def center_of(objects: Sequence[SceneMesh | SceneInstance]) -> Floats:
-    """Return the center of the bounding rectangle of the centers of objects.
+    """Return the center of the rectangle that encloses all object centers.
 
     The result contains x and y, which are zero if there are no objects.
     """
@@ -509,7 +520,7 @@ def center_of(objects: Sequence[SceneMesh | SceneInstance]) -> Floats:
 
 
 def _center(item: SceneMesh | SceneInstance) -> Floats:
-    """Return the center of the bounding box of an object in world coordinates."""
+    """Return the center of an object's bounding box in world coordinates."""
     if isinstance(item, SceneMesh):
         return np.asarray(item.bounds.mean(axis=0))
     middle = item.mesh.bounds.mean(axis=0)
@@ -517,7 +528,7 @@ def _center(item: SceneMesh | SceneInstance) -> Floats:
 
 
 def scale_problem(system: str, x: float, y: float, *, in_system: bool = True) -> str:
-    """Return why the lengths in a system are not true to scale at a location.
+    """Explain why lengths in a coordinate system are not true to scale at a location.
 
     The result is a clause that follows the name of the system, such as "whose meter is 0.68 m long
     on the ground here". It is an empty string if lengths are true to scale. The system must have
@@ -563,7 +574,7 @@ def world_advice(x: float, y: float, z: float) -> str:
 
 
 def target_problem(epsg: int, x: float, y: float, *, why_there: str = "") -> str:
-    """Return why the lengths in a target system are not true to scale at a location.
+    """Explain why lengths in a target coordinate system are not true to scale at a location.
 
     The result is a clause that starts with the system, such as "EPSG:3857 (WGS 84 /
     Pseudo-Mercator), whose …". It is an empty string if lengths are correct within
@@ -595,7 +606,7 @@ def target_problem(epsg: int, x: float, y: float, *, why_there: str = "") -> str
 
 
 def is_utm(epsg: int) -> bool:
-    """Return whether an EPSG code is that of a UTM zone of WGS 84, ETRS89 or NAD83."""
+    """Return whether an EPSG code denotes a UTM zone of WGS 84, ETRS89 or NAD83."""
     return any(epsg in codes for codes in UTM_EPSG)
 
 

@@ -1,4 +1,4 @@
-"""Reader of sweeps that consist of float32 rows, such as .bin (KITTI) and .pcd.bin (nuScenes)."""
+"""Reader of float32 sweep files, such as .bin (KITTI) and .pcd.bin (nuScenes)."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _NUSCENES_ENDING = ".pcd.bin"
 
 
 def columns_by_name(path: Path) -> tuple[str, ...]:
-    """Return the column names of a file according to its extension."""
+    """Return the column names of a file, as determined by its extension."""
     return NUSCENES if path.name.lower().endswith(_NUSCENES_ENDING) else KITTI
 
 
 def read_float_columns(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray]:
-    """Read the columns of a sweep by name.
+    """Read the columns of a sweep, keyed by name.
 
     `names` is `KITTI` or `NUSCENES`. Each column has shape (n,).
 
@@ -55,7 +55,7 @@ def read_float_columns(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray
 
 
 def read_float_rows(path: Path) -> list[Sweep]:
-    """Read the points of a sweep in the format that its extension specifies.
+    """Read the points of a sweep in the format implied by the file extension.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Reader of glTF 2.0 files, .glb and .gltf, according to the Khronos Group specification (2021).
+"""Reader of glTF 2.0 files (.glb and .gltf), as specified by the Khronos Group (2021).
 
 trimesh 5.2 is not used because it places a node with several parents only once, loses the children
 of cameras, ignores sparse and normalized positions, skins and required extensions, and reads
@@ -89,7 +89,7 @@ def read_gltf(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 class _NodeReader:
-    """A reader of nodes, meshes and skins, each of which is read once."""
+    """A reader that caches nodes, meshes and skins."""
 
     def __init__(self, file: GltfFile, materials: GltfMaterials) -> None:
         self._file = file
@@ -110,7 +110,10 @@ class _NodeReader:
         self._worlds: dict[int, Floats] = {}  # {node: transform to the scene} in this frame
 
     def animated_content(self, name: str) -> Content:
-        """Read the scene and bake an animation into its meshes, from the first to the last key."""
+        """Read the scene and bake an animation into its meshes.
+
+        The animation is baked from its first to its last keyframe.
+        """
         animation = find_animation(self._file.header.get("animations", []), name)
         first, last = keyframe_range(animation, self._file.accessor)
         count = max(1, math.ceil((last - first) * RATE_HZ))
@@ -119,7 +122,10 @@ class _NodeReader:
         return bake_animation(self._poses(animation, times_s), times_s.tolist(), self._allowance)
 
     def _poses(self, animation: dict[str, Any], times_s: Floats) -> Generator[Content]:
-        """Yield the content at each time of an animation, with colors only at the first."""
+        """Yield the content at each time of an animation.
+
+        Only the content at the first time has colors.
+        """
         self._channels = sample_channels(animation, times_s, self._file.accessor)
         if not self._channels:
             raise MeshFileError(
@@ -150,7 +156,7 @@ class _NodeReader:
         return _matrix({**node, **animated})
 
     def node(self, index: int) -> Node:
-        """Return a node, which is named after its mesh if it has no name.
+        """Return a node, named after its mesh if it has no name.
 
         Hidden nodes are returned without meshes and children.
         """
@@ -202,7 +208,7 @@ class _NodeReader:
         ]
 
     def _copies(self, attributes: dict[str, Any]) -> Floats | None:
-        """Return the transforms of the instances of a node's mesh, or None without instancing.
+        """Return the transforms of a node's mesh instances, or None if it is not instanced.
 
         The shape is (k, 4, 4).
         """
@@ -312,7 +318,7 @@ class _NodeReader:
         return join_pieces(name, map(piece, surfaces), self._allowance)
 
     def _read_joints(self, skin: int) -> Floats:
-        """Return the transforms of the joints of a skin from mesh to scene coordinates.
+        """Return the transforms of a skin's joints from mesh coordinates to scene coordinates.
 
         See glTF 2.0, section 3.7.3. The shape is (j, 4, 4).
         """
@@ -326,7 +332,7 @@ class _NodeReader:
         return worlds
 
     def _apply_skin(self, vertices: Floats, attributes: dict[str, Any], joints: Floats) -> Floats:
-        """Return vertices transformed by the weighted joints of each vertex."""
+        """Transform each vertex by its weighted joints."""
         blend = np.zeros((len(vertices), 4, 4))
         total = np.zeros(len(vertices))
         sets = (
@@ -353,7 +359,7 @@ class _NodeReader:
         return np.asarray(moved)
 
     def _primitive(self, primitive: dict[str, Any]) -> Piece:
-        """Return the triangles of a primitive with their mask, colors and material."""
+        """Return a primitive as a piece with its mask, colors and material."""
         position = primitive["attributes"].get("POSITION")
         index = primitive.get("indices")
         packed = primitive.get("extensions", {}).get(DRACO)
@@ -382,7 +388,8 @@ class _NodeReader:
 def _matrix(node: dict[str, Any]) -> Floats:
     """Return the local transform of a node.
 
-    It is stated as a matrix in column-major order, or as translation, rotation and scale.
+    The transform is stated as a matrix in column-major order, or as translation, rotation and
+    scale.
     """
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
@@ -399,9 +406,9 @@ def _matrices(
     rotation: Floats | None,
     scale: Floats | None,
 ) -> Floats | None:
-    """Return transforms composed from translations, quaternions and scales.
+    """Compose transforms from translations, quaternions and scales.
 
-    Their shapes are (k, 3), (k, 4) and (k, 3), and the shape of the result is (k, 4, 4).
+    The inputs have the shapes (k, 3), (k, 4) and (k, 3), and the result has shape (k, 4, 4).
     """
     rows = next((part for part in (translation, rotation, scale) if part is not None), None)
     if rows is None:

@@ -1,4 +1,7 @@
-"""Animations of glTF 2.0 files, with samplers as in section 3.11 and appendix C."""
+"""Animations in glTF 2.0 files.
+
+Samplers are implemented as in section 3.11 and appendix C of the specification.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +48,7 @@ def find_animation(animations: list[dict[str, Any]], name: str) -> dict[str, Any
 def keyframe_range(
     animation: Mapping[str, Any], read: Callable[[Any], AnyArray]
 ) -> tuple[float, float]:
-    """Return the times of the first and the last keyframe of an animation.
+    """Return the first and the last keyframe time of an animation.
 
     `read` returns the values of an accessor.
 
@@ -63,7 +66,7 @@ def keyframe_range(
 def sample_channels(
     animation: Mapping[str, Any], at_s: Floats, read: Callable[[Any], AnyArray]
 ) -> AnimatedNodes:
-    """Return the values of animated nodes at given times.
+    """Return the values of animated nodes at the given times.
 
     `at_s` has shape (t,), and `read` returns the values of an accessor.
 
@@ -95,7 +98,7 @@ def sample_channels(
 def _interpolate(
     keys: Floats, values: Floats, at_s: Floats, kind: str, are_rotations: bool
 ) -> Floats:
-    """Interpolate keyframe values at given times.
+    """Interpolate keyframe values at the given times.
 
     Times have shape (t,), keyframe times have shape (k,), and the result has shape (t, w). Keyframe
     values have shape (k, 1, w), or (k, 3, w) for splines, which have an in-tangent, a value and an
@@ -128,7 +131,7 @@ def _interpolate(
 
 
 def _slerp(u: Floats, start: Floats, stop: Floats) -> Floats:
-    """Interpolate along the shorter rotation between quaternions (Shoemake, 1985).
+    """Interpolate between quaternions along the shorter rotation (Shoemake, 1985).
 
     Fractions have shape (t, 1), and quaternions have shape (t, 4).
     """

@@ -25,9 +25,10 @@ def decompress_draco(data: bytes, allowance: Allowance) -> Any:
 
 
 def _draco_counts(data: bytes) -> tuple[int, int]:
-    """Return the numbers of faces and vertices that the header of a Draco 2.2 mesh declares.
+    """Return the face and vertex counts that the header of a Draco 2.2 mesh declares.
 
-    The decoder allocates memory for these numbers, although a small file can declare any number.
+    The decoder allocates memory according to these counts, and even a small file can declare
+    arbitrarily large ones.
     """
     magic, version, kind, method, flags = struct.unpack_from("<5sHBBH", data)
     if magic != b"DRACO" or kind != 1 or method > 1:

@@ -42,7 +42,7 @@ V = TypeVar("V")
 
 
 def split_chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """Return the JSON object of a file, and the binary buffer of a .glb file."""
+    """Return the JSON object of a file and, for a .glb file, its binary buffer."""
     body = b""
     if data[:4] == b"glTF" and len(data) >= 20:
         version, total, size = struct.unpack_from("<III", data, 4)
@@ -90,7 +90,7 @@ def extension_notes(header: dict[str, Any]) -> list[str]:
 
 
 def root_nodes(header: dict[str, Any]) -> list[int]:
-    """Return the indices of the root nodes of the default scene, or of the file without scenes."""
+    """Return the root nodes of the default scene, or of the file if it has no scenes."""
     nodes = header.get("nodes", ())
     if scenes := header.get("scenes"):
         return list(scenes[header.get("scene", 0)].get("nodes", ()))
@@ -135,7 +135,7 @@ class GltfFile:
         return entries[number]
 
     def _read_accessor(self, index: int) -> AnyArray:
-        """Return the values of an accessor, without copying them if possible.
+        """Return the values of an accessor, avoiding a copy if possible.
 
         The shape is (count, width).
         """
@@ -174,7 +174,7 @@ class GltfFile:
         return np.maximum(numbers / np.iinfo(numbers.dtype).max, -1.0)
 
     def _array(self, part: dict[str, Any], kind: np.dtype[Any], count: int, width: int) -> Any:
-        """Return values in a buffer view, starting at `part['byteOffset']`.
+        """Return the values in a buffer view that start at `part['byteOffset']`.
 
         The shape is (count, width).
         """
@@ -196,7 +196,7 @@ class GltfFile:
         return memoryview(self._buffer(view["buffer"]))[start : start + view["byteLength"]]
 
     def _read_buffer(self, index: int) -> bytes:
-        """Return the bytes of a buffer, which is in the file itself, a data URI or another file."""
+        """Read a buffer, which can be in the file itself, in a data URI or in another file."""
         buffer = self.part("buffers", index)
         uri = buffer.get("uri")
         if uri is None:
@@ -239,14 +239,13 @@ class GltfFile:
 
 
 def _decode_data_uri(uri: str) -> bytes:
-    """Decode a data URI."""
     kind, _, text = uri.partition(",")
     content = unquote_to_bytes(text)
     return base64.b64decode(content) if kind.endswith(";base64") else content
 
 
 def extension(part: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return the data of an extension of a part, or an empty dictionary."""
+    """Return a part's data for an extension, or an empty dictionary."""
     content: dict[str, Any] = part.get("extensions", {}).get(name, {})
     return content
 

@@ -35,7 +35,10 @@ _WRAPS: dict[Any, Wrap] = {33071: "clamp", 33648: "mirror"}
 
 
 class GltfMaterials:
-    """Masks, base colors and names of the materials of a file, with each texture created once."""
+    """Masks, base colors and names of a file's materials.
+
+    Each texture is created only once.
+    """
 
     def __init__(self, file: GltfFile, options: ReadOptions) -> None:
         self._file = file
@@ -104,7 +107,7 @@ class GltfMaterials:
     def _read_tinted(self, key: tuple[int, tuple[float, ...], Wrap, Wrap]) -> Texture:
         """Return the texture of a tinted image.
 
-        Keys are (image, linear tint, wrap along u, wrap along v).
+        Keys are tuples (image, linear tint, wrap mode along u, wrap mode along v).
         """
         image, light, wrap_u, wrap_v = key
         colors = self._file.image(image, partial(read_colors, notes=self.notes))
@@ -114,7 +117,7 @@ class GltfMaterials:
         return Texture(colors, (wrap_u, wrap_v), self._allowance)
 
     def _wraps(self, texture: dict[str, Any]) -> tuple[Wrap, Wrap]:
-        """Return how a texture continues beyond its edges along u and along v."""
+        """Return the wrap modes of a texture along u and v."""
         sampler = self._file.part("samplers", texture["sampler"]) if "sampler" in texture else {}
         wrap_u, wrap_v = (_WRAPS.get(sampler.get(name), "repeat") for name in ("wrapS", "wrapT"))
         return wrap_u, wrap_v
@@ -138,7 +141,7 @@ class GltfMaterials:
         return name[:80] or f"material {str(number)[:20]}"
 
     def _read_texture(self, number: int) -> tuple[Texture, dict[str, Any]] | None:
-        """Return the mask of a material and its texture info, or None if the material is opaque."""
+        """Return the mask and texture info of a material, or None if the material is opaque."""
         material = self._file.part("materials", number)
         mode = material.get("alphaMode", "OPAQUE")
         if mode not in _CUT:
@@ -163,7 +166,8 @@ class GltfMaterials:
     def _read_mask(self, key: tuple[int, int, Wrap, Wrap]) -> Texture:
         """Return the mask of an image.
 
-        Keys are (image, minimum alpha that blocks light, wrap along u, wrap along v).
+        Keys are tuples (image, minimum alpha that blocks light, wrap mode along u, wrap mode along
+        v).
         """
         image, min_alpha, wrap_u, wrap_v = key
         opacity = self._opacity(image)
@@ -174,7 +178,7 @@ class GltfMaterials:
         return self._file.image(index, read_opacity)
 
     def _coordinates(self, info: dict[str, Any], primitive: dict[str, Any], mesh: Any) -> Any:
-        """Return the texture coordinates of a primitive for a texture info.
+        """Return the texture coordinates to which a texture info of a primitive refers.
 
         The shape is (v, 2).
         """
@@ -196,10 +200,6 @@ class GltfMaterials:
         return uv
 
     def _attribute(self, name: str, primitive: dict[str, Any], mesh: Any) -> AnyArray:
-        """Return a vertex attribute of a primitive.
-
-        The shape is (v, width).
-        """
         accessor = primitive["attributes"][name]
         if mesh is None:
             return self._file.accessor(accessor)
@@ -210,7 +210,10 @@ class GltfMaterials:
 
 
 def _base_of(material: dict[str, Any]) -> tuple[dict[str, Any] | None, Sequence[float]]:
-    """Return the texture info of the base color of a material, or None, and the color factors."""
+    """Return the texture info and the factors of a material's base color.
+
+    The texture info is None if the material has no texture.
+    """
     usual = material.get("pbrMetallicRoughness", {})
     glossy = extension(material, _GLOSSY)
     info = usual.get("baseColorTexture") or glossy.get("diffuseTexture")
@@ -218,7 +221,7 @@ def _base_of(material: dict[str, Any]) -> tuple[dict[str, Any] | None, Sequence[
 
 
 def _image_of(texture: dict[str, Any]) -> int:
-    """Return the index of the image of a texture, or raise MaskError for an unsupported format."""
+    """Return the image index of a texture, or raise MaskError if its format is unsupported."""
     index = texture.get("source", extension(texture, "EXT_texture_webp").get("source"))
     if index is None:
         raise MaskError("its image is in a format that cannot be read")

@@ -26,7 +26,7 @@ class Limits(NamedTuple):
     high: float
 
     def is_plain(self) -> bool:
-        """Return whether the limits are those of a typical scale, such as 0 to 1, 100 or 255."""
+        """Return whether the limits are typical of a full scale, such as 0 to 1, 100 or 255."""
         steps = {self.high, self.high + 1}
         return self.low == 0 and not steps.isdisjoint(_PLAIN_STEPS)
 
@@ -39,12 +39,12 @@ class Limits(NamedTuple):
 
 
 def common_limits(limits: Sequence[Limits]) -> Sequence[Limits] | None:
-    """Return the limits that bring the intensities of all scans to the same scale.
+    """Return the limits that convert the intensities of all scans to the same scale.
 
     Many programs write the lowest and highest measured intensity of each scan as its limits,
-    although all scans have the same scale. Different limits are therefore only interpreted as
-    different scales if they differ by a factor of 16, or if all of them are plain limits, such as 0
-    to 255, or start at the lowest value of Leica's scale.
+    although all scans have the same scale. Different limits are therefore interpreted as different
+    scales only in two cases: if they differ by a factor of 16, or if all of them are plain limits,
+    such as 0 to 255, or start at the lowest value of Leica's scale.
 
     Returns
     -------

@@ -1,8 +1,8 @@
-"""Coordinate units according to the coordinate system of a file, which is WKT or GeoTIFF keys.
+"""Coordinate units according to the coordinate system that a file states.
 
-OGC WKT 1 and 2 state the length of each unit. GeoTIFF keys refer to units or coordinate systems by
-EPSG codes. The units of a coordinate system are looked up in the PROJ database, which is part of
-rasterio.
+The system is stated as WKT or as GeoTIFF keys. OGC WKT 1 and 2 state the length of each unit.
+GeoTIFF keys refer to units or coordinate systems by EPSG codes. The units of a coordinate system
+are looked up in the PROJ database, which is part of rasterio.
 """
 
 from __future__ import annotations
@@ -88,9 +88,9 @@ _OVERRIDE = (
 
 
 def reprojection_advice(epsg: int | None) -> str:
-    """Return a sentence that explains how to transform a cloud to a system in meters.
+    """Suggest how to transform a cloud to a coordinate system in meters.
 
-    `epsg` is the code of the suggested system, or None.
+    The result is a sentence. `epsg` is the code of the suggested system, or None.
     """
     code = epsg or "CODE"
     return (
@@ -110,7 +110,7 @@ METRE = CoordinateUnit("metre", 1.0)
 
 
 def unit_by_name(name: str) -> float | None:
-    """Return the length of a unit in meters by its name, or None if the unit is unknown.
+    """Return the length of a named unit in meters, or None if the unit is unknown.
 
     The case of the name is ignored.
     """
@@ -120,7 +120,7 @@ def unit_by_name(name: str) -> float | None:
 
 @dataclass(frozen=True)
 class CoordinateUnits:
-    """Horizontal and vertical length units of the coordinates in a file."""
+    """Horizontal and vertical length units of coordinates."""
 
     horizontal: CoordinateUnit
     vertical: CoordinateUnit
@@ -128,7 +128,7 @@ class CoordinateUnits:
 
     @property
     def factors(self) -> tuple[float, float, float]:
-        """Lengths of the units of x, y and z in meters."""
+        """Factors that convert x, y and z to meters."""
         return self.horizontal.meters, self.horizontal.meters, self.vertical.meters
 
     @property
@@ -224,7 +224,7 @@ def wkt_units(text: str) -> CoordinateUnits:
 
 
 def wkt_method(text: str) -> str:
-    """Return the name of the projection method in WKT, or an empty string if there is none."""
+    """Return the name of the projection method in WKT, or an empty string without a projection."""
     _, parts = _parse_systems(text)
     for part in parts:
         if part.keyword in _HORIZONTAL:
@@ -245,7 +245,7 @@ def wkt_code(text: str) -> int | None:
 
 
 def _parse_systems(text: str) -> tuple[_Node, list[_Node]]:
-    """Return the coordinate system in WKT, and its components.
+    """Return the coordinate system in WKT and its components.
 
     A system that is not compound is its only component.
     """
@@ -256,7 +256,7 @@ def _parse_systems(text: str) -> tuple[_Node, list[_Node]]:
 
 
 def _without_transformation(node: _Node) -> _Node:
-    """Return the source system of a bound system, or the system itself if it is not bound."""
+    """Return a bound system's source system, or any other system unchanged."""
     source = node.child({"SOURCECRS"}) if node.keyword in _BOUND else None
     return source.nodes[0] if source and source.nodes else node
 
@@ -269,7 +269,6 @@ def _is_geocentric(system: _Node) -> bool:
 
 
 def _parse_wkt(text: str) -> _Node:
-    """Parse WKT and return the root node."""
     root = _Node("")
     open_nodes = [root]
     for match in _TOKENS.finditer(text):
@@ -295,7 +294,10 @@ def _parse_wkt(text: str) -> _Node:
 
 
 def _length_unit(system: _Node) -> CoordinateUnit | None:
-    """Return the unit of the first axis of a system, which WKT 2 can state for each axis."""
+    """Return the unit of a system's first axis.
+
+    WKT 2 can state the unit of each axis.
+    """
     for node in (system, *system.nodes):
         if node is system or node.keyword == "AXIS":
             unit = node.child({*_LENGTH_UNITS})
@@ -305,7 +307,7 @@ def _length_unit(system: _Node) -> CoordinateUnit | None:
 
 
 def _third_unit(system: _Node) -> CoordinateUnit | None:
-    """Return the unit of the third axis of a three-dimensional projected system, or None."""
+    """Return the unit of a three-dimensional projected system's third axis, or None."""
     axes = [node for node in system.nodes if node.keyword == "AXIS"]
     if len(axes) < 3:
         return None
@@ -340,7 +342,6 @@ def geo_keys(records: Mapping[int, bytes]) -> dict[int, float]:
 
 
 def _key_values(data: bytes, count: int, doubles: bytes) -> Iterator[tuple[int, float]]:
-    """Yield the numeric GeoTIFF keys and their values."""
     for number in range(count):
         key, location, _, value = struct.unpack_from("<4H", data, 8 + 8 * number)
         if location == 0:
@@ -400,7 +401,7 @@ def method_of_keys(keys: Mapping[int, float]) -> str:
 
 
 def _unit_of_code(code: float | None) -> CoordinateUnit | None:
-    """Return the unit with an EPSG code, or None if it is missing or user-defined."""
+    """Return the unit for an EPSG code, or None if the code is missing or user-defined."""
     if code is None or code in (0, USER_DEFINED):
         return None
     if int(code) not in _EPSG_UNITS:

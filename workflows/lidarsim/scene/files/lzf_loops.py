@@ -9,7 +9,7 @@ from raybeam.compiled import compiled
 
 @compiled()
 def unpack_lzf(packed, unpacked):
-    """Decompress data, and return the number of bytes written, or -1 if the data is corrupt.
+    """Decompress data and return the number of bytes written, or -1 if the data is corrupt.
 
     A control byte below 32 is the number of literal bytes that follow, minus one. Any other control
     byte starts a copy of earlier output. Its upper three bits are the length minus two, to which an

@@ -1,4 +1,4 @@
-"""Registry of mesh file formats, which are selected by file extension.
+"""Registry of mesh file formats, keyed by file extension.
 
 The module of a reader is imported when the first file in its format is read. Formats of other
 packages are found through the tables in `_TABLES`, so that this module does not import these
@@ -36,7 +36,7 @@ MeshReader = Callable[[bytes, Path, ReadOptions], Content]
 
 @dataclass(frozen=True)
 class MeshFormat:
-    """A mesh file format, with the reader and the options for its files.
+    """A mesh file format with its reader and options.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class MeshFormat:
 
     @property
     def reader(self) -> MeshReader:
-        """Function that reads a file, which is imported if it is specified by name.
+        """Reader function, which is imported if it is specified by name.
 
         Raises
         ------
@@ -121,7 +121,10 @@ class MeshFormat:
 
 
 def _options_problem(options: type) -> str:
-    """Return why a class cannot define format-specific options, or an empty string if it can."""
+    """Explain why a class cannot define format-specific options.
+
+    The result is an empty string if the class is suitable.
+    """
     if not is_dataclass(options):
         return "are not a dataclass"
     for entry in fields(options):
@@ -185,7 +188,10 @@ _NOT_READ = (
 
 
 def known_formats() -> Iterator[MeshFormat]:
-    """Yield all formats in the tables, with those that cannot be read last."""
+    """Yield all formats in the tables.
+
+    Formats that cannot be read come last.
+    """
     yield from _formats_read()
     yield from _NOT_READ
 
@@ -216,7 +222,7 @@ def missing_packages() -> list[str]:
 def format_of(path: str | Path) -> MeshFormat | None:
     """Return the format of a file according to its extension, or None if it is unknown.
 
-    The format can be one that cannot be read and only has advice.
+    The format can be one that lidarpool cannot read and for which it only gives advice.
 
     Raises
     ------
@@ -236,7 +242,7 @@ def _first_with_ending(ending: str, rows: Iterator[MeshFormat]) -> MeshFormat | 
 
 
 def plugin_of(path: str | Path) -> Plugin | None:
-    """Return the plug-in that reads files with the extension of a path, or None."""
+    """Return the plug-in for the extension of a path, or None."""
     ending = Path(path).suffix.lower()
     return None if _first_with_ending(ending, _formats_read()) else _plugin_of_ending(ending)
 

@@ -1,4 +1,4 @@
-"""Options that readers of all mesh file formats share.
+"""Options shared by the readers of all mesh file formats.
 
 Options for specific formats are defined by the dataclasses in `MeshFormat.options`.
 """

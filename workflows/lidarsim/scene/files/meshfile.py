@@ -83,7 +83,7 @@ class Objects(NamedTuple):
     epsg: int | None = None  # code of the coordinate system of x and y, if the file states it
 
     def at_start(self, tell: Callable[[str], None]) -> tuple[SceneMesh | SceneInstance, ...]:
-        """Return all objects as static objects, with actors at their first pose.
+        """Convert actors at their first pose to static objects, and return all objects.
 
         If there are actors, `tell` is called with a message about them.
         """
@@ -105,8 +105,8 @@ def load_objects(
 
     Each placed mesh of a scene graph becomes an object that is named after its node. Large meshes
     that are placed several times become instances. In formats without names, the object is named
-    after the file. Objects that their nodes scale to zero, and instances of meshes with zero area,
-    are skipped.
+    after the file. Objects whose nodes scale them to zero are skipped, and so are instances of
+    meshes with zero area.
 
     Parameters
     ----------
@@ -227,7 +227,7 @@ def _place_in_world(
 def _report_notes(
     path: Path, content: Content, tell: Callable[[str], None], *, unit_given: bool
 ) -> None:
-    """Call `tell` with messages about skipped objects and with the notes of the reader."""
+    """Call `tell` with messages about skipped objects and with the reader's notes."""
     if content.skipped:
         names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
         tell(f"{path} has objects without an area, which were skipped: {names}.")
@@ -251,7 +251,7 @@ def load_meshes(
 def _summary(
     meshes: Sequence[SceneMesh | SceneInstance], unit_m: float, up_axis: str, options: ReadOptions
 ) -> str:
-    """Return a summary of a file, such as "4 objects, 38 triangles, in m, Y-up, 1 texture"."""
+    """Summarize a file, for example as "4 objects, 38 triangles, in m, Y-up, 1 texture"."""
     meshes_once = [item.mesh if isinstance(item, SceneInstance) else item for item in meshes]
     shared = [mesh for item, mesh in zip(meshes, meshes_once, strict=True) if item is not mesh]
     words = [plural(len(meshes), "object")]
@@ -279,9 +279,9 @@ def _summary(
 
 
 def written_by_lidarpool(path: Path) -> bool:
-    """Return whether lidarpool wrote the file, which is in meters then.
+    """Return whether lidarpool wrote the file.
 
-    The format of the file must not state a unit itself.
+    Files written by lidarpool are in meters. The format of the file must not state a unit itself.
     """
     with open_input(path) as file:
         return FORMAT_COMMENT.encode() in file.read(_HEAD_BYTES)
@@ -323,7 +323,10 @@ def _report_axes(
 
 
 def _doubt_about_rotation(content: Content, meshes: Sequence[SceneMesh | SceneInstance]) -> str:
-    """Return why a file that was rotated from Y-up may have been Z-up, or an empty string."""
+    """Explain why a file that was rotated from Y-up may actually be Z-up.
+
+    The result is an empty string if the rotation is not in doubt.
+    """
     if "trimesh" in content.generator:
         return ", but was written by trimesh, which does not convert axes"
     lower = np.min([_corners(mesh).min(axis=0) for mesh in meshes], axis=0)
@@ -334,7 +337,7 @@ def _doubt_about_rotation(content: Content, meshes: Sequence[SceneMesh | SceneIn
 
 
 def _read(path: Path, row: MeshFormat, data: bytes, options: ReadOptions) -> Content:
-    """Read a file, and convert all errors to LidarError."""
+    """Read a file, converting all errors to LidarError."""
     try:
         with prefixed(path):
             return _checked_content(row, path, data, options)
@@ -356,7 +359,7 @@ def _read(path: Path, row: MeshFormat, data: bytes, options: ReadOptions) -> Con
 
 
 def _truncation_error(error: Exception, data: bytes) -> CutShortError | None:
-    """Return a CutShortError if the error of a library means that the file is truncated."""
+    """Return a CutShortError if a library error indicates a truncated file, or None."""
     if isinstance(error, json.JSONDecodeError):
         if error.msg.startswith("Unterminated") or error.pos >= len(error.doc.rstrip()):
             return CutShortError(f"its JSON ends in line {error.lineno}, column {error.colno}")
@@ -436,7 +439,7 @@ _FOREIGN = {
 
 
 def _other_format(path: Path, data: bytes) -> str:
-    """Return a hint about the probable format of a rejected file, or an empty string."""
+    """Return a hint about the likely format of a rejected file, or an empty string."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return " It appears to be encoded in UTF-16. Save it as UTF-8."
     if path.suffix.lower() in SCAN_READERS and not is_text_raster(path):
@@ -450,7 +453,7 @@ def _other_format(path: Path, data: bytes) -> str:
 def _place_object(
     item: SceneMesh | SceneInstance, stem: str, transforms: Sequence[Transform]
 ) -> tuple[SceneMesh | SceneInstance | None, float]:
-    """Return an object in world coordinates, and its maximum coordinate in meters.
+    """Return an object in world coordinates and its maximum coordinate in meters.
 
     The object is None if it is too far from the origin. Its name is safe to print and to use in
     files.
@@ -506,7 +509,7 @@ def _mesh_at_start(actor: Actor) -> SceneMesh:
 
 
 def _corners(item: SceneMesh | SceneInstance) -> Floats:
-    """Return points in world coordinates whose bounding box contains an object."""
+    """Return world points with the same bounding box as an object."""
     if isinstance(item, SceneMesh):
         return (item.animation or item).bounds
     box = np.array(list(product(*item.mesh.bounds.T)))

@@ -1,4 +1,4 @@
-"""Materials of Wavefront files, which define colors and opacity masks."""
+"""Wavefront materials, which define colors and opacity masks."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _MAX_BYTES = 1 << 26  # maximum size of a material file
 
 @dataclass
 class _Image:
-    """An image of a material, with the options in its statement."""
+    """A material image with the options in its statement."""
 
     name: str
     options: dict[bytes, list[bytes]] = field(default_factory=dict)
@@ -59,12 +59,12 @@ class _Image:
 
     @property
     def wrap(self) -> Wrap:
-        """How the image continues beyond its edges."""
+        """Wrap mode beyond the edges of the image."""
         clamped = [word.lower() for word in self.options.get(b"-clamp", [])] == [b"on"]
         return "clamp" if clamped else "repeat"
 
     def coordinates(self, vt: Floats) -> Floats:
-        """Convert the texture coordinates in the file to image coordinates, with v pointing down.
+        """Convert texture coordinates from the file to image coordinates, in which v points down.
 
         Both arrays have shape (c, 2).
         """
@@ -75,26 +75,25 @@ class _Image:
         return np.column_stack([u, v])
 
     def _numbers(self, option: bytes, default: float) -> list[float]:
-        """Return two values of an option, with a default for missing values."""
+        """Return the two values of an option, replacing missing ones by a default."""
         numbers = [float(word) for word in self.options.get(option, [])]
         return (numbers + [default] * 2)[:2]
 
 
 @dataclass
 class _Entry:
-    """Images and color of a material."""
-
     images: dict[bytes, _Image] = field(default_factory=dict)  # {b"map_d": image}
     color: Bytes | None = None  # uint8 (1, 1, 3)
 
 
 class MtlMaterials:
-    """Masks and colors of the materials of a .obj file, each of which is read once.
+    """Masks and colors of the materials in an .obj file.
 
-    The material files are named by the `libraries` statements. Masks are `map_d` images, or the
-    alpha channels of `map_Kd` images if there are none. Constant opacities (`d` and `Tr`) are
-    ignored because some programs confuse the two. Colors are `map_Kd` images, or `Kd` if there are
-    none. `Kd` is ignored if there is an image because some programs set it to black then.
+    Each image is read only once. The material files are named by the `libraries` statements. Masks
+    are `map_d` images, or the alpha channels of `map_Kd` images if there are none. Constant
+    opacities (`d` and `Tr`) are ignored because some programs confuse the two. Colors are `map_Kd`
+    images, or `Kd` if there are none. `Kd` is ignored if there is an image because some programs
+    set it to black then.
     """
 
     def __init__(
@@ -121,7 +120,7 @@ class MtlMaterials:
         )
 
     def cutout(self, name: bytes, vt: Floats, corners: Ints) -> Cutout | None:
-        """Return the mask of a material for triangles, or None if there is no mask.
+        """Return the mask that a material applies to triangles, or None if it has no mask.
 
         `vt` contains texture coordinates of shape (c, 2), and `corners` contains indices into `vt`
         of shape (k, 3).
@@ -219,9 +218,9 @@ class MtlMaterials:
     def _read_mask(
         self, key: tuple[str, bool, float, float, Wrap]
     ) -> Texture | Literal["solid", "glass"]:
-        """Return the mask for a key, or the kind of material if no mask is required.
+        """Return the mask for a key, or 'solid' or 'glass' if the material requires no mask.
 
-        Keys are (name, whether brightness is opacity, base, gain, wrap).
+        Keys are tuples of name, whether brightness is opacity, base, gain, and wrap mode.
         """
         name, gray, base, gain, wrap = key
         opacity = self._opacity((name, gray))
@@ -235,7 +234,7 @@ class MtlMaterials:
     def _read_opacity(self, key: tuple[str, bool]) -> Bytes | None:
         """Return the opacity of an image, or None if it is opaque.
 
-        Keys are (name, whether brightness is opacity).
+        Keys are tuples of the name and whether brightness is opacity.
         """
         name, gray = key
         file = image_file(self._mesh, name, self._options, self._allowance)
@@ -244,7 +243,7 @@ class MtlMaterials:
     def _read_image(self, key: tuple[str, Wrap]) -> Texture:
         """Return the texture of a color image.
 
-        Keys are (name, wrap).
+        Keys are tuples of the name and the wrap mode.
         """
         name, wrap = key
         file = image_file(self._mesh, name, self._options, self._allowance)
@@ -253,7 +252,7 @@ class MtlMaterials:
 
 
 def _read_mtl(data: bytes) -> dict[bytes, _Entry]:
-    """Parse the materials in a file by name."""
+    """Parse the materials in a file, keyed by name."""
     entries: dict[bytes, _Entry] = {}
     entry = _Entry()
     text = data.removeprefix(b"\xef\xbb\xbf")  # byte order mark of editors on Windows

@@ -24,13 +24,13 @@ _WITHHELD_COLUMNS = ("withheld", "withheldflag", "classifwithheldflag")
 
 
 class OmittedPoints(NamedTuple):
-    """Numbers of omitted points by reason."""
+    """Number of omitted points for each reason."""
 
     withheld: int = 0
     noise: int = 0
 
     def note(self) -> str:
-        """Return a note that states the numbers, or an empty string if they are zero."""
+        """Return a note that states the numbers, or an empty string if no points were omitted."""
         kinds = []
         if self.withheld:
             kinds.append(f"{plural(self.withheld, 'withheld point')}")
@@ -56,7 +56,7 @@ def _marking_columns(names: tuple[str, ...]) -> tuple[str | None, str | None]:
 def usable_points(
     columns: Mapping[str, AnyArray], noise_classes: Collection[int] = NOISE_CLASSES
 ) -> tuple[Bools | None, OmittedPoints]:
-    """Return a mask of the usable points, and the numbers of omitted points.
+    """Return a mask of the usable points and the numbers of omitted points.
 
     Withheld points and noise points are not usable. The mask has shape (n,), or is None if all
     points are usable.

@@ -26,9 +26,9 @@ _EXPECTED = (
 def read_npy_cloud(path: Path) -> list[Sweep]:
     """Read the points of a NumPy array.
 
-    The first three columns, or the fields of these names, are x, y and z. The other columns are
-    named `column_4`, `column_5` and so on. Range images of shape (rows, columns, 3 or more) are
-    flattened.
+    The coordinates x, y and z are the first three columns, or the fields with these names. The
+    other columns are named `column_4`, `column_5` and so on. Range images of shape (rows, columns,
+    3 or more) are flattened.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def _fields(records: AnyArray) -> dict[str, AnyArray]:
 
 
 def _read_array(file: BinaryIO, size: int) -> AnyArray:
-    """Read the array in a file whose size in bytes is `size`."""
+    """Read the array in a file of `size` bytes."""
     shape, is_fortran, kind = _read_header(file)
     if not _holds_numbers(kind):
         raise ValueError(f"its array has the type {printable(str(kind))[:80]!r}. {_EXPECTED}")
@@ -94,7 +94,7 @@ def _read_array(file: BinaryIO, size: int) -> AnyArray:
 
 
 def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return the shape of the array in a file, whether it is in Fortran order, and its type."""
+    """Return the shape, Fortran-order flag and dtype of the array in a file."""
     layout: Any = np.lib.format
     readers = {(1, 0): layout.read_array_header_1_0, (2, 0): layout.read_array_header_2_0}
     start = file.read(len(layout.MAGIC_PREFIX))
@@ -115,7 +115,7 @@ def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
 
 
 def _holds_numbers(kind: np.dtype[Any]) -> bool:
-    """Return whether a type consists only of real numbers."""
+    """Return whether a dtype contains only real numbers."""
     if kind.names is not None:
         return all(_holds_numbers(kind[name]) for name in kind.names)
     return kind.base.kind in "biuf"

@@ -52,8 +52,6 @@ _NO_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class _Field:
-    """A field declared in the header."""
-
     name: str
     kind: str  # NumPy type, such as "<f4"
     count: int  # numbers per point
@@ -65,8 +63,6 @@ class _Field:
 
 
 class _Header(NamedTuple):
-    """The header of a .pcd file."""
-
     fields: list[_Field]
     points: int
     encoding: str
@@ -75,7 +71,7 @@ class _Header(NamedTuple):
 
 
 def read_pcd(path: Path) -> list[Sweep]:
-    """Read the points of a .pcd file, with its VIEWPOINT as their pose.
+    """Read a .pcd file, whose VIEWPOINT becomes the pose of the points.
 
     Fields with several numbers become the columns `name_0`, `name_1` and so on. The packed colors
     `rgb` and `rgba` become red, green, blue, and alpha unless it is constant. Padding fields (`_`)
@@ -163,7 +159,6 @@ def pcd_bytes(
 
 
 def _parse_header(data: bytes, encoding: str) -> _Header:
-    """Parse the header before the DATA line."""
     entries: dict[str, tuple[int, list[str]]] = {}  # {keyword: (line number, words)}
     lines = data.decode("latin-1").splitlines()
     for number, line in enumerate(lines, 1):
@@ -259,10 +254,10 @@ def _whole_numbers(
 
 
 def _viewpoint(entries: _Entries) -> tuple[float, ...]:
-    """Return the position and the normalized quaternion in the order w, x, y, z.
+    """Return the position and the normalized quaternion of the viewpoint.
 
-    If all numbers are zero, return the default, because programs that do not support VIEWPOINT
-    write zeros.
+    The quaternion has the order w, x, y, z. If all numbers are zero, return the default, because
+    programs that do not support VIEWPOINT write zeros.
     """
     if "VIEWPOINT" not in entries:
         return _NO_VIEWPOINT
@@ -291,7 +286,10 @@ def _pose(viewpoint: Sequence[float]) -> Floats:
 
 
 def _read_binary(header: _Header, body: memoryview) -> list[AnyArray]:
-    """Return an array of shape (n, count) for each field of binary rows."""
+    """Read the fields of binary rows.
+
+    Each array has shape (n, count).
+    """
     row_size = sum(field.size for field in header.fields)
     _check_length(header, row_size, len(body))
     size = row_size * header.points
@@ -304,7 +302,7 @@ def _read_binary(header: _Header, body: memoryview) -> list[AnyArray]:
 
 
 def _row_type(fields: Sequence[_Field], row_size: int) -> np.dtype[Any]:
-    """Return the type of a row, whose fields are named by their indices."""
+    """Return the dtype of a row, whose fields are named by their indices."""
     offsets = list(accumulate((field.size for field in fields), initial=0))[:-1]
     return np.dtype(
         {
@@ -326,9 +324,10 @@ def _check_length(header: _Header, row_size: int, size: int) -> None:
 
 
 def _read_compressed(header: _Header, body: memoryview, file_size: int) -> list[AnyArray]:
-    """Return an array of shape (n, count) for each field of a compressed body.
+    """Read the fields of a compressed body.
 
-    The fields are stored one after the other. PCL does not store padding, but other programs do.
+    Each array has shape (n, count). The fields are stored one after the other. PCL does not store
+    padding, but other programs do.
     """
     if len(body) < 8:
         raise CutShortError("the sizes of its compressed points are missing")
@@ -378,10 +377,10 @@ def _decompress(packed: memoryview, size: int) -> Bytes:
 
 
 def _read_text(header: _Header, body: memoryview) -> list[AnyArray]:
-    """Return an array of shape (n, count) for each field of text lines.
+    """Read the fields of text lines.
 
-    Floating-point fields are read in double precision regardless of their SIZE, since programs
-    write more digits.
+    Each array has shape (n, count). Floating-point fields are read in double precision regardless
+    of their SIZE, since programs write more digits.
     """
     names = [name for field in header.fields for name in _column_names(field)]
     lines = bytes(body).rstrip().count(b"\n") + 1
@@ -460,7 +459,7 @@ def _named_columns(fields: Sequence[_Field], arrays: Sequence[AnyArray]) -> dict
 
 
 def split_rgb(columns: dict[str, AnyArray]) -> dict[str, AnyArray]:
-    """Replace the packed column `rgb` or `rgba` by red, green and blue.
+    """Replace the packed column `rgb` or `rgba` with the columns red, green and blue.
 
     A column `alpha` is added unless alpha is constant.
     """
@@ -477,7 +476,7 @@ def split_rgb(columns: dict[str, AnyArray]) -> dict[str, AnyArray]:
 
 
 def _packed_colors(values: AnyArray) -> AnyArray:
-    """Return packed colors as integers 0xAARRGGBB.
+    """Convert packed colors to integers in the form 0xAARRGGBB.
 
     Colors are stored as integers, or as the bits of floating-point numbers. The first versions of
     PCL instead converted the integer to a floating-point number, such as 4.2108e+06 for a gray. The

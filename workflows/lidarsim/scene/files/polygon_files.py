@@ -31,7 +31,7 @@ from .scene_graph import Content, MeshFileError, Piece, ReadOptions, join_pieces
 
 
 def _ints(numbers: array[int]) -> Ints:
-    """Return a Python array as a NumPy array without copying it."""
+    """Wrap a Python array in a NumPy array without copying the data."""
     return np.frombuffer(numbers, np.int64)
 
 
@@ -49,8 +49,6 @@ _MAX_COORDINATE = 1 << 62  # limit for the indices of texture coordinates
 
 
 class _ObjTriangles(NamedTuple):
-    """Triangles of an object."""
-
     vertices: Ints  # (t, 3), indices of vertices
     coordinates: Ints  # (t, 3), indices of texture coordinates
     materials: Ints  # (t,), indices of materials
@@ -58,7 +56,7 @@ class _ObjTriangles(NamedTuple):
 
 @dataclass
 class _ObjPolygons:
-    """Polygons of an object while it is read.
+    """Polygons of an object that is being read.
 
     Arrays are used because lists would require ten times as much memory.
     """
@@ -134,7 +132,7 @@ def read_obj(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 def _parse_obj(text: bytes, stem: str, with_colors: bool, with_materials: bool) -> _ObjContent:
-    """Parse the lines of a file.
+    """Parse the lines of a Wavefront file.
 
     Polygons before the first named object belong to the object `stem`.
     """
@@ -177,7 +175,7 @@ def _parse_obj(text: bytes, stem: str, with_colors: bool, with_materials: bool) 
 def _obj_pieces(
     content: _ObjContent, polygons: _ObjPolygons, materials: MtlMaterials, options: ReadOptions
 ) -> list[Piece]:
-    """Return the triangles of an object as a piece for each material."""
+    """Split the triangles of an object into one piece per material."""
     vertices = content.vertices
     uv = content.uv
     tints = content.vertex_colors
@@ -203,7 +201,10 @@ def _obj_names(key: bytes, text: bytes) -> list[bytes]:
 
 
 def _obj_coordinates(value: bytes) -> list[float]:
-    """Parse two texture coordinates, which are NaN if a word is not a number."""
+    """Parse two texture coordinates.
+
+    Both are NaN if a word is not a number.
+    """
     try:
         u, v = [*map(float, value.partition(b"#")[0].split()[:2]), 0.0][:2]
     except ValueError:
@@ -212,7 +213,7 @@ def _obj_coordinates(value: bytes) -> list[float]:
 
 
 def _obj_coordinate_rows(value: bytes, count: int) -> list[int]:
-    """Return the indices of the texture coordinates of a face, or -1 for missing ones.
+    """Return the texture coordinate indices of a face, or -1 for missing ones.
 
     `count` is the number of texture coordinates that have been read so far.
     """
@@ -242,7 +243,10 @@ def _obj_corners(value: bytes, count: int) -> list[int]:
 
 
 def _obj_mistake(data: bytes, with_colors: bool) -> str | None:
-    """Return which line of a file is invalid, or None if each line is valid by itself."""
+    """Describe the first invalid line of a file, or return None if there is none.
+
+    Each line is checked without considering other lines.
+    """
     total = len(re.findall(rb"^[ \t]*v[ \t]", data, re.MULTILINE))
     count = 0  # vertices read so far
     for number, line in _logical_lines(data):
@@ -307,7 +311,10 @@ _OFF = re.compile(rb"(?:ST)?C?N?OFF(?![A-Z])", re.IGNORECASE)
 
 
 def read_off(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read an Object File Format (.off) file as a single mesh, with its vertex colors (COFF)."""
+    """Read an Object File Format (.off) file as a single mesh.
+
+    Vertex colors (COFF) are also read.
+    """
     uncommented = re.sub(rb"#[^\r\n]*", b"", data).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     text = uncommented.lstrip()
     keyword = _OFF.match(text)
@@ -355,7 +362,7 @@ def _off_lines(text: bytes, first_line: int) -> tuple[list[_NumberedLine], list[
 
 
 def _off_vertices(lines: Sequence[_NumberedLine], *, is_colored: bool) -> tuple[Floats, Floats]:
-    """Return the vertices, and the colors of the vertices that have one."""
+    """Parse the vertices, and the colors of those vertices that have one."""
     numbers = array("d")
     tints = array("d")
     for number, words in lines:
@@ -370,7 +377,7 @@ def _off_vertices(lines: Sequence[_NumberedLine], *, is_colored: bool) -> tuple[
 
 
 def _off_faces(lines: Sequence[_NumberedLine], count: int) -> tuple[Ints, Ints]:
-    """Return the corners of all faces, and the number of corners of each face.
+    """Return the corners of all faces and the number of corners of each face.
 
     `count` is the number of vertices.
     """
@@ -409,7 +416,7 @@ def _color_shares(colors: Floats) -> Floats:
 
 
 def _vertex_colors(shares: Floats, faces: Ints) -> Colors:
-    """Return face colors from vertex colors that range from 0 to 1."""
+    """Convert vertex colors between 0 and 1 to face colors."""
     return Colors.from_vertex_colors(as_bytes(shares)[faces])
 
 
@@ -456,7 +463,7 @@ def read_stl(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 def _stl_mistake(text: bytes) -> str | None:
-    """Return which line of a text file is invalid, or None if all facets have three vertices."""
+    """Describe the first error in a text file, or return None if all facets are valid."""
     count = 0
     for number, line in enumerate(text.split(b"\n"), 1):
         key, *words = line.lower().split() or [b""]
@@ -472,7 +479,10 @@ def _stl_mistake(text: bytes) -> str | None:
 
 
 def _stl_mesh(name: str, corners: Floats) -> list[SceneMesh]:
-    """Return a list with a mesh of separate triangles, which is empty if there are no triangles."""
+    """Convert separate triangles to a list with one mesh.
+
+    The list is empty if there are no triangles.
+    """
     faces = np.arange(len(corners)).reshape(-1, 3)
     return [SceneMesh(name, corners, faces)] if len(faces) else []
 
@@ -495,7 +505,7 @@ _PLY_COLORS = ("red", "green", "blue")
 
 @dataclass
 class _Element:
-    """An element declared in a .ply header."""
+    """Declaration of an element in a .ply header."""
 
     name: str
     count: int
@@ -504,7 +514,7 @@ class _Element:
 
 
 class _PlyColumn(NamedTuple):
-    """The values of a property in all rows of an element."""
+    """A property's values in all rows of an element."""
 
     numbers: AnyArray  # (sum of sizes,)
     sizes: Ints  # (rows,), number of values in each row
@@ -524,10 +534,11 @@ class _PlyHeader(NamedTuple):
 
 
 def read_ply_mesh(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read a Stanford polygon (.ply) file, which is text or binary and can mix any polygons.
+    """Read a Stanford polygon (.ply) file.
 
-    Vertex colors are the properties red, green and blue. They are integers, or floating-point
-    numbers from 0 to 1 or 255.
+    The file can be text or binary, and its polygons can have different numbers of corners. Vertex
+    colors are the properties red, green and blue. They are integers, or floating-point numbers from
+    0 to 1 or 255.
     """
     header = _ply_header(data)
     counts = {element.name: element.count for element in header.elements}
@@ -560,7 +571,7 @@ def _ply_faces(rows: _PlyRows, vertices: Floats) -> Ints:
 
 
 def _ply_colors(rows: _PlyRows, type_name: str, faces: Ints) -> Colors:
-    """Return face colors from the vertex colors, which are stored with the given type."""
+    """Convert the vertex colors, which are stored with the given type, to face colors."""
     columns = [rows["vertex"][name].numbers for name in _PLY_COLORS]
     colors = np.stack(columns, axis=1).astype(np.float64)
     kind = np.dtype(type_name)
@@ -571,9 +582,9 @@ def _ply_colors(rows: _PlyRows, type_name: str, faces: Ints) -> Colors:
 
 
 def read_ply_columns(data: bytes) -> dict[str, AnyArray]:
-    """Read the vertex properties of a Stanford polygon (.ply) file by name, except lists.
+    """Read the vertex properties of a Stanford polygon (.ply) file, keyed by name.
 
-    Each column has shape (n,).
+    List properties are omitted. Each column has shape (n,).
     """
     rows = _ply_rows(_ply_header(data)).get("vertex", {})
     return {name: values for name, (values, sizes) in rows.items() if (sizes == 1).all()}
@@ -654,7 +665,7 @@ def _ply_rows(header: _PlyHeader) -> _PlyRows:
 
 
 def _text_mistake(header: _PlyHeader) -> str | None:
-    """Return which line of a text body is invalid, or None."""
+    """Describe the first invalid line of a text body, or return None if there is none."""
     for number, line in enumerate(header.body.splitlines(), header.lines + 1):
         for word in line.split():
             if not _is_real(word):
@@ -663,7 +674,7 @@ def _text_mistake(header: _PlyHeader) -> str | None:
 
 
 class _PlyElementReader:
-    """A reader of the rows of an element."""
+    """A reader of an element's rows."""
 
     def __init__(self, element: _Element, order: str, body: bytes) -> None:
         self._element = element

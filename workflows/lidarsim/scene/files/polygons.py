@@ -19,9 +19,8 @@ _FLAT = 1e-12  # a corner is reflex if the sine of its turning angle is below mi
 def triangulate(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
     """Triangulate polygons without changing their corners and orientation.
 
-    Convex polygons and quadrilaterals become fans, where all polygons with the same number of
-    corners are processed together. Other polygons are triangulated by ear clipping with
-    mapbox_earcut.
+    Convex polygons and quadrilaterals become fans. All of these with the same number of corners are
+    processed together. Other polygons are triangulated by ear clipping with mapbox_earcut.
 
     Parameters
     ----------
@@ -69,7 +68,10 @@ def triangulate(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
 
 
 def _triangulate_nonconvex(vertices: Floats, corners: Ints) -> Ints:
-    """Triangulate a polygon with reflex corners, and return no triangles if it has no area."""
+    """Triangulate a polygon with reflex corners.
+
+    There are no triangles if the polygon has no area.
+    """
     clipped = triangulate_with_holes(vertices, [corners])
     if len(clipped) < len(corners) - 2 and _leaves_gaps(vertices[corners], vertices[clipped]):
         return np.asarray(corners[_all_triangles(vertices[corners])])
@@ -77,10 +79,10 @@ def _triangulate_nonconvex(vertices: Floats, corners: Ints) -> Ints:
 
 
 def _from_reflex_corner(vertices: Floats, quadrangles: Ints) -> Ints:
-    """Rotate the corners of quadrilaterals to start at a reflex corner, so that a fan is valid.
+    """Reorder the corners of quadrilaterals so that they start at a reflex corner.
 
-    Ear clipping would omit half of a quadrilateral that is so warped that its projection intersects
-    itself. Quadrilaterals have shape (p, 4).
+    A fan of triangles is then valid. Ear clipping would omit half of a quadrilateral that is so
+    warped that its projection intersects itself. Quadrilaterals have shape (p, 4).
     """
     reflex = _reflex_corners(vertices[quadrangles])
     start = np.where(reflex.sum(axis=1) == 1, reflex.argmax(axis=1), 0)
@@ -115,9 +117,10 @@ def triangulate_with_holes(vertices: Floats, rings: list[Ints]) -> Ints:
 
 
 def _clip_ears(flat: Floats, sizes: list[int]) -> Ints:
-    """Triangulate planar rings, which are an outline and holes with the given sizes.
+    """Triangulate a planar outline with holes.
 
-    Points have shape (k, 2), and triangles have shape (t, 3).
+    `sizes` contains the number of points of each ring, starting with the outline. Points have shape
+    (k, 2), and triangles have shape (t, 3).
     """
     stops = np.cumsum(sizes).astype(np.uint32)
     triangles = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), stops)
@@ -125,7 +128,7 @@ def _clip_ears(flat: Floats, sizes: list[int]) -> Ints:
 
 
 def unroll_strip(strip: Ints) -> Ints:
-    """Return the triangles of a triangle strip, all with the same orientation.
+    """Return the triangles of a triangle strip with a consistent orientation.
 
     `strip` has shape (t + 2,), and the result has shape (t, 3).
     """
@@ -144,7 +147,7 @@ def fan_triangles(corners: Ints) -> Ints:
 
 
 def _leaves_gaps(points: Floats, triangles: Floats) -> bool:
-    """Return whether a polygon is warped and its triangles leave gaps.
+    """Return whether a polygon is so warped that its triangles leave gaps.
 
     If the projection of a warped polygon intersects itself, ear clipping omits triangles. The area
     vectors of a complete triangulation add up to the area vector of the polygon. The polygon has
@@ -160,7 +163,7 @@ def _leaves_gaps(points: Floats, triangles: Floats) -> bool:
 
 
 def _all_triangles(points: Floats) -> Ints:
-    """Return the complete triangulation of a warped polygon.
+    """Triangulate a warped polygon without gaps.
 
     The polygon is clipped along its normal. If triangles are missing, the result is the fan with
     the smallest area, which starts at the reflex corner if there is only one. The polygon has shape
@@ -184,7 +187,7 @@ def _all_triangles(points: Floats) -> Ints:
 
 
 def _newell(points: Floats) -> Floats:
-    """Return twice the area vector of a polygon by Newell's method."""
+    """Compute twice the area vector of a polygon with Newell's method."""
     return np.asarray(np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0))
 
 

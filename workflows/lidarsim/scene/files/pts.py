@@ -70,7 +70,7 @@ def read_pts(path: Path) -> list[Sweep]:
 
 
 def next_line(lines: Iterator[tuple[int, str]]) -> tuple[int, str] | None:
-    """Return the next nonblank line with its line number, or None at the end."""
+    """Return the next nonblank line with its line number, or None at the end of the file."""
     return next(((number, line) for number, line in lines if not line.isspace()), None)
 
 
@@ -93,7 +93,7 @@ def _read_cloud(lines: Iterator[tuple[int, str]], number: int, count: int | None
 
 
 def cell_names(entry: tuple[int, str], names: dict[int, tuple[str, ...]]) -> tuple[str, ...]:
-    """Return the cell names of a line according to the number of cells.
+    """Return the names of the cells in a line, which depend on the number of cells.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def cell_names(entry: tuple[int, str], names: dict[int, tuple[str, ...]]) -> tup
 
 
 def point_columns(values: Floats, names: Sequence[str]) -> dict[str, AnyArray]:
-    """Return the columns after x, y and z by name.
+    """Return the columns after x, y and z, keyed by name.
 
     `values` has shape (n, k). Colors from 0 to 255 are converted to bytes.
     """

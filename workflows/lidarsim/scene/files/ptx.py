@@ -142,7 +142,7 @@ def _pose(matrix: Floats, start: int) -> Floats:
     """Return the transform from scan coordinates to file coordinates.
 
     `matrix` is the transformation in the file, whose header starts at line `start`. Raise
-    ValueError if it is not a rotation and a translation.
+    ValueError if the matrix is not a rotation and a translation.
     """
     rotation = matrix[:3, :3]
     error = np.abs(matmul(rotation, rotation.T) - np.eye(3)).max()

@@ -78,7 +78,7 @@ class ReadOptions(NamedTuple):
 
 
 class RigidPart(NamedTuple):
-    """Objects that move as a rigid body, and the poses of the body."""
+    """Objects that move as a rigid body, and the poses of this body."""
 
     name: str
     objects: Sequence[SceneMesh | SceneInstance]
@@ -247,9 +247,9 @@ def placed_content(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> C
 def bake_animation(
     contents: Iterable[Content], times_s: Sequence[float], allowance: Allowance
 ) -> Content:
-    """Combine the poses of the same meshes at evenly spaced times into animated meshes.
+    """Combine meshes at evenly spaced times into animated meshes.
 
-    `contents` yields the meshes at each time.
+    `contents` yields the same meshes, in the pose of each time.
 
     Raises
     ------
@@ -296,10 +296,10 @@ class Piece(NamedTuple):
 def join_pieces(
     name: str, pieces: Iterable[Piece], allowance: Allowance | None = None
 ) -> list[SceneMesh]:
-    """Merge pieces into a list with one mesh, which is empty if the pieces have no faces.
+    """Merge pieces into a list with a single mesh.
 
-    Pieces with masks come last. No allowance is required for formats in which the content cannot be
-    much larger than the file.
+    The list is empty if the pieces have no faces. Pieces with masks come last. No allowance is
+    required for formats in which the content cannot be much larger than the file.
 
     Raises
     ------

@@ -72,8 +72,6 @@ Meters = tuple[float, float, float]  # units of x, y and z in meters
 
 
 class _TiffTag(NamedTuple):
-    """A TIFF tag."""
-
     number: int
     type: int  # 3 for 16 bits, 4 for 32 bits, 12 for doubles, 2 for text
     value_count: int
@@ -115,9 +113,9 @@ class StatedSystem:
 
     @classmethod
     def from_comments(cls, comments: Iterable[str]) -> StatedSystem | None:
-        """Create a system from the first comment that only states a system, or return None.
+        """Create a system from the first comment that states a system and nothing else.
 
-        For example, "crs: EPSG:3857" is such a comment.
+        For example, "crs: EPSG:3857" is such a comment. The result is None if there is none.
         """
         matches = (_COMMENT.fullmatch(comment.strip()) for comment in comments)
         texts = (match["wkt"] or f"EPSG:{match['code']}" for match in matches if match)
@@ -134,7 +132,7 @@ class StatedSystem:
 
     @cached_property
     def _code(self) -> int | None:
-        """EPSG code in the text, or of the projected system in WKT or GeoTIFF keys."""
+        """EPSG code of the projected system in the text or in the GeoTIFF keys, or None."""
         if match := _CODE.fullmatch(self.text):
             return int(match[1])
         if self.text:
@@ -178,7 +176,8 @@ class StatedSystem:
     def crs(self) -> Any:
         """The `rasterio.crs.CRS`, or None if it is unknown.
 
-        It is unknown without rasterio, and if PROJ knows no such system on Earth.
+        The system is unknown if rasterio is not installed, or if PROJ knows no such system on
+        Earth.
         """
         if not has_registry():
             return None
@@ -206,7 +205,10 @@ class StatedSystem:
 
     @property
     def angles(self) -> str:
-        """Clause about angular or geocentric coordinates that follows the file name, or empty."""
+        """Message clause about angular or geocentric coordinates, or an empty string.
+
+        The clause follows the file name.
+        """
         if self.crs is None or self.crs.is_projected:
             return ""
         if is_geocentric(self.crs):
@@ -264,7 +266,7 @@ class StatedSystem:
 
     @property
     def name(self) -> str:
-        """Code and name of the system for messages."""
+        """Code and name of the system, as shown in messages."""
         if self.crs is not None and self._has_name:
             return crs_name(self.crs if is_geocentric(self.crs) else horizontal_part(self.crs)[0])
         if self._code is not None:
@@ -282,7 +284,7 @@ class StatedSystem:
 
 @dataclass(frozen=True)
 class _Scale:
-    """The scale of a system at the location of the positions, as far as it is known."""
+    """Scale of a coordinate system at the location of the positions, if known."""
 
     problem: str = ""  # why lengths are not true to scale, as a clause after the file name
     epsg: int | None = None  # code of a suggested system that is true to scale
@@ -292,14 +294,16 @@ class _Scale:
 def stated_meters(
     system: StatedSystem | None, positions: Floats, unit: str | None
 ) -> tuple[Meters, list[str]]:
-    """Return the units of x, y and z in meters, and notes that follow the name of the file.
+    """Return the units of x, y and z in meters, and notes about the coordinate system.
+
+    Each note is a clause that follows the file name.
 
     Parameters
     ----------
     system
         The system that the file states, or None for meters.
     positions
-        All positions in the file, or a sample, in the units of the file. Shape (n, 3).
+        Positions in the file, or a sample of them, in the units of the file. Shape (n, 3).
     unit
         Unit specified by the user, which replaces the units of the system.
 
@@ -324,7 +328,7 @@ def stated_meters(
 
 
 def check_metric_format(system: StatedSystem | None, positions: Floats) -> list[str]:
-    """Check the system of a file whose format requires meters, such as E57, and return notes.
+    """Check the coordinate system of a file whose format requires meters, such as E57.
 
     `positions` contains all positions in the file, or a sample, in meters. Its shape is (n, 3).
 
@@ -356,10 +360,10 @@ def check_metric_format(system: StatedSystem | None, positions: Floats) -> list[
 
 
 def _scale_of(system: StatedSystem, positions: Floats) -> _Scale:
-    """Determine the scale of a system at the median of positions.
+    """Determine the scale of a coordinate system at the median of the positions.
 
-    Without rasterio, or if PROJ cannot compute the scale, it is inferred from the name of the
-    projection.
+    If rasterio is not installed, or if PROJ cannot compute the scale, the scale is inferred from
+    the name of the projection.
     """
     middle = np.median(positions[:, :2], axis=0) if len(positions) else np.zeros(2)
     if system.is_in_utm_zone(positions):  # the registry takes half a second to load
@@ -417,10 +421,10 @@ def _scale_by_name(system: StatedSystem) -> _Scale:
 
 
 class Reprojection:
-    """A transformation from the system of a file to a system that is true to scale in meters.
+    """Transformation from the coordinate system of a file to one that is true to scale.
 
-    Heights are converted to meters, but keep their vertical datum. Heights of geocentric
-    coordinates are above the ellipsoid.
+    The target system is in meters. Heights are converted to meters, but keep their vertical datum.
+    Heights of geocentric coordinates are above the ellipsoid.
 
     Parameters
     ----------
@@ -466,7 +470,7 @@ class Reprojection:
             self.notes += [note] if note else []
 
     def check(self, positions: Floats) -> None:
-        """Check that the target system is true to scale at the median of positions.
+        """Check that the target system is true to scale at the median of the positions.
 
         Raises
         ------

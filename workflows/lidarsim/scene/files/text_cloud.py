@@ -235,9 +235,10 @@ def _names(head: _Head, first_cells: Sequence[str], separator: str | None) -> li
 
 
 def _axes(head: _Head, names: Sequence[str]) -> tuple[list[int], tuple[float, float, float] | None]:
-    """Return the indices of x, y and z, and their units in meters, or None if they are not stated.
+    """Return the indices of the columns x, y and z, and their units in meters.
 
-    Raise ValueError if the columns belong to a trajectory, or if the coordinates are not lengths.
+    The units are None if the file does not state them. Raise ValueError if the columns belong to a
+    trajectory, or if the coordinates are not lengths.
     """
     columns = [column_name(name) for name in names]
     words = [column.words for column in columns]
@@ -288,9 +289,9 @@ def _numeric_cells(
 
 
 def _column(values: Floats, first_cell: str) -> AnyArray:
-    """Return a column as integers if its numbers are written as integers.
+    """Convert a column to integers if its numbers are written as integers.
 
-    For example, the class 2 is an integer, but the fraction 1.0 is not.
+    For example, the class 2 is written as an integer, but the fraction 1.0 is not.
     """
     if not first_cell.strip("+-").isdecimal() or (values % 1 != 0).any():  # also NaN
         return values
@@ -301,7 +302,10 @@ def _column(values: Floats, first_cell: str) -> AnyArray:
 
 
 def _check_rows(head: _Head, reader: RowReader, values: Floats) -> None:
-    """Check the number of points, and whether the rows of a file without a header are points."""
+    """Check the number of points.
+
+    In a file without a header, also check that the rows are points.
+    """
     if head.announced is not None and len(values) != head.announced:
         failure = CutShortError if len(values) < head.announced else ValueError
         raise failure(
@@ -330,7 +334,7 @@ def _check_rows(head: _Head, reader: RowReader, values: Floats) -> None:
 
 
 def _are_poses(values: Floats) -> bool:
-    """Return whether rows are poses in the format of TUM or KITTI."""
+    """Return whether rows are poses in TUM or KITTI format."""
     if values.shape[1] == _TUM_COLUMNS:
         units = values[:, None, 4:]
     elif values.shape[1] == _KITTI_COLUMNS:

@@ -116,7 +116,7 @@ class RowReader:
         return np.frombuffer(numbers, np.float64).reshape(-1, width)
 
     def _number(self, cell: str, index: int, line_number: int) -> float:
-        """Parse the number in a cell, and record which decimal mark it contains."""
+        """Parse the number in a cell and record its decimal mark."""
         text = cell
         if "." in cell and not self.point_line:
             self.point_line = line_number
@@ -134,7 +134,6 @@ class RowReader:
             ) from error
 
     def _wrong_width(self, line_number: int, cells: Sequence[str]) -> str:
-        """Return the error message for a line with too few or too many cells."""
         names = printable(", ".join(self.names))
         message = (
             f"line {line_number} has {plural(len(cells), 'cell')}, but {len(self.names)} were "
@@ -149,7 +148,7 @@ class RowReader:
 
 
 def _line_with(mark: str, lines: Sequence[str], number: int) -> int:
-    """Return the line number of the first line that contains a character.
+    """Return the number of the first line that contains a given character.
 
     `number` is the line number of `lines[0]`.
     """
