@@ -1,1 +1,1 @@
-"""Parts, the files that store points during a run, and clouds that are read from them."""
+"""Files called parts, which store points during a run, and point clouds that are read from them."""

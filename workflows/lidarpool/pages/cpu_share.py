@@ -1,4 +1,4 @@
-"""Limit the CPU time of an activity that runs alongside a run."""
+"""Limit the CPU time of a background activity during a run."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 
 class CpuShare:
-    """Limit an activity to a share of a CPU core.
+    """Limiter of an activity to a fraction of a CPU core.
 
     Only CPU time counts, not time spent waiting.
     """
@@ -24,12 +24,12 @@ class CpuShare:
 
     @property
     def wait_s(self) -> float:
-        """Seconds until the activity may run again, which is 0 or negative if it may run now."""
+        """Seconds until the activity may run again, or a number of at most 0 if it may run now."""
         return self._due_at - time.monotonic()
 
     @contextmanager
     def use(self, pause_s: float = 0.0) -> Iterator[None]:
-        """Measure the CPU time of the body, and delay the next use accordingly.
+        """Measure the CPU time of the body to determine when the activity may run again.
 
         The delay is the CPU time divided by the share, plus `pause_s`.
         """
