@@ -232,7 +232,7 @@ class Transmitter:
                 file.write_text(text, encoding="utf-8")
 
     def _redirect(self, number: int, destination: Destination) -> None:
-        """Change the destination of a stream on behalf of its sensor interface."""
+        """Change the destination of a stream when its sensor interface requests it."""
         stream = replace(self._streams[number], destination=destination)
         with suppress(LidarError):  # sending the next packets raises the same error
             self.sender.redirect(number, destination, stream.source_address)
