@@ -205,7 +205,6 @@ class _Commands(click.Group):
         return command
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Complete the name of a command or option, without importing plug-ins."""
         items = super().shell_complete(ctx, incomplete)
         return items or completion.starting_with(incomplete, plugins_of(PLUGINS))
 

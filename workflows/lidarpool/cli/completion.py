@@ -105,7 +105,6 @@ def live(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
 
 
 def _in_list(incomplete: str, names: Iterable[str]) -> Items:
-    """Complete the last name in a comma-separated list, excluding names that the list contains."""
     before, comma, last = incomplete.rpartition(",")
     used = before.split(",")
     unused = [name for name in names if name not in used]

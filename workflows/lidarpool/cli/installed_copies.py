@@ -74,7 +74,6 @@ def _editable_checkout() -> Path | None:
 
 
 def _checkout_of(folder: Path) -> Path | None:
-    """Return the checkout that contains a folder, or None if there is none."""
     for candidate in (folder.resolve(), *folder.resolve().parents):
         if (candidate / "workflows" / "lidarpool" / "__init__.py").is_file():
             return candidate

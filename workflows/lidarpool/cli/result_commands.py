@@ -251,7 +251,6 @@ def _make_export_specs(names: Iterable[str], layout: str, **options: Any) -> lis
 
 
 def _print_note(note: str) -> None:
-    """Print a note without importing Dask, unlike `Terminal.tell`."""
     click.echo(f"note: {note}", err=True)
 
 

@@ -282,7 +282,6 @@ def _failed_jobs(figures: dict[str, Any]) -> str:
 
 
 def _unused_target(target: Path | Storage) -> str:
-    """Return an unused output folder whose name is derived from `target`."""
     from lidarsim.io.storage import Storage
 
     names = (f"{str(target).rstrip('/')}-{number}" for number in count(2))

@@ -193,7 +193,6 @@ def stations(
 
 
 def _scenario_model(scenario: Scenario) -> str | None:
-    """Return the sensor model of a scenario or the path of its sensor file, or None."""
     model = scenario.sensor.model
     if model is not None and scenario.sensor.has_custom_model:
         return str(scenario.path(model))
@@ -372,7 +371,6 @@ def _prepared_with_notes(
 
 
 def _target_phrase(targets: Sequence[str]) -> str:
-    """Return a phrase such as " of Wall* and Roof", or an empty string if there are no targets."""
     return f" of {joined(targets)}" if targets else ""
 
 

@@ -38,7 +38,6 @@ class Terminal(Screen):
 
     @property
     def _stream(self) -> Any:
-        """Stream for messages, or None if the command is quiet."""
         return None if self.quiet or sys.stderr is None else TolerantStream(sys.stderr)
 
     @property

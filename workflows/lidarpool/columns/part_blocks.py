@@ -172,7 +172,6 @@ class _OpenPart:
         return columns
 
     def check(self) -> None:
-        """Verify the checksums of all columns after the last block was read."""
         for name, array in self._arrays.items():
             if self._crcs[name] != array.crc:
                 raise LidarError(f"it is damaged (the checksum of {name}.npy is wrong)")

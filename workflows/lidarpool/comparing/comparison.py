@@ -107,14 +107,13 @@ class _ImageLayout(NamedTuple):
 
     @classmethod
     def for_rows(cls, row_count: int) -> _ImageLayout:
-        """Return the layout for range images with `row_count` rows."""
         image_height = int(np.clip(2.2 * row_count, 90, 300))
         defaults = cls._field_defaults
         gaps = defaults["top"] + 2 * defaults["gap"] + defaults["bottom"]
         return cls(image_height, 3 * image_height + gaps)
 
     def image_bottom(self, number: int) -> float:
-        """Return the lower edge of the given image as a fraction of the page height."""
+        """Return the lower edge of an image, numbered from 0, as a fraction of the page height."""
         pixels = self.page_height - self.top - (number + 1) * self.image_height - number * self.gap
         return pixels / self.page_height
 
@@ -158,7 +157,6 @@ def _range_scale(images: RangeImages) -> LogNorm:
 
 
 def _range_colors(images: RangeImages, index: int, scale: LogNorm) -> AnyArray:
-    """Return the pixel colors of the range image of A (`index` 0) or B (`index` 1)."""
     ranges = np.nan_to_num(images.ranges[index], nan=1.0)
     colors = theme.apply_colormap(theme.RANGE_COLORS, scale(ranges).filled(0))
     colors[~images.returned[index]] = NO_RETURN
@@ -177,7 +175,6 @@ def _residual_colors(images: RangeImages, scale: Normalize) -> AnyArray:
 
 
 def _draw_gap_legend(page: Page, axes: Axes) -> None:
-    """Draw a legend that explains the colors of cells without a return."""
     for text, color in zip(GAP_LABELS, (ONLY_A, ONLY_B, NO_RETURN), strict=True):
         axes.plot([], [], "s", color=color, ms=4, label=text)
     _draw_legend(page, axes)
@@ -385,7 +382,7 @@ def _scatter_points(
 
 
 def _residual_limit(comparison: Comparison) -> float:
-    """Return the upper end of the residual scale, in millimeters."""
+    """Return the upper limit of the residual scale, in millimeters."""
     residual = comparison.figures["ranges"]["residual"]
     if not residual["cells"]:
         return 1
@@ -404,7 +401,6 @@ def _intensity_bins(values: AnyArray) -> AnyArray:
 
 
 def _draw_legend(page: Page, axes: Axes) -> None:
-    """Draw a right-aligned legend above the axes."""
     handles, _ = axes.get_legend_handles_labels()
     style = {"ncols": len(handles), "columnspacing": 1.2, "borderaxespad": 0.3}
     page.key(handles, 6.8, axes, loc="lower right", bbox_to_anchor=(1, 1), **style)

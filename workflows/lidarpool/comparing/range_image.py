@@ -172,7 +172,6 @@ class _PolarSweep:
 
     @property
     def _block(self) -> Ints:
-        """Index of the azimuth block that contains each point. Shape (n,)."""
         return (self.azimuth * (_BLOCKS / 360)).astype(np.int64).clip(0, _BLOCKS - 1)
 
     def image(self, ring_rows: Ints, phases: Floats, cells: _Cells) -> tuple[Floats, float]:
@@ -328,7 +327,7 @@ def images_of_rays(
 
 
 def _spacing(elevation: Floats) -> float:
-    """Return the median spacing between rings in degrees."""
+    """Return the median spacing between rings, in degrees."""
     gaps = np.diff(np.sort(elevation))
     return float(np.median(gaps)) if len(gaps) else 1.0
 

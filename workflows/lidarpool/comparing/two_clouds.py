@@ -261,7 +261,6 @@ class _Comparing:
         self.ray_counts = np.zeros(4, np.int64)
 
     def note(self, text: str) -> None:
-        """Add a note, unless it has already been added."""
         if text not in self.notes:
             self.notes.append(text)
 
@@ -320,7 +319,6 @@ class _Comparing:
 
     @property
     def has_same_rays(self) -> bool:
-        """Whether A and B are known to have the same rays."""
         first, second = self.recordings
         return bool(first.firing_key) and first.firing_key == second.firing_key
 
@@ -349,14 +347,12 @@ class _Comparing:
             self._add_rays(rays, budget)
 
     def _add_image_cells(self, images: RangeImages, budget: int) -> None:
-        """Compare the cells or rays of two range images."""
         self.images = self.images or images
         in_a, in_b = np.isfinite(images.compared[:, 0])
         self._count_cells(images, in_a, in_b)
         self._add_residuals(images.compared, images.rings[images.cell_rows], budget)
 
     def _add_rays(self, rays: RayPairs, budget: int) -> None:
-        """Compare the rays of two sweeps for which there are no range images."""
         in_a, in_b = np.isfinite(rays.values[:, 0])
         states = in_b & ~in_a, in_a & ~in_b, in_a & in_b
         self.ray_counts[1:] += [np.count_nonzero(state) for state in states]
@@ -488,7 +484,6 @@ class _Comparing:
         }
 
     def _empty_notes(self) -> list[str]:
-        """Return a note about pairs that were skipped because one of their sweeps is empty."""
         if not self.empty_pairs:
             return []
         total = plural(len(self.pairs), "pair")
@@ -511,7 +506,6 @@ class _Comparing:
         ]
 
     def _images(self) -> RangeImages | None:
-        """Return the range images to draw, or None if one of the pairs has none."""
         return None if self.ray_counts.any() else self.images
 
     def _range_figures(self, cells: _CellPairs, paired_by: str) -> dict[str, Any]:
@@ -567,7 +561,6 @@ def _no_return_figures(counts: Any) -> dict[str, Any]:
 
 
 def _scores(precision: float | None, recall: float | None) -> dict[str, float | None]:
-    """Return precision, recall and their harmonic mean, with None for undefined values."""
     f1 = None
     if precision is not None and recall is not None:
         f1 = 2 * precision * recall / (precision + recall) if precision + recall else 0.0

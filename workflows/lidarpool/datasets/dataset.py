@@ -245,7 +245,6 @@ class DataSet:
             )
 
     def _write_manifest(self, storage: Listing, row: JobRow, manifest: dict[str, Any]) -> None:
-        """Write a job's manifest without the casting time, because it varies between runs."""
         row_of_all_runs = asdict(replace(row, seconds=None))
         manifest |= {"made_with": dict(self.made_with), "row": row_of_all_runs}
         manifest["crc"] = _crc(manifest)

@@ -381,7 +381,6 @@ def _with_plain_names(row: JobRow) -> JobRow:
 
 
 def _plain(value: Any) -> Any:
-    """Convert a NumPy scalar to a Python object, and return other values unchanged."""
     return value.item() if isinstance(value, np.generic) else value
 
 

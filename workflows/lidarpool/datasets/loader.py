@@ -170,7 +170,6 @@ class SavedSweeps:
         return TorchSweeps(self, transform, even)
 
     def _close(self) -> None:
-        """Close the jobs that are open in the current thread."""
         for job in self._local.__dict__.pop("jobs", {}).values():
             job.reader.close()
         self._local.__dict__.clear()

@@ -60,7 +60,6 @@ class TorchSweeps(torch.utils.data.IterableDataset):
         return self.__dict__ | {"_rank": self._rank or _ranks()}
 
     def _share(self) -> range:
-        """Return the indices of the sweeps that the current rank reads."""
         rank, ranks = self._rank or _ranks()
         count = len(self.sweeps)
         return range(rank, count - count % ranks if self.even else count, ranks)

@@ -67,7 +67,6 @@ def fingerprint(*values: Any) -> str:
 
 @lru_cache(1024)
 def _hash_name(word: str) -> str:
-    """Return the fingerprint of a field name, which is cached because the same names recur."""
     return fingerprint(word)
 
 
@@ -238,7 +237,6 @@ def _used_names(code: types.CodeType) -> list[str]:
 
 
 def _is_cached(kind: type, name: str) -> bool:
-    """Return True if a name is that of a cached property, which is derived from other fields."""
     return isinstance(getattr(kind, name, None), cached_property)
 
 

@@ -73,7 +73,6 @@ def source_hash() -> str:
 
 @cache
 def _plugin_version(plugin: Plugin) -> str:
-    """Return the version of a plug-in's distribution and the hash of its source files."""
     return f"{plugin.version} (sources {_hash_packages((_top_package(plugin.module),))})"
 
 
@@ -215,7 +214,6 @@ def _call_if_compatible(
 
 
 def _entry_name(plugin: Plugin) -> str:
-    """Return the key of a plug-in in the result of `software`."""
     return f"plug-in {plugin.distribution}"
 
 

@@ -83,7 +83,6 @@ class RecentJobs:
         }
 
     def _format_values(self, values: Mapping[str, Value | None]) -> list[str]:
-        """Format values in the order of the table columns. Missing values become empty strings."""
         shown = ("" if (value := values.get(name)) is None else value for name in self._names)
         words = (rounded(value, 4) if isinstance(value, float) else value for value in shown)
         return [str(value).lower() if isinstance(value, bool) else str(value) for value in words]

@@ -155,7 +155,6 @@ class LiveJob:
             return self._view
 
     def _show(self) -> None:
-        """Update the points of the view if it exists."""
         with self._making:
             if self._view is not None:
                 self._view.replace_points(InMemoryPoints(self.cloud))

@@ -188,14 +188,12 @@ def growing_view(path: Path, *, keep_noise: bool = False) -> ProgressiveView | N
 
 
 def _preview(path: Path, of_mesh: Mapping[str, Any], tell: Callable[[str], None]) -> View:
-    """Return a preview of a scenario or mesh."""
     from .preview import scenario_view
 
     return scenario_view(path, of_mesh, tell)
 
 
 def _has_faces(path: Path) -> bool:
-    """Return whether the header of a .ply file declares faces, as that of a mesh does."""
     with open_input(path) as file:
         header = file.read(_HEADER_BYTES).partition(b"end_header")[0]
     lines = (line.split() for line in header.splitlines())

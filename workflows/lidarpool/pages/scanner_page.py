@@ -144,7 +144,6 @@ class ScannerPage(ScannerView):
 
 
 def _name(scanner: Scanner) -> str:
-    """Return the name of a scanner, or an empty string if it has none."""
     return scanner.survey.carried[0].name
 
 

@@ -126,7 +126,6 @@ def _sweeps(
 
 
 def _cast(scanner: Scanner, pose: Any, number: int, start_s: float) -> _NumberedSweep:
-    """Simulate a sweep that starts at the given time in seconds."""
     return number, start_s, scanner.sweep(pose, number=number)
 
 

@@ -119,6 +119,5 @@ class Prefetcher(Generic[Item]):
             yield first.result()
 
     def _start_tasks(self) -> None:
-        """Submit tasks until `count` of them are pending or there are no more tasks."""
         for task in islice(self._tasks, self._count - len(self._futures)):
             self._futures.append(self._pool.submit(task))

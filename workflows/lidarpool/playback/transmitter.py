@@ -130,7 +130,6 @@ def streams_to(streams: Sequence[Stream], to: Sequence[str], api: Sequence[str])
 
 
 def _loopback_address(number: int, has_own_address: bool) -> ReceiverAddress:
-    """Return the default address of a sensor's interface."""
     return ReceiverAddress(f"127.0.0.{number + (2 if has_own_address else 1)}")
 
 

@@ -424,7 +424,6 @@ def _sample(sweep: Sweep, number: int) -> Sweep:
 
 
 def _voxel_m(samples: Sequence[Sweep]) -> float:
-    """Return the edge length of the map voxels in meters, which depends on the median range."""
     ranges = np.concatenate([np.linalg.norm(sample.points, axis=1) for sample in samples])
     return float(np.clip(_VOXEL_SHARE * np.median(ranges), _MIN_VOXEL_M, _MAX_VOXEL_M))
 

@@ -425,7 +425,6 @@ class _Building:
         return _Built(parts, submaps)
 
     def _load_observations(self, index: int) -> Observations:
-        """Load the observations of a submap, which are rays that end on its surfels."""
         observations: Observations = self.steps.load(_BUILD, index)[1]
         return observations
 
@@ -559,7 +558,6 @@ class _Built:
     submaps: Sequence[Submap]
 
     def held_out(self) -> HeldOutRays:
-        """Return the rays of all held-out sweeps that were compared."""
         return HeldOutRays.concatenate(
             [part.held_out for part in self.parts if part.held_out is not None]
         )

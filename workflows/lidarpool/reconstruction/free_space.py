@@ -85,7 +85,6 @@ class RangeImage:
 
 
 def _cells(points: Floats, edges_rad: Floats) -> tuple[Ints, Ints]:
-    """Return the image row and column of each point."""
     turns = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
     rows = np.searchsorted(edges_rad, -elevations(points))
     return rows, (turns * _COLUMNS).astype(np.int64) % _COLUMNS

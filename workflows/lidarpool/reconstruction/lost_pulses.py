@@ -223,6 +223,5 @@ class SensorCoverage(NamedTuple):
 
 
 def _cells(sweep: Sweep) -> tuple[Ints, Ints]:
-    """Return the ring and the azimuth cell of each ray."""
     turns = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi) + 0.5
     return sweep.columns["row"], (turns * _COLUMNS).astype(np.int64) % _COLUMNS

@@ -192,7 +192,6 @@ class RecordedSweeps:
         return sweep if known.all() or not len(self.rings) else sweep.select(known)
 
     def _returns(self, number: int) -> Sweep:
-        """Read the returns of a sweep, with only the required columns."""
         sweep = self.recording[number]
         used = {name: values for name, values in sweep.columns.items() if name in _COLUMNS}
         return sweep.with_columns(**used).returns()
@@ -277,7 +276,6 @@ def _compact(sweep: Sweep) -> Sweep:
 
 
 def _wide(sweep: Sweep) -> Sweep:
-    """Convert a compact sweep to double precision."""
     columns = {**sweep.columns, "row": sweep.columns["row"].astype(np.int64)}
     if "intensity" in columns:
         columns["intensity"] = columns["intensity"].astype(np.float64)
@@ -285,13 +283,11 @@ def _wide(sweep: Sweep) -> Sweep:
 
 
 def _exact32(values: AnyArray) -> AnyArray:
-    """Convert values to single precision, unless this would change them."""
     single = values.astype(np.float32)
     return single if np.array_equal(single, values, equal_nan=True) else values
 
 
 def _has_points(recording: Recording) -> bool:
-    """Return whether any of the reference sweeps contains points."""
     numbers = even_indices(len(recording), _REFERENCE_SWEEPS).tolist()
     return any(len(recording.read_fired(number)) for number in numbers)
 

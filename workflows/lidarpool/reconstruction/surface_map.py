@@ -248,7 +248,6 @@ def _shifts(surfel: Ints, offset_m: Floats, count: int) -> Floats:
 
 
 def _evenly_chosen(stationary: Mapping[int, Bools]) -> list[int]:
-    """Return evenly spaced sweep numbers."""
     numbers = np.fromiter(stationary, np.int64)
     chosen: list[int] = numbers[even_indices(len(numbers), _VOTING_SWEEPS)].tolist()
     return chosen
@@ -304,6 +303,5 @@ def _shortest(cells: Ints, range_m: Floats) -> tuple[Ints, Floats]:
 
 
 def _view_cells(points: Floats) -> Ints:
-    """Return the index of each point's cell."""
     cells = np.floor(points / _VIEW_CELL_M).astype(np.int64) & _CELL_MASK
     return np.asarray((cells[:, 0] << 2 * _CELL_BITS) | (cells[:, 1] << _CELL_BITS) | cells[:, 2])

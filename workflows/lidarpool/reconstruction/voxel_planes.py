@@ -78,6 +78,5 @@ class VoxelPlanes:
 
 
 def _is_plane(variances: Floats) -> Bools:
-    """Mark planar neighborhoods, given their ascending variances of shape (n, 3)."""
     smallest, middle, largest = variances.T
     return np.asarray((smallest < _MAX_FLAT * middle) & (middle > _MIN_WIDTH * largest))

@@ -107,7 +107,6 @@ class _Layout(NamedTuple):
 
     @property
     def page_height(self) -> int:
-        """Height of the page in pixels."""
         return TOP + self.row_count * self.row_height + (self.row_count - 1) * ROW_GAP
 
     def add_charts(self, page: Page, number: int) -> tuple[Axes, Axes]:
@@ -249,7 +248,6 @@ def _add_axes(page: Page, x: float, y: float, chart_width: float, chart_height: 
 
 
 def _format_tick(value: float, _: object = None) -> str:
-    """Format a tick label such as "1.5 M"."""
     for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if abs(value) >= 10 * size or (abs(value) >= size and letter != "k"):
             return f"{value / size:.4g}{NARROW}{letter}"

@@ -238,7 +238,6 @@ class GridCounts:
         self._level += 1
 
     def _indices(self, numbers: Sequence[Ints]) -> tuple[Ints, ...]:
-        """Return array indices for all combinations of square numbers along both axes."""
         return np.ix_(*(along_axis % self._across for along_axis in numbers))
 
     @property

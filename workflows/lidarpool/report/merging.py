@@ -78,11 +78,9 @@ class _ShardFolder:
 
     @cached_property
     def ranges(self) -> Sequence[range]:
-        """Numbers of the jobs or scans in each shard of the folder."""
         return [self.numbers(shard) for shard in self.shards]
 
     def has(self, number: int) -> bool:
-        """Return True if one of the folder's shards includes this job or scan."""
         return any(number in numbers for numbers in self.ranges)
 
     @property

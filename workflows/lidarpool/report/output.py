@@ -144,7 +144,6 @@ class SurveyOutput:
 
     @property
     def _requested(self) -> Sequence[str]:
-        """Optional columns that the user requested, excluding those that only formats require."""
         columns = self.survey.columns if self.scenario is None else self.scenario.cloud.columns
         return [column.name for column in optional_columns(columns)]
 
@@ -426,7 +425,6 @@ def _write_sweeps(staged: Path, result: RunResult, sweeps: Sweeps) -> Sweeps:
 
 
 def _write_report(staged: Path, report: dict[str, Any], further: Sequence[str]) -> None:
-    """Add the names of all files to the report, and write report.json."""
     present = [name for name in FILES[1:] if name == REPORT or (staged / name).exists()]
     report["files"] = [CLOUD, *further, *present]
     text = json.dumps(report, indent=1, allow_nan=False) + "\n"

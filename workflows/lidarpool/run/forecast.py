@@ -354,7 +354,6 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
 
 
 def _closest_existing(folder: Path) -> Path:
-    """Return the folder if it exists, or else its closest existing parent."""
     return next(path for path in (folder, *folder.absolute().parents) if path.exists())
 
 

@@ -238,7 +238,6 @@ class RunLoop:
             watch.forget([OTHER])
 
     def _save(self) -> None:
-        """Store new trials and the number of delivered frames in the run's database."""
         if self._trials is not None and (only_job := self._store.only_job) is not None:
             new_trials = self._trials.trials[len(only_job.trials) :]
             self._store.db.add_trials(only_job.committed, new_trials)

@@ -110,7 +110,6 @@ def unlabeled_notes(scene: Scene, survey: Survey) -> list[str]:
 
 
 def _is_mesh_survey(scenario: Scenario) -> bool:
-    """Return whether the user specified a mesh file instead of a scenario."""
     files = [scenario.path(entry.file) for entry in scenario.scene.files]
     return scenario.source in map(mesh_survey_name, files)
 
@@ -135,7 +134,6 @@ def _unnamed_classes(survey: Survey) -> Iterator[str]:
 
 
 def _format_notes(prepared: PreparedScenario) -> list[str]:
-    """Return notes about data that an output format cannot store."""
     specs = prepared.scenario.output.write
     notes = (note for spec in specs for note in spec.cloud_format.survey_notes(prepared.survey))
     return [*dict.fromkeys(notes)]
@@ -174,7 +172,6 @@ def _size_note(prepared: PreparedScenario, side: float) -> str:
 
 
 def _lacks_unit(path: Path) -> bool:
-    """Return whether neither the mesh file nor its format specifies a unit."""
     row = format_of(path)
     return row is not None and row.unitless and not written_by_lidarpool(path)
 

@@ -501,7 +501,6 @@ class _Base:
 
 
 def _noise_seed(seed: int, number: int) -> int:
-    """Return the noise seed of a job, which is never 0."""
     return JobRandom(seed, number, _NOISE_SEED).bits(63) or 1
 
 

@@ -186,7 +186,6 @@ def _as_fraction(bits: int) -> Decimal:
 
 
 def _round(value: float) -> float:
-    """Round a number to `_DIGITS` significant digits."""
     return float(f"{value:.{_DIGITS}g}")
 
 
@@ -583,7 +582,6 @@ class Splits:
 
 @lru_cache
 def _block_order(seed: int, block: int, count: int) -> list[int]:
-    """Return the jobs of a block in random order."""
     return JobRandom(seed, block, "splits").permutation(count)
 
 

@@ -256,7 +256,6 @@ def _poses_beside(scene: Scene, center: Floats, buildings: Sequence[str] = ()) -
 
 
 def _local_positions(poses: Sequence[Pose], scene: Scene) -> Floats:
-    """Return the positions of poses in local coordinates. Shape (k, 3)."""
     return np.array([pose.position for pose in poses]) - scene.origin
 
 

@@ -117,6 +117,5 @@ def _span(ranges: Floats) -> str:
 
 
 def _start_position(scene: Scene, survey: Survey) -> str:
-    """Return a sentence that states the first sensor position in scenario coordinates."""
     (x, y, z) = survey.pose(0).position + scene.origin
     return f"The sensor starts at ({x:,.3f}, {y:,.3f}, {z:,.3f})"

@@ -83,7 +83,7 @@ def missing_epsg_note(scene: Scene, epsg: int | None) -> str:
 
 
 def _center(scene: Scene) -> Floats:
-    """Return the horizontal center of a scene in world coordinates. Shape (2,)."""
+    """Return the horizontal center of a scene in world coordinates."""
     center: Floats = (scene.bounds.mean(axis=0) + scene.origin)[:2]
     return center
 

@@ -69,7 +69,7 @@ class _Motion(NamedTuple):
 
     @property
     def speeds(self) -> Floats:
-        """Speeds in m/s. Shape (k,)."""
+        """Speed of the platform in m/s, with shape (k,)."""
         return np.asarray(np.linalg.norm(self.velocities, axis=1))
 
 

@@ -355,7 +355,6 @@ def _stack(group: Columns) -> AnyArray:
 
 
 def _has_values(values: AnyArray) -> bool:
-    """Return whether any value is neither 0 nor NaN."""
     return bool(np.any((values != 0) & (values == values)))
 
 

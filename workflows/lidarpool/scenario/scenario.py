@@ -492,7 +492,6 @@ class Scenario(Section):
 
 
 def _is_contradictory(content: Any) -> bool:
-    """Return whether the sections of a scenario contradict each other."""
     try:
         return any(Scenario.model_validate(content)._contradictions())
     except ValidationError:  # the content has another error

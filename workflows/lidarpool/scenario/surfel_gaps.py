@@ -130,7 +130,6 @@ def _normalize(vectors: Floats) -> Floats:
 
 
 def _dot(first: Floats, second: Floats) -> Floats:
-    """Return the dot products of vectors along the last axis."""
     products: Floats = (first * second).sum(axis=-1)
     return products
 

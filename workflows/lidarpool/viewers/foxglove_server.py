@@ -182,19 +182,16 @@ class FoxgloveServer(Viewer):
         self._send(topic, channels.SceneUpdateChannel, update, self._start_ns)
 
     def _send(self, topic: str, kind: Callable[..., Any], message: Any, time_ns: int) -> None:
-        """Send a message to all subscribers of a topic."""
         channel = self._channel(topic, kind)
         self._latest[topic] = message, time_ns
         channel.log(message, log_time=time_ns)
 
     def _channel(self, topic: str, kind: Callable[..., Any]) -> Any:
-        """Return the channel of a topic, creating and advertising it if necessary."""
         if topic not in self._channels:
             self._channels[topic] = kind(topic, context=self._context)
         return self._channels[topic]
 
     def _send_again(self, topic: str) -> None:
-        """Send the latest message of a topic again to all its subscribers."""
         if topic in self._latest:
             message, time_ns = self._latest[topic]
             self._channels[topic].log(message, log_time=time_ns)
@@ -207,7 +204,6 @@ class _SubscriptionListener(ServerListener):
         self._subscribed = subscribed
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        """Report the topic of a new subscription."""
         self._subscribed(channel.topic)
 
 

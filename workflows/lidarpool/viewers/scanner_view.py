@@ -118,7 +118,6 @@ class _ExternalScannerView(ScannerView):
 
     @property
     def description(self) -> str:
-        """Message for users, which contains the addresses to open."""
         return self._viewer.description
 
     def _send(self, scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> None:
@@ -232,5 +231,4 @@ def pose_at(pose: Any, time_ns: float) -> Pose:
 
 
 def _position_and_quaternion(pose: Pose, origin: Floats) -> tuple[Floats, Floats]:
-    """Return the world position and the quaternion of a pose in local coordinates."""
     return np.array(pose.position) + origin, quaternions_of(pose.rotation_matrix[None])[0]

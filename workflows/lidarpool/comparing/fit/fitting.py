@@ -178,7 +178,6 @@ def _fit_of(recording: Recording, measured: SensorMeasurement, base: SensorModel
 
 
 def _has_rings(model: SensorModel, stack: SweepStack) -> bool:
-    """Return True if each ring matches a beam, or if a calibration file defines the beams."""
     offset_deg = np.abs(stack.elevation_deg[:, None] - (model.beams.elevation_deg or np.inf))
     is_near = not offset_deg.min(axis=1).max() > _MAX_RING_OFFSET_DEG
     return model.needs_calibration or is_near

@@ -242,12 +242,10 @@ class _RayPoses:
     duration_ns: ClassVar[float] = np.inf
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
-        """Return the pose of the ray that was fired at the given time."""
         positions, rotations = self.poses(station, np.array([time_ns]))
         return Pose.from_rotation(positions[0], rotations[0])
 
     def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return the poses of the rays that were fired at the given times."""
         ray = np.rint(times_ns).astype(np.int64).clip(0, len(self.positions) - 1)
         return self.positions[ray], self.rotations[ray]
 
@@ -364,7 +362,6 @@ def _firing_poses(fired: Sweep, index: Ints) -> tuple[Floats, Floats]:
 
 
 def _rotate_vectors(rotations: Floats, vectors: Floats) -> Floats:
-    """Rotate the vector of each cell by the rotation of the same cell."""
     turned = np.einsum("kij,kj->ki", rotations, vectors.reshape(-1, 3))
     return np.asarray(turned.reshape(vectors.shape))
 

@@ -297,7 +297,6 @@ def _scenario_yaml(scenario: Scenario) -> str:
 
 
 def _changed_fields(values: Mapping[str, Any], kind: type) -> list[tuple[str, str]]:
-    """Return the names and values of dataclass fields that differ from their defaults."""
     usual = declared_values(kind(), kind)
     return [(name, formatted(values[name])) for name in usual if values[name] != usual[name]]
 
@@ -353,7 +352,6 @@ class _TimeAxis(NamedTuple):
         return "".join(f"M{x_start:.1f} {ROW / 2:g}H{x_stop:.1f}" for x_start, x_stop in joined)
 
     def row(self, label: str, stage: str, detail: str, times: Iterable[TimeSpan]) -> dict[str, str]:
-        """Return the values of a row for the template."""
         text = f"{label}: {detail}"
         return {"label": label, "detail": text, "stage": stage, "bars": self.bars(times)}
 

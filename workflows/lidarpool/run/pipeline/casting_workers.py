@@ -444,7 +444,6 @@ class _Payload:
         return self.future
 
     def record_copy(self, worker: str) -> None:
-        """Record that a worker has received a copy of the value."""
         self._holders.add(worker)
 
     def record_loss(self, worker: str, *, unseen: bool = False) -> None:
@@ -480,7 +479,6 @@ class _Worker:
 
 
 def _is_local(address: str) -> bool:
-    """Return True if a worker probably runs on this machine."""
     return urlsplit(address).hostname in (None, "127.0.0.1", "::1", get_ip())
 
 

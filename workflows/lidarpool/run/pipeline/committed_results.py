@@ -69,7 +69,6 @@ class CommittedParts:
         self._count(part, -1)
 
     def _index(self, scan: int) -> int:
-        """Return the index of the last part that starts at or before a scan, or 0 if none does."""
         return max(0, bisect.bisect_right(self.ordered, scan, key=_FIRST) - 1)
 
     def _count(self, part: Receipt, sign: int) -> None:

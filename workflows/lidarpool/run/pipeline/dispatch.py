@@ -263,7 +263,6 @@ class Dispatcher:
             self._fail_condemned(batch.job)
 
     def _fail_condemned(self, job: PipelineJob) -> None:
-        """Fail a job that has condemned batches after all its other batches have been committed."""
         if job.condemned and not self._batches_of(job):
             self.failed.setdefault(job, JobError("\n".join(job.condemned)))
 
@@ -324,7 +323,6 @@ class Dispatcher:
         self._recast_uncollected([*task_batches], "its columns could not be fetched")
 
     def _recast_uncollected(self, batches: Iterable[Batch], reason: str) -> None:
-        """Cast those batches again that are in the state COLLECTING."""
         for batch in batches:
             if batch.state is BatchState.COLLECTING:
                 self._offer_again(batch, reason)

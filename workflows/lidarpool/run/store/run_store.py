@@ -410,7 +410,6 @@ class RunStore:
         return self._add(StoredJob(job, committed, self.storage, self.db, resumed, keeper=self))
 
     def _check(self, stored: StoredJob, strays: Sequence[str]) -> StoredJob:
-        """Check the parts of an earlier run, and update the number of resumed scans."""
         self.notes += check_parts(stored, self.db, self._sizes, strays)
         return self._add(replace(stored, resumed=stored.parts.scans_done))
 
