@@ -225,7 +225,10 @@ class StoredCloud(CloudDisplay):
 
     @property
     def bounds(self) -> Floats:
-        """Minimum and maximum coordinates in meters, or zeros for an empty cloud. Shape (2, 3)."""
+        """Minimum and maximum coordinates in meters, or zeros for an empty cloud.
+
+        The array has shape (2, 3).
+        """
         if self.cells is None:
             return np.zeros((2, 3))
         return cell_positions(self.cells, self.precision_m, self.origin)

@@ -55,12 +55,18 @@ class RangeImages:
 
     @property
     def ranges(self) -> Floats:
-        """Ranges of A and B in meters, or NaN where there is no return. Shape (2, r, c)."""
+        """Ranges of A and B in meters, or NaN where there is no return.
+
+        The array has shape (2, r, c).
+        """
         return self.images[:, 0]
 
     @property
     def returned(self) -> tuple[Bools, Bools]:
-        """Masks of the cells that have a return in A and in B, each with shape (r, c)."""
+        """Masks of the cells that have a return in A and in B.
+
+        Each mask has shape (r, c).
+        """
         return np.isfinite(self.ranges[0]), np.isfinite(self.ranges[1])
 
 

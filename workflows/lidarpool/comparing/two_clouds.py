@@ -214,7 +214,10 @@ def _sweep_times(recording: Recording) -> Floats:
 
 
 class _CellPairs(NamedTuple):
-    """Ranges of cells or rays with a return in both sweeps, as arrays of shape (k,)."""
+    """Ranges of cells or rays with a return in both sweeps.
+
+    All arrays have shape (k,).
+    """
 
     residual: Floats  # meters
     ring: Ints

@@ -80,10 +80,10 @@ class VariedQuantity:
 
     @cached_property
     def edges(self) -> Floats:
-        """Edges of the histogram bins. Shape (bins + 1,).
+        """Edges of the histogram bins.
 
-        Each label or small integer has its own bin. Otherwise, bins have equal widths, or equal
-        ratios if the values have a logarithmic distribution.
+        The array has shape (bins + 1,). Each label or small integer has its own bin. Otherwise,
+        bins have equal widths, or equal ratios if the values have a logarithmic distribution.
         """
         values = self.known_values
         lower, upper = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
@@ -227,7 +227,10 @@ class DataSetStatistics:
 
     @property
     def failures(self) -> Bools:
-        """Mask of the failed jobs. Shape (jobs,)."""
+        """Mask of the failed jobs.
+
+        The array has shape (jobs,).
+        """
         return np.array(self._per_job["failed"]) > 0
 
     def percentiles(self, name: str) -> dict[str, float] | None:

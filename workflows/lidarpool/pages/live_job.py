@@ -182,6 +182,9 @@ class LiveJob:
 
 
 def _sample_rays(frames: list[ScanFrame]) -> Floats32:
-    """Return the sample rays of frames in local coordinates. Shape (n, 2, 3)."""
+    """Return the sample rays of frames in local coordinates.
+
+    The array has shape (n, 2, 3).
+    """
     pairs = ((np.full_like(frame.samples, frame.pose.position), frame.samples) for frame in frames)
     return np.concatenate([np.stack(pair, axis=1) for pair in pairs]).astype(np.float32)

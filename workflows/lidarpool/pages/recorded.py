@@ -275,7 +275,10 @@ def _read_sweeps(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[
 
 
 def _frame_poses(recording: Recording) -> Floats | None:
-    """Return the pose of each sweep from the frames of a bag, or None. Shape (n, 4, 4)."""
+    """Return the pose of each sweep from the frames of a bag, or None.
+
+    The array has shape (n, 4, 4).
+    """
     has_frames = recording.read_poses is not None
     return recording.poses(range(len(recording))) if has_frames else None
 

@@ -126,7 +126,9 @@ class _Workspace:
         self._zeros = np.zeros(width, np.float32)  # an array, for speed (see the class docstring)
 
     def evaluate(self, points: Floats32, cost: Floats32, entry_price: float) -> None:
-        """Write the cost of each path to `cost`, which has shape (width,).
+        """Write the cost of each path to `cost`.
+
+        `cost` has shape (width,).
 
         `points` contains the points of the paths, including their ends. Shape (k + 2, 2, width).
         """

@@ -109,7 +109,10 @@ class Swarm:
         self._move()
 
     def best(self) -> Floats32:
-        """Return the corners of the best path found so far. Shape (waypoints, 2)."""
+        """Return the corners of the best path found so far.
+
+        The array has shape (waypoints, 2).
+        """
         return self._best[:, self._best_cost.argmin()].reshape(-1, 2)
 
     def _remember(self, cost: Floats32) -> None:
@@ -150,11 +153,12 @@ def _spreads(groups: int, widest: float) -> Floats:
 
 
 def _scatter_paths(corners: int, particles: int, spreads: Floats, randoms: Randoms) -> Floats32:
-    """Return the initial positions of all particles. Shape (corners, 2, groups, size).
+    """Return the initial positions of all particles.
 
-    The paths of the first group bend at one point, those of the second group at two points, and so
-    on. Bends are drawn within the group's spread around the straight line, and corners are evenly
-    spaced. Paths with few bends pass between discs more often than paths with independent corners.
+    The array has shape (corners, 2, groups, size). The paths of the first group bend at one point,
+    those of the second group at two points, and so on. Bends are drawn within the group's spread
+    around the straight line, and corners are evenly spaced. Paths with few bends pass between discs
+    more often than paths with independent corners.
     """
     groups = len(spreads)
     size = particles // groups

@@ -61,7 +61,10 @@ def run_trial(planning: Planning, trial: int) -> Trial:
 
 
 def with_ends(planning: Planning, waypoints: Floats) -> Floats:
-    """Return the entire path, with its start, waypoints and target. Shape (k + 2, 2)."""
+    """Return the entire path, with its start, waypoints and target.
+
+    The array has shape (k + 2, 2).
+    """
     return np.vstack([planning.start, waypoints, planning.target])
 
 

@@ -217,7 +217,10 @@ class AlignedSweep(NamedTuple):
 
     @property
     def range_m(self) -> Floats:
-        """Ranges along the rays in meters, with shape (n,)."""
+        """Range of each return along its ray, in meters.
+
+        The array has shape (n,).
+        """
         return np.asarray(np.linalg.norm(self.world - self.origins, axis=1))
 
 
@@ -571,5 +574,8 @@ def _spherical_derivatives(points: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def transform_points(points: Floats, pose: Floats) -> Floats:
-    """Transform points of shape (n, 3) with a pose of shape (4, 4)."""
+    """Transform points from the frame of a pose.
+
+    The points have shape (n, 3), and the pose has shape (4, 4).
+    """
     return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])

@@ -62,7 +62,10 @@ class HeldOutRays:
 
     @property
     def returned(self) -> Bools:
-        """Mask of the rays that have a recorded return, with shape (n,)."""
+        """Mask of the rays that have a recorded return.
+
+        The array has shape (n,).
+        """
         return np.isfinite(self.range_m)
 
     def select(self, rays: Bools) -> HeldOutRays:

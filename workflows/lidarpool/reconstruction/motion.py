@@ -55,7 +55,10 @@ class MotionStep(NamedTuple):
 
     @classmethod
     def between(cls, pose: Floats, following: Floats) -> MotionStep:
-        """Return the motion between two poses of shape (4, 4)."""
+        """Return the motion between two poses.
+
+        Both poses have shape (4, 4).
+        """
         from scipy.spatial.transform import Rotation
 
         turned = pose[:3, :3].T @ following[:3, :3]
@@ -65,7 +68,10 @@ class MotionStep(NamedTuple):
         )
 
     def fraction(self, share: float) -> Floats:
-        """Return a fraction of the motion as a transformation matrix of shape (4, 4)."""
+        """Return a fraction of the motion as a transformation matrix.
+
+        The matrix has shape (4, 4).
+        """
         from scipy.spatial.transform import Rotation
 
         moved = np.eye(4)

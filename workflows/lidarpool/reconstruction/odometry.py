@@ -159,7 +159,9 @@ def _read_poses(sweeps: RecordedSweeps, trajectory: Path, times_s: Floats) -> tu
 
 
 def _sensor_poses(sweeps: RecordedSweeps, trajectory: Path, rows: Floats) -> Floats:
-    """Convert KITTI rows of shape (k, 3, 4) to sensor poses of shape (s, 4, 4).
+    """Convert KITTI rows to sensor poses.
+
+    The rows have shape (k, 3, 4), and the poses have shape (s, 4, 4).
 
     The rows are camera poses if the recording, or otherwise the folder of the file, contains a
     KITTI calibration.

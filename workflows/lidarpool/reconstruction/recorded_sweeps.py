@@ -127,7 +127,10 @@ class RecordedSweeps:
 
     @property
     def elevation_rad(self) -> Floats:
-        """Median elevation of each ring, from the highest to the lowest. Shape (r,)."""
+        """Median elevation of each ring, from the highest to the lowest.
+
+        The array has shape (r,).
+        """
         return self.rings.elevation_rad
 
     @property

@@ -91,16 +91,19 @@ class Response:
     scale: float
 
     def factors(self, range_m: AnyFloats, cosine: AnyFloats, ring: Integers) -> Floats:
-        """Return the expected intensities of white surfaces. Shape (k,)."""
+        """Return the expected intensities of white surfaces.
+
+        The array has shape (k,).
+        """
         factors = self.by_range[_range_bin(range_m)] * self.by_incidence[_incidence_bin(cosine)]
         law = self.model.law(range_m, cosine)
         return np.asarray(factors * self.by_ring[ring] * self.white * law)
 
     def reflectances(self, observations: Observations, centers: Floats) -> Reflectances:
-        """Estimate the reflectances of the surfels whose centers have shape (m, 3).
+        """Estimate the reflectances of surfels, given the centers of the surfels.
 
-        A surfel that no ray hits, for example because it is occluded, has the reflectance of the
-        nearest surfel with observations.
+        The centers have shape (m, 3). A surfel that no ray hits, for example because it is
+        occluded, has the reflectance of the nearest surfel with observations.
         """
         from scipy.spatial import cKDTree
 

@@ -68,7 +68,10 @@ class Submap:
 
 
 def split_into_submaps(positions: Floats) -> list[Submap]:
-    """Divide a drive into submaps, given sweep positions of shape (s, 3)."""
+    """Divide a drive into submaps, given the positions of its sweeps.
+
+    The positions have shape (s, 3).
+    """
     meters = _meters(positions)
     counts = np.array([len(meter) for meter in meters])
     before = np.cumsum(counts) - counts

@@ -93,7 +93,10 @@ class SurfelHits(NamedTuple):
 
     @property
     def ends(self) -> Bools:
-        """Mask of the rays that end on the surfel that they hit. Shape (k,)."""
+        """Mask of the rays that end on the surfel that they hit.
+
+        The array has shape (k,).
+        """
         near = np.abs(self.distance_m - self.range_m) < _ON_RAY_M
         return np.asarray(near | (self.off_plane_m < _ON_SURFEL_M))
 

@@ -49,12 +49,18 @@ class Surfels:
 
     @cached_property
     def centers(self) -> Floats:
-        """Centers of the surfels in meters. Shape (m, 3)."""
+        """Centers of the surfels in meters.
+
+        The array has shape (m, 3).
+        """
         return surfel_centers(self.mesh)
 
     @cached_property
     def normals(self) -> Floats:
-        """Unit normals of the surfels. Shape (m, 3)."""
+        """Unit normals of the surfels.
+
+        The array has shape (m, 3).
+        """
         corners = self.mesh.vertices.reshape(-1, 4, 3)
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -70,7 +76,10 @@ class Surfels:
         return Surfels(SceneMesh(mesh.name, vertices, faces, materials=materials), self.dark[rows])
 
     def shift_along_normals(self, shifts_m: Floats) -> Surfels:
-        """Move each surfel along its normal by the distance in `shifts_m`, of shape (m,)."""
+        """Move each surfel along its normal by the distance in `shifts_m`.
+
+        `shifts_m` has shape (m,).
+        """
         offsets = (shifts_m[:, None] * self.normals).repeat(4, axis=0)
         return replace(self, mesh=replace(self.mesh, vertices=self.mesh.vertices + offsets))
 
@@ -81,7 +90,10 @@ class Surfels:
 
     @staticmethod
     def are_enough(points: Floats, voxel_m: float) -> bool:
-        """Return whether the points, of shape (n, 3), occupy enough voxels to create surfels."""
+        """Return whether points occupy enough voxels to create surfels.
+
+        The points have shape (n, 3).
+        """
         cells = np.unique(np.floor(points / voxel_m).astype(np.int64), axis=0)
         return len(cells) > 2 * _NEIGHBORS[-1]
 
@@ -152,12 +164,18 @@ class Surfels:
 
 
 def surfel_mesh(name: str, corners: Floats) -> SceneMesh:
-    """Create a surfel mesh from corners of shape (m, 4, 3) in meters."""
+    """Create a surfel mesh from the corners of surfels, in meters.
+
+    The corners have shape (m, 4, 3).
+    """
     return SceneMesh(name, corners.reshape(-1, 3), surfel_faces(len(corners)))
 
 
 def surfel_centers(mesh: SceneMesh) -> Floats:
-    """Return the centers of a mesh's surfels in meters. Shape (m, 3)."""
+    """Return the centers of a mesh's surfels in meters.
+
+    The array has shape (m, 3).
+    """
     return np.asarray(mesh.vertices.reshape(-1, 4, 3).mean(axis=1))
 
 
@@ -206,7 +224,10 @@ class _Planes(NamedTuple):
         return cls(axes, halves, radius_m)
 
     def corners(self, centers: Floats, outward: Floats, voxel_m: float, gap_rad: float) -> Floats:
-        """Return surfel corners of shape (m, 4, 3), counterclockwise as seen from the sensor."""
+        """Return the surfel corners, counterclockwise as seen from the sensor.
+
+        The array has shape (m, 4, 3).
+        """
         range_m = np.linalg.norm(outward, axis=1)
         facing = np.einsum("mi,mi->m", self.axes[:, 0], outward)
         cosine = np.abs(facing) / np.maximum(range_m, 1e-9)
@@ -232,7 +253,10 @@ def _nearest(tree: object, centers: Floats, count: int) -> Ints:
 
 
 def _principal(around: Floats) -> tuple[Floats, Floats]:
-    """Return the ascending variances and principal axes of point sets of shape (m, k, 3)."""
+    """Return the ascending variances and principal axes of point sets.
+
+    The point sets have shape (m, k, 3).
+    """
     offsets = around - around.mean(axis=1, keepdims=True)
     covariances = np.einsum("mki,mkj->mij", offsets, offsets) / around.shape[1]
     variances, axes = np.linalg.eigh(covariances)

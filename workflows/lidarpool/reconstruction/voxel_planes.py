@@ -28,7 +28,9 @@ class VoxelPlanes:
 
     @classmethod
     def from_points(cls, name: str, points: Floats, voxel_m: float) -> VoxelPlanes | None:
-        """Find planes in points of shape (n, 3), or return None if there are none.
+        """Find the planes in a point cloud, or return None if there are none.
+
+        The points have shape (n, 3).
 
         Raises
         ------

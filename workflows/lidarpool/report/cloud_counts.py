@@ -71,7 +71,10 @@ class CloudCounts:
         self._squares = GridCounts(_SQUARES)
 
     def add(self, columns: Mapping[str, AnyArray]) -> None:
-        """Add the columns of n > 0 points, as {column name: array of shape (n,)}."""
+        """Add the columns of at least one point, as {column name: values}.
+
+        The values have shape (n,).
+        """
         self.no_surface += count_labels(columns["object"], self.by_object)
         if "class" in columns:
             count_labels(columns["class"], self.by_class)
@@ -124,7 +127,10 @@ class CloudCounts:
 
     @property
     def bounds(self) -> Floats:
-        """Minimum and maximum world coordinates in meters, or zeros for an empty cloud."""
+        """Minimum and maximum world coordinates in meters, or zeros for an empty cloud.
+
+        The array has shape (2, 3).
+        """
         if self._squares.box is None:
             return np.zeros((2, 3))
         return cell_positions(self._squares.box, self._precision_m, self._origin)
@@ -144,7 +150,10 @@ class CloudCounts:
 
     @property
     def corner(self) -> Floats:
-        """World position of the southwest corner of `above`, in meters. Shape (2,)."""
+        """World position of the southwest corner of `above`, in meters.
+
+        The array has shape (2,).
+        """
         return cell_positions(self._pixels.lowest, self._precision_m, self._origin[:2])
 
     @property
@@ -197,7 +206,10 @@ class GridCounts:
         self._array = np.zeros((across, across), np.int64)
 
     def widen(self, cell_box: Ints) -> None:
-        """Extend the grid to a box, given its lowest and highest cells. Shape (2, axes)."""
+        """Extend the grid to a box, given its lowest and highest cells.
+
+        The box has shape (2, axes).
+        """
         earlier = self.box
         if earlier is not None:
             lowest = np.minimum(earlier[0], cell_box[0])
@@ -262,7 +274,10 @@ class GridCounts:
 
     @property
     def lowest(self) -> Ints:
-        """Lowest cell of `counts` along each axis. Shape (2,)."""
+        """Lowest cell of `counts` along each axis.
+
+        The array has shape (2,).
+        """
         box = np.zeros((2, 2), np.int64) if self.box is None else self.box
         return (_numbers(box[0], self._level) << self._level) - SHIFT
 

@@ -346,7 +346,10 @@ def poses_around(scene: Scene, mounted: Mounted) -> tuple[Pose, ...]:
 
 
 def _direction(azimuth_deg: float, elevation_deg: float) -> Floats:
-    """Return the unit vector with the given azimuth and elevation. Shape (3,)."""
+    """Return the unit vector with the given azimuth and elevation.
+
+    The array has shape (3,).
+    """
     angles = np.radians([azimuth_deg, elevation_deg])
     cosines = np.cos(angles)
     sines = np.sin(angles)

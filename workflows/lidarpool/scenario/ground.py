@@ -36,7 +36,10 @@ class SupportSurfaces:
 
     @property
     def origin(self) -> Floats:
-        """Origin of the scene in world coordinates, in meters. Shape (3,)."""
+        """Origin of the scene in world coordinates, in meters.
+
+        The array has shape (3,).
+        """
         return np.zeros(3) if self._scene is None else self._scene.origin
 
     def select(self, names: Sequence[str]) -> SupportSurfaces:
@@ -101,7 +104,10 @@ class SupportSurfaces:
 
     @property
     def rectangle(self) -> Floats:
-        """Minimum x and y, and maximum x and y, in world coordinates. Shape (4,)."""
+        """Minimum x and y, and maximum x and y, in world coordinates.
+
+        The array has shape (4,).
+        """
         assert self._scene is not None
         x, y = self._tops[0][..., :2].reshape(-1, 2).T
         origin = self._scene.origin[[0, 1, 0, 1]]

@@ -69,7 +69,10 @@ class _Motion(NamedTuple):
 
     @property
     def speeds(self) -> Floats:
-        """Speed of the platform in m/s, with shape (k,)."""
+        """Speed of the platform in m/s.
+
+        The array has shape (k,).
+        """
         return np.asarray(np.linalg.norm(self.velocities, axis=1))
 
 
@@ -254,7 +257,10 @@ def _bad_positions(
 
 
 def _inside_actor(actor: Actor, samples: list[_SensorPosition]) -> Bools:
-    """Mark the sensor positions that are inside the closed mesh of an actor. Shape (k,)."""
+    """Mark the sensor positions that are inside the closed mesh of an actor.
+
+    The mask has shape (k,).
+    """
     times = np.array([sample.time_ns for sample in samples])
     inside = np.zeros(len(samples), np.bool_)
     if not samples:
@@ -434,7 +440,10 @@ class _MeanOrientation(NamedTuple):
 
     @classmethod
     def measure(cls, motion: _Motion, rotations: Floats) -> _MeanOrientation:
-        """Return the mean orientation along a path, given rotations of shape (k, 3, 3)."""
+        """Return the mean orientation along a path.
+
+        `rotations` has shape (k, 3, 3).
+        """
         level = float(np.average(rotations[:, 2, 2], weights=motion.durations_s))
         forward = rotations[:, :2, 0]
         travel = motion.velocities[:, :2]

@@ -372,9 +372,10 @@ def _as_integers(classes: AnyArray) -> Ints:
 
 
 def _as_srgb(colors: AnyArray) -> Floats32:
-    """Convert colors to sRGB values between 0 and 255. Shape (n, 3).
+    """Convert colors to sRGB values between 0 and 255.
 
-    The input has 8 or 16 bits, or consists of floats from 0 to 1 or from 0 to 255.
+    The result has shape (n, 3). The input has 8 or 16 bits, or consists of floats from 0 to 1 or
+    from 0 to 255.
     """
     if colors.dtype == np.uint8:
         return colors.astype(np.float32)

@@ -318,9 +318,9 @@ class PointVoxels:
 
     @classmethod
     def from_points(cls, path: Path, positions: Floats, voxel_m: float) -> PointVoxels:
-        """Assign the points in a file, with positions of shape (n, 3), to voxels.
+        """Assign the points in a file to voxels.
 
-        Raise LidarError if there are too many voxels.
+        The positions have shape (n, 3). Raise LidarError if there are too many voxels.
         """
         lower = positions.min(axis=0)
         spans = (positions.max(axis=0) - lower) / voxel_m + 1
@@ -338,9 +338,9 @@ class PointVoxels:
         return cls(order, starts, np.diff(starts, append=len(order)))
 
     def means(self, values: AnyArray) -> Floats:
-        """Return the mean in each voxel of values with shape (n, k).
+        """Return the mean of the values in each voxel.
 
-        The means have shape (v, k).
+        `values` has shape (n, k), and the means have shape (v, k).
         """
         sums = np.add.reduceat(values[self.order].astype(np.float64), self.starts, axis=0)
         means: Floats = sums / self.counts[:, None]
@@ -356,11 +356,11 @@ class PointVoxels:
             return self.means(np.where(known, values, 0.0)) / self.means(known)
 
     def most_frequent(self, numbers: Ints, distinct: int, unknown: int | None = None) -> Ints:
-        """Return the number that occurs most often in each voxel. Shape (v,).
+        """Return the number that occurs most often in each voxel.
 
-        Ties are resolved in favor of the lowest number. `numbers` has shape (n,) and contains
-        integers from 0 to `distinct` - 1. The number `unknown` is returned only if a voxel contains
-        no other number.
+        The array has shape (v,). Ties are resolved in favor of the lowest number. `numbers` has
+        shape (n,) and contains integers from 0 to `distinct` - 1. The number `unknown` is returned
+        only if a voxel contains no other number.
         """
         voxel = np.repeat(np.arange(len(self.counts)), self.counts)
         pairs, repeats = np.unique(voxel * distinct + numbers[self.order], return_counts=True)
@@ -383,7 +383,10 @@ def _outward(points: Sweep) -> Floats | None:
 
 
 def _normalize(outward: Floats) -> Floats:
-    """Scale vectors to length 1, leaving zero vectors unchanged. Shape (n, 3)."""
+    """Scale vectors to length 1, leaving zero vectors unchanged.
+
+    The vectors have shape (n, 3).
+    """
     lengths = np.sqrt((outward * outward).sum(axis=1, keepdims=True))
     return np.divide(outward, lengths, out=np.zeros_like(outward), where=lengths > 0)
 
@@ -428,7 +431,10 @@ def _fill_from_neighbors(o3d: Any, light: Floats, centers: Floats) -> None:
 
 
 def _to_linear(colors: AnyArray) -> Floats:
-    """Convert sRGB colors from 0 to 255 to linear light, preserving NaN. Shape (n, 3)."""
+    """Convert sRGB colors from 0 to 255 to linear light, preserving NaN.
+
+    The colors have shape (n, 3).
+    """
     known = np.isfinite(colors)
     light = LINEAR[np.where(known, colors, 0).astype(np.uint8)]
     return np.where(known, light, np.nan)

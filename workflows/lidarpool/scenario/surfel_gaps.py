@@ -124,7 +124,10 @@ def _rays_between(points: Floats, count: int, rng: np.random.Generator) -> Itera
 
 
 def _normalize(vectors: Floats) -> Floats:
-    """Scale vectors to length 1, leaving zero vectors unchanged. Shape (..., 3)."""
+    """Scale vectors to length 1, leaving zero vectors unchanged.
+
+    The vectors have shape (..., 3).
+    """
     lengths = np.sqrt(_dot(vectors, vectors))[..., None]
     return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)
 
@@ -135,7 +138,10 @@ def _dot(first: Floats, second: Floats) -> Floats:
 
 
 def _search_tree(points: Floats) -> Any:
-    """Return Open3D's nearest neighbor search for points of shape (n, 3)."""
+    """Return Open3D's nearest neighbor search for the given points.
+
+    The points have shape (n, 3).
+    """
     from open3d.core import Tensor, nns
 
     tree = nns.NearestNeighborSearch(Tensor(np.ascontiguousarray(points)))

@@ -144,7 +144,10 @@ class FoxgloveServer(Viewer):
             self.show_path(surroundings.path)
 
     def show_path(self, path: Floats) -> None:
-        """Show a planned path of shape (w, 3), in world coordinates in meters."""
+        """Show a planned path in world coordinates, in meters.
+
+        The path has shape (w, 3).
+        """
         self._send_entities(_PATH, [_entity("path", lines=[_line(path, _GREEN)])])
 
     def show_sweep(self, shown: ShownSweep) -> None:
@@ -302,7 +305,10 @@ def _triangle_list(surface: Surface, face_indices: Any, pose: Any, color: Any) -
 
 
 def _line(positions: Floats, color: Any) -> Any:
-    """Return a line through positions of shape (k, 3), relative to the first position."""
+    """Return a line through the given positions, relative to the first position.
+
+    The positions have shape (k, 3).
+    """
     return messages.LinePrimitive(
         type=messages.LinePrimitiveLineType.LineStrip,
         pose=_pose(positions[0]),

@@ -68,7 +68,10 @@ class RerunServer(Viewer):
         self._log.show_surroundings(surroundings)
 
     def show_path(self, path: Floats) -> None:
-        """Show a planned path of shape (w, 3), in world coordinates in meters."""
+        """Show a planned path in world coordinates, in meters.
+
+        The path has shape (w, 3).
+        """
         self._log.show_path(path)
 
     def show_sweep(self, shown: ShownSweep) -> None:

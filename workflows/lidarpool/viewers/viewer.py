@@ -42,7 +42,10 @@ class Viewer(ABC):
 
     @abstractmethod
     def show_path(self, path: Floats) -> None:
-        """Show a planned path of shape (w, 3), in world coordinates in meters."""
+        """Show a planned path in world coordinates, in meters.
+
+        The path has shape (w, 3).
+        """
 
     @abstractmethod
     def show_sweep(self, shown: ShownSweep) -> None:

@@ -48,7 +48,10 @@ _LIGHT_COLUMNS = 3  # number of cells on either side whose intensities are avera
 
 @dataclass(frozen=True, eq=False)
 class ScenePulses:
-    """Pulses that hit smooth surfaces of a scene, as arrays of shape (n,)."""
+    """Pulses that hit smooth surfaces of a scene.
+
+    All arrays have shape (n,).
+    """
 
     row: Ints
     column: Ints

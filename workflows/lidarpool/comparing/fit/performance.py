@@ -141,7 +141,10 @@ class ScatterFit(NamedTuple):
 
 
 class _VarianceSamples(NamedTuple):
-    """Range variances of rays that lose few pulses, as arrays of shape (k,)."""
+    """Range variances of rays that lose few pulses.
+
+    All arrays have shape (k,).
+    """
 
     variance: Floats  # square meters
     freedom: Ints  # degrees of freedom of the variance

@@ -76,32 +76,38 @@ class RangeChanges:
 
     @cached_property
     def design(self) -> Floats:
-        """Derivatives of the selected rays' ranges with respect to the motion. Shape (k, 4).
+        """Derivatives of the selected rays' ranges with respect to the motion.
 
-        The columns are the shift along x, y and z, and the yaw at `ARM_M`. Yaw is expressed in
-        meters so that all unknowns have a similar magnitude.
+        The array has shape (k, 4). The columns are the shift along x, y and z, and the yaw at
+        `ARM_M`. Yaw is expressed in meters so that all unknowns have a similar magnitude.
         """
         yaw = self.surfaces.azimuth_slope[self.chosen] / ARM_M
         return np.column_stack([-self.surfaces.scaled_normal[self.chosen], yaw])
 
     @cached_property
     def distance(self) -> Floats:
-        """Ranges of the selected rays in the first sweep, in meters. Shape (k,)."""
+        """Ranges of the selected rays in the first sweep, in meters.
+
+        The array has shape (k,).
+        """
         return np.linalg.norm(self.points[self.chosen], axis=1)
 
     @cached_property
     def normal_error(self) -> Floats:
-        """Errors of the surface normals at the selected rays, in radians. Shape (k,).
+        """Errors of the surface normals at the selected rays, in radians.
 
-        Normals are computed from points two columns away on either side, because adjacent points
-        would yield inaccurate normals.
+        The array has shape (k,). Normals are computed from points two columns away on either side,
+        because adjacent points would yield inaccurate normals.
         """
         step_rad = 2 * np.pi / self.change.shape[1]
         return np.asarray(_ASSUMED_NOISE_M / (np.sqrt(10) * self.distance * step_rad))
 
     @cached_property
     def noise(self) -> Floats:
-        """Assumed noise of the selected rays' range changes, in meters. Shape (k,)."""
+        """Assumed noise of the selected rays' range changes, in meters.
+
+        The array has shape (k,).
+        """
         noise = _ASSUMED_NOISE_M + MAX_KINK_PER_M * self.distance
         return np.asarray(np.hypot(noise, _ASSUMED_SHIFT_M * self.normal_error))
 

@@ -106,10 +106,11 @@ def find_surfaces(stack: SweepStack, distance: Floats, error_m: Floats) -> Smoot
 
 
 def _beam_origins(points: Floats) -> Floats:
-    """Return the origin of the beams in each row, in meters. Shape (r, 1, 3).
+    """Return the origin of the beams in each row, in meters.
 
-    The beams in a row intersect on the z axis, near the sensor's origin. Their height increases
-    linearly with the distance from the axis, and the height at distance 0 is the origin.
+    The array has shape (r, 1, 3). The beams in a row intersect on the z axis, near the sensor's
+    origin. Their height increases linearly with the distance from the axis, and the height at
+    distance 0 is the origin.
     """
     with warnings.catch_warnings(action="ignore"):
         distance = np.hypot(points[..., 0], points[..., 1])
@@ -123,7 +124,10 @@ def _beam_origins(points: Floats) -> Floats:
 
 
 class SmoothRays(NamedTuple):
-    """Rays that hit smooth surfaces, as arrays of shape (k,)."""
+    """Rays that hit smooth surfaces.
+
+    All arrays have shape (k,).
+    """
 
     row: Ints
     column: Ints
@@ -141,7 +145,10 @@ class SmoothRays(NamedTuple):
 
 
 class _RayStatistics(NamedTuple):
-    """Statistics of each ray's returns without outliers, as arrays of shape (k,)."""
+    """Statistics of each ray's returns without outliers.
+
+    All arrays have shape (k,).
+    """
 
     mean_range: Floats  # meters
     mean_intensity: Floats

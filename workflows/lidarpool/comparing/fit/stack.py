@@ -59,12 +59,18 @@ class SweepStack:
 
     @cached_property
     def trials(self) -> Ints:
-        """Number of sweeps in which each cell has a return or a lost pulse. Shape (r, c)."""
+        """Number of sweeps in which each cell has a return or a lost pulse.
+
+        The array has shape (r, c).
+        """
         return np.asarray(self.covered.sum(axis=0))
 
     @cached_property
     def steady(self) -> Bools:
-        """Mask of the cells near which no object appears or disappears. Shape (r, c)."""
+        """Mask of the cells near which no object appears or disappears.
+
+        The array has shape (r, c).
+        """
         return steady_cells(np.isfinite(self.ranges), self.covered)
 
     @classmethod

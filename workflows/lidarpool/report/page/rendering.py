@@ -165,7 +165,10 @@ def draw_top_view(counts: Ints, pixel_m: float = 1.0, marks: Sequence[_Mark] = (
 
 
 def _shade_counts(counts: Ints) -> str:
-    """Return an image of point counts, of shape (rows, columns), as a data URL."""
+    """Return an image of point counts as a data URL.
+
+    `counts` has shape (rows, columns).
+    """
     shade = np.log1p(counts)
     weakest = np.where(counts > 0, _WEAKEST, 0)  # makes single points visible
     pixels = np.full((*counts.shape, 4), (53, 105, 176, 0), np.uint8)

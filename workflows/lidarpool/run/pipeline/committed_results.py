@@ -27,7 +27,10 @@ class CommittedParts:
 
     @property
     def cell_box(self) -> Ints | None:
-        """Lowest and highest cell of all points, with shape (2, 3), or None without points."""
+        """Lowest and highest cell of all points, or None if there are no points.
+
+        The array has shape (2, 3).
+        """
         boxes = [part.cell_box for part in self.ordered if part.cell_box]
         if not boxes:
             return None
