@@ -160,7 +160,7 @@ class Result(RunResult):
 
     @cached_property
     def _cloud_file(self) -> Path:
-        """Write the cloud to a temporary folder as a PLY file, and return the path of the file.
+        """Path of a temporary PLY file that contains the cloud.
 
         The folder is removed when the result is garbage-collected.
         """
@@ -184,7 +184,7 @@ class Result(RunResult):
 
     @cached_property
     def _images(self) -> str:
-        """Return the plots as HTML image elements."""
+        """Plots of the result as HTML image elements."""
         from lidarview.cell_pictures import compress_png
 
         with TemporaryDirectory(prefix="lidarpool-") as folder:

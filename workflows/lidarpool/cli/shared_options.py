@@ -291,7 +291,7 @@ def _scheduler_address(
 
 
 def world_lines(epsg: int | None, origin: Sequence[float]) -> Iterator[str]:
-    """Yield a line about the coordinate system of the output and its origin.
+    """Yield a line about the output's coordinate system and origin.
 
     Yield nothing if the output has neither an EPSG code nor an origin.
     """

@@ -264,7 +264,7 @@ def _show_coverage(
     slant_deg: float,
     targets: Sequence[str],
 ) -> None:
-    """Print how much of the area that a scenario's stations can reach is covered by a cloud."""
+    """Print the fraction of the area visible from a scenario's stations that a cloud covers."""
     from ..comparing.compared_sweep import compared_in_world
     from ..plan.stations import survey_coverage
     from ..recordings.opening import open_recording

@@ -1,1 +1,1 @@
-"""Files called parts, which store points during a run, and point clouds that are read from them."""
+"""Parts, which are files that store points during a run, and point clouds read from parts."""

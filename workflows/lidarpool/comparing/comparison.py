@@ -181,7 +181,7 @@ def _draw_gap_legend(page: Page, axes: Axes) -> None:
 
 
 def _show_image(axes: Axes, images: RangeImages, colors: AnyArray) -> None:
-    """Show a range image as seen by the sensor, with directions to its left on the left.
+    """Show a range image from the viewpoint of the sensor, with the sensor's left on the left.
 
     The image has shape (r, c, …).
     """

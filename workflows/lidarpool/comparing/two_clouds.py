@@ -155,7 +155,7 @@ def compare(
 
 @contextmanager
 def _sensor_chosen_by(option: str) -> Iterator[None]:
-    """Convert errors about several sensors in the body, so that they suggest the given option."""
+    """Add the command-line option that selects a sensor to errors about ambiguous sensors."""
     try:
         yield
     except SeveralSensorsError as error:
@@ -373,7 +373,7 @@ class _Comparing:
         self.cells.append(_CellPairs(range_a - range_b, rings[in_both], intensity_a, intensity_b))
 
     def _count_cells(self, images: RangeImages, in_a: Bools, in_b: Bools) -> None:
-        """Count the cells of each ring in each of the states `CELLS`.
+        """Count the cells of each ring that are in each of the states in `CELLS`.
 
         The masks `in_a` and `in_b` mark returns. Both have shape (k,).
         """
@@ -542,7 +542,7 @@ class _Comparing:
 
 
 def _residual_figures(values: Floats) -> dict[str, Any]:
-    """Return statistics of the residuals A - B in meters, which are None without residuals."""
+    """Return residual statistics in meters, which are None if there are no residuals."""
     if not len(values):
         return {"cells": 0, **dict.fromkeys(RESIDUALS)}
     p05, median, p95 = np.quantile(values, (0.05, 0.5, 0.95)).tolist()

@@ -105,7 +105,7 @@ def _hash_packages(packages: Iterable[str]) -> str:
 
 
 def _package_files(package: str) -> Iterator[tuple[str, Path]]:
-    """Yield the name of each file in a package, starting with the package name, and its path."""
+    """Yield the path of each file in a package, preceded by a name that includes the package."""
     try:
         spec = find_spec(package)
     except ModuleNotFoundError:  # the parent package is missing

@@ -24,7 +24,7 @@ class CpuShare:
 
     @property
     def wait_s(self) -> float:
-        """Seconds until the activity may run again, or a number of at most 0 if it may run now."""
+        """Seconds until the activity may run again, which is 0 or negative if it may run now."""
         return self._due_at - time.monotonic()
 
     @contextmanager

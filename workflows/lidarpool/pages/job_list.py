@@ -55,7 +55,7 @@ class JobList:
         self.title = self.location.rstrip("/").rpartition("/")[2] or self.location
 
     def answer(self, question: str, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Answer a request of the job list, or of the viewer of a job."""
+        """Answer a request from the job list or from the viewer of a job."""
         if question == "jobs":
             return self._list(), {}
         match = re.fullmatch(r"job/(\d+)/(\w+)", question)

@@ -129,7 +129,7 @@ class LiveJob:
         self._show()
 
     def hit_counts(self) -> Floats:
-        """Return how often rays have hit each triangle of the scene.
+        """Return the values of the scene's hit counters.
 
         If some parts were not read, the counts are scaled to the total number of hits.
         """

@@ -143,7 +143,7 @@ class LivePage(RunPage):
     # -- called by the page -------------------------------------------------------------
 
     def answer(self, question: str, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Answer a request of the job list, or of the viewer of a job."""
+        """Answer a request from the job list or from the viewer of a job."""
         if question == "jobs":
             if arguments.get("newest"):
                 self._views.request_newest()
@@ -165,7 +165,7 @@ class LivePage(RunPage):
         return self._answer_for_only_job(jobs[number], viewer_question, arguments, abandoned)
 
     def _answer_for_only_job(self, job: LiveJob, question: str, *arguments: Any) -> Answer:
-        """Answer a request of the viewer of the only job."""
+        """Answer a request from the viewer of the only job."""
         progress = self._status.progress
         points = {"points": (progress and progress.points) or self._listed.sums["points"]}
         if question == "news":

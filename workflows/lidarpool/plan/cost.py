@@ -74,7 +74,7 @@ class PathCost:
 
 
 def _enlarged_radii(centers: Floats, radii: Floats) -> Floats:
-    """Return radii with a margin for rounding errors, but without covering the path's end points.
+    """Enlarge radii by a margin for rounding errors without covering the path's end points.
 
     The enlarged discs do not contain the end points of the path.
     """

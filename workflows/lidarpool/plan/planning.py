@@ -110,7 +110,7 @@ class Planning(Search):
 def _checked(
     name: str, value: ArrayLike, fits: Callable[[Floats], bool], requirement: str
 ) -> Floats:
-    """Convert `value` to a new array, and raise LidarError unless it is finite and meets `fits`."""
+    """Convert `value` to a new array of finite numbers that satisfy `fits`, or raise LidarError."""
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):

@@ -389,7 +389,7 @@ def _default_spacing_m(scene: Scene) -> float:
 
 
 def candidates(scene: Scene, caster: RayCaster, height_m: float, spacing_m: float) -> Floats:
-    """Return grid positions on which an instrument can be set up, in local meters.
+    """Return grid positions at which an instrument can be set up, in local meters.
 
     The result has shape (c, 3). The floor is the lowest surface. If the lowest surface is the
     underside of a slab, the floor is the top of the slab. Excluded are floors that can be reached
@@ -565,7 +565,7 @@ def _sample_surfaces(scene: Scene, is_target: Bools) -> _SurfaceSamples:
 def _sample_triangles(
     rng: np.random.Generator, face_areas: Floats, areas: Floats, counts: Ints
 ) -> Ints:
-    """Draw `counts` triangles of each object with probabilities proportional to their areas."""
+    """Draw triangles of each object with probabilities proportional to area, sorted by object."""
     owner = np.repeat(np.arange(len(counts)), counts)
     nth = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
     offsets = (nth + rng.random(len(owner))) / counts[owner] * areas[owner]

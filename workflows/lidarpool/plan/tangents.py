@@ -201,7 +201,7 @@ def _graph(tangents: _Tangents, centers: Floats, radii: Floats) -> Graph:
 def _open_arcs(
     angles: Floats, circle: int, centers: Floats, radii: Floats
 ) -> list[tuple[int, int, float]]:
-    """Return the arcs between adjacent contact points of `circle` that no disc blocks.
+    """Return the unblocked arcs between adjacent contact points of `circle`.
 
     `angles` contains the sorted angles of the contact points. Each arc is returned as the indices
     of its two angles, and the angle between them. A contact point never lies inside another disc,

@@ -1,4 +1,4 @@
-"""Playback schedules with deadlines on a clock that all processes share, and prefetching."""
+"""Schedules for playback on a clock that all processes share, and prefetching of sweeps."""
 
 from __future__ import annotations
 

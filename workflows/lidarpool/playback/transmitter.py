@@ -1,4 +1,4 @@
-"""Transmission of packets to receivers by a separate process, and sensor interfaces."""
+"""Transmission of packets by a separate process, and simulation of sensor interfaces."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ def _check_distinguishable(stream: Stream, other: Stream) -> None:
 
 
 class Transmitter:
-    """Context manager for a process that sends datagrams, and for sensor interfaces.
+    """Context manager that runs the sending process and the sensor interfaces.
 
     If `lateness` is set, statistics on how late datagrams were are written to this file as JSON.
     """

@@ -1,4 +1,4 @@
-"""Run garbage collection less often in a command and its workers, by importing this module.
+"""Run garbage collection less often once this module has been imported.
 
 With Python's default threshold, a tenth of the import time is spent on garbage collection.
 """

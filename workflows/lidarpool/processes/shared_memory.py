@@ -28,7 +28,7 @@ class Pickled(NamedTuple):
 
     @classmethod
     def from_value(cls, value: object) -> Pickled:
-        """Pickle a value without copying its arrays, of which the buffers are views."""
+        """Pickle a value, with buffers that are views of its arrays instead of copies."""
         buffers: list[pickle.PickleBuffer] = []
         head = cloudpickle.dumps(value, protocol=5, buffer_callback=buffers.append)
         return cls(head, tuple(buffer.raw() for buffer in buffers))

@@ -25,7 +25,7 @@ def trace(point: str, /, **fields: Any) -> None:
 
 
 def trace_to(sink: Sink | None) -> None:
-    """Set the function that is called at each trace point in this process, or remove it with None.
+    """Set or remove the function that is called at each trace point in this process.
 
     The function is called as ``sink(point, fields)`` in the thread that reaches the trace point,
     before the thread continues. It can log the trace point, block the thread, or end the process.

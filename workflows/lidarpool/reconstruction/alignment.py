@@ -183,7 +183,7 @@ class Alignment:
     def _split_by_step(
         self, number: int, times_s: Floats
     ) -> Iterator[tuple[Bools, MotionStep, Floats]]:
-        """Yield masks of points, with the motion step and the points' fractions of this step."""
+        """Yield a mask of points, the step that moves them, and their fractions of this step."""
         for backward, rows in ((False, times_s >= 0), (True, times_s < 0)):
             if rows.any():
                 step, step_s = self.step(number, backward=backward)

@@ -80,7 +80,7 @@ class SweepImages(NamedTuple):
         return cls(np.array([number]), range_m, in_twin_m, intensity, in_twin)
 
     def pictures(self) -> list[_Image]:
-        """Return the images of the recorded and simulated sweep, and the range differences."""
+        """Return the images of the recorded and the simulated sweep, and of their differences."""
         near_m, far_m = np.nanquantile(self.range_m, (0.01, 0.98)).tolist()
         ranges = LogNorm(max(near_m, 0.1), max(far_m, 1.0))
         differences = Normalize(-_DIFFERENCE_M, _DIFFERENCE_M)
@@ -127,7 +127,7 @@ class TopViewPoints(NamedTuple):
 
 
 def draw_sweep(sweep: SweepImages) -> Page:
-    """Draw the ranges and intensities of a recorded sweep and its simulation, and the errors."""
+    """Draw the ranges and intensities of a recorded and a simulated sweep, and the differences."""
     images = sweep.pictures()
     height = _TOP + len(images) * _IMAGE_HEIGHT + (len(images) - 1) * _GAP + _BOTTOM
     page = Page((_WIDTH, height))

@@ -180,7 +180,7 @@ def _step_rad(gap_rad: Floats) -> float:
 
 
 def _received(gaps: _Gaps, ring_count: int) -> Bools:
-    """Mark the azimuth sectors whose packets were received, because enough rings have returns."""
+    """Mark azimuth sectors in which enough rings have returns to show that packets arrived."""
     cells = np.unique(_sectors(gaps.azimuth) * ring_count + gaps.ring)
     rings = np.bincount(cells // ring_count, minlength=_SECTORS)
     return np.asarray(rings >= max(_MIN_RINGS * ring_count, 1))

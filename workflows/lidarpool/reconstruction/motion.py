@@ -19,7 +19,7 @@ from lidarsim.numerics.arrays import Floats
 
 
 class Motion(StrEnum):
-    """Motion compensation of the stored points, and the origin of their firing times."""
+    """Whether stored points are motion-compensated, and how their firing times are known."""
 
     COMPENSATED = "compensated"
     TIMED = "as fired, with point times"

@@ -31,7 +31,7 @@ _METER_SWEEPS = 80  # maximum number of sweeps that are used per section
 
 @dataclass(frozen=True, eq=False)
 class Submap:
-    """Consecutive sweeps of a drive, including sweeps of the surroundings.
+    """Sweeps of one section of a drive, and the surrounding sweeps.
 
     Attributes
     ----------

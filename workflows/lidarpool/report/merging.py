@@ -537,7 +537,7 @@ def _copy_points(
     assert only is not None, "the store of a survey has a single job"
 
     def copy_part(source: Storage, part_file: Receipt) -> Receipt | None:
-        """Copy a part, and return its receipt or, if it is missing or damaged, None."""
+        """Copy a part and return its receipt, or return None if the part is missing or damaged."""
         name = part_name(mark, 0, part_file.first, part_file.stop)
         with (
             explained(f"{source.path(part_file.name)} cannot be copied"),

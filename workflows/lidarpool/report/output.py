@@ -401,7 +401,7 @@ def _write_formats(
 
 
 def _points_with_progress(result: RunResult, file: str, show: WritingProgress) -> StoredCloud:
-    """Return the points of a result that report how many of them have been read for a file."""
+    """Return the points of a result, which report their progress for a file while they are read."""
     count = len(result.points)
     read_count = 0
 
@@ -439,7 +439,7 @@ def _upload(staged: Path, storage: Storage, further: Collection[str]) -> None:
 
 
 def _optional_files(survey: Survey, formats: Sequence[ExportSpec]) -> list[str]:
-    """Return the names of those files and folders that not all results have."""
+    """Return the names of files and folders that only some results have."""
     instruments = Instruments.from_survey(survey)
     measured = [] if instruments is None else instruments.files
     return [*(output_format.row.file for output_format in formats), *measured]

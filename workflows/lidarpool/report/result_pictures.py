@@ -131,7 +131,10 @@ def draw_pictures(
 def _picture_makers(
     shown: PictureContent, cloud: Path, size: tuple[int, int], color: str
 ) -> dict[str, Callable[[], Page]]:
-    """Return functions that draw each image, keyed by its name. They read `cloud` on demand."""
+    """Return the function that draws each image, keyed by the name of the image.
+
+    The functions read the file `cloud` on demand.
+    """
     columns = [column.name for column in CloudFile(cloud).table] if cloud.exists() else []
     alone = shown.coordinates == "sensor"
     middle = shown.duration_ns / 2

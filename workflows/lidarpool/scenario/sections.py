@@ -178,7 +178,7 @@ class MeshFile(Section):
 
     @property
     def reading_options(self) -> dict[str, Any]:
-        """Return the keyword arguments for `load_objects`, except for folders."""
+        """Keyword arguments for `load_objects`, excluding folders."""
         own = type(self).model_fields.keys() - MeshFile.model_fields.keys()
         shared = {field.name for field in fields(MeshOptions)} & MeshFile.model_fields.keys()
         return self.model_dump(include={*own, *shared} - {"assets"}, exclude_unset=True)

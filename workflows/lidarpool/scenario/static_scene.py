@@ -90,7 +90,7 @@ class FileFindings:
         return FileFindings(*(values.copy() for values in vars(self).values()))
 
     def class_patterns(self, number: int) -> tuple[str, ...]:
-        """Return patterns of the names of objects to which files assign the class `number`."""
+        """Return name patterns of the objects to which files assign the class `number`."""
         patterns = dict.fromkeys(
             pattern
             for classes in self.classes.values()

@@ -221,7 +221,7 @@ def fit_scatter(rays: SmoothRays, increase_name: str, growth: Floats, power: int
 
 
 def _variance_samples(rays: SmoothRays, growth: Floats) -> _VarianceSamples:
-    """Select the rays to whose variances the model is fitted.
+    """Select the rays that are used to fit the noise model.
 
     Rays that lose many pulses are excluded, because only their closer or brighter pulses return.
     `growth` is the quantity that range noise grows with.

@@ -260,7 +260,7 @@ def fit_creep(stack: SweepStack) -> Creep:
 
 
 class _SweepMotion(NamedTuple):
-    """Sensor motion relative to the mean of all sweeps, with its standard errors.
+    """Sensor motion relative to the mean of all sweeps, with an estimate of its errors.
 
     The seven values correspond to the columns of `_CreepRays.design`.
     """

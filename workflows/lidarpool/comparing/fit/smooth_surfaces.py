@@ -38,7 +38,7 @@ class SmoothSurfaces(NamedTuple):
 
 
 class CellNeighbors(NamedTuple):
-    """Points in the four cells next to each cell of a range image, in meters.
+    """Points in the cells next to each cell of a range image, in meters.
 
     Each array has shape (r, c, 3).
     """

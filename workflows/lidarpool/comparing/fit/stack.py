@@ -36,7 +36,7 @@ MAX_KINK_M = 0.01  # maximum distance of a surface from its plane within four co
 
 @dataclass(frozen=True, eq=False)
 class SweepStack:
-    """Returns of all sweeps in common cells, with rings by descending elevation.
+    """Returns of all sweeps in common cells, sorted by descending ring elevation.
 
     Values are NaN in cells without a return.
     """
@@ -130,7 +130,7 @@ def check_sweeps(recording: Recording) -> None:
 
 @dataclass(eq=False)
 class _CommonCells:
-    """Cells shared by all sweeps, which are filled sweep by sweep.
+    """Cells that all sweeps share, filled with one sweep at a time.
 
     A ring is added with its first return.
     """

@@ -78,7 +78,7 @@ def _rotate_about_z(points: Floats, yaw_rad: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class VisibilityImage:
-    """Ranges of the closest and farthest surfaces that a sweep hits around each direction."""
+    """Ranges of the closest and farthest surfaces around each direction of a sweep."""
 
     elevation_rad: Floats  # (r,): elevations of the rows, descending
     step_rad: float  # width of a column
@@ -193,7 +193,7 @@ class Evidence(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class VisibilityPair:
-    """Two sweeps in which the points of each are classified by the other.
+    """Two sweeps, and the visibility of each sweep's points in the other sweep.
 
     The classes apply if the sensor is stationary.
     """
@@ -205,7 +205,7 @@ class VisibilityPair:
 
     @classmethod
     def from_images(cls, first: VisibilityImage, second: VisibilityImage) -> VisibilityPair:
-        """Classify the points of each sweep with the image of the other sweep."""
+        """Classify the points of each sweep using the image of the other sweep."""
         return cls(
             first,
             second,
@@ -236,7 +236,7 @@ class VisibilityPair:
         return samples[0], samples[1]
 
     def score(self, motions: RigidMotion, first: Floats, second: Floats) -> Ints:
-        """Count how many points of two sweeps each motion aligns.
+        """Score each motion by how well it aligns two sweeps.
 
         The score is the number of points on surfaces of the other sweep, minus the number in empty
         space.
@@ -247,7 +247,7 @@ class VisibilityPair:
         )
 
     def _seen_in_motion(self, motion: RigidMotion) -> tuple[Ints, Ints]:
-        """Classify the points of each sweep with the other sweep, assuming a sensor motion."""
+        """Classify the points of each sweep using the other sweep, given a sensor motion."""
         in_second = motion.to_second(self.first.points)
         in_first = motion.to_first(self.second.points)
         return self.second.classify_points(in_second), self.first.classify_points(in_first)

@@ -133,7 +133,7 @@ class CastingWorkers:
 
     @property
     def pending(self) -> list[str]:
-        """Return the keys of unfinished tasks."""
+        """Keys of the unfinished tasks."""
         casts = [key for key, (future, _) in self._casts.items() if future.status == "pending"]
         return casts + [check.key for check in self._checks.values()]
 

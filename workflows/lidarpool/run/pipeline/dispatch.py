@@ -94,7 +94,7 @@ class Dispatcher:
         return policies.max_weight_in_flight(slots, self._collector_count, self.per_task)
 
     def room(self, job: PipelineJob) -> float:
-        """Return the total weight of further batches that a job may submit.
+        """Return the total weight of the batches that can still be added for a job.
 
         There is no room if the result is 0 or negative, or if too many batches have been created
         since the oldest batch of the job, because their scans have to be kept until it is done.
@@ -267,7 +267,7 @@ class Dispatcher:
             self.failed.setdefault(job, JobError("\n".join(job.condemned)))
 
     def _blame_scene(self, batch: Batch, worker: str) -> None:
-        """Count the death of a worker with a single batch before any batch of the job was cast.
+        """Count the death of a worker before any batch of the job was cast.
 
         The cause may be the scene rather than the batch. A different batch is therefore tried next,
         and the job fails once several batches have killed a worker.

@@ -304,7 +304,7 @@ class LongStages:
         return self._restart(now_s)
 
     def _restart(self, now_s: float) -> tuple[dict[str, str], list[str]]:
-        """Restart stages that have died or are waiting for a slot, and return like `refresh`."""
+        """Restart stages that have died or are waiting for a slot, with the result of `refresh`."""
         died: dict[str, str] = {}
         started: list[str] = []
         locations = self._locate()

@@ -345,7 +345,7 @@ class Pipeline:
 
     @property
     def _wants_scans(self) -> bool:
-        """Return True if `wait` should receive ranges of scans from stage 1.
+        """Whether `wait` should receive ranges of scans from stage 1.
 
         True if the job that stage 1 is describing has room for batches or has ended.
         """
