@@ -236,7 +236,7 @@ class Campaign(CampaignSpec):  # noqa: D101 - inherits the docstring
         split: str | None = None,
         **options: Unpack[RunKeywords],
     ) -> SweepStream:
-        """Simulate the jobs of the campaign and yield their sweeps, without writing a data set.
+        """Return a stream of the campaign's sweeps, which are simulated while they are being read.
 
         The sweeps are the same as in a data set of the campaign, with all columns, and are ordered
         by job, sensor and time. The workers send points directly to this process rather than

@@ -215,7 +215,7 @@ def export(
 
 
 def _check_not_existing(target: Path | Storage, file: str, *, overwrite: bool) -> None:
-    """Raise LidarError if the output file exists and `overwrite` is False."""
+    """Raise LidarError if a storage already contains a file that must not be overwritten."""
     if isinstance(target, Storage) and not overwrite and file in target.entries():
         raise LidarError(
             f"{target.path(file)} already exists. Pass another folder with `--out`, or pass "

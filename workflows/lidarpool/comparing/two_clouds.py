@@ -163,7 +163,7 @@ def _sensor_chosen_by(option: str) -> Iterator[None]:
 
 
 def _motion_note(compensated: Recording, fired: Recording) -> str:
-    """Return a note if only the first of two recordings is compensated for motion."""
+    """Return a note which states that only the first recording is compensated for motion."""
     return (
         f"{compensated.name} is compensated for the motion of the sensor during each sweep, but "
         f"{fired.name} contains points as fired, so the differences include this motion. Export "

@@ -370,7 +370,7 @@ class RunStore:
         return dict(json.loads(self.db.meta.get("sensors", "{}")))
 
     def note_nothing_to_resume(self, target: object) -> None:
-        """Add a note if `--resume` has no effect because a survey has no unfinished run.
+        """Add a note if the user asked to resume a survey that has no unfinished run.
 
         The note names `target`, the location of the result.
         """
