@@ -1,4 +1,4 @@
-"""Entry point of the command, which Ctrl-C stops from the first moment on."""
+"""Entry point of the `lidarpool` command, which exits cleanly on Ctrl-C even during imports."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from lidarsim.environment.interrupts import exit_on_signals
 
 
 def main() -> NoReturn:
-    """Run the command (`cli.main`)."""
+    """Run the `lidarpool` command."""
     exit_on_signals()
     # A second of imports, during which an interrupt would print Python's traceback.
     from .cli.commands import main as command

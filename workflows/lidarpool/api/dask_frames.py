@@ -12,7 +12,7 @@ from ..columns.parts import StoredCloud, read_part
 
 
 def to_dask(points: StoredCloud) -> Any:
-    """Return a Dask DataFrame with all columns of the stored points, and one partition per part.
+    """Return the stored points as a Dask DataFrame with all columns and one partition per part.
 
     The workers that compute the DataFrame must be able to read the parts. Keep a reference to the
     result until the DataFrame has been computed.

@@ -1,4 +1,4 @@
-"""The result of a survey, which can write the same files as `lidarpool run`."""
+"""Result of a survey, with methods that write the same files as `lidarpool run`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _NOTEBOOK_PICTURES = ("hits", "cloud")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Result(RunResult):
-    """Result of a survey, with methods to write and display it.
+    """Result of a survey, with methods that write, plot and display it.
 
     Notebooks display the result as a table with two pictures.
     """
@@ -46,7 +46,7 @@ class Result(RunResult):
         formats: Sequence[str | Mapping[str, Any]] = (),
         overwrite: bool = False,
     ) -> None:
-        """Write the cloud, the pictures and the report, as `lidarpool run` does.
+        """Write the point cloud, the plots and the report, as `lidarpool run` does.
 
         Either all files are written or none.
 
@@ -91,7 +91,7 @@ class Result(RunResult):
         size: tuple[int, int] = (1600, 1000),
         color: str = "z",
     ) -> list[Path]:
-        """Draw pictures of the result, as `lidarpool plot` does.
+        """Draw plots of the result, as `lidarpool plot` does.
 
         Parameters
         ----------
@@ -160,7 +160,7 @@ class Result(RunResult):
 
     @cached_property
     def _cloud_file(self) -> Path:
-        """Path of the cloud as a PLY file in a temporary folder.
+        """Path of a temporary PLY file that contains the cloud.
 
         The folder is removed when the result is garbage-collected.
         """
@@ -175,7 +175,6 @@ class Result(RunResult):
         return "\n".join([survey, cloud, "; ".join(further)]).rstrip()
 
     def _repr_html_(self) -> str:
-        """Return the table and pictures that notebooks display."""
         further = {
             "backend": self.backend,
             "seconds": f"{self.seconds:.1f}",
@@ -185,7 +184,7 @@ class Result(RunResult):
 
     @cached_property
     def _images(self) -> str:
-        """Pictures of the result as HTML."""
+        """Plots of the result as HTML image elements."""
         from lidarview.cell_pictures import compress_png
 
         with TemporaryDirectory(prefix="lidarpool-") as folder:
@@ -193,7 +192,7 @@ class Result(RunResult):
             return "".join(html_image(compress_png(path.read_bytes()), path.stem) for path in drawn)
 
     def _summary(self) -> Iterator[tuple[str, str]]:
-        """Yield labels and texts that summarize the result."""
+        """Yield the labels and texts of the summary table."""
         yield (
             "survey",
             f"{format_scan_counts(self.survey.scan_count, self.survey.sweep_count)}, "

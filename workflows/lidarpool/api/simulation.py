@@ -1,4 +1,4 @@
-"""Simulations from Python, as single surveys or as campaigns that create data sets."""
+"""Functions that simulate a single survey, or a campaign that creates a data set."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ class Campaign(CampaignSpec):  # noqa: D101 - inherits the docstring
         shard: tuple[int, int] = (1, 1),
         **options: Unpack[RunKeywords],
     ) -> CampaignRun:
-        """Run the jobs of the campaign, several at a time, and write the data set.
+        """Run several jobs of the campaign at a time, and write the data set.
 
         Parameters
         ----------
@@ -236,7 +236,7 @@ class Campaign(CampaignSpec):  # noqa: D101 - inherits the docstring
         split: str | None = None,
         **options: Unpack[RunKeywords],
     ) -> SweepStream:
-        """Stream the sweeps of the jobs as they are simulated, without writing a data set.
+        """Return a stream of the campaign's sweeps, which are simulated while they are being read.
 
         The sweeps are the same as in a data set of the campaign, with all columns, and are ordered
         by job, sensor and time. The workers send points directly to this process rather than

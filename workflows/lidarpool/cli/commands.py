@@ -92,7 +92,7 @@ _common_options = shared.combine(
 
 
 def _parse_duration(text: str) -> float:
-    """Parse a duration such as 90, 90s, 10m or 2h, and return it in seconds."""
+    """Convert a duration such as 90, 90s, 10m or 2h to seconds."""
     unit = {"s": 1, "m": 60, "h": 3600}.get(text[-1:])
     try:
         return float(text[:-1]) * unit if unit else float(text)
@@ -104,7 +104,7 @@ def _parse_duration(text: str) -> float:
 
 
 def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Pass a Terminal and RunOptions to a command, and all other options as keyword arguments.
+    """Call a command with a Terminal, RunOptions, and the remaining options as keyword arguments.
 
     A fork server imports the modules that workers require in the background.
     """
@@ -170,10 +170,10 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 class _LiveCommand(click.Command):
-    """A command with an option --live whose value is optional, even before an argument."""
+    """Command whose option --live has an optional value, even before an argument."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the arguments, inserting the default value of --live if it has no value."""
+        """Insert the default value of --live if it has no value, and parse the arguments."""
         # The word that is being completed may be the value of --live.
         if ctx.resilient_parsing and args[-1:] == ["--live"]:
             args = args[:-1]
@@ -189,7 +189,7 @@ class _LiveCommand(click.Command):
 
 
 class _Commands(click.Group):
-    """A command group that includes the commands of plug-ins."""
+    """Command group that includes the commands of plug-ins."""
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return the command with this name, or None if there is none.
@@ -205,7 +205,6 @@ class _Commands(click.Group):
         return command
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Complete the name of a command or option, without importing plug-ins."""
         items = super().shell_complete(ctx, incomplete)
         return items or completion.starting_with(incomplete, plugins_of(PLUGINS))
 
@@ -471,7 +470,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 
 
 def _user_error_message(error: Exception) -> str | None:
-    """Return the message for an error that the user can correct, or None for a defect."""
+    """Return the message for an error that the user can correct, or None for any other error."""
     match error:
         case click.MissingParameter():
             usage = error.ctx.get_usage() if error.ctx else ""
@@ -494,7 +493,7 @@ def _user_error_message(error: Exception) -> str | None:
 
 
 def _notes(error: BaseException | None) -> list[str]:
-    """Return the notes of an error or of its cause, such as how to resume the run."""
+    """Return the notes that were added to an error or to its cause."""
     while error is not None:
         if notes := getattr(error, "__notes__", []):
             return list(notes)

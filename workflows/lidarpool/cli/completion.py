@@ -24,12 +24,12 @@ Items = list[CompletionItem]
 
 
 def starting_with(incomplete: str, names: Iterable[str]) -> Items:
-    """Return completion items for the names that start with the incomplete word."""
+    """Return completion items for all names that start with the incomplete word."""
     return [CompletionItem(name) for name in names if name.startswith(incomplete)]
 
 
 def sensors(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete the name of a sensor model, with or without its manufacturer, or a file name."""
+    """Complete a file name or the name of a sensor model, with or without its manufacturer."""
     del ctx, param
     from lidarsim.schema.model_names import model_names, plugin_model_names
 
@@ -52,7 +52,7 @@ def columns(ctx: click.Context, param: click.Parameter, incomplete: str) -> Item
 
 
 def colors(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete the name of a column by which points can be colored."""
+    """Complete the name of a column that can determine the color of points."""
     del ctx, param
     return starting_with(incomplete, (*ALWAYS_COLUMNS, *OPTIONAL_COLUMNS, *COMPOSED_COLUMNS))
 
@@ -70,7 +70,7 @@ def format_name(ctx: click.Context, param: click.Parameter, incomplete: str) -> 
 
 
 def sensor_formats(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete the name of a sensor format that matches the file extension of --out, if any."""
+    """Complete the name of a sensor format, considering the file extension of --out."""
     del param
     file = ctx.params.get("out")
     rows = [row for row in FORMATS if file is None or file.suffix.lower() in row.endings]
@@ -78,7 +78,7 @@ def sensor_formats(ctx: click.Context, param: click.Parameter, incomplete: str) 
 
 
 def sensor_file(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete the extension of an exported sensor file according to --as, or a file name."""
+    """Complete a file name, or the file extension that the format given by --as requires."""
     del param
     stem, dot, _ = incomplete.rpartition(".")
     name = ctx.params.get("file_format")
@@ -97,7 +97,7 @@ def bridges(ctx: click.Context, param: click.Parameter, incomplete: str) -> Item
 
 
 def live(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete the optional value of --live, or the next argument."""
+    """Complete the optional value of --live or, if it is omitted, the next argument."""
     del param
     items = starting_with(incomplete, [PAGE, *VIEWERS])
     takes_file = any(isinstance(param, click.Argument) for param in ctx.command.params)
@@ -105,7 +105,6 @@ def live(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
 
 
 def _in_list(incomplete: str, names: Iterable[str]) -> Items:
-    """Complete the last name in a comma-separated list, excluding names that were already used."""
     before, comma, last = incomplete.rpartition(",")
     used = before.split(",")
     unused = [name for name in names if name not in used]

@@ -1,4 +1,4 @@
-"""Check the installation, the machine and a cluster, and determine which problem to fix first."""
+"""Check the installation, the machine and a cluster, and suggest which problem to fix first."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _MIN_DISK_GIB = 1.0
 
 
 def check_environment(cluster_fault: str = "") -> dict[str, Any]:
-    """Check the environment and return the results as plain data for JSON.
+    """Check the environment, and return the results as a dictionary for JSON.
 
     The entry `fix_first` is an empty string if no problems were found. `cluster_fault` is the
     result of `find_cluster_fault`, or an empty string if there is no cluster.
@@ -76,7 +76,7 @@ def check_environment(cluster_fault: str = "") -> dict[str, Any]:
 
 
 def find_cluster_fault(pool: Pool) -> str:
-    """Return the reason why the workers of a cluster cannot run a scenario with default options.
+    """Return the reason why the workers of a cluster cannot run a scenario, or an empty string.
 
     Return an empty string if they can.
     """
@@ -98,7 +98,7 @@ def _open3d_state() -> str:
 
 
 def _extras() -> dict[str, str]:
-    """Return the state of each optional extra: READY, or the command that installs it."""
+    """Return the state of each optional extra, which is READY or the command that installs it."""
     try:
         names = metadata("lidarpool").get_all("Provides-Extra") or []
     except PackageNotFoundError:  # a checkout that is not installed
@@ -126,7 +126,7 @@ def _is_installed(requirement: Requirement) -> bool:
 
 
 def _port_state(port: int) -> str:
-    """Return whether this process can listen on a port of the loopback interface."""
+    """Describe whether this process can listen on a port of the loopback interface."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -137,12 +137,11 @@ def _port_state(port: int) -> str:
 
 
 def _fix_first(figures: dict[str, Any]) -> str:
-    """Return the most urgent advice, or an empty string if there is none."""
     return next(_advice(figures), "")
 
 
 def _advice(figures: dict[str, Any]) -> Iterator[str]:
-    """Yield advice in order of urgency."""
+    """Yield suggestions for solving problems, starting with the most urgent one."""
     machine = figures["machine"]
     backends = figures["backends"]
     if figures["open3d"] != READY:
@@ -171,7 +170,7 @@ def _advice(figures: dict[str, Any]) -> Iterator[str]:
 
 
 def result_lines(figures: dict[str, Any]) -> list[str]:
-    """Return the results of `check_environment` as lines of text."""
+    """Format the results of `check_environment` as lines of text."""
     machine = figures["machine"]
     disks = ", ".join(f"{free:.1f} GiB in {name}" for name, free in machine["disk_gib"].items())
     memory = f"{machine['memory_gib']:.1f} GiB, {machine['available_memory_gib']:.1f} GiB available"

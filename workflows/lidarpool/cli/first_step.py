@@ -16,10 +16,7 @@ _COMPILER = logging.getLogger("raybeam.compiled")  # the module itself may not b
 
 
 class _Lines(logging.Handler):
-    """Logging handler that writes messages as progress lines."""
-
     def emit(self, record: logging.LogRecord) -> None:
-        """Write the message of a log record."""
         _write(record.getMessage())
 
 
@@ -27,7 +24,7 @@ _LINES = _Lines()
 
 
 def print_first_step(step: str, *, quiet: bool = False) -> None:
-    """Print the first step of a command, and report when loops are being compiled.
+    """Print the first step of a command, and print a message if loops must be compiled.
 
     The step is only printed if stderr is not a terminal. A terminal shows a status instead. A
     `quiet` command prints neither.
@@ -44,5 +41,4 @@ def print_first_step(step: str, *, quiet: bool = False) -> None:
 
 
 def _write(line: str) -> None:
-    """Write a line with the current time to stderr."""
     click.echo(f"{time.strftime('%H:%M:%S')}  {line}", err=True)

@@ -1,4 +1,4 @@
-"""Output of `lidarpool check`: estimates for a survey, or for sample jobs of a campaign."""
+"""Output of `lidarpool check`, which estimates the size of a survey or of a campaign's jobs."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def forecast_scenario(
 def _campaign_figures(
     campaign: CampaignSpec, out: Path | Storage, forecast_job: Callable[[int], dict[str, Any]]
 ) -> dict[str, Any]:
-    """Return estimates for a campaign, based on evenly spaced jobs.
+    """Estimate the size of a campaign from evenly spaced jobs.
 
     `forecast_job` returns the estimates for a single job.
     """
@@ -164,7 +164,6 @@ def _campaign_figures(
 
 
 def _job_figures(campaign: CampaignSpec, number: int, figures: dict[str, Any]) -> dict[str, Any]:
-    """Return the JSON entry for a campaign job."""
     return {
         "number": number,
         "name": campaign.name(number),
@@ -181,7 +180,6 @@ def _holds_files(folder: Path | Storage) -> bool:
 
 
 def _campaign_lines(campaign: CampaignSpec, figures: dict[str, Any]) -> Iterator[str]:
-    """Yield the estimates for a campaign as lines of text."""
     data_set = campaign.keep.format + f", {campaign.keep.layout}" * (campaign.keep.format == "mcap")
     yield f"campaign    {plural(campaign.count, 'job')}, seed {campaign.seed}, stored as {data_set}"
     for name, words in campaign.choices.items():
@@ -215,7 +213,6 @@ def _campaign_lines(campaign: CampaignSpec, figures: dict[str, Any]) -> Iterator
 
 
 def _remarks(figures: dict[str, Any]) -> Iterator[str]:
-    """Yield notes and warnings as lines of text."""
     for note in figures["notes"]:
         yield f"note: {note}"
     for warning in figures["warnings"]:
@@ -223,7 +220,7 @@ def _remarks(figures: dict[str, Any]) -> Iterator[str]:
 
 
 def _describe_job(job: dict[str, Any]) -> str:
-    """Return the name, the split and the varied values of a job as text."""
+    """Return the job's name, split and varied values as text."""
     shown = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in job["values"].items()}
     shown = {k: "none" if v is None else v for k, v in shown.items()}
     values = ", ".join(f"{name} {value}" for name, value in shown.items())
@@ -232,7 +229,6 @@ def _describe_job(job: dict[str, Any]) -> str:
 
 
 def _job_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
-    """Yield the estimates for a survey as lines of text."""
     if "job" in figures:
         yield f"job         {_describe_job(figures['job'])}"
     yield from _scene_lines(figures)
@@ -246,7 +242,6 @@ def _job_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
 
 
 def _scene_lines(figures: dict[str, Any]) -> Iterator[str]:
-    """Yield lines about the objects, files, size and masks of the scene."""
     yield f"scene       {', '.join(plural(figures[f'{n}s'], n) for n in ('object', 'triangle'))}"
     for file, content in figures["sources"].items():
         yield f"file        {file}: {content}"
@@ -262,7 +257,6 @@ def _scene_lines(figures: dict[str, Any]) -> Iterator[str]:
 
 
 def _survey_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
-    """Yield lines about the scans, poses and rays of the survey."""
     sensor = job.survey.sensor
     pattern = f"{sensor.channels:,} per firing"
     if len(job.survey.carried) > 1:
@@ -283,7 +277,7 @@ def _survey_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
 
 
 def _drive_lines(drive: dict[str, Any]) -> Iterator[str]:
-    """Yield lines about the length of the trajectory and the firings of each sensor."""
+    """Yield lines about the trajectory's length and each sensor's firings."""
     lines = drive["lines"]
     of_lines = ""
     if lines:
@@ -303,7 +297,6 @@ def _drive_lines(drive: dict[str, Any]) -> Iterator[str]:
 
 
 def _return_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
-    """Yield lines about the returns, the atmospheric extinction and the number of points."""
     survey = job.survey
     returns = survey.returns_each[0]
     if figures["drive"] or returns != type(returns)():
@@ -322,7 +315,6 @@ def _return_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
 
 
 def _resource_lines(figures: dict[str, Any]) -> Iterator[str]:
-    """Yield lines about the workers, slots, memory and disk space that the run requires."""
     backend = figures["backend"]
     device = {None: "backend not yet known", "cuda": "GPU, cuda"}.get(backend, f"CPU, {backend}")
     yield f"cast by     {plural(figures['casters'], 'casting worker')} ({device})"

@@ -27,7 +27,7 @@ Importer = Callable[[Path, Path, Sequence[Path]], Iterable[str]]
 
 
 def find_importer(survey: Path) -> Plugin | None:
-    """Return the plug-in that imports a survey.
+    """Return the plug-in that imports a survey, or None if there is none.
 
     Returns None for formats that lidarpool imports itself, and for unknown formats.
 
@@ -41,12 +41,12 @@ def find_importer(survey: Path) -> Plugin | None:
 
 
 def is_mujoco_model(survey: Path) -> bool:
-    """Return True if a file is a MuJoCo model."""
+    """Return True if the file is a MuJoCo model."""
     return _format_key(survey) == _MUJOCO
 
 
 def _format_key(survey: Path) -> str:
-    """Return the root tag of an XML file without its namespace, or the file extension."""
+    """Return the root tag of an XML file without its namespace, or else the file extension."""
     with suppress(OSError, LidarError, ValueError):
         return parse_lenient_xml(read_input(survey)).tag.rpartition(":")[2]
     return survey.suffix.lower()
@@ -59,7 +59,7 @@ def import_with_plugin(
     assets: Sequence[Path],
     check: Callable[[Path], object],
 ) -> list[str]:
-    """Convert a survey to a scenario with a plug-in.
+    """Convert a survey to a scenario, using a plug-in.
 
     The other arguments and the result are those of `import_atomically`.
 

@@ -1,4 +1,4 @@
-"""Detect multiple installed copies of lidarpool's packages, of which Python imports only one."""
+"""Detect whether several copies of lidarpool are installed, of which Python imports only one."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FOLDERS_OF_CHECKOUT = ("kernels", "scheduler", "workflows")
 
 
 def find_second_copy() -> str:
-    """Return advice if there is a second copy of the packages, otherwise an empty string."""
+    """Return a warning if a second copy of the packages is installed, or an empty string."""
     roots = {name: root for name in PACKAGES if (root := _root_of(name)) is not None}
     root = roots.get("lidarpool")
     if root is None:
@@ -47,7 +47,7 @@ _REMEDY = (
 
 
 def _root_of(package: str) -> Path | None:
-    """Return the checkout or site-packages folder that a package is imported from."""
+    """Return the checkout or site-packages folder from which Python imports a package."""
     spec = find_spec(package)
     if spec is None or spec.origin is None:
         return None
@@ -56,13 +56,13 @@ def _root_of(package: str) -> Path | None:
 
 
 def _is_chosen(root: Path, environment: Mapping[str, str]) -> bool:
-    """Return True if the user has added a checkout to PYTHONPATH."""
+    """Return True if PYTHONPATH contains the checkout."""
     entries = environment.get("PYTHONPATH", "").split(os.pathsep)
     return any(Path(entry).resolve().is_relative_to(root) for entry in entries if entry)
 
 
 def _editable_checkout() -> Path | None:
-    """Return the checkout of an editable installation, if there is one."""
+    """Return the checkout of an editable installation, or None if there is none."""
     try:
         text = distribution("lidarpool").read_text("direct_url.json")
     except PackageNotFoundError:
@@ -74,7 +74,6 @@ def _editable_checkout() -> Path | None:
 
 
 def _checkout_of(folder: Path) -> Path | None:
-    """Return the checkout that contains a folder, if there is one."""
     for candidate in (folder.resolve(), *folder.resolve().parents):
         if (candidate / "workflows" / "lidarpool" / "__init__.py").is_file():
             return candidate

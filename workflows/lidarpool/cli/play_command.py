@@ -150,7 +150,6 @@ def play(
 def _play_recording(
     path: Path, to: tuple[str, ...], schedule: Any, settings: dict[str, Any], *, loop: bool
 ) -> None:
-    """Play back recorded packets."""
     from ..playback.pcap_recording import PcapRecording, play_recording, recorded_streams
     from ..playback.transmitter import Transmitter
     from .terminal import Terminal
@@ -168,7 +167,7 @@ def _play_recording(
 
 @contextmanager
 def _summary_at_end(summary: Callable[[], str]) -> Iterator[None]:
-    """Print a summary when the body ends, including when it is interrupted with Ctrl-C."""
+    """Print a summary after the body, even if Ctrl-C interrupts it."""
     try:
         yield
     except KeyboardInterrupt as error:

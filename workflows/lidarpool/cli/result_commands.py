@@ -1,4 +1,4 @@
-"""Commands for results and recordings: `plot`, `export`, `view`, `compare` and `fit`."""
+"""Implementation of the commands `plot`, `export`, `view`, `compare` and `fit`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def _parse_size(text: str) -> tuple[int, int]:
-    """Parse a picture size in pixels, such as 1600x1000."""
+    """Parse an image size in pixels, such as 1600x1000."""
     if match := re.fullmatch(r"(\d{1,6})[xX×](\d{1,6})", text):
         return int(match[1]), int(match[2])
     raise click.BadParameter(
@@ -33,19 +33,12 @@ def _parse_size(text: str) -> tuple[int, int]:
 
 
 class _FormatName(click.Choice[str]):
-    """Parameter type for the name of an output format, built in or from a plug-in."""
+    """Parameter type for the name of an output format that is built in or provided by a plug-in."""
 
     def __init__(self) -> None:
         super().__init__(EXPORTS)
 
     def convert(self, value: str, param: Any, ctx: Any) -> str:
-        """Check the name of a format and return it.
-
-        Raises
-        ------
-        LidarError
-            If the format is unknown, or if it belongs to a plug-in that cannot be used.
-        """
         if value in EXPORTS or value == "ply":
             return super().convert(value, param, ctx)
         format_row(value)
@@ -222,7 +215,7 @@ def export(
 
 
 def _check_not_existing(target: Path | Storage, file: str, *, overwrite: bool) -> None:
-    """Raise LidarError if a storage contains a file that must not be overwritten."""
+    """Raise LidarError if a storage already contains a file that must not be overwritten."""
     if isinstance(target, Storage) and not overwrite and file in target.entries():
         raise LidarError(
             f"{target.path(file)} already exists. Pass another folder with `--out`, or pass "
@@ -231,7 +224,7 @@ def _check_not_existing(target: Path | Storage, file: str, *, overwrite: bool) -
 
 
 def _make_export_specs(names: Iterable[str], layout: str, **options: Any) -> list[ExportSpec]:
-    """Return the export specifications of formats, each with the options that it supports.
+    """Return the export specification of each format, with the options that it supports.
 
     An option that none of the formats supports is passed to all of them, so that it is rejected.
     """
@@ -258,7 +251,6 @@ def _make_export_specs(names: Iterable[str], layout: str, **options: Any) -> lis
 
 
 def _print_note(note: str) -> None:
-    """Print a note without importing Dask, which `Terminal.tell` would require."""
     click.echo(f"note: {note}", err=True)
 
 

@@ -195,7 +195,7 @@ def run_job(
     backend: str | None,
     extent: str | None,
 ) -> None:
-    """Run a single job of a campaign, and write its result like that of a survey.
+    """Run a single job of a campaign, and write its result as for a survey.
 
     If `out` contains the data set of the campaign, the result is written to a folder in the data
     set, and its points are compared with those in the data set.
@@ -225,7 +225,7 @@ def run_job(
 
 
 def _compare_with_dataset(dataset: Storage, number: int, name: str, result: RunResult) -> str:
-    """Compare the points of a job with those in the data set, and return a note if they match.
+    """Compare a job's points with those in the data set, and return a note if they are equal.
 
     Return an empty string if the data set does not contain the job. Raise LidarError if the points
     differ.

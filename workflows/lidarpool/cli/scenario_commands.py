@@ -1,4 +1,4 @@
-"""Commands that prepare a run: `init`, `import`, `check`, `schema`, `scene` and `sensors`."""
+"""Implementation of the commands `init`, `import`, `check`, `schema`, `scene` and `sensors`."""
 
 from __future__ import annotations
 
@@ -269,7 +269,7 @@ def check(
 
 
 def _failed_jobs(figures: dict[str, Any]) -> str:
-    """Return the first line of the message about campaign jobs that cannot be run."""
+    """Format the first line of the error message about campaign jobs that cannot run."""
     failed = len(figures["failed"])
     checked = figures["checked"]
     if failed < checked:
@@ -282,7 +282,6 @@ def _failed_jobs(figures: dict[str, Any]) -> str:
 
 
 def _unused_target(target: Path | Storage) -> str:
-    """Return an unused output folder, derived from the name of one that is in use."""
     from lidarsim.io.storage import Storage
 
     names = (f"{str(target).rstrip('/')}-{number}" for number in count(2))
@@ -320,7 +319,7 @@ _out = click.argument("out", type=click.Path(path_type=Path), metavar="OUT.ply|.
 
 
 def _generated_scene_options(triangles: int) -> Callable[[Command], Command]:
-    """Add the output file, the number of triangles and the seed of a generated scene."""
+    """Return a decorator that adds the options shared by all generated scenes."""
     return combine(
         _out,
         overwrite,
@@ -585,7 +584,7 @@ def _write_sensor(
     seconds: float | None,
     revolutions: int | None,
 ) -> None:
-    """Export a sensor to a file, and print the properties that the file cannot store."""
+    """Export a sensor to a file, and print which properties the file format cannot store."""
     from lidarsim.sensor.export import export_sensor
 
     if out.exists() and not overwrite:
@@ -598,7 +597,6 @@ def _write_sensor(
 
 
 def _list_models() -> None:
-    """Print a table of the sensor models and their main properties."""
     from lidarsim.schema.model_names import model_names, plugin_model_names
 
     heads = ("model", "channels", "field of view", "range", "rate (Hz)", "points/s")
@@ -609,7 +607,7 @@ def _list_models() -> None:
 
 
 def _show_model(name: str) -> None:
-    """Print the properties of a model and their sources."""
+    """Print the properties of a sensor model and the sources of their values."""
     from lidarsim.schema.model_names import model_names, plugin_model_names
     from lidarsim.sensor.models import format_noise, read_model
 
@@ -638,7 +636,7 @@ def _show_model(name: str) -> None:
 
 
 def _model_row(name: str) -> tuple[str, ...]:
-    """Return the table row of a model, with the columns that `_list_models` prints."""
+    """Return a sensor model's row in the table that `_list_models` prints."""
     from lidarsim.sensor.models import read_model
 
     model = read_model(name)
@@ -657,7 +655,6 @@ def _model_row(name: str) -> tuple[str, ...]:
 
 
 def _field_of_view(name: str, model: SensorModel) -> str:
-    """Describe the field of view of a model."""
     import numpy as np
 
     from lidarsim.sensor.models import load_sensor

@@ -29,7 +29,7 @@ Command = Callable[..., None]
 
 
 class StoragePath(click.Path):
-    """Parameter type for a local path, or for a URL of a remote storage."""
+    """Parameter type for a local path or the URL of a remote storage."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(path_type=Path, **options)
@@ -79,7 +79,7 @@ copies = click.option(
 
 
 def combine(*options: Callable[[Command], Command]) -> Callable[[Command], Command]:
-    """Return a decorator that adds several options to a command, in the order of the arguments."""
+    """Return a decorator that adds options to a command in the given order."""
     return lambda command: reduce(
         lambda decorated, option: option(decorated), reversed(options), command
     )
@@ -102,12 +102,11 @@ def _parse_position(text: str) -> list[float]:
 
 
 def _parse_names(text: str) -> list[str]:
-    """Parse a comma-separated list of names."""
     return [name.strip() for name in text.split(",")]
 
 
 def _mesh_option(name: str, description: str, **settings: Any) -> Callable[[Command], Command]:
-    """Return an option that only applies to mesh files."""
+    """Return an option that applies only to mesh files."""
     return click.option(f"--{name}", help=f"{description}. Mesh input only.", **settings)
 
 
@@ -156,7 +155,7 @@ _mesh_options = combine(
 
 
 def mesh_options(command: Command) -> Command:
-    """Add the options for mesh files, which are passed to the command as the mapping `of_mesh`.
+    """Add the options for mesh files, which the command receives as the dictionary `of_mesh`.
 
     The mapping contains arguments of `mesh_data`.
     """
@@ -178,7 +177,7 @@ def mesh_options(command: Command) -> Command:
 
 
 def mesh_reading(command: Command) -> Command:
-    """Add --unit and --up-axis, which are passed to the command as the mapping `of_mesh`."""
+    """Add --unit and --up-axis, which the command receives as the dictionary `of_mesh`."""
 
     @wraps(command)
     def with_options(*arguments: Any, **settings: Any) -> None:
@@ -190,7 +189,7 @@ def mesh_reading(command: Command) -> Command:
 
 
 def reject_mesh_options(of_mesh: Mapping[str, Any], path: Any) -> None:
-    """Raise LidarError if mesh options were passed for a file that is not a mesh."""
+    """Raise LidarError if mesh options were specified for a file that is not a mesh."""
     for name in of_mesh:
         raise LidarError(
             f"`--{name.replace('_', '-')}` only applies to mesh files, and {path} is not a "
@@ -199,7 +198,7 @@ def reject_mesh_options(of_mesh: Mapping[str, Any], path: Any) -> None:
 
 
 def command_arguments(of_mesh: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the command-line arguments that correspond to these mesh options."""
+    """Yield the command-line arguments that are equivalent to `of_mesh`."""
     for name, value in of_mesh.items():
         for item in value if name == "pose" else [value]:
             yield f"--{name.replace('_', '-')}"
@@ -207,7 +206,7 @@ def command_arguments(of_mesh: Mapping[str, Any]) -> Iterator[str]:
 
 
 def scheduler(command: Command) -> Command:
-    """Add the options for a running scheduler: its address, its scheduler file and certificates.
+    """Add the options for connecting to a running scheduler.
 
     The address is passed to the command as `scheduler`, and the certificates are passed as `files`.
     All options are validated before the command is called.
@@ -244,7 +243,7 @@ def scheduler(command: Command) -> Command:
 
 
 def _check_combination(settings: Mapping[str, Any], file: Path | None, files: TlsFiles) -> None:
-    """Check the options that select a cluster.
+    """Raise an error if options that select a cluster contradict each other.
 
     Raise UsageError for options that cannot be combined, or LidarError if a certificate file cannot
     be read.
@@ -279,7 +278,7 @@ def _check_combination(settings: Mapping[str, Any], file: Path | None, files: Tl
 def _scheduler_address(
     given: str | None, file: Path | None, startup_timeout_s: float | None
 ) -> str | None:
-    """Validate and return the scheduler address from --scheduler or --scheduler-file."""
+    """Return the validated scheduler address from --scheduler or --scheduler-file."""
     if given is not None and is_scheduler_file(given):
         file = Path(given)
     if file is not None:
@@ -292,7 +291,7 @@ def _scheduler_address(
 
 
 def world_lines(epsg: int | None, origin: Sequence[float]) -> Iterator[str]:
-    """Yield a line about the coordinate system and the origin of the output.
+    """Yield a line about the output's coordinate system and origin.
 
     Yield nothing if the output has neither an EPSG code nor an origin.
     """

@@ -193,7 +193,6 @@ def stations(
 
 
 def _scenario_model(scenario: Scenario) -> str | None:
-    """Return the sensor model of a scenario, or the path of its sensor file."""
     model = scenario.sensor.model
     if model is not None and scenario.sensor.has_custom_model:
         return str(scenario.path(model))
@@ -201,7 +200,7 @@ def _scenario_model(scenario: Scenario) -> str | None:
 
 
 def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **settings: Any) -> None:
-    """Choose stations, write a scenario and a picture of them, and print a summary."""
+    """Choose stations, write them to a scenario and a plot, and print a summary."""
     from lidarsim.schema.model_names import full_name
     from lidarsim.sensor.models import load_sensor
 
@@ -265,7 +264,7 @@ def _show_coverage(
     slant_deg: float,
     targets: Sequence[str],
 ) -> None:
-    """Print the share of the area reachable from the stations of a scenario that a cloud covers."""
+    """Print the fraction of the area visible from a scenario's stations that a cloud covers."""
     from ..comparing.compared_sweep import compared_in_world
     from ..plan.stations import survey_coverage
     from ..recordings.opening import open_recording
@@ -317,7 +316,7 @@ def _show_coverage(
 
 
 def _station_positions(prepared: PreparedScenario) -> Floats:
-    """Return the positions of the sensor at all stations in world coordinates, in meters.
+    """Return the sensor position at each station in world coordinates, in meters.
 
     The result has shape (s, 3).
     """
@@ -328,7 +327,7 @@ def _station_positions(prepared: PreparedScenario) -> Floats:
 
 
 def _coverage_figures(coverage: SurveyCoverage, prepared: PreparedScenario) -> dict[str, Any]:
-    """Return the coverage of a cloud as printed by --json."""
+    """Return the coverage of a cloud as a dictionary for JSON."""
     names = prepared.scene.names
     reachable_m2 = float(coverage.reachable_m2.sum())
     return {
@@ -341,7 +340,7 @@ def _coverage_figures(coverage: SurveyCoverage, prepared: PreparedScenario) -> d
 def _object_figures(
     names: Sequence[str], areas: StationPlan | SurveyCoverage
 ) -> dict[str, dict[str, float]]:
-    """Return the areas of all targets as printed by --json."""
+    """Return the areas of each target as a dictionary for JSON."""
     kinds = ("area_m2", "reachable_m2", "covered_m2")
     return {
         name: {kind: float(getattr(areas, kind)[index]) for kind in kinds}
@@ -353,7 +352,7 @@ def _object_figures(
 def _prepared_with_notes(
     scenario: Scenario, terminal: Terminal
 ) -> tuple[PreparedScenario, list[str]]:
-    """Prepare a scenario, and print its notes and warnings except those about automatic poses.
+    """Prepare a scenario and print its notes and warnings, except those about automatic poses.
 
     Returns the prepared scenario with the notes and warnings.
     """
@@ -372,12 +371,11 @@ def _prepared_with_notes(
 
 
 def _target_phrase(targets: Sequence[str]) -> str:
-    """Return a phrase such as " of Wall* and Roof", or an empty string without targets."""
     return f" of {joined(targets)}" if targets else ""
 
 
 def _target_notes(plan: StationPlan, prepared: PreparedScenario) -> Iterator[str]:
-    """Yield a note if a single object accounts for most of the reachable area."""
+    """Yield a note if one object accounts for most of the reachable area."""
     reachable_m2 = plan.reachable_m2
     largest = int(reachable_m2.argmax())
     share = float(reachable_m2[largest] / reachable_m2.sum())
@@ -392,7 +390,7 @@ def _target_notes(plan: StationPlan, prepared: PreparedScenario) -> Iterator[str
 def _unreachable_notes(
     names: Sequence[str], areas: StationPlan | SurveyCoverage, positions: str
 ) -> Iterator[str]:
-    """Yield a note if most of the area of some targets cannot be reached.
+    """Yield a note about targets whose area is mostly unreachable.
 
     `positions` describes the positions from which they cannot be reached, such as "stations".
     """
@@ -413,7 +411,7 @@ def _unreachable_notes(
 
 
 def _shortfalls(plan: StationPlan, count: int | None, coverage: float | None) -> Iterator[str]:
-    """Yield a note if a plan has less coverage or fewer stations than requested."""
+    """Yield notes if a plan has less coverage or fewer stations than the user requested."""
     from ..plan.stations import MAX_STATIONS
 
     reached = float(plan.coverage[-1])
@@ -437,7 +435,7 @@ def _stations_scenario(
     targets: Sequence[str],
     warnings: Sequence[str],
 ) -> str:
-    """Return the text of a scenario file with the stations as poses and warnings as comments."""
+    """Return the text of a scenario file with stations as poses and warnings as comments."""
     import yaml
 
     def relative(file: Path) -> str:
@@ -472,7 +470,7 @@ def _stations_scenario(
 def _plan_figures(
     plan: StationPlan, prepared: PreparedScenario, sensor: str, notes: list[str]
 ) -> dict[str, Any]:
-    """Return the station plan as printed by --json."""
+    """Return a station plan as a dictionary for JSON."""
     names = prepared.scene.names
     return {
         "sensor": sensor,
@@ -492,7 +490,7 @@ def _plan_figures(
 def _plan_lines(
     plan: StationPlan, prepared: PreparedScenario, targets: Sequence[str]
 ) -> Iterator[str]:
-    """Yield the stations and the covered areas of a plan as lines of text."""
+    """Format the stations and covered areas of a plan as lines of text."""
     names = prepared.scene.names
     yield (
         f"{plural(len(plan.candidates), 'candidate position')} on a grid of "
@@ -514,7 +512,7 @@ def _plan_lines(
 
 
 def _object_lines(names: Sequence[str], areas: StationPlan | SurveyCoverage) -> Iterator[str]:
-    """Yield a table of the areas of objects, sorted by uncovered area in descending order."""
+    """Yield the lines of a table of objects, in descending order of uncovered area."""
     uncovered_m2 = areas.reachable_m2 - areas.covered_m2
     order = (-uncovered_m2).argsort(kind="stable").tolist()
     order = [k for k in order if areas.reachable_m2[k] > 0]

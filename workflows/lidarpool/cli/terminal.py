@@ -1,4 +1,4 @@
-"""Messages and progress that a command prints while it is running."""
+"""Messages and progress bars that a command prints to stderr."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PLAIN_EVERY_S = (2.0, 60.0)
 
 @dataclass(frozen=True)
 class Terminal(Screen):
-    """Messages and progress of a command, printed to stderr."""
+    """Messages and progress bars of a command, which are printed to stderr."""
 
     quiet: bool = False
     verbose: bool = False
@@ -38,12 +38,11 @@ class Terminal(Screen):
 
     @property
     def _stream(self) -> Any:
-        """Stream for messages, or None if the command is quiet."""
         return None if self.quiet or sys.stderr is None else TolerantStream(sys.stderr)
 
     @property
     def console(self) -> Console | None:
-        """Console for animated progress, or None if stderr is not a capable terminal."""
+        """Console for progress bars, or None if stderr is not a terminal that supports them."""
         console = Console(file=self._stream) if self._stream else None
         return console if console and console.is_terminal and not console.is_dumb_terminal else None
 
@@ -53,7 +52,7 @@ class Terminal(Screen):
             self._stream.write(f"note: {words}\n")
 
     def warn(self, words: str) -> None:
-        """Print a warning unless it was printed before. Quiet commands print warnings, too."""
+        """Print a warning, even in quiet mode, unless it was printed before."""
         if words not in self.warnings:
             self.warnings.append(words)
             click.echo(f"warning: {words}", err=True)
@@ -64,12 +63,12 @@ class Terminal(Screen):
             sys.exit(WARNED)
 
     def notes(self, notes: Iterable[str]) -> Iterator[str]:
-        """Return notes as lines of text, except those that were printed as warnings."""
+        """Return the notes that were not printed as warnings, as lines of text."""
         return (f"note: {note}" for note in notes if note not in self.warnings)
 
     @contextmanager
     def status(self, words: str, *, logged: bool = True) -> Iterator[None]:
-        """Show a status while the body runs.
+        """Show a status message while the body runs.
 
         Outside a terminal, the status is printed as a line of text if `logged` is True.
         """
@@ -81,7 +80,7 @@ class Terminal(Screen):
 
     @contextmanager
     def writing(self, words: str) -> Iterator[WritingProgress]:
-        """Show a progress bar for each file that the body writes.
+        """Show a progress bar for each file that is written in the body.
 
         Outside a terminal, `words` and occasional progress lines are printed.
         """
@@ -95,7 +94,7 @@ class Terminal(Screen):
 
     @contextmanager
     def progress(self) -> Iterator[Show]:
-        """Show a progress bar for each stage, or lines of text outside a terminal."""
+        """Show a progress bar for each stage, or lines of text if stderr is not a terminal."""
         if (console := self.console) is not None:
             with bars(console) as show:
                 yield show
@@ -106,7 +105,7 @@ class Terminal(Screen):
     def starting(
         self, cluster: AbstractContextManager[Client], words: str, *, shares_terminal: bool = False
     ) -> Iterator[Client]:
-        """Show a status until the cluster has started, and yield its client.
+        """Show a status message until the cluster has started, and yield its client.
 
         If `shares_terminal` is True, the workers use the log settings of this process.
         """
@@ -120,12 +119,11 @@ class Terminal(Screen):
 
 
 def _tell(stream: Any, line: str) -> None:
-    """Write a line with the current time to a stream."""
     stream.write(f"{time.strftime('%H:%M:%S')}  {line}\n")
 
 
 class WrittenLines:
-    """Callback that prints the progress of written files as lines of text.
+    """Callback that prints lines of text about the progress of writing files.
 
     Calls have the signature of `WritingProgress`.
     """
@@ -136,7 +134,7 @@ class WrittenLines:
         self._next = PLAIN_EVERY_S[0]  # elapsed time in seconds at which the next line is due
 
     def __call__(self, name: str, completed: int, total: int, unit: str) -> None:
-        """Write a progress line if one is due."""
+        """Print a line if enough time has passed since the last one."""
         elapsed_s = time.monotonic() - self._started
         if elapsed_s >= self._next and completed < total:
             min_s, max_s = PLAIN_EVERY_S
@@ -145,7 +143,7 @@ class WrittenLines:
 
 
 class PlainLines:
-    """Callback that prints the progress of a run as lines of text."""
+    """Callback that prints lines of text about the progress of a run."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
@@ -159,7 +157,7 @@ class PlainLines:
         self._waiting_reason = ""  # empty while the run makes progress
 
     def __call__(self, progress: Progress) -> None:
-        """Write a line if one is due, if a stage is complete or if the run starts waiting."""
+        """Print a line if one is due, if a stage ends, or if the run starts to wait."""
         elapsed_s = progress.seconds
         if (reason := waiting_reason(progress)) != self._waiting_reason:
             self._waiting_reason = reason

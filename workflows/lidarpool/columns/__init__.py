@@ -1,1 +1,1 @@
-"""Parts, the files that store points during a run, and clouds that are read from them."""
+"""Parts, which are files that store points during a run, and point clouds read from parts."""

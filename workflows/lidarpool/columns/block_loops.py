@@ -1,4 +1,4 @@
-"""A compiled loop that fills in the scan number of each row in a block."""
+"""Compiled loop that computes the scan number of each row in a block."""
 
 # mypy: disable-error-code="no-untyped-def"
 

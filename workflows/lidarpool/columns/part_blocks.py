@@ -1,4 +1,4 @@
-"""Read parts in blocks of rows into reusable memory.
+"""Read parts in blocks of rows, reusing the same memory for each block.
 
 Each column of a part is stored contiguously, so the columns of one row are far apart in the file.
 If a whole part were read at once, its data would not fit in the CPU caches: it would be written to
@@ -32,7 +32,7 @@ _ALIGNMENT = 64  # bytes, the size of a cache line
 
 
 class BlockMemory:
-    """Reusable memory for the columns of a block of rows.
+    """Memory for the columns of a block of rows, which is reused for each block.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class BlockMemory:
         }
 
     def columns(self, rows: int) -> dict[str, AnyArray]:
-        """Return views of the first `rows` rows of all columns, as {name: array of shape (rows,)}.
+        """Return views of all columns, limited to the first `rows` rows, as {name: array}.
 
         The views are overwritten when the next block is read.
         """
@@ -78,7 +78,7 @@ class BlockMemory:
 def read_blocks(
     storage: Storage, name: str, row_count: int, memory: BlockMemory
 ) -> Iterator[dict[str, AnyArray]]:
-    """Read a part block by block into `memory`, and yield the columns of each block.
+    """Read the blocks of a part into `memory` one by one, and yield the columns of each block.
 
     Checksums are compared after the last block. Discard any results computed from the blocks unless
     the iterator finishes without an error.
@@ -103,19 +103,17 @@ def read_blocks(
 
 
 def _open(storage: Storage, name: str) -> BufferedReader | io.BytesIO:
-    """Open a part from a local folder, or load it into memory from a remote storage."""
+    """Open a part in a local folder, or load a part from a remote storage into memory."""
     return open_input(storage.local(name)) if storage.is_local else io.BytesIO(storage.read(name))
 
 
 class _Scans(NamedTuple):
-    """Range of scans in a part."""
-
     first: int  # number of the first scan
     row_ends: Ints  # number of rows up to and including each scan, shape (scans,)
 
 
 class _OpenPart:
-    """A part file that is open for reading.
+    """Part file that is open for reading.
 
     The constructor and the methods raise LidarError if the part is damaged. The message is a
     clause, which `reading_part` completes to a sentence.
@@ -154,7 +152,7 @@ class _OpenPart:
         return _Scans(first, row_ends)
 
     def _read_small(self, array: StoredArray) -> AnyArray:
-        """Read a whole array and verify its checksum."""
+        """Read an entire array and verify its checksum."""
         values = np.zeros(array.shape, array.dtype)
         data = values.reshape(-1).view(np.uint8).data
         self._fill(data, array.offset)
@@ -163,7 +161,7 @@ class _OpenPart:
         return values
 
     def read(self, first: int, stop: int) -> dict[str, AnyArray]:
-        """Read the rows from `first` to `stop` into the memory, and return their columns."""
+        """Read the rows from `first` to `stop` into `memory`, and return their columns."""
         columns = self._memory.columns(stop - first)
         for name, array in self._arrays.items():
             data = columns[name].view(np.uint8).data
@@ -174,13 +172,12 @@ class _OpenPart:
         return columns
 
     def check(self) -> None:
-        """Verify the checksums of all columns after the last block has been read."""
         for name, array in self._arrays.items():
             if self._crcs[name] != array.crc:
                 raise LidarError(f"it is damaged (the checksum of {name}.npy is wrong)")
 
     def _fill(self, data: memoryview, offset: int) -> None:
-        """Fill `data` with the bytes of the file that start at `offset`."""
+        """Fill `data` with bytes of the file, starting at `offset`."""
         self._file.seek(offset)
         # Memory mapping would not be faster, and a disk error would kill the process.
         while data and (count := self._file.readinto(data)):

@@ -1,4 +1,4 @@
-"""Parts: files that store the columns of consecutive scans.
+"""Parts, which are files that store the columns of consecutive scans.
 
 A part is an uncompressed NumPy archive, which ``numpy.load`` can open. It contains one array per
 column, with rows ordered by scan and ray, and these additional arrays:
@@ -49,7 +49,7 @@ _AGAIN = "Resume the run with `--resume` (`resume=True` in Python) to cast its s
 
 
 def part_name(mark: str, job: int, first: int, stop: int) -> str:
-    """Return the file name of the part that contains the scans from `first` to `stop` of a job.
+    """Return the file name of the part with the scans from `first` to `stop` of a job.
 
     If a task is repeated, it overwrites its part with the same bytes.
     """
@@ -57,7 +57,7 @@ def part_name(mark: str, job: int, first: int, stop: int) -> str:
 
 
 def parse_part_name(name: str, mark: str) -> tuple[int, int, int] | None:
-    """Return the job number, the first scan and the stop scan from the file name of a part.
+    """Parse the file name of a part, and return its job number, first scan and stop scan.
 
     Return None if the file does not belong to the run with this mark.
     """
@@ -73,12 +73,12 @@ def probe_name(mark: str, driver: str) -> str:
 
 
 def mark_name(mark: str) -> str:
-    """Return the name of the file that records which run owns the folder of parts."""
+    """Return the name of the file that identifies the run that owns the folder of parts."""
     return f"{mark}-mark"
 
 
 def deletable_files(storage: Storage, mark: str | None) -> list[str]:
-    """Return the names of the files that a run may delete, including files left by killed writers.
+    """Return the names of the files that a run may delete, including incompletely written files.
 
     Only files whose name starts with the mark of the run are returned, and only if the folder
     contains the mark file. If `mark` is None, the files of all marks in the folder are returned.
@@ -99,7 +99,7 @@ def _mark_of(name: str) -> str:
 
 
 def pack(part: PartColumns) -> list[Piece]:
-    """Encode a part as pieces for `Storage.write`.
+    """Encode a part as pieces that `Storage.write` accepts.
 
     Encoding is deterministic. The pieces are views of the columns, which are not copied.
     """
@@ -117,7 +117,7 @@ def pack(part: PartColumns) -> list[Piece]:
 
 
 def unpack(data: bytes) -> PartColumns:
-    """Decode a part and verify the checksum of each array.
+    """Decode a part, verifying the checksum of each array.
 
     Raises LidarError if the data is not a part or is damaged. The message is a clause, which
     `reading_part` completes to a sentence.
@@ -154,7 +154,7 @@ def read_part(storage: Storage, name: str) -> PartColumns:
 
 @contextmanager
 def reading_part(storage: Storage, name: str) -> Iterator[None]:
-    """Convert errors in the body to a LidarError that names the part and suggests a remedy.
+    """Convert errors in the body to a LidarError that names the part and suggests a solution.
 
     The message of a LidarError that the body raises must be a clause.
     """
@@ -171,7 +171,7 @@ def reading_part(storage: Storage, name: str) -> Iterator[None]:
 
 
 def read_hit_counts(storage: Storage, name: str) -> tuple[Ints32, Ints]:
-    """Read only the hit counts of a part, without its columns.
+    """Read the hit counts of a part without reading its columns.
 
     Returns the indices of the hit counters that are not zero, and the number of hits of each
     counter. Both arrays have shape (k,). Raises the same errors as `read_part`.
@@ -190,12 +190,12 @@ def read_hit_counts(storage: Storage, name: str) -> tuple[Ints32, Ints]:
 
 
 def _ignore_progress(points: int) -> None:
-    """Do nothing. This is the default progress callback."""
+    """Ignore the progress."""
 
 
 @dataclass(eq=False, repr=False)
 class StoredCloud(CloudDisplay):
-    """A cloud whose points are stored in the parts of a run and read in chunks.
+    """Point cloud that is stored in the parts of a run and read in chunks.
 
     Points are ordered by scan and ray.
     """
@@ -225,24 +225,27 @@ class StoredCloud(CloudDisplay):
 
     @property
     def bounds(self) -> Floats:
-        """Minimum and maximum coordinates in meters, or zeros if empty. Shape (2, 3)."""
+        """Minimum and maximum coordinates in meters, or zeros for an empty cloud.
+
+        The array has shape (2, 3).
+        """
         if self.cells is None:
             return np.zeros((2, 3))
         return cell_positions(self.cells, self.precision_m, self.origin)
 
     @property
     def table(self) -> tuple[Column, ...]:
-        """All columns except the positions, in the order in which files store them."""
+        """All columns except the positions, in the order in which they are written to files."""
         columns = [c for c in self.columns if c not in AXES and c.name != WAVEFORM]
         return (SCAN, *columns)
 
     @property
     def recorded(self) -> bool:
-        """Whether the points have waveforms."""
+        """Whether the cloud contains waveforms."""
         return any(column.name == WAVEFORM for column in self.columns)
 
     def cloud_of(self, part: PartColumns, row_selection: Integers | slice = slice(None)) -> Cloud:
-        """Return the points of a part, or only the selected rows, as a cloud."""
+        """Return the points of a part as a cloud, or only the selected rows."""
         return part.cloud(self.table, self.precision_m, self.origin, row_selection, self.sweeps)
 
     def positions_of(self, columns: Mapping[str, AnyArray]) -> Iterator[tuple[str, Floats]]:
@@ -277,7 +280,7 @@ class StoredCloud(CloudDisplay):
             yield Cloud.concatenate(pending)
 
     def row_of(self, scan: int) -> int:
-        """Return the row of the first point of a scan."""
+        """Return the row index of the first point of a scan."""
         index = bisect_right(self.firsts, scan) - 1
         row = sum(self.rows[: max(0, index)])
         if index < 0 or scan == self.firsts[index]:
@@ -300,7 +303,7 @@ class StoredCloud(CloudDisplay):
         return Cloud.concatenate(clouds) if clouds else self.load()
 
     def load(self) -> Cloud:
-        """Read the whole cloud into memory."""
+        """Read all points into memory."""
         parts = list(self.chunks())
         if parts:
             return Cloud.concatenate(parts)

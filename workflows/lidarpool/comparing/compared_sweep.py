@@ -1,4 +1,4 @@
-"""Read the sweeps of a recording with only the columns that are compared or fitted."""
+"""Read sweeps of a recording, keeping only the columns required to compare or fit them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RAY_KEY = "ray_key"  # column that identifies the ray and the return
 
 
 def compared_sweep(recording: Recording, number: int, *, with_rays: bool = False) -> Sweep:
-    """Read the returns of a sweep in the sensor frame.
+    """Read the returns of a sweep in sensor coordinates.
 
     The columns are `channel` and `intensity` if the recording has them, and `RAY_KEY` if
     `with_rays` is true.
@@ -28,7 +28,7 @@ def compared_sweep(recording: Recording, number: int, *, with_rays: bool = False
 
 
 def compared_in_world(recording: Recording, number: int) -> Sweep:
-    """Read the returns of a sweep or of a part of a cloud in the world frame.
+    """Read the returns of a sweep, or of a portion of a cloud, in world coordinates.
 
     The only column is `intensity`, if the recording has it.
 
@@ -57,7 +57,7 @@ def _check_reach(recording: Recording, sweep: Sweep) -> None:
 
 
 def with_compared_columns(sweep: Sweep, *, with_rays: bool = False) -> Sweep:
-    """Return a sweep with only the columns described in `compared_sweep`.
+    """Return a sweep with only those columns that `compared_sweep` describes.
 
     If it has no column `channel`, its rings are determined when they are first requested.
     """
@@ -72,7 +72,7 @@ def with_compared_columns(sweep: Sweep, *, with_rays: bool = False) -> Sweep:
 
 
 def rings_note(recording: Recording, sweep: Sweep) -> list[str]:
-    """Return a note on how the rings of a sweep were determined.
+    """Return a note about how the rings of a sweep were determined.
 
     The list is empty if the rings are stored in a column or are unknown.
     """
@@ -81,7 +81,7 @@ def rings_note(recording: Recording, sweep: Sweep) -> list[str]:
 
 
 def _ray_keys(columns: Columns) -> Ints:
-    """Return a unique key for each return of each ray."""
+    """Return a unique integer for each return, composed of its ray and its return number."""
     if "time" in columns:
         rays = columns["time"].astype(np.int64) << 16 | columns["channel"]
     else:

@@ -1,4 +1,4 @@
-"""The result of comparing two clouds or recordings, and its charts and report."""
+"""Result of comparing two clouds or recordings, with its charts and its report."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ MIN_DISTANCE_M = 0.001  # lower end of the distance scale
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
-    """Result of `compare`, which is printed as a table."""
+    """Result of `compare`, whose text representation is a table."""
 
     figures: dict[str, Any]  # content of compare.json; lengths are in meters, None is unknown
     images: RangeImages | None  # range images of the first pair of sweeps that has them
@@ -65,7 +65,7 @@ class Comparison:
         return render_template("comparison.txt", report=self.figures).rstrip("\n")
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write compare.json, compare.html and the pictures, and return their paths.
+        """Write compare.json, compare.html and the charts, and return their paths.
 
         The folder is created if it does not exist. Pictures of an earlier comparison are removed.
 
@@ -97,7 +97,7 @@ class Comparison:
 
 
 class _ImageLayout(NamedTuple):
-    """Heights in pixels of the elements on a page with three stacked range images."""
+    """Heights, in pixels, of the elements on a page with three range images."""
 
     image_height: int
     page_height: int
@@ -107,20 +107,19 @@ class _ImageLayout(NamedTuple):
 
     @classmethod
     def for_rows(cls, row_count: int) -> _ImageLayout:
-        """Return the layout for images with `row_count` rings."""
         image_height = int(np.clip(2.2 * row_count, 90, 300))
         defaults = cls._field_defaults
         gaps = defaults["top"] + 2 * defaults["gap"] + defaults["bottom"]
         return cls(image_height, 3 * image_height + gaps)
 
     def image_bottom(self, number: int) -> float:
-        """Return the lower edge of image `number` (from 0) as a fraction of the page height."""
+        """Return the lower edge of an image, numbered from 0, as a fraction of the page height."""
         pixels = self.page_height - self.top - (number + 1) * self.image_height - number * self.gap
         return pixels / self.page_height
 
 
 def draw_ranges(comparison: Comparison) -> Page:
-    """Draw the range images of A and B, and their residuals, one below the other."""
+    """Draw the range images of A and B and the image of their residuals, one below the other."""
     images = comparison.images
     assert images is not None
     row_count, column_count = images.ranges[0].shape
@@ -152,14 +151,12 @@ def draw_ranges(comparison: Comparison) -> Page:
 
 
 def _range_scale(images: RangeImages) -> LogNorm:
-    """Return the color scale of ranges, in meters."""
     ranges = np.concatenate([image[np.isfinite(image)] for image in images.ranges])
     min_m, max_m = np.quantile(ranges, (0.01, 0.98)) if len(ranges) else (0.0, 1.0)
     return LogNorm(max(float(min_m), 0.01), max(float(max_m), float(min_m) * 1.01, 0.02))
 
 
 def _range_colors(images: RangeImages, index: int, scale: LogNorm) -> AnyArray:
-    """Return the colors of the range image of A (`index` 0) or B (`index` 1)."""
     ranges = np.nan_to_num(images.ranges[index], nan=1.0)
     colors = theme.apply_colormap(theme.RANGE_COLORS, scale(ranges).filled(0))
     colors[~images.returned[index]] = NO_RETURN
@@ -167,7 +164,7 @@ def _range_colors(images: RangeImages, index: int, scale: LogNorm) -> AnyArray:
 
 
 def _residual_colors(images: RangeImages, scale: Normalize) -> AnyArray:
-    """Return the colors of the residual image, which also mark cells without a return."""
+    """Return the pixel colors of the residual image, including those of cells without a return."""
     residual = images.ranges[0] - images.ranges[1]
     in_a, in_b = images.returned
     colors = theme.apply_colormap(RESIDUAL_COLORS, scale(1000 * np.nan_to_num(residual)).data)
@@ -178,14 +175,13 @@ def _residual_colors(images: RangeImages, scale: Normalize) -> AnyArray:
 
 
 def _draw_gap_legend(page: Page, axes: Axes) -> None:
-    """Draw a legend for the colors of cells without a return."""
     for text, color in zip(GAP_LABELS, (ONLY_A, ONLY_B, NO_RETURN), strict=True):
         axes.plot([], [], "s", color=color, ms=4, label=text)
     _draw_legend(page, axes)
 
 
 def _show_image(axes: Axes, images: RangeImages, colors: AnyArray) -> None:
-    """Show an image from the viewpoint of the sensor, with the sensor's left on the left.
+    """Show a range image from the viewpoint of the sensor, with the sensor's left on the left.
 
     The image has shape (r, c, …).
     """
@@ -200,7 +196,7 @@ def _show_image(axes: Axes, images: RangeImages, colors: AnyArray) -> None:
 
 
 def draw_rings(comparison: Comparison) -> Page:
-    """Draw the residuals and lost returns of each ring, and a histogram of all residuals."""
+    """Draw each ring's residuals and lost returns, and a histogram of all residuals."""
     image = comparison.figures["ranges"]
     rings = [ring for ring in image["rings"] if ring["cells"]]
     page = Page((WIDTH, 760))
@@ -226,10 +222,6 @@ def draw_rings(comparison: Comparison) -> Page:
 
 
 def _draw_residual_histogram(axes: Axes, residuals: Floats, limit: float) -> None:
-    """Draw a histogram of residuals in meters.
-
-    The axis ends at `limit`, in millimeters.
-    """
     bin_mm = np.ceil(limit / 25) if limit > 10 else limit / 25  # ranges are often whole millimeters
     outer = np.floor(limit / bin_mm) + 0.5
     edges = np.arange(-outer, outer + 1) * bin_mm
@@ -246,7 +238,7 @@ def _marker_size(page: Page, rings: Sequence[Any]) -> float:
 def _draw_ring_residuals(
     page: Page, axes: Axes, rings: Sequence[Mapping[str, Any]], limit: float
 ) -> None:
-    """Draw the spread, median and mean of each ring's residuals.
+    """Draw the mean, median and spread of the residuals in each ring.
 
     The axis ends at `limit`, in millimeters.
     """
@@ -267,7 +259,7 @@ def _draw_ring_residuals(
 
 
 def _draw_ring_gaps(page: Page, axes: Axes, rings: Sequence[Mapping[str, Any]]) -> None:
-    """Draw the percentage of cells without a return in A and in B for each ring."""
+    """Draw each ring's percentage of cells without a return in A and in B."""
     elevation = np.array([ring["elevation_deg"] for ring in rings])
     counts = np.array([[ring["no_return"][name] for name in CELLS] for ring in rings])
     style: dict[str, Any] = {"ms": _marker_size(page, rings), "mew": 0, "lw": 0.6 * page.unit}
@@ -279,7 +271,7 @@ def _draw_ring_gaps(page: Page, axes: Axes, rings: Sequence[Mapping[str, Any]]) 
 
 
 def draw_distances(comparison: Comparison) -> Page:
-    """Draw the distribution of distances in both directions, and intensities if they are known."""
+    """Draw the distributions of distances in both directions, and of intensities if available."""
     page = Page((WIDTH, 760))
     distances = comparison.figures["distances"]
     page.title(
@@ -313,7 +305,7 @@ def draw_distances(comparison: Comparison) -> Page:
 
 
 def _draw_intensities(page: Page, comparison: Comparison) -> None:
-    """Draw a 2D histogram of the paired intensities on the right half of the page."""
+    """Draw a two-dimensional histogram of paired intensities on the right half of the page."""
     figures = comparison.figures["intensity"]
     frame = (LEFT + 0.5, 0.13, 0.4, 0.64)
     name_a, name_b = figures["columns"]["a"], figures["columns"]["b"]
@@ -334,7 +326,7 @@ def _draw_intensities(page: Page, comparison: Comparison) -> None:
 
 
 def draw_above(comparison: Comparison) -> Page:
-    """Draw a top view of both clouds, colored by the distance to the other cloud."""
+    """Draw a top view of both clouds, coloring each point by its distance to the other cloud."""
     height = 830
     page = Page((WIDTH, height))
     pictured = comparison.figures["pictured"]
@@ -366,7 +358,6 @@ def draw_above(comparison: Comparison) -> Page:
 
 
 def _distance_scale(distances: Floats) -> LogNorm:
-    """Return the color scale of distances, in meters."""
     max_m = max(float(np.quantile(distances, 0.99)), 10 * MIN_DISTANCE_M)
     min_m = max(MIN_DISTANCE_M, min(float(np.quantile(distances, 0.05)), max_m / 10))
     return LogNorm(min_m, max_m)
@@ -375,7 +366,7 @@ def _distance_scale(distances: Floats) -> LogNorm:
 def _scatter_points(
     page: Page, axes: Axes, points: Floats, distances: Floats, scale: LogNorm
 ) -> None:
-    """Draw a top view of points colored by their distances, with the largest distances on top."""
+    """Draw a top view of points colored by distance, with the largest distances on top."""
     rows = even_indices(len(points), MAX_DOTS)
     rows = rows[np.argsort(distances[rows])]
     axes.scatter(
@@ -391,7 +382,7 @@ def _scatter_points(
 
 
 def _residual_limit(comparison: Comparison) -> float:
-    """Return the upper end of the residual scale, in millimeters."""
+    """Return the upper limit of the residual scale, in millimeters."""
     residual = comparison.figures["ranges"]["residual"]
     if not residual["cells"]:
         return 1
@@ -399,7 +390,7 @@ def _residual_limit(comparison: Comparison) -> float:
 
 
 def _intensity_bins(values: AnyArray) -> AnyArray:
-    """Return histogram bin edges for intensities.
+    """Return the edges of histogram bins for intensities.
 
     Integers are at the centers of their bins.
     """
@@ -410,7 +401,6 @@ def _intensity_bins(values: AnyArray) -> AnyArray:
 
 
 def _draw_legend(page: Page, axes: Axes) -> None:
-    """Draw a legend of all labels above the axes, aligned to the right."""
     handles, _ = axes.get_legend_handles_labels()
     style = {"ncols": len(handles), "columnspacing": 1.2, "borderaxespad": 0.3}
     page.key(handles, 6.8, axes, loc="lower right", bbox_to_anchor=(1, 1), **style)

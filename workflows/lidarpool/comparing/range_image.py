@@ -1,4 +1,4 @@
-"""Range images of two sweeps of one sensor, on common cells of rings and azimuth steps.
+"""Range images of two sweeps from the same sensor, with common rings and azimuth steps.
 
 A fixed grid would have cells with two pulses or none, because recorded pulses have jitter, the
 azimuth step does not divide the revolution, and there is a seam. Therefore the phase of each ring's
@@ -34,7 +34,7 @@ _MAX_RANGE_M = 20_000.0  # beyond the range of any lidar with rings, so not in t
 
 @dataclass(frozen=True, eq=False)
 class RangeImages:
-    """Range images of two sweeps on the same cells.
+    """Range images of two sweeps with the same cells.
 
     Rows are rings, and columns are azimuth steps.
     """
@@ -55,25 +55,29 @@ class RangeImages:
 
     @property
     def ranges(self) -> Floats:
-        """Ranges of A and B in meters, NaN without a return. Shape (2, r, c)."""
+        """Ranges of A and B in meters, or NaN where there is no return.
+
+        The array has shape (2, r, c).
+        """
         return self.images[:, 0]
 
     @property
     def returned(self) -> tuple[Bools, Bools]:
-        """Masks of the cells with a return in A and in B. Shape (r, c) each."""
+        """Masks of the cells that have a return in A and in B.
+
+        Each mask has shape (r, c).
+        """
         return np.isfinite(self.ranges[0]), np.isfinite(self.ranges[1])
 
 
 class _Cells(NamedTuple):
-    """Cells of a range image."""
-
     shape: tuple[int, int]  # rows, columns
     step_deg: float
 
 
 @dataclass(frozen=True, eq=False)
 class _PolarSweep:
-    """A sweep in polar coordinates, with its rings."""
+    """Points of a sweep in polar coordinates, with their rings."""
 
     azimuth: Floats  # (n,): degrees, 0 to 360
     elevation: Floats  # (n,): degrees
@@ -135,7 +139,7 @@ class _PolarSweep:
         )
 
     def step(self) -> float:
-        """Return the typical azimuth step between consecutive pulses of a ring, in degrees."""
+        """Estimate the azimuth step between consecutive pulses of a ring, in degrees."""
         order = np.lexsort((self.azimuth, self.ring_index))
         steps = np.diff(self.azimuth[order])[np.diff(self.ring_index[order]) == 0]
         steps = steps[steps > _FINEST_DEG]
@@ -157,7 +161,7 @@ class _PolarSweep:
         return float(step)
 
     def phases(self, ring_rows: Ints, cells: _Cells) -> Floats:
-        """Return the mean phase of the pulses in each row and block, in azimuth steps.
+        """Return the mean phase of the pulses in each row and azimuth block, in azimuth steps.
 
         The result has shape (rows, blocks) and is NaN where there are no pulses. `ring_rows`
         contains the row of each ring of the sweep.
@@ -174,11 +178,10 @@ class _PolarSweep:
 
     @property
     def _block(self) -> Ints:
-        """Index of the block that contains each point. Shape (n,)."""
         return (self.azimuth * (_BLOCKS / 360)).astype(np.int64).clip(0, _BLOCKS - 1)
 
     def image(self, ring_rows: Ints, phases: Floats, cells: _Cells) -> tuple[Floats, float]:
-        """Return the range image of a sweep, and the fraction of points that it does not show.
+        """Return a sweep's range image, and the fraction of points that are not part of it.
 
         `ring_rows` contains the row of each ring of the sweep, and `phases` is the result of the
         method `phases`. If several points fall into a cell, the point closest to the center of the
@@ -202,7 +205,7 @@ class _PolarSweep:
 def range_images(
     a: Sweep, b: Sweep, names: tuple[str, str], azimuth_deg: float | None = None
 ) -> RangeImages:
-    """Return the range images of two sweeps of one sensor on the same cells.
+    """Create range images of two sweeps from the same sensor, with the same cells.
 
     The width of a column is the azimuth step between pulses, or the larger of the two steps. The
     cells of each ring are centered on its pulses in every 10° block, so that no pulse falls on the
@@ -239,7 +242,7 @@ def range_images(
 
 
 class _CommonPhases(NamedTuple):
-    """Column width of the common cells, and the phases of the pulses in both sweeps."""
+    """Azimuth step of the common cells, and the phases of the pulses in both sweeps."""
 
     step_deg: float
     phases_a: Floats  # (rows, blocks), in steps
@@ -247,14 +250,14 @@ class _CommonPhases(NamedTuple):
 
     @property
     def seam(self) -> float:
-        """Median change of the phase over a revolution, in steps."""
+        """Median phase change over a revolution, in azimuth steps."""
         return float(np.median(self.phases_b[:, -1] - self.phases_b[:, 0]))
 
 
 def _common_phases(
     a: _PolarSweep, b: _PolarSweep, common: _CommonRings, azimuth_deg: float | None
 ) -> _CommonPhases:
-    """Choose the azimuth step, and compute the phases of both sweeps without gaps.
+    """Choose a common azimuth step, and compute the phases of both sweeps without gaps.
 
     If `azimuth_deg` is not None, it is used as the step.
     """
@@ -285,7 +288,7 @@ def _common_phases(
 
 
 class RayPairs(NamedTuple):
-    """Returns of two sweeps with the same rays, paired by ray.
+    """Returns of two sweeps with identical rays, paired by ray.
 
     If the sensor moves, pulses in the same cell of two range images often belong to different rays.
     """
@@ -296,7 +299,7 @@ class RayPairs(NamedTuple):
 
 
 def pair_rays(a: Sweep, b: Sweep) -> RayPairs:
-    """Pair the returns of two sweeps with the same rays."""
+    """Pair the returns of two sweeps that have identical rays."""
     keys, channels = (np.append(a.columns[name], b.columns[name]) for name in (RAY_KEY, "channel"))
     _, first, ray = np.unique(keys, return_index=True, return_inverse=True)
     values = np.full((2, 2, len(first)), np.nan)
@@ -310,7 +313,7 @@ def pair_rays(a: Sweep, b: Sweep) -> RayPairs:
 def images_of_rays(
     pairs: RayPairs, names: tuple[str, str], azimuth_deg: float | None = None
 ) -> RangeImages:
-    """Return range images of paired rays, like `range_images` for sweeps.
+    """Create range images from paired rays, analogous to `range_images`.
 
     If several rays fall into a cell, one of them is shown. Raises the same errors as
     `range_images`.
@@ -330,13 +333,13 @@ def images_of_rays(
 
 
 def _spacing(elevation: Floats) -> float:
-    """Return the typical spacing between rings in degrees."""
+    """Return the median spacing between rings, in degrees."""
     gaps = np.diff(np.sort(elevation))
     return float(np.median(gaps)) if len(gaps) else 1.0
 
 
 class _CommonRings(NamedTuple):
-    """Rings of two sweeps and their rows, sorted by descending elevation."""
+    """Rings that occur in two sweeps, and their row indices, sorted by descending elevation."""
 
     rings: Ints  # (r,): ring numbers of B
     elevation: Floats  # (r,): degrees
@@ -346,7 +349,7 @@ class _CommonRings(NamedTuple):
 
 
 def _common_rings(a: _PolarSweep, b: _PolarSweep, names: tuple[str, str]) -> _CommonRings:
-    """Match the rings of A and B that have the same elevation.
+    """Match rings of A and B that have the same elevation.
 
     Some programs number rings from the bottom, others from the top, and some start at 1. If the
     numbers of A can be converted to those of B, a ring with returns in only one sweep also gets a
@@ -373,12 +376,12 @@ def _common_rings(a: _PolarSweep, b: _PolarSweep, names: tuple[str, str]) -> _Co
 
 
 def _ring_tolerance(b: _PolarSweep) -> float:
-    """Return the tolerance for the elevation of a ring in A and in B, in degrees."""
+    """Return the maximum elevation difference between matching rings of A and B, in degrees."""
     return max(_spacing(b.ring_elevation) / 2, 0.05)
 
 
 def _ring_numbers(a: _PolarSweep, b: _PolarSweep) -> tuple[Ints, list[str]]:
-    """Return the numbers of A's rings in the numbering of B, and notes on the conversion.
+    """Convert A's ring numbers to the numbering of B, and return notes about the conversion.
 
     The numbers are shifted or reversed. If neither is possible, rings are matched by elevation, and
     unmatched rings get negative numbers.
@@ -409,7 +412,7 @@ def _ring_numbers(a: _PolarSweep, b: _PolarSweep) -> tuple[Ints, list[str]]:
 def _check_elevations(
     a: _PolarSweep, b: _PolarSweep, numbers: Ints, names: tuple[str, str]
 ) -> None:
-    """Raise LidarError if the rings of A and B with the same numbers have different elevations."""
+    """Raise LidarError if rings with the same number have different elevations in A and B."""
     shared, in_a, in_b = np.intersect1d(numbers, b.rings, return_indices=True)
     offset = np.abs(a.ring_elevation[in_a] - b.ring_elevation[in_b])
     too_few = len(shared) < min(len(a.rings), len(b.rings)) / 2
@@ -423,7 +426,7 @@ def _check_elevations(
 
 
 def _field_of_view(occupied: Indices, column_count: int, step_deg: float) -> tuple[Ints, float]:
-    """Return the columns in the field of view, and the azimuth of the first column.
+    """Return the columns within the field of view, and the azimuth of the first column.
 
     `occupied` contains the indices of the columns with a return. The azimuth is between -180 and
     180 degrees.

@@ -1,4 +1,4 @@
-"""Compare two clouds or recordings by sweeps, range image cells and nearest points."""
+"""Compare two clouds or recordings, using sweeps, range image cells and nearest neighbors."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def compare(
 
 @contextmanager
 def _sensor_chosen_by(option: str) -> Iterator[None]:
-    """Add the command-line option that selects a sensor to the error for several sensors."""
+    """Add the command-line option that selects a sensor to errors about ambiguous sensors."""
     try:
         yield
     except SeveralSensorsError as error:
@@ -163,7 +163,7 @@ def _sensor_chosen_by(option: str) -> Iterator[None]:
 
 
 def _motion_note(compensated: Recording, fired: Recording) -> str:
-    """Return a note that only the first of two recordings is compensated for motion."""
+    """Return a note which states that only the first recording is compensated for motion."""
     return (
         f"{compensated.name} is compensated for the motion of the sensor during each sweep, but "
         f"{fired.name} contains points as fired, so the differences include this motion. Export "
@@ -173,7 +173,7 @@ def _motion_note(compensated: Recording, fired: Recording) -> str:
 
 
 def _choose_pairs(pairs: list[tuple[int, int]], sweeps: Sequence[int]) -> list[tuple[int, int]]:
-    """Return the pairs with the given indices in ascending order.
+    """Return the pairs with the given indices, sorted by index.
 
     Raises LidarError if an index is out of range.
     """
@@ -187,10 +187,6 @@ def _choose_pairs(pairs: list[tuple[int, int]], sweeps: Sequence[int]) -> list[t
 
 
 def _pair_sweeps(a: Recording, b: Recording, match: str) -> list[tuple[int, int]]:
-    """Return the indices of matching sweeps in A and B.
-
-    Raises LidarError if no sweeps match.
-    """
     pairs = [(number, number) for number in range(min(a.count, b.count))]
     if match == "time":
         times_a = _sweep_times(a)
@@ -212,17 +208,16 @@ def _pair_sweeps(a: Recording, b: Recording, match: str) -> list[tuple[int, int]
 
 
 def _sweep_times(recording: Recording) -> Floats:
-    """Return the start time of each sweep in nanoseconds.
-
-    Raises LidarError if the recording has no times.
-    """
     if recording.stamps_ns is None:
         raise LidarError(f"{recording.name} has no sweep times. Omit `--match time`.")
     return recording.stamps_ns
 
 
 class _CellPairs(NamedTuple):
-    """Cells or rays with a return in both sweeps. All arrays have shape (k,)."""
+    """Ranges of cells or rays with a return in both sweeps.
+
+    All arrays have shape (k,).
+    """
 
     residual: Floats  # meters
     ring: Ints
@@ -231,7 +226,7 @@ class _CellPairs(NamedTuple):
 
 
 class _NearestPairs(NamedTuple):
-    """Points of one cloud with their nearest neighbors in the other cloud.
+    """Points of one cloud, each with its nearest neighbor in the other cloud.
 
     All arrays have shape (n,).
     """
@@ -243,7 +238,7 @@ class _NearestPairs(NamedTuple):
 
 @dataclass(eq=False)
 class _Comparing:
-    """A comparison in progress, to which pairs of sweeps are added one by one."""
+    """Comparison in progress, to which pairs of sweeps are added one by one."""
 
     recordings: tuple[Recording, Recording]
     distances_m: tuple[float, ...]
@@ -269,7 +264,6 @@ class _Comparing:
         self.ray_counts = np.zeros(4, np.int64)
 
     def note(self, text: str) -> None:
-        """Add a note unless it was added before."""
         if text not in self.notes:
             self.notes.append(text)
 
@@ -292,7 +286,7 @@ class _Comparing:
         return Sweep.concatenate(parts)
 
     def add_sweeps(self, numbers: tuple[int, int], a: Sweep, b: Sweep, budget: int) -> None:
-        """Compare two sweeps in the sensor frame.
+        """Compare two sweeps in sensor coordinates.
 
         At most `budget` cells and points of each sweep are compared.
         """
@@ -308,7 +302,7 @@ class _Comparing:
         self.add_points(a, b, budget)
 
     def add_points(self, a: Sweep, b: Sweep, budget: int) -> None:
-        """Compare distances and intensities of two sweeps or clouds.
+        """Compare the distances and intensities of two sweeps or clouds.
 
         At most `budget` points of each are compared.
         """
@@ -328,12 +322,11 @@ class _Comparing:
 
     @property
     def has_same_rays(self) -> bool:
-        """Whether A and B are known to have the same rays."""
         first, second = self.recordings
         return bool(first.firing_key) and first.firing_key == second.firing_key
 
     def _add_ranges(self, a: Sweep, b: Sweep, budget: int) -> None:
-        """Compare the ranges of two sweeps by ray if they have the same rays, otherwise by cell.
+        """Compare the ranges of two sweeps by ray if both have the same rays, otherwise by cell.
 
         Sweeps with the same rays are compared even if there are no range images. Otherwise, the
         reason why there are none is recorded for a note.
@@ -357,21 +350,19 @@ class _Comparing:
             self._add_rays(rays, budget)
 
     def _add_image_cells(self, images: RangeImages, budget: int) -> None:
-        """Compare the cells or rays in the range images of two sweeps."""
         self.images = self.images or images
         in_a, in_b = np.isfinite(images.compared[:, 0])
         self._count_cells(images, in_a, in_b)
         self._add_residuals(images.compared, images.rings[images.cell_rows], budget)
 
     def _add_rays(self, rays: RayPairs, budget: int) -> None:
-        """Compare the rays of two sweeps without range images."""
         in_a, in_b = np.isfinite(rays.values[:, 0])
         states = in_b & ~in_a, in_a & ~in_b, in_a & in_b
         self.ray_counts[1:] += [np.count_nonzero(state) for state in states]
         self._add_residuals(rays.values, rays.rings, budget)
 
     def _add_residuals(self, compared: Floats, rings: Ints, budget: int) -> None:
-        """Add the residuals where both sweeps have returns.
+        """Add the range residuals of cells or rays in which both sweeps have a return.
 
         `compared` contains the range and intensity in A and in B, with shape (2, 2, k), and `rings`
         contains the ring numbers, with shape (k,).
@@ -382,7 +373,7 @@ class _Comparing:
         self.cells.append(_CellPairs(range_a - range_b, rings[in_both], intensity_a, intensity_b))
 
     def _count_cells(self, images: RangeImages, in_a: Bools, in_b: Bools) -> None:
-        """Count the cells of each ring by their state (`CELLS`).
+        """Count the cells of each ring that are in each of the states in `CELLS`.
 
         The masks `in_a` and `in_b` mark returns. Both have shape (k,).
         """
@@ -405,7 +396,6 @@ class _Comparing:
             self.rings[ring] = elevation, total + count
 
     def result(self) -> Comparison:
-        """Compute all statistics of the comparison."""
         counts = self.point_counts.tolist()
         for recording, count in zip(self.recordings, counts, strict=True):
             if not count:
@@ -450,7 +440,7 @@ class _Comparing:
         return Comparison(figures, self._images(), residuals, distances, intensities, self.points)
 
     def _source_figures(self) -> dict[str, Any]:
-        """Return the names and sizes of A and B, and the sweeps that were compared."""
+        """Return the names and sizes of A and B, and the indices of the compared sweeps."""
         counts = self.point_counts.tolist()
         return {
             key: {
@@ -465,12 +455,12 @@ class _Comparing:
         }
 
     def _compared_sweeps(self, number: int) -> list[int] | None:
-        """Return the indices of the compared sweeps of A (0) or B (1), or None for all sweeps."""
+        """Return the compared sweeps of A (0) or B (1), or None if all of them are compared."""
         indices = sorted({pair[number] for pair in self.pairs})
         return None if len(indices) == self.recordings[number].count else indices
 
     def _intensity_figures(self, a: Floats, b: Floats, paired_by: str) -> dict[str, Any] | None:
-        """Return the statistics of paired intensities, or None if they have no rank correlation."""
+        """Return statistics of paired intensities, or None if they have no rank correlation."""
         correlation = rank_correlation(a, b)
         if correlation is None:
             return None
@@ -484,7 +474,7 @@ class _Comparing:
         }
 
     def _distance_figures(self, to_b: Floats, to_a: Floats) -> dict[str, Any]:
-        """Return the statistics of the distances from A to B and from B to A, in meters."""
+        """Return statistics of the distances from A to B and from B to A, in meters."""
         f_scores: list[dict[str, float | None]] = []
         for distance in self.distances_m:
             scores = _scores(float(np.mean(to_b <= distance)), float(np.mean(to_a <= distance)))
@@ -497,14 +487,13 @@ class _Comparing:
         }
 
     def _empty_notes(self) -> list[str]:
-        """Return a note on pairs that were skipped because a sweep is empty."""
         if not self.empty_pairs:
             return []
         total = plural(len(self.pairs), "pair")
         return [f"{self.empty_pairs:,} of {total} of sweeps have an empty sweep and are skipped"]
 
     def _image_notes(self) -> list[str]:
-        """Return notes on pairs without range images, and on how they are compared instead."""
+        """Return notes about pairs without range images, and how these pairs are compared."""
         instead = "Their ranges are compared ray by ray"
         first, second = self.recordings
         if not self.has_same_rays:
@@ -520,11 +509,10 @@ class _Comparing:
         ]
 
     def _images(self) -> RangeImages | None:
-        """Return the range images to show, or None if a pair of sweeps has no range images."""
         return None if self.ray_counts.any() else self.images
 
     def _range_figures(self, cells: _CellPairs, paired_by: str) -> dict[str, Any]:
-        """Return the statistics of all ranges and of each ring, by descending elevation."""
+        """Return statistics of all ranges, and of each ring by descending elevation."""
         images = self._images()
         has_gaps = not any(recording.thinned for recording in self.recordings)
         rings = sorted(self.rings.items(), key=lambda item: -item[1][0]) if images else []
@@ -554,7 +542,7 @@ class _Comparing:
 
 
 def _residual_figures(values: Floats) -> dict[str, Any]:
-    """Return the statistics of the residuals A - B in meters, which are None without residuals."""
+    """Return residual statistics in meters, which are None if there are no residuals."""
     if not len(values):
         return {"cells": 0, **dict.fromkeys(RESIDUALS)}
     p05, median, p95 = np.quantile(values, (0.05, 0.5, 0.95)).tolist()
@@ -565,7 +553,7 @@ def _residual_figures(values: Floats) -> dict[str, Any]:
 
 
 def _no_return_figures(counts: Any) -> dict[str, Any]:
-    """Score A's prediction of the cells of B that have no return.
+    """Evaluate how well A predicts which cells of B have no return.
 
     `counts` contains the number of cells in each state of `CELLS`.
     """
@@ -576,7 +564,6 @@ def _no_return_figures(counts: Any) -> dict[str, Any]:
 
 
 def _scores(precision: float | None, recall: float | None) -> dict[str, float | None]:
-    """Return precision, recall and their harmonic mean. Undefined values are None."""
     f1 = None
     if precision is not None and recall is not None:
         f1 = 2 * precision * recall / (precision + recall) if precision + recall else 0.0
@@ -584,7 +571,7 @@ def _scores(precision: float | None, recall: float | None) -> dict[str, float | 
 
 
 def _distance_quantiles(values: Floats) -> dict[str, Any]:
-    """Return the mean and the quantiles of distances in meters."""
+    """Return the mean and quantiles of distances in meters."""
     shares = {"median_m": 0.5, "p90_m": 0.9, "p95_m": 0.95, "p99_m": 0.99, "max_m": 1.0}
     quantiles = np.quantile(values, list(shares.values())).tolist()
     return {

@@ -1,4 +1,4 @@
-"""Validation of the Dask scheduler addresses and certificates that users specify.
+"""Validate scheduler addresses and certificates that the user specified.
 
 A command checks them before it reads or computes anything else.
 """
@@ -28,14 +28,14 @@ _NEEDED = {  # {option: key in Dask's configuration}
 
 
 def is_scheduler_file(given: str) -> bool:
-    """Return whether `given` is the path of a scheduler file rather than an address."""
+    """Return whether `given` is the path of a scheduler file instead of an address."""
     return "://" not in given and (given.endswith(".json") or Path(given).is_file())
 
 
 def read_scheduler_file(
     path: Path, wait_s: float = 0.0, tell: Callable[[str], None] = lambda text: None
 ) -> str:
-    """Read the address from a file written by ``dask scheduler --scheduler-file``.
+    """Read the scheduler address from a file that ``dask scheduler --scheduler-file`` wrote.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def read_scheduler_file(
 
 
 def _read(path: Path) -> str:
-    """Read the address from a scheduler file. Raise LidarError if this is not possible."""
+    """Read the address from a scheduler file, or raise LidarError if this is not possible."""
     if not path.exists():
         raise MissingFileError(
             f"The scheduler file {path} does not exist. Start the scheduler with "
@@ -85,7 +85,7 @@ def _read(path: Path) -> str:
 
 
 def check_address(address: str) -> None:
-    """Raise LidarError if an address has an unknown scheme, no host, or no valid port."""
+    """Raise LidarError if an address has an unknown scheme, no host or an invalid port."""
     scheme, separator, _ = address.partition("://")
     if separator and scheme not in _SCHEMES:
         raise LidarError(
@@ -103,7 +103,7 @@ def check_address(address: str) -> None:
 
 
 def check_certificates(address: str, files: TlsFiles) -> None:
-    """Raise LidarError if the TLS files do not match the scheme of the cluster's address.
+    """Raise LidarError unless the TLS files match the scheme of the scheduler address.
 
     An encrypted cluster requires certificates, which may also be set in Dask's configuration. An
     unencrypted cluster must not have any.

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class TlsFiles(NamedTuple):
-    """PEM files that a client requires to connect to a TLS cluster."""
+    """PEM files that a client needs to connect to a TLS cluster."""
 
     ca: Path | None = None  # certificate of the certificate authority
     cert: Path | None = None  # certificate of the client

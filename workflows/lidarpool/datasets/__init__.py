@@ -1,1 +1,1 @@
-"""Write data sets of many jobs with their job tables, and read them for training."""
+"""Write data sets that consist of many jobs, and read them for training."""

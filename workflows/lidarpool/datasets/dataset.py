@@ -1,4 +1,4 @@
-"""Write data sets of many jobs.
+"""Write data sets that consist of many jobs.
 
 Each job writes its own files, and `DataSet.finish` writes the files that all jobs share.
 """
@@ -52,7 +52,7 @@ _MAX_LISTED_FOLDERS = 32  # cached folder listings; many jobs share the same fol
 
 
 def _name_pattern(cloud_format: type[CloudFormat]) -> str:
-    """Return a regular expression for the names of the files that jobs write in a format."""
+    """Return a regular expression that matches the names of a job's files in a format."""
     folder = re.escape(cloud_format.job_path)
     folder = folder.replace(r"\{name\}", "[^/]+").replace(r"\{number\}", r"\d+")
     files = cloud_format.file_pattern
@@ -82,7 +82,7 @@ def job_file(format: str, name: str, file: str) -> str:  # noqa: A002
 
 @dataclass(frozen=True)
 class DataSet:
-    """A data set of many jobs in a folder or object store.
+    """Data set of many jobs in a folder or object store.
 
     The object is small when pickled, so that any process can write jobs. The files depend on the
     format:
@@ -139,7 +139,7 @@ class DataSet:
 
     @property
     def spec(self) -> ExportSpec:
-        """File format of a job, with its options."""
+        """File format of each job's cloud, with its options."""
         return ExportSpec(
             DATA_SETS[self.format],
             self.layout,
@@ -150,7 +150,7 @@ class DataSet:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns that the clouds of jobs must have."""
+        """Names of the columns that each job's cloud must have."""
         return self.spec.needs
 
     def check_installed(self) -> None:
@@ -233,7 +233,7 @@ class DataSet:
         return row
 
     def write_failed(self, rows: Iterable[JobRow]) -> None:
-        """Write the manifests of failed jobs, ignoring other jobs.
+        """Write the manifests of the failed jobs among the rows.
 
         Raises LidarError if the storage is not writable.
         """
@@ -245,14 +245,13 @@ class DataSet:
             )
 
     def _write_manifest(self, storage: Listing, row: JobRow, manifest: dict[str, Any]) -> None:
-        """Write the manifest of a job, without the casting time, which varies between runs."""
         row_of_all_runs = asdict(replace(row, seconds=None))
         manifest |= {"made_with": dict(self.made_with), "row": row_of_all_runs}
         manifest["crc"] = _crc(manifest)
         storage.write(manifest_file(row.name), json.dumps(manifest).encode())
 
     def finish(self, jobs: Iterable[JobRow]) -> None:
-        """Write the files that all jobs share, from the manifests of the finished jobs.
+        """Use the manifests of finished jobs to write the files that all jobs share.
 
         Jobs are processed in the given order, and only one manifest is in memory at a time. No jobs
         may be written in the meantime. `dataset.json` marks a finished data set, so it is removed
@@ -281,7 +280,7 @@ class DataSet:
                 index.seal()
 
     def _renumber(self, job: str, classes: Sequence[int]) -> None:
-        """Rewrite the labels of a job with the class numbers of the merged data set.
+        """Renumber the labels of a job to match the class numbers of the merged data set.
 
         The manifest is removed first, so that the job is repeated if this is interrupted.
         """
@@ -299,7 +298,7 @@ class DataSet:
         self.storage.write(manifest_file(job), json.dumps(manifest).encode())
 
     def _indexed(self, jobs: Iterable[JobRow], index: SealedWriter) -> Iterator[dict[str, Any]]:
-        """Yield the manifests of finished jobs, and add the jobs to the index."""
+        """Yield the manifests of finished jobs, adding each job to the index."""
         comma = ""
         named = dict[int, dict[str, None]]()  # {class number: distinct names in the jobs}
         for job, (manifest, damage) in self.check_jobs(jobs):
@@ -321,7 +320,7 @@ class DataSet:
     def check_jobs(
         self, jobs: Iterable[JobRow], *, contents: bool = False
     ) -> Iterator[tuple[JobRow, tuple[dict[str, Any], str]]]:
-        """Yield each finished job with its manifest and a description of damage to its files.
+        """Yield each finished job with its manifest and a description of any damage to its files.
 
         The description is a clause, which is empty if the files are intact. If the manifest itself
         is missing or damaged, it is an empty dictionary. By default, only file sizes are compared.
@@ -332,7 +331,7 @@ class DataSet:
         yield from read_ahead(lambda job: check_job(job.name), (job for job in jobs if job.done))
 
     def _job_checker(self, contents: bool = False) -> Callable[[str], tuple[dict[str, Any], str]]:
-        """Return a function that checks a job by its name, as described in `check_jobs`."""
+        """Return a function that checks a job given its name, as described in `check_jobs`."""
         sizes = lru_cache(_MAX_LISTED_FOLDERS)(lambda folder: self.storage.below(folder).sizes())
 
         def check_job(job: str) -> tuple[dict[str, Any], str]:
@@ -349,7 +348,7 @@ class DataSet:
         return check_job
 
     def copy_jobs(self, source: Storage, identity: str) -> Iterator[tuple[str, JobRow | None, str]]:
-        """Copy the files of jobs from `source`, which contains a data set of the same format.
+        """Copy the files of all jobs from another data set with the same format.
 
         Files that already exist in this data set are not copied again. A job that failed in the
         source does not replace the job in this data set.
@@ -425,13 +424,13 @@ class DataSet:
 
 @dataclass(frozen=True)
 class Listing(Storage):
-    """A storage that records the size and CRC-32 of each file written to it."""
+    """Storage that records the size and CRC-32 of each file written to it."""
 
     files: dict[str, list[int]] = field(default_factory=dict)  # {name: [bytes, CRC-32]}
 
     @classmethod
     def from_storage(cls, storage: Storage) -> Listing:
-        """Return a storage that records all files written from now on."""
+        """Wrap a storage to record all files written from now on."""
         return cls(storage.url, storage.durable, storage.named)
 
     def write(self, name: str, data: Any) -> None:  # noqa: D102 - as in Storage
@@ -441,7 +440,7 @@ class Listing(Storage):
 
 
 def read_ahead(read: Callable[[T], R], items: Iterator[T]) -> Iterator[tuple[T, R]]:
-    """Yield each item with the result of `read`, which runs ahead in background threads."""
+    """Yield each item with the result of `read`, which is called ahead in background threads."""
     with ThreadPoolExecutor(_REQUESTS, "read") as pool:
         while group := [*islice(items, _AHEAD)]:
             yield from zip(group, pool.map(read, group), strict=True)
@@ -457,7 +456,7 @@ def _crc(manifest: Mapping[str, Any]) -> int:
 
 
 def _write_pieces(output: MultiFileFormat, storage: Storage) -> list[Any]:
-    """Write all pieces of a job in parallel, and return the details that the format reports."""
+    """Write all pieces of a job in parallel, and return the details reported by the format."""
     # In an object store, each file requires a request, so files are written in parallel.
     spans = [(0, len(output))] if storage.is_local else output.spans(_REQUESTS)
     with ThreadPoolExecutor(_REQUESTS, "write") as pool:

@@ -1,4 +1,4 @@
-"""Statistics of a data set, with totals and a few values for each job."""
+"""Statistics of a data set, which are totals and a few values for each job."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ _LETTER = 11.5  # average width of a letter in a label, in pixels
 
 
 def rank_correlation(a: AnyArray, b: AnyArray) -> float | None:
-    """Return Spearman's rank correlation, with mean ranks for ties, or None for constant values.
+    """Return Spearman's rank correlation, or None if all values of `a` or `b` are equal.
+
+    Tied values receive their mean rank.
 
     Examples
     --------
@@ -57,15 +59,15 @@ class VariedQuantity:
 
     @property
     def known_values(self) -> Floats:
-        """Values of the jobs that have the quantity."""
+        """Values of those jobs in which the quantity is known."""
         return self.values[np.isfinite(self.values)]
 
     def counts(self) -> Ints:
-        """Return the number of jobs with each label."""
+        """Return the number of jobs for each label."""
         return np.bincount(self.known_values.astype(np.intp), minlength=len(self.labels))
 
     def merge_rare_labels(self) -> VariedQuantity:
-        """Combine the rarest labels into one, so that there are at most `MAX_LABELS` labels."""
+        """Combine the rarest labels into one, to get at most `MAX_LABELS` labels."""
         labels = self.labels
         if len(labels) <= MAX_LABELS:
             return self
@@ -78,10 +80,10 @@ class VariedQuantity:
 
     @cached_property
     def edges(self) -> Floats:
-        """Histogram bin edges. Shape (bins + 1,).
+        """Edges of the histogram bins.
 
-        Each label or small integer has its own bin. Otherwise, bins have equal widths, or equal
-        ratios if the values have a logarithmic distribution.
+        The array has shape (bins + 1,). Each label or small integer has its own bin. Otherwise,
+        bins have equal widths, or equal ratios if the values have a logarithmic distribution.
         """
         values = self.known_values
         lower, upper = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
@@ -99,7 +101,7 @@ class VariedQuantity:
 
     @property
     def is_log(self) -> bool:
-        """Whether the bins, and therefore the axis of a chart, are logarithmic."""
+        """Whether the histogram bins and the axis of the chart are logarithmic."""
         widths = np.diff(self.edges)
         return bool(widths[-1] > 1.01 * widths[0])
 
@@ -109,7 +111,7 @@ class VariedQuantity:
         return [shorten_name(label, 15) for label in remove_common_prefix(self.labels)]
 
     def needs_slanted_labels(self, width: float) -> bool:
-        """Return True if the labels are too long to be horizontal on an axis of `width` pixels."""
+        """Return True if the labels do not fit horizontally on an axis of `width` pixels."""
         longest = max(map(len, self.short_labels), default=0)
         return longest * _LETTER > width / max(1, len(self.labels))
 
@@ -149,7 +151,7 @@ class DataSetStatistics:
         return self.__dict__ | {"_digest": None}  # hash objects cannot be pickled
 
     def add(self, row: JobRow) -> None:
-        """Add the row of a job to the statistics."""
+        """Add the table row of a job to the statistics."""
         self.jobs += 1
         for name, column in self._per_job.items():
             value = not row.done if name == "failed" else getattr(row, name)
@@ -184,18 +186,18 @@ class DataSetStatistics:
 
     @property
     def totals(self) -> dict[str, int]:
-        """Total numbers of scans, sweeps, rays, hits and points of all finished jobs."""
+        """Numbers of scans, sweeps, rays, hits and points in all finished jobs."""
         counts_of_splits = self.splits.values()
         return {name: sum(counts[name] for counts in counts_of_splits) for name in _COUNTS}
 
     @property
     def sha256(self) -> str:
-        """Hash of the names and points of all finished jobs, in row order."""
+        """Hash of the names and points of all finished jobs, in the order of their rows."""
         return self._digest.hexdigest()
 
     @property
     def varied(self) -> list[VariedQuantity]:
-        """Values of each varied quantity in all jobs."""
+        """Each varied quantity, with its values in all jobs."""
         return [self._varied(name) for name in self._values]
 
     def _varied(self, name: str) -> VariedQuantity:
@@ -217,7 +219,7 @@ class DataSetStatistics:
         return VariedQuantity(name, codes, tuple(order))
 
     def per_job(self, name: str) -> Floats:
-        """Return the points, rays, hits or seconds of each job.
+        """Return the number of points, rays, hits or seconds of each job.
 
         The result has shape (jobs,). Unknown values are NaN.
         """
@@ -225,11 +227,14 @@ class DataSetStatistics:
 
     @property
     def failures(self) -> Bools:
-        """Mask of the failed jobs. Shape (jobs,)."""
+        """Mask of the failed jobs.
+
+        The array has shape (jobs,).
+        """
         return np.array(self._per_job["failed"]) > 0
 
     def percentiles(self, name: str) -> dict[str, float] | None:
-        """Return the minimum, 10th, 50th and 90th percentile, and maximum over finished jobs.
+        """Return the minimum, 10th, 50th and 90th percentiles, and maximum over all finished jobs.
 
         Return None if no finished job has a known value.
         """
@@ -241,7 +246,7 @@ class DataSetStatistics:
         return dict(zip(names, np.percentile(values, (0, 10, 50, 90, 100)).tolist(), strict=True))
 
     def summaries(self) -> Iterator[dict[str, Any]]:
-        """Yield the statistics of each varied quantity as a dictionary for JSON."""
+        """Yield statistics of each varied quantity as a dictionary for JSON."""
         is_done = ~self.failures
         points = self.per_job("points")
         for varied in self.varied:

@@ -1,4 +1,4 @@
-"""Casting times of the jobs of a data set, which are stored in a file next to its report.
+"""Casting times of a data set's jobs, which are stored in a file next to its report.
 
 Casting times vary between runs. The job table does not contain them, because its bytes must be the
 same in every run.
@@ -20,7 +20,7 @@ _HEADER = ["number", "seconds"]
 
 
 def writing_seconds(storage: Storage, jobs: Iterable[JobRow]) -> Iterator[JobRow]:
-    """Yield the rows of jobs unchanged, while writing their casting times to SECONDS_FILE.
+    """Yield the rows of jobs unchanged, and write their casting times to SECONDS_FILE.
 
     The file appears after the last row.
     """
@@ -53,7 +53,7 @@ def read_seconds(storage: Storage) -> Mapping[int, float]:
 
 
 def known_seconds(storage: Storage) -> Mapping[int, float]:
-    """Return the known casting times, or an empty dictionary if the file is unusable."""
+    """Return the known casting times, or an empty dictionary if the file cannot be read."""
     try:
         return read_seconds(storage)
     except LidarError:

@@ -1,4 +1,4 @@
-"""The job table of a data set, and the point statistics of a job.
+"""Job table of a data set, and point statistics of a job.
 
 `jobs.csv` contains one row per job. The columns are number, name and split, then the varied values,
 then the results, then the number of points of each class. Varied values are written as in JSON,
@@ -109,12 +109,12 @@ class JobRow:
 
     @property
     def done(self) -> bool:
-        """Whether the job succeeded, so that the data set contains its points."""
+        """Whether the job succeeded and its points are in the data set."""
         return not self.error
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> JobRow:
-        """Create a row from its JSON object.
+        """Create a row from a JSON object.
 
         Raises ValueError if a field is missing, unknown or has the wrong type, or if the name or
         the split is not a plain file name.
@@ -132,7 +132,7 @@ class JobRow:
 
 
 class Tally:
-    """Point counts and hash of a job, computed from chunks of points that are added in order.
+    """Point counts and hash of a job, updated with consecutive chunks of its points.
 
     Examples
     --------
@@ -154,7 +154,7 @@ class Tally:
 
     @classmethod
     def from_cloud(cls, cloud: CloudLike) -> Tally:
-        """Return the tally of a whole cloud."""
+        """Compute the tally of an entire cloud."""
         tally = cls()
         for chunk in cloud.chunks():
             tally.add(chunk)
@@ -189,7 +189,7 @@ class Tally:
 
     @property
     def classes(self) -> dict[int, int]:
-        """Number of points of each class that occurs, as {class: points}.
+        """Number of points in each class that occurs, as {class: points}.
 
         The dictionary is empty if the points have no ``class`` column.
         """
@@ -197,7 +197,7 @@ class Tally:
 
     @property
     def sha256(self) -> str:
-        """Hash of positions and columns, as 64 hexadecimal digits.
+        """Hash of the positions and columns, as 64 hexadecimal digits.
 
         Each column contributes a line with its name, type and hash, starting with the positions,
         and the result is the hash of these lines. It does not depend on the division into chunks,
@@ -306,7 +306,6 @@ def read_table(storage: Storage, checksum: Sequence[int] | None = None) -> Itera
 
 
 def _column_of(name: str) -> str:
-    """Return the column name of a varied value."""
     ambiguous = name in _HEAD or name in _TAIL or _CLASS.fullmatch(name) or name.startswith(_VARIED)
     return f"{_VARIED}{name}" if ambiguous else name
 
@@ -314,7 +313,7 @@ def _column_of(name: str) -> str:
 def _columns(
     names: Sequence[str], jobs: Iterable[JobRow]
 ) -> tuple[list[int], dict[str, set[type]]]:
-    """Return all classes that occur in the rows, and the types of each varied value."""
+    """Return the classes that occur in any row, and the value types of each varied quantity."""
     classes: set[int] = set()
     kinds: dict[str, set[type]] = {name: set() for name in names}
     for row in jobs:
@@ -331,7 +330,6 @@ def _columns(
 
 
 def _cells(row: JobRow, names: Sequence[str], classes: Sequence[int]) -> Iterator[str]:
-    """Yield the cells of a job's row in jobs.csv."""
     for name, kind in (_HEAD | _TAIL).items():
         if name == "error":
             for value in names:
@@ -347,7 +345,7 @@ def _cells(row: JobRow, names: Sequence[str], classes: Sequence[int]) -> Iterato
 
 
 def _row(header: Sequence[str], names: Sequence[str], cells: Sequence[str]) -> JobRow:
-    """Parse a row of jobs.csv. Raises ValueError if the row is invalid."""
+    """Parse a row of jobs.csv, or raise ValueError if it is invalid."""
     if len(cells) != len(header):
         raise ValueError(f"the row has {len(cells)} cells, but the header has {len(header)}")
     first = len(_HEAD)
@@ -370,7 +368,7 @@ def _row(header: Sequence[str], names: Sequence[str], cells: Sequence[str]) -> J
 
 
 def _with_plain_names(row: JobRow) -> JobRow:
-    """Return the row if its name and split are plain file names, otherwise raise ValueError.
+    """Return the row if its name and split are valid file names, or raise ValueError otherwise.
 
     Both are used as parts of file names, so other values could lead outside the data set.
     """
@@ -383,7 +381,6 @@ def _with_plain_names(row: JobRow) -> JobRow:
 
 
 def _plain(value: Any) -> Any:
-    """Convert a NumPy scalar to a Python object. Other values are returned unchanged."""
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -401,7 +398,7 @@ def _kind(value: Any) -> type:
 
 
 def _written(value: Any) -> str:
-    """Return the cell of a varied value, from which the value can be read back with its type.
+    """Format a varied value as a table cell from which its value and type can be restored.
 
     The cell is empty for None.
     """
@@ -417,7 +414,7 @@ def _written(value: Any) -> str:
 
 
 def _shielded(text: str) -> str:
-    """Return text that no spreadsheet interprets as a formula.
+    """Return text that spreadsheets do not interpret as a formula.
 
     Examples
     --------
@@ -428,18 +425,16 @@ def _shielded(text: str) -> str:
 
 
 def _unshielded(text: str) -> str:
-    """Reverse `_shielded`."""
     return text[1:] if text.startswith("'") and _FORMULA.match(text) else text
 
 
 def _read(text: str) -> Value:
-    """Return the varied value in a cell."""
     plain = _unshielded(text)
     return _parsed(text) if plain == text else plain
 
 
 def _parsed(text: str) -> Value:
-    """Parse a JSON scalar, or return the text unchanged if it is not a JSON scalar."""
+    """Parse a JSON scalar, or return any other text unchanged."""
     try:
         value = json.loads(text) if text.lstrip()[:1] not in "[{" else text
     except ValueError:
@@ -454,7 +449,7 @@ def _write_parquet(
     kinds: Mapping[str, set[type]],
     rows: Iterator[JobRow],
 ) -> None:
-    """Write jobs.parquet.
+    """Write the job table to jobs.parquet.
 
     If a varied value is a string in any row, it is stored as a string in all rows.
     """

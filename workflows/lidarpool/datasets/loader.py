@@ -1,4 +1,4 @@
-"""Read data sets of many jobs, sweep by sweep, for training."""
+"""Read the sweeps of data sets with many jobs, for example for training."""
 
 from __future__ import annotations
 
@@ -44,15 +44,13 @@ _OPEN_JOBS = 16  # number of jobs that each thread keeps open, with their poses,
 
 @dataclass(frozen=True)
 class _Run:
-    """Consecutive sweeps of one sensor within a job's `Sweeps`."""
-
     job: JobRow
     first: int
     count: int
 
 
 class SavedSweeps:
-    """The sequence of sweeps in a data set, which `sweeps` returns.
+    """Sequence of the sweeps in a data set, which is returned by `sweeps`.
 
     Items are read when they are accessed, and iteration prefetches the next items in background
     threads. Items can be accessed from several threads, from forked processes, and from processes
@@ -86,7 +84,7 @@ class SavedSweeps:
         return self.ahead(range(len(self)))
 
     def ahead(self, indices: Iterable[int]) -> Generator[Sweep]:
-        """Yield the sweeps with these indices in order, and prefetch the next ones."""
+        """Yield the sweeps with the given indices in order, and prefetch the next ones."""
         cloud_format = self._dataset.spec.cloud_format
         is_local = self._dataset.storage.is_local
         if is_local and cloud_format.raw_sweeps:
@@ -127,7 +125,7 @@ class SavedSweeps:
         return job.read(number)
 
     def _locate(self, index: int) -> tuple[_OpenJob, int]:
-        """Return the open job that contains a sweep, and the index of the sweep in this job."""
+        """Return the open job that contains a sweep, and the sweep's index in this job."""
         position = operator.index(index)
         position += len(self) if position < 0 else 0
         if not 0 <= position < len(self):
@@ -142,7 +140,7 @@ class SavedSweeps:
         return self._opened(run.job), number
 
     def torch(self, transform: Callable[[Sweep], Any] | None = None, *, even: bool = True) -> Any:
-        """Return a `torch.utils.data.IterableDataset` of the sweeps.
+        """Return the sweeps as a `torch.utils.data.IterableDataset`.
 
         The sweeps are divided among the workers of a DataLoader, and among the ranks of
         torch.distributed if it is initialized when the loader starts. Each sweep is read by a
@@ -172,13 +170,12 @@ class SavedSweeps:
         return TorchSweeps(self, transform, even)
 
     def _close(self) -> None:
-        """Close the jobs that are open in this thread."""
         for job in self._local.__dict__.pop("jobs", {}).values():
             job.reader.close()
         self._local.__dict__.clear()
 
     def _opened(self, job: JobRow) -> _OpenJob:
-        """Return a job opened in this thread, from the cache if possible."""
+        """Return a job that is open in the current thread, using the cache if possible."""
         local = self._local
         if getattr(local, "process", None) != os.getpid():  # forked processes share file offsets
             local.process = os.getpid()
@@ -193,7 +190,7 @@ class SavedSweeps:
 
 
 class _OpenJob:
-    """Poses, boxes and reader of an open job."""
+    """Poses, boxes and reader of a job that is open."""
 
     def __init__(self, dataset: DataSet, job: JobRow, classes: Mapping[int, str]) -> None:
         self.storage = storage = dataset.storage
@@ -220,7 +217,7 @@ class _OpenJob:
         self.reader = JobReader(storage, self.sweeps, entry, dataset.layout, classes)
 
     def prefetch(self, sweep: int) -> None:
-        """Ask the operating system to load the files of a sweep into its page cache."""
+        """Ask the operating system to load a sweep's files into its page cache."""
         self.reader.prefetch(self.cloud_format.sweep_files(self.reader, sweep))
 
     def read(self, sweep: int) -> Sweep:
@@ -241,7 +238,7 @@ def sweeps(
     sensors: Sequence[str] | None = None,
     shuffle: int | None = None,
 ) -> SavedSweeps:
-    """Open the sweeps of a data set written by a campaign.
+    """Open the sweeps of a data set that a campaign wrote.
 
     Parameters
     ----------
@@ -348,7 +345,7 @@ def _chosen(
     jobs: Sequence[int | str] | None,
     storage: Storage,
 ) -> list[JobRow]:
-    """Return the rows of the jobs that belong to one of the splits and are among `jobs`."""
+    """Return the rows of the jobs that belong to one of the given splits and are among `jobs`."""
     if split is not None:
         splits = [split] if isinstance(split, str) else list(split)
         _check_known("split", splits, dict.fromkeys(row.split for row in rows), storage)
@@ -385,7 +382,7 @@ def _check_known(label: str, requested: Sequence[str], available: Any, storage: 
 
 
 def _unreadable(file: str, error: Exception) -> LidarError:
-    """Return the one-line error for a file that is missing or damaged."""
+    """Return a one-line error for a missing or damaged file."""
     if isinstance(error, LidarError):
         return error
     # Errors of remote storages have a cause instead of `strerror`.

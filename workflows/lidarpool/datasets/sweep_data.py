@@ -1,4 +1,4 @@
-"""Create the sweeps of a job from points that were read from a file or received from a stream."""
+"""Create sweeps from the points of a job that were read from a file or received from a stream."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def sweep_of_job(
     boxes: Boxes | None,
     index: int | EllipsisType = ...,
 ) -> Sweep:
-    """Return one sweep of a job with its points, in the sensor frame at the start of the sweep.
+    """Create one sweep of a job from its points, in sensor coordinates at the start of the sweep.
 
     `number` is the index of the sweep in `sweeps`. `boxes` contains either the boxes of this sweep
     only, or the boxes of several sweeps. In the latter case, `index` is the index of this sweep in

@@ -1,4 +1,4 @@
-"""PyTorch data sets of sweeps.
+"""PyTorch data sets that consist of sweeps.
 
 This module is imported only when a `torch` method is called, because torch is an optional
 dependency.
@@ -20,32 +20,32 @@ from lidarsim.errors import LidarError
 
 
 class ReadSweeps(Protocol):
-    """Sweeps that can be read by index, such as the sweeps in a data set."""
+    """Protocol of sweeps that are read by index, such as the sweeps in a data set."""
 
     def __len__(self) -> int: ...
 
     def ahead(self, indices: Iterable[int]) -> Generator[Sweep]:
-        """Yield the sweeps with these indices in order, and prefetch the next ones."""
+        """Yield the sweeps with the given indices in order, and prefetch the next ones."""
         ...
 
 
 class JobStream(Protocol):
-    """Sweeps of the jobs of a campaign, ordered by job."""
+    """Protocol of a stream of a campaign's sweeps, ordered by job."""
 
     @property
     def numbers(self) -> Sequence[int]:
-        """Numbers of the jobs."""
+        """Numbers of all jobs in the stream."""
         ...
 
     def of_jobs(self, numbers: Sequence[int]) -> Self:
-        """Return the stream of a subset of the jobs."""
+        """Return a stream that contains only the given jobs."""
         ...
 
     def __iter__(self) -> Generator[Sweep]: ...
 
 
 class TorchSweeps(torch.utils.data.IterableDataset):
-    """Iterable data set of stored sweeps, divided among ranks and the workers of each rank."""
+    """Iterable data set of stored sweeps, which are divided among ranks and workers."""
 
     def __init__(
         self, sweeps: ReadSweeps, transform: Callable[[Sweep], Any] | None, even: bool
@@ -60,7 +60,6 @@ class TorchSweeps(torch.utils.data.IterableDataset):
         return self.__dict__ | {"_rank": self._rank or _ranks()}
 
     def _share(self) -> range:
-        """Return the indices of the sweeps that this rank reads."""
         rank, ranks = self._rank or _ranks()
         count = len(self.sweeps)
         return range(rank, count - count % ranks if self.even else count, ranks)
@@ -72,7 +71,7 @@ class TorchSweeps(torch.utils.data.IterableDataset):
 
 
 class TorchStream(torch.utils.data.IterableDataset):
-    """Iterable data set of the sweeps in a `SweepStream`, whose jobs are divided among ranks."""
+    """Iterable data set of the sweeps in a `SweepStream`, with jobs divided among ranks."""
 
     def __init__(self, stream: JobStream, transform: Callable[[Sweep], Any] | None) -> None:
         self.stream = stream
@@ -92,7 +91,6 @@ class TorchStream(torch.utils.data.IterableDataset):
 
 
 def _ranks() -> tuple[int, int]:
-    """Return the rank of this process and the number of ranks."""
     distributed = torch.distributed
     if not (distributed.is_available() and distributed.is_initialized()):
         return 0, 1
@@ -100,7 +98,7 @@ def _ranks() -> tuple[int, int]:
 
 
 def tensors(sweep: Sweep) -> dict[str, Any]:
-    """Convert a sweep to a dictionary of tensors, as described in `SavedSweeps.torch`."""
+    """Convert a sweep to a dictionary of tensors, as `SavedSweeps.torch` describes."""
     boxes = sweep.boxes
     arrays = {
         name: array.astype(np.int64) if array.dtype.kind in "iu" else array

@@ -1,1 +1,1 @@
-"""Identity of runs and results: content fingerprints, software versions, checksums and shards."""
+"""Identities of runs and results, which include fingerprints, software versions and checksums."""

@@ -26,7 +26,7 @@ _MARK = " #"  # separates a description from the fingerprint of its content
 
 
 def describe_fields(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the path and a readable description of each field in a value.
+    """Yield the path of each field in a value, with a readable description of the field.
 
     Fields that are None are skipped.
 
@@ -66,7 +66,6 @@ def describe_fields(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
 
 
 def _format_value(value: Any) -> str:
-    """Return a plain value as it is written in a scenario file."""
     if isinstance(value, bool):
         return str(value).lower()
     text = f"{value:.12g}" if isinstance(value, float) else str(value)
@@ -87,7 +86,7 @@ def _summarize(value: Any) -> str:
 def describe_changes(
     earlier: Mapping[str, str], now: Mapping[str, str], max_fields: int = 4
 ) -> str:
-    """Describe the fields that changed between two descriptions of a run.
+    """Describe which fields differ between two descriptions of a run.
 
     Parameters
     ----------
@@ -115,7 +114,7 @@ def describe_changes(
 
 
 def _describe_change(name: str, earlier_text: str | None, text: str | None) -> str:
-    """Return a clause that describes the change of a field. A text is None if it is not set."""
+    """Describe the change of a field, whose text is None if it is not set."""
     earlier_value = earlier_text and earlier_text.partition(_MARK)[0]
     value = text and text.partition(_MARK)[0]
     if earlier_value is None:

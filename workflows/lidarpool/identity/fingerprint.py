@@ -1,4 +1,4 @@
-"""Content fingerprints, which are equal only for values that lead to the same result.
+"""Content fingerprints, which are only equal for values that lead to the same result.
 
 The fingerprint of an object depends on its class and its fields. Classes and functions that are
 defined outside lidarpool also contribute their code, so that a subclass with a modified method has
@@ -41,7 +41,7 @@ _CODE = (
 
 
 def fingerprint(*values: Any) -> str:
-    """Return the SHA-256 hash of the content of one or more values, in hexadecimal.
+    """Return the SHA-256 hash of the given values as hexadecimal text.
 
     Parameters
     ----------
@@ -67,7 +67,6 @@ def fingerprint(*values: Any) -> str:
 
 @lru_cache(1024)
 def _hash_name(word: str) -> str:
-    """Return the fingerprint of a field name. It is cached, because the same names recur."""
     return fingerprint(word)
 
 
@@ -81,7 +80,7 @@ _MIN_CACHED_BYTES = 1 << 16  # smaller arrays are hashed each time
 
 
 def _hash_array(array: np.ndarray[Any, Any]) -> bytes:
-    """Return the hash of an array's values. Hashes of large read-only arrays are cached."""
+    """Return the hash of an array's values, which is cached for large read-only arrays."""
     cached = _hashes.get(id(array))
     if cached is not None and cached[0]() is array:
         return cached[1]
@@ -95,7 +94,7 @@ def _hash_array(array: np.ndarray[Any, Any]) -> bytes:
 
 
 class _Digest:
-    """Hash that is accumulated from values of any supported type."""
+    """Hash that is computed from values of any supported type."""
 
     def __init__(self) -> None:
         self._hash = hashlib.sha256()
@@ -110,7 +109,7 @@ class _Digest:
             self._hash.update(b"%d:" % len(data) + data)
 
     def add(self, value: Any) -> None:
-        """Add a value.
+        """Add a value to the hash.
 
         A reference to an enclosing value is recorded as a cycle instead of being followed.
         """
@@ -144,7 +143,6 @@ class _Digest:
             self._add_object(value)
 
     def _add_container(self, container: Any) -> None:
-        """Add a list, tuple, mapping or set."""
         if isinstance(container, (list, tuple)):
             self._mark("sequence", len(container), *getattr(container, "_fields", ()))
             for item in container:
@@ -159,7 +157,6 @@ class _Digest:
             self.add(sorted(container, key=fingerprint))
 
     def _add_code_object(self, value: Any) -> None:
-        """Add a function, method, class, builtin or module."""
         if isinstance(value, partial):
             self.add((value.func, value.args, value.keywords))
         elif isinstance(value, types.FunctionType):
@@ -234,13 +231,12 @@ class _Digest:
 
 
 def _used_names(code: types.CodeType) -> list[str]:
-    """Return the sorted global and attribute names that code uses, including nested code."""
+    """Return the sorted global and attribute names that are used in code, including nested code."""
     inner = [c for c in code.co_consts if isinstance(c, types.CodeType)]
     return sorted({*code.co_names, *(name for c in inner for name in _used_names(c))})
 
 
 def _is_cached(kind: type, name: str) -> bool:
-    """Return True if a name belongs to a cached property, which is derived from other fields."""
     return isinstance(getattr(kind, name, None), cached_property)
 
 

@@ -1,4 +1,4 @@
-"""Summaries of job errors, in which jobs with the same error share one line."""
+"""Summaries of job errors, with one line for all jobs that have the same error."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _VALUES = "\nThe values of the job are "  # text that introduces the varied valu
 
 
 def summarize_errors(errors: Iterable[tuple[str, str]], max_jobs: int = 5) -> list[str]:
-    """Return one line for each distinct error, which lists the jobs that failed with it.
+    """Return one line for each distinct error, listing the jobs that failed with it.
 
     Parameters
     ----------

@@ -22,13 +22,13 @@ class SealedWriter:
         self._crc = 0
 
     def write(self, text: str) -> None:
-        """Write a piece of the object's text, which must not include the closing brace."""
+        """Write a piece of the object's text, excluding the closing brace."""
         data = text.encode()
         self._crc = zlib.crc32(data, self._crc)
         self._file.write(data)
 
     def seal(self) -> None:
-        """Write the checksum of the text and the closing brace."""
+        """Write a checksum of the text, followed by the closing brace."""
         self._file.write(f',\n"crc": {self._crc}}}\n'.encode())
 
 
@@ -47,7 +47,7 @@ def seal_json(content: Mapping[str, Any]) -> bytes:
 
 
 def unseal_json(data: bytes) -> dict[str, Any]:
-    """Return the content of a JSON object written by `seal_json` or `SealedWriter`.
+    """Verify and return the content of a JSON object written by `seal_json` or `SealedWriter`.
 
     Raises
     ------

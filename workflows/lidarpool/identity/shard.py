@@ -1,4 +1,4 @@
-"""Shards, which divide a run into equal shares for clusters that work independently."""
+"""Shards that divide a run into equal parts, so that independent clusters can each compute one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _KUBERNETES = ["JOB_COMPLETION_INDEX"]
 
 
 def describe_shard(text: str) -> str:
-    """Return the name of a shard in messages.
+    """Return the name of a shard for use in messages.
 
     Examples
     --------
@@ -26,7 +26,7 @@ def describe_shard(text: str) -> str:
 
 @dataclass(frozen=True, order=True)
 class Shard:
-    """One of several equal shares of a run.
+    """One of several equal parts of a run.
 
     Raise LidarError if the number is not between 1 and the total.
     """
@@ -81,14 +81,14 @@ class Shard:
             ) from error
 
     def jobs(self, count: int) -> range:
-        """Return the indices of this shard's jobs in a campaign with `count` jobs.
+        """Return the job indices of this shard in a campaign with `count` jobs.
 
         Consecutive jobs belong to different shards.
         """
         return range(self.number - 1, count, self.total)
 
     def scans(self, count: int) -> range:
-        """Return the indices of this shard's scans, which are consecutive, out of `count` scans."""
+        """Return the consecutive scan indices of this shard in a survey with `count` scans."""
         return range(count * (self.number - 1) // self.total, count * self.number // self.total)
 
 

@@ -1,4 +1,4 @@
-"""Software versions that determine the bytes of a result.
+"""Versions of the software on which the bytes of a result depend.
 
 A run records the versions of its driver, and refuses workers that have different versions.
 """
@@ -32,7 +32,7 @@ CLOCK_TOLERANCE_S = 5.0  # maximum clock difference between a file server and th
 
 
 def software(backend: str = "", plugins: Iterable[Plugin] = ()) -> dict[str, str]:
-    """Return the versions of the software in this process, by name.
+    """Return the versions of the software in this process, keyed by name.
 
     Processes with the same versions produce the same bytes. This does not depend on the processor,
     because no result comes from a function whose last bits differ between processors (see
@@ -63,7 +63,7 @@ def software(backend: str = "", plugins: Iterable[Plugin] = ()) -> dict[str, str
 
 @cache
 def source_hash() -> str:
-    """Return the hash of the installed sources, as eight hexadecimal digits.
+    """Return a hash of the installed source files, as eight hexadecimal digits.
 
     If files have changed since this process started, it may be running older code. The function
     then returns a text that says so instead of a hash.
@@ -73,12 +73,11 @@ def source_hash() -> str:
 
 @cache
 def _plugin_version(plugin: Plugin) -> str:
-    """Return the version and the source hash of a plug-in's distribution."""
     return f"{plugin.version} (sources {_hash_packages((_top_package(plugin.module),))})"
 
 
 def _top_package(module: str) -> str:
-    """Return the outermost regular package of a module, or the module if it has no package.
+    """Return the outermost regular package of a module, or the module itself if there is none.
 
     Namespace packages are skipped, because several distributions can share them.
     """
@@ -92,7 +91,7 @@ def _top_package(module: str) -> str:
 
 
 def _hash_packages(packages: Iterable[str]) -> str:
-    """Return the hash of the files in packages or modules, as described in `source_hash`."""
+    """Return the hash of the files in packages or modules, as `source_hash` describes."""
     digest = hashlib.sha256()
     newest_s = 0.0
     for package in packages:
@@ -106,7 +105,7 @@ def _hash_packages(packages: Iterable[str]) -> str:
 
 
 def _package_files(package: str) -> Iterator[tuple[str, Path]]:
-    """Yield the name and path of each file in a package. Names start with the package name."""
+    """Yield the path of each file in a package, preceded by a name that includes the package."""
     try:
         spec = find_spec(package)
     except ModuleNotFoundError:  # the parent package is missing
@@ -127,7 +126,7 @@ def _package_files(package: str) -> Iterator[tuple[str, Path]]:
 def software_query(
     backend: str = "", plugins: Sequence[Plugin] = ()
 ) -> Callable[[], dict[str, str]]:
-    """Return a function that calls `software` on a worker.
+    """Return a function that workers can run to call `software`.
 
     The returned function is nested, so that it is pickled by value. Workers that lack lidarpool, or
     have a different version, can therefore run it, too. If lidarpool is not installed, it returns
@@ -156,12 +155,12 @@ def software_query(
 
 
 def plugin_versions(plugins: Iterable[Plugin]) -> dict[Plugin, str]:
-    """Return the version and the source hash of each plug-in, as installed in this process."""
+    """Return the version and source hash of each plug-in installed in this process."""
     return {plugin: _plugin_version(plugin) for plugin in plugins}
 
 
 def call_with_same_sources(required: str, function: Callable[..., T], *arguments: Any) -> T:
-    """Call a function in a task after checking that the worker has the same sources as the driver.
+    """Check that the worker has the same sources as the driver, and call a function.
 
     Parameters
     ----------
@@ -181,7 +180,7 @@ def call_with_same_sources(required: str, function: Callable[..., T], *arguments
 def call_with_plugins(
     versions: Mapping[Plugin, str], function: Callable[..., T], *arguments: Any
 ) -> T:
-    """Call a function in a task after checking that the worker has the driver's plug-ins.
+    """Check that the worker has the same plug-ins as the driver, and call a function.
 
     Parameters
     ----------
@@ -215,12 +214,11 @@ def _call_if_compatible(
 
 
 def _entry_name(plugin: Plugin) -> str:
-    """Return the name of a plug-in's entry in `software`."""
     return f"plug-in {plugin.distribution}"
 
 
 def describe_difference(installed: Mapping[str, Any], required: Mapping[str, str]) -> str:
-    """Describe the first difference between installed and required software.
+    """Describe the first difference between the installed and the required software.
 
     Returns an empty string if all required entries are the same.
 

@@ -1,1 +1,1 @@
-"""Access to Open3D without its viewers, and to its nearest neighbor search."""
+"""Open3D without its viewers, and nearest neighbor search based on Open3D."""

@@ -10,7 +10,7 @@ from .open3d_module import load_open3d
 
 
 def nearest_neighbors(points: Floats, reference: Floats) -> tuple[Floats, Ints]:
-    """Find the nearest point in a reference cloud for each point.
+    """Find the nearest point in a reference cloud for each of the given points.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Show runs and results in the browser and in viewers, without internet access."""
+"""Pages that show runs and results in the browser or in viewers, without internet access."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:  # Importing the modules of runs takes seconds, and results do
 
 
 def page_of(jobs: Jobs, live: Live) -> AbstractContextManager[RunPage]:
-    """Open the live page or the viewer of a run.
+    """Open the live page of a run, or show the run in a viewer.
 
     Only the modules that the page or viewer needs are imported.
 

@@ -1,4 +1,4 @@
-"""Limit the CPU time of an activity that runs alongside a run."""
+"""Limit the CPU time of a background activity during a run."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 
 class CpuShare:
-    """Limit an activity to a share of a CPU core.
+    """Limiter of an activity to a fraction of a CPU core.
 
     Only CPU time counts, not time spent waiting.
     """
@@ -29,7 +29,7 @@ class CpuShare:
 
     @contextmanager
     def use(self, pause_s: float = 0.0) -> Iterator[None]:
-        """Measure the CPU time of the body, and delay the next use accordingly.
+        """Measure the CPU time of the body to determine when the activity may run again.
 
         The delay is the CPU time divided by the share, plus `pause_s`.
         """

@@ -1,4 +1,4 @@
-"""Point formats that the pages of results offer for download."""
+"""Point cloud formats that can be downloaded from the pages of results."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ DOWNLOADS = ("ply", "las", "parquet")  # formats that a page offers
 
 
 def downloads() -> DownloadFormats:
-    """Return the download formats whose packages are installed, with their writer."""
+    """Return the download formats whose required packages are installed, with their writer."""
     return DownloadFormats([name for name in DOWNLOADS if ExportSpec(name).installed], save_cloud)

@@ -1,4 +1,4 @@
-"""Web page of a data set, which lists the jobs and shows the points of each."""
+"""Web page of a data set, which lists its jobs and displays the points of each job."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _MAX_VIEWS = 4  # maximum number of jobs whose points are kept in memory
 
 
 class JobList:
-    """Request handler for the page of a data set at a folder or URL.
+    """Request handler for the page of a data set in a folder or at a URL.
 
     Raises
     ------
@@ -55,7 +55,7 @@ class JobList:
         self.title = self.location.rstrip("/").rpartition("/")[2] or self.location
 
     def answer(self, question: str, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Answer a request for the job list or from the viewer of a job."""
+        """Answer a request from the job list or from the viewer of a job."""
         if question == "jobs":
             return self._list(), {}
         match = re.fullmatch(r"job/(\d+)/(\w+)", question)
@@ -64,7 +64,7 @@ class JobList:
         return self.view_of(int(match[1])).answer(match[2], arguments, abandoned)
 
     def _list(self) -> dict[str, Any]:
-        """Return the page state and the job list as JSON-compatible objects."""
+        """Return the state of the page and the job list as JSON-compatible objects."""
         done = [row for row in self.rows if row.done]
         failed = [row for row in self.rows if not row.done]
         sums = Counter(points=0, rays=0)
@@ -95,7 +95,7 @@ class JobList:
         }
 
     def _entry(self, row: JobRow) -> dict[str, Any]:
-        """Return a row of the job table."""
+        """Return the entry of the job list for a job."""
         return {
             "number": row.number,
             "name": row.name,
@@ -126,7 +126,7 @@ class JobList:
             return self._views[number]
 
     def _open(self, row: JobRow) -> View:
-        """Read all sweeps of a job."""
+        """Read all sweeps of a job, and return a view of their points."""
         name = job_file(self._index["format"], row.name, SWEEPS_FILE)
         saved = Sweeps.load(self._storage.path(name), partial(self._storage.read, name))
         saved = replace(saved, coordinates="world")
@@ -139,7 +139,7 @@ class JobList:
 
 
 def show_jobs(jobs: JobList, *, port: int, browser: bool = True) -> None:
-    """Show a job list in the browser until Ctrl-C."""
+    """Show a job list in the browser until Ctrl-C is pressed."""
     stopped = threading.Event()
     with page_server(jobs.answer, port, stopped.set, index="jobs.html") as page:
         words = f"{page.url} shows {plural(len(jobs.rows), 'job')}. Press Ctrl-C to stop."
@@ -148,7 +148,7 @@ def show_jobs(jobs: JobList, *, port: int, browser: bool = True) -> None:
 
 
 def _format_value(value: Value | None) -> str:
-    """Format a value of a job, or return an empty string for None."""
+    """Format a varied value of a job, or return an empty string for None."""
     if value is None:
         return ""
     if isinstance(value, bool):

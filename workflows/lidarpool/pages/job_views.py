@@ -1,4 +1,4 @@
-"""Views of the jobs of a run: the only job, recent jobs whose points were read, or written jobs."""
+"""Views of the jobs of a run, showing points that were read or jobs that were written."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAX_VIEWS = 4  # maximum number of jobs with points, since a browser may show an
 
 
 class JobViews:
-    """Views of jobs whose points were read, and of jobs that were written to a data set."""
+    """Views of jobs whose points have been read, and of jobs in a data set."""
 
     def __init__(self) -> None:
         self.jobs: dict[int, LiveJob] = {}  # by job number, newest last
@@ -36,20 +36,20 @@ class JobViews:
 
     @property
     def opens_written(self) -> bool:
-        """Whether jobs can be opened after they were written."""
+        """Whether jobs can be opened once they have been written."""
         return self._written is not None
 
     def follow(self, dataset: DataSet) -> None:
-        """Make the jobs of a data set available if each job has a local folder."""
+        """Make the jobs of a data set available for viewing, if each job has a local folder."""
         if dataset.format == "folder" and dataset.storage.is_local:
             self._written = dataset.storage
 
     def request_newest(self) -> None:
-        """Record that a browser requested points of the newest job."""
+        """Record that a browser has requested points of the newest job."""
         self._requested_at = time.monotonic()
 
     def read(self, row: JobRow, job: StoredJob, is_only: bool) -> None:
-        """Read the points of a job, if it is the only job or a browser shows points of jobs.
+        """Read the points of a job if it is the only one, or if a browser displays points of jobs.
 
         The points of the first job are always read. Those of other jobs are only read if the CPU
         share permits it.
@@ -65,7 +65,7 @@ class JobViews:
                 self.jobs = {number: jobs[number] for number in [*jobs][-MAX_VIEWS:]}
 
     def view(self, number: int, name_of: Callable[[int], str]) -> View:
-        """Return the view of a job that was read or written.
+        """Return the view of a job that has been read or written.
 
         Raises
         ------

@@ -19,7 +19,7 @@ MAX_UNDER_WAY = 12
 
 
 class RecentJobs:
-    """The most recent jobs of a run, with totals over all jobs that have ended.
+    """Most recent jobs of a run, and totals over all jobs that have ended.
 
     `names` are the names of the values that the jobs vary, in the order of the table columns.
     """
@@ -33,14 +33,14 @@ class RecentJobs:
         self._failures: deque[dict[str, Any]] = deque(maxlen=MAX_FAILED)
 
     def update(self, under_way: Callable[[], Sequence[Mapping[str, Any]]], is_last: bool) -> None:
-        """Update the running jobs if the last update is old or this update is the last one."""
+        """Update the running jobs if enough time has passed or if `is_last` is set."""
         time_s = time.monotonic()
         if time_s >= self._list_at or is_last:
             self._list_at = time_s + LIST_EVERY_S
             self.under_way = under_way()
 
     def end(self, row: JobRow, opens: bool) -> None:
-        """Count a job, and move its entry from the running jobs to the ended jobs.
+        """Count a job that has ended, and move it from the running jobs to the ended jobs.
 
         `opens` states whether the page can open the job.
         """
@@ -63,7 +63,7 @@ class RecentJobs:
         return str(names[number])
 
     def news(self, readable: Container[int]) -> dict[str, Any]:
-        """Return the lists as JSON-compatible objects.
+        """Return the job lists as JSON-compatible objects.
 
         Jobs whose numbers are in `readable` can be opened as well.
         """
@@ -83,7 +83,6 @@ class RecentJobs:
         }
 
     def _format_values(self, values: Mapping[str, Value | None]) -> list[str]:
-        """Format values in the order of the table columns. Missing values are empty strings."""
         shown = ("" if (value := values.get(name)) is None else value for name in self._names)
         words = (rounded(value, 4) if isinstance(value, float) else value for value in shown)
         return [str(value).lower() if isinstance(value, bool) else str(value) for value in words]

@@ -1,4 +1,4 @@
-"""Charts of the jobs of a run, which are drawn with a small share of a CPU core."""
+"""Charts of a run's jobs, which are drawn using a small fraction of a CPU core."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DRAWING_SHARE = 0.06  # maximum share of a CPU core, since drawing takes 0.5 to 
 
 
 class Charts:
-    """Charts of varied quantities and of results, which are updated while a browser shows them.
+    """Charts of varied quantities and results, which are updated while a browser displays them.
 
     Only a few numbers of each job are kept. At the end, the run draws its own pictures first,
     because Matplotlib can only draw in one thread.
@@ -34,12 +34,12 @@ class Charts:
         self._svg = ""
 
     def add(self, row: JobRow) -> None:
-        """Add the statistics of a job."""
+        """Add the table row of a job to the statistics."""
         with self._lock:
             self._figures.add(row)
 
     def version(self, over: bool) -> int:
-        """Return the number of jobs that `drawn` would include.
+        """Return how many jobs the charts would include if `drawn` were called now.
 
         The number only changes if the charts are due to be drawn again.
         """
@@ -50,7 +50,7 @@ class Charts:
         return jobs if over or (is_due and jobs < self._count) else self._drawn
 
     def drawn(self, over: bool) -> str:
-        """Return the charts as HTML elements, and draw them again if they are due."""
+        """Return the charts as HTML elements, redrawing them if an update is due."""
         with self._drawing:
             if self.version(over) != self._drawn:
                 with self._lock:  # held briefly, so that the run does not wait for the drawing

@@ -1,4 +1,4 @@
-"""Points and hits of a running job, from those of its parts that there is time to read."""
+"""Points and hits of a running job, read from as many of its parts as time permits."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MAX_FRAMES = 40  # maximum number of frames whose rays are shown
 
 
 class LiveJob:
-    """View of a running job, which samples those of its parts that there is time to read.
+    """View of a running job, which samples as many of its parts as time permits.
 
     The thread of the run adds parts, and the threads of the page read them. When the run ends, an
     evenly spaced sample of the complete result replaces the points, so skipped parts do not matter.
@@ -64,20 +64,20 @@ class LiveJob:
     # -- called by the run --------------------------------------------------------------
 
     def add(self, receipts: Sequence[Receipt]) -> None:
-        """Record stored parts without reading them."""
+        """Record that parts have been stored, without reading them."""
         with self._lock:
             self._waiting += [part.name for part in receipts]
             while len(self._waiting) > MAX_WAITING_PARTS:
                 del self._waiting[1::2]
 
     def read_all(self) -> None:
-        """Read all pending parts of a finished job before they are removed."""
+        """Read all pending parts of a finished job before they are deleted."""
         while self._waiting:
             self.gather()
         self._all_read = True
 
     def finish(self, result: RunResult | None) -> None:
-        """Replace the points with a sample of the result, and the hit counts with its counts.
+        """Show a sample of the result's points, and its hit counts.
 
         Afterward, the parts may be removed.
         """
@@ -93,7 +93,7 @@ class LiveJob:
         self._end_version += 1
 
     def show_file(self, cloud: Path) -> None:
-        """Show the written cloud with its sweeps, because the parts have been removed."""
+        """Show the written cloud and its sweeps, because the parts have been deleted."""
         view = self.view
         view.sweeps = self._job.sweeps
         view.replace_points(
@@ -129,7 +129,7 @@ class LiveJob:
         self._show()
 
     def hit_counts(self) -> Floats:
-        """Return the hit counts of the scene.
+        """Return the values of the scene's hit counters.
 
         If some parts were not read, the counts are scaled to the total number of hits.
         """
@@ -140,7 +140,7 @@ class LiveJob:
 
     @property
     def view(self) -> View:
-        """View of the job, which is created on first use."""
+        """View of the job, which is created when it is first used."""
         with self._making:
             if self._view is None:
                 job = self._job
@@ -155,13 +155,12 @@ class LiveJob:
             return self._view
 
     def _show(self) -> None:
-        """Update the points of the view, if it has been created."""
         with self._making:
             if self._view is not None:
                 self._view.replace_points(InMemoryPoints(self.cloud))
 
     def news(self) -> Answer:
-        """Return the changes since the last request, during or after the run."""
+        """Return what has changed since the last request, both during and after the run."""
         view = self.view
         frames = [] if self._end_version else list(self.frames)
         planning = self._job.planning
@@ -183,6 +182,9 @@ class LiveJob:
 
 
 def _sample_rays(frames: list[ScanFrame]) -> Floats32:
-    """Return the sample rays of frames in local coordinates, of shape (n, 2, 3)."""
+    """Return the sample rays of frames in local coordinates.
+
+    The array has shape (n, 2, 3).
+    """
     pairs = ((np.full_like(frame.samples, frame.pose.position), frame.samples) for frame in frames)
     return np.concatenate([np.stack(pair, axis=1) for pair in pairs]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Live page of a run, which shows its jobs during the run and until the page is closed.
+"""Live page of a run, which shows the run's jobs until the page is closed.
 
 The run calls the page in its own thread, passes updates to it, and never waits for a browser. Parts
 are read when a page requests updates, or by the thread that removes the files of ended jobs. Charts
@@ -45,7 +45,7 @@ from .run_status import PartitionLoads, RunStatus
 
 
 class LivePage(RunPage):
-    """Live page of a run with several jobs, or with a single job."""
+    """Live page of a run that has one or several jobs."""
 
     page: PageServer
 
@@ -63,14 +63,14 @@ class LivePage(RunPage):
     # -- called by the run --------------------------------------------------------------
 
     def begun(self, job: StoredJob) -> None:
-        """Show the only job, including scans that were committed earlier."""
+        """Show the only job of a run, including scans that were committed earlier."""
         if job.committed_text:
             self._status.progress = job.progress()
         self._views.jobs = {0: LiveJob(job)}
         self._status.state = "starting the worker processes"
 
     def follow(self, partitions: Mapping[str, Partition], dataset: DataSet | None = None) -> None:
-        """Show the running jobs, the busy slots of the partitions, and the written jobs."""
+        """Show running jobs, busy slots and written jobs."""
         self._loads.partitions = partitions
         if dataset is not None:
             self._views.follow(dataset)
@@ -79,17 +79,17 @@ class LivePage(RunPage):
         )
 
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
-        """Record committed parts of the only job."""
+        """Record parts that the only job has committed."""
         self._views.jobs[0].add(receipts)
 
     def on_frame(self, frame: ScanFrame) -> None:
-        """Record a frame, which is shown unless many frames arrive at once."""
+        """Record a frame to be shown. Frames are skipped if many arrive at once."""
         self._views.jobs[0].frames.append(frame)
 
     def on_progress(
         self, progress: Progress, under_way: Callable[[], Sequence[Mapping[str, Any]]]
     ) -> None:
-        """Record the progress.
+        """Record the progress of the run.
 
         Raises
         ------
@@ -108,16 +108,16 @@ class LivePage(RunPage):
         self._loads.poll()
 
     def ended(self, row: JobRow) -> None:
-        """Count a job, and move its entry from the running jobs to the ended jobs."""
+        """Count a job that has ended, and move it from the running jobs to the ended jobs."""
         self._listed.end(row, opens=row.done and self._views.opens_written)
         self._charts.add(row)
 
     def look(self, row: JobRow, job: StoredJob) -> None:
-        """Read the points of a job if a browser shows points and the CPU share permits it."""
+        """Read the points of a job if a browser displays points and the CPU limit permits it."""
         self._views.read(row, job, is_only=self._count == 1)
 
     def finish(self, seconds: float, result: RunResult | None = None) -> None:
-        """Show that the run has finished, and show the result of a survey.
+        """Show that the run has finished, with the result if it was a survey.
 
         Afterward, the parts of the survey may be removed.
         """
@@ -128,7 +128,7 @@ class LivePage(RunPage):
         self._status.finish(seconds, None if result is None else len(result.points))
 
     def stay(self, cloud: Path | None = None) -> None:
-        """Keep the page open until Ctrl-C or until a user stops it.
+        """Keep the page open until Ctrl-C is pressed or a user stops it.
 
         The points of a survey are read from the written `cloud`, because the parts have been
         removed.
@@ -143,7 +143,7 @@ class LivePage(RunPage):
     # -- called by the page -------------------------------------------------------------
 
     def answer(self, question: str, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Answer a request for the job list or from the viewer of a job."""
+        """Answer a request from the job list or from the viewer of a job."""
         if question == "jobs":
             if arguments.get("newest"):
                 self._views.request_newest()
@@ -207,7 +207,7 @@ def live_page(
     port: int = PORT,
     browser: bool = True,
 ) -> Iterator[LivePage]:
-    """Serve the live page of a run while the body runs, and print its address."""
+    """Serve the live page of a run during the body, and print its address."""
     live = LivePage(jobs, names, title)
     index = VIEWER if jobs == 1 else "jobs.html"
     with (

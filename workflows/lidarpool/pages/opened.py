@@ -1,4 +1,4 @@
-"""Open the files that lidarpool reads or writes in the viewer, and offer points for download.
+"""Open files that lidarpool reads or writes in the viewer, and provide them for download.
 
 Results, clouds, recordings, exports, meshes and scenarios are opened as one view each. A data set
 is opened as a list of jobs with one view each (see `job_list`).
@@ -32,7 +32,7 @@ _HEADER_BYTES = 1 << 16  # maximum size of a .ply header, which names the elemen
 
 
 def is_data_set(place: Path | Storage) -> bool:
-    """Return whether a folder or URL contains a data set with jobs, finished or not."""
+    """Return whether a folder or URL contains a complete or incomplete data set of jobs."""
     if isinstance(place, Storage):
         with explained(f"{place.url} cannot be read"):
             return INDEX_FILE in place.entries()
@@ -42,7 +42,7 @@ def is_data_set(place: Path | Storage) -> bool:
 
 
 def open_views(paths: Sequence[Path], **options: Any) -> View:
-    """Open several files and folders as one view of all their points.
+    """Open several files and folders in a single view.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def open_view(
 
 
 def _is_previewed(path: Path) -> bool:
-    """Return whether a path is a scenario or a mesh.
+    """Return whether the path is that of a scenario or a mesh.
 
     Raise LidarError if the file cannot be read.
     """
@@ -141,7 +141,6 @@ def _is_previewed(path: Path) -> bool:
 
 
 def _open_recorded(path: Path, title: str, keep_noise: bool, on_part: OnPart) -> View:
-    """Open a recording."""
     from ..recordings.opening import UnknownFormatError, open_sensors
     from .recorded import recorded_view
 
@@ -165,7 +164,7 @@ def _open_recorded(path: Path, title: str, keep_noise: bool, on_part: OnPart) ->
 
 
 def growing_view(path: Path, *, keep_noise: bool = False) -> ProgressiveView | None:
-    """Return a view of a large .las or .laz file that shows more points while they are read.
+    """Return a view of a large .las or .laz file, to which points are added as they are read.
 
     Return None for other files and folders.
 
@@ -189,14 +188,12 @@ def growing_view(path: Path, *, keep_noise: bool = False) -> ProgressiveView | N
 
 
 def _preview(path: Path, of_mesh: Mapping[str, Any], tell: Callable[[str], None]) -> View:
-    """Return a preview of a scenario or mesh."""
     from .preview import scenario_view
 
     return scenario_view(path, of_mesh, tell)
 
 
 def _has_faces(path: Path) -> bool:
-    """Return whether the header of a .ply file declares faces, so that the file is a mesh."""
     with open_input(path) as file:
         header = file.read(_HEADER_BYTES).partition(b"end_header")[0]
     lines = (line.split() for line in header.splitlines())
@@ -204,7 +201,7 @@ def _has_faces(path: Path) -> bool:
 
 
 def refuse_unfinished(path: Path) -> None:
-    """Raise LidarError if a folder contains an unfinished run and no cloud."""
+    """Raise LidarError if a folder contains an unfinished run but no cloud."""
     from ..run.store.database import FILE
     from ..run.store.run_store import RUN_FOLDER
 

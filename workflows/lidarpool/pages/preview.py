@@ -1,4 +1,4 @@
-"""Views of scenarios and meshes before a run: scene, sensors, trajectories and first sweeps."""
+"""Previews of scenarios and meshes, with their scene, sensors, trajectories and first sweeps."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def scenario_view(
     of_mesh: Mapping[str, Any] = MappingProxyType({}),
     tell: Callable[[str], None] = lambda note: None,
 ) -> View:
-    """Return a preview of a scenario, of the first job of a campaign, or of a mesh file.
+    """Return a preview of a scenario, of a campaign's first job, or of a mesh file.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def scenario_view(
 
 
 def _with_materials(scenario: Scenario) -> Scenario:
-    """Return a copy of a scenario that stores the material of each point.
+    """Return a copy of a scenario in which the material of each point is stored.
 
     The faces of the scene then have materials as well.
     """
@@ -76,7 +76,7 @@ def _with_materials(scenario: Scenario) -> Scenario:
 
 
 def job_preview(job: Job, note: str, title: str) -> View:
-    """Simulate the first sweeps of a job, and return their view."""
+    """Simulate the first sweeps of a job, and return a view of them."""
     planning = planning_picture(job.planning)
     content, _ = PictureContent.before_casting(job.scene, job.survey, planning)
     cloud = Cloud.concatenate([*first_sweeps(job)])
@@ -88,7 +88,7 @@ def job_preview(job: Job, note: str, title: str) -> View:
 
 
 def first_sweeps(job: Job) -> Iterator[Cloud]:
-    """Simulate the first sweep of each sensor of a job in this process, in scan order."""
+    """Simulate the first sweep of each sensor in this process, and yield them in scan order."""
     sweeps = job.sweeps
     survey = job.survey
     if not len(sweeps):

@@ -1,4 +1,4 @@
-"""Views of recordings and of clouds from other programs, which are held in memory."""
+"""Views of recordings and of clouds from other programs, whose points are kept in memory."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ ASPRS_CLASSES = (
 
 
 def finite_points(sweep: Sweep) -> Sweep:
-    """Return the points with finite coordinates, and the columns with one number per point."""
+    """Return the points with finite coordinates and all columns with one number per point."""
     arrays = {name: np.asarray(values) for name, values in sweep.columns.items()}
     columns = {
         name: values
@@ -54,7 +54,7 @@ def finite_points(sweep: Sweep) -> Sweep:
 
 
 def merge_sweeps(sweeps: Sequence[Sweep], **further: AnyArray) -> Cloud:
-    """Merge sweeps into a cloud with the columns that all sweeps have.
+    """Merge sweeps into a cloud with the columns that all of them have.
 
     Columns that only contain zeros are omitted. Sweeps without points may lack columns. `further`
     are additional columns of all points.
@@ -78,7 +78,7 @@ def merge_sweeps(sweeps: Sequence[Sweep], **further: AnyArray) -> Cloud:
 
 
 def _native(name: str, values: AnyArray) -> AnyArray:
-    """Return values in native byte order, with bytes for colors and booleans."""
+    """Convert values to native byte order, and colors and booleans to bytes."""
     if name in COLORS and values.dtype.kind == "f" and np.isnan(values).any():
         return np.nan_to_num(values, nan=_GRAY).astype(np.uint8)
     kind = np.dtype(np.uint8) if values.dtype == np.bool_ else values.dtype
@@ -86,7 +86,7 @@ def _native(name: str, values: AnyArray) -> AnyArray:
 
 
 def _describe_column(name: str, values: AnyArray) -> Column:
-    """Return the description of a column, from the standard table if the type matches."""
+    """Return a column's standard description if its type matches, or else a new description."""
     known = TABLE.get(name)
     if known is not None and np.dtype(known.dtype) == values.dtype:
         return known
@@ -102,7 +102,7 @@ def recorded_view(
     downloads: DownloadFormats | None,
     on_part: OnPart = lambda *_: None,
 ) -> View:
-    """Return a view of the sensors of a recording, with playback of its sweeps.
+    """Return a view that plays back the sweeps of a recording's sensors.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def recorded_view(
 
 
 def _station_names(recording: Recording, sweeps: Sweeps) -> list[str]:
-    """Return the names of the stations, indexed by station number.
+    """Return the station names, indexed by station number.
 
     Number 0 means that there is no station. Unnamed stations have empty names.
     """
@@ -163,7 +163,7 @@ def _station_names(recording: Recording, sweeps: Sweeps) -> list[str]:
 
 
 def sampled_view(recording: Recording, title: str) -> tuple[View, Sweep]:
-    """Return a view of a sample of a cloud, and the points of the sample.
+    """Return a view of a sample of a cloud, and the points in this sample.
 
     The recording must have `Recording.sample`. The sample consists of runs of consecutive points,
     which are read within a second.
@@ -182,7 +182,7 @@ def sampled_view(recording: Recording, title: str) -> tuple[View, Sweep]:
 def growing_view(
     recording: Recording, title: str, read: Callable[[OnPart], View]
 ) -> ProgressiveView:
-    """Return a view that shows a sample of a cloud, and more points while `read` reads it."""
+    """Return a view of a sample of a cloud, to which `read` adds points."""
     total = recording.point_count or 0
     sampled, sample = sampled_view(recording, title)
     parts = [sample]
@@ -199,7 +199,7 @@ def growing_view(
 
 
 def _read_cloud(recording: Recording, on_part: OnPart) -> Cloud:
-    """Read a cloud, or evenly spaced points of a large cloud."""
+    """Read a cloud, or evenly spaced points of it if it is large."""
     total = recording.point_count or 0
     step = max(1, -(-total // MAX_POINTS))
     parts: list[Sweep] = []
@@ -212,7 +212,7 @@ def _read_cloud(recording: Recording, on_part: OnPart) -> Cloud:
 
 @dataclass(frozen=True, eq=False)
 class _TimedSweep:
-    """Time, sensor and number of a sweep that has not been read."""
+    """Time, sensor and number of a sweep that has not been read yet."""
 
     begins_ns: float
     sensor: int
@@ -220,7 +220,7 @@ class _TimedSweep:
 
 
 def _sort_sweeps(sensors: Sequence[Recording]) -> tuple[list[_TimedSweep], bool]:
-    """Return the sweeps of all sensors in order of time, and whether their times are known."""
+    """Return the sweeps of all sensors, sorted by time, and whether their times are known."""
     sweeps: list[_TimedSweep] = []
     is_timed = True
     for sensor, recording in enumerate(sensors):
@@ -241,7 +241,7 @@ def _sort_sweeps(sensors: Sequence[Recording]) -> tuple[list[_TimedSweep], bool]
 
 
 def _read_sweeps(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[str]]:
-    """Read sweeps up to the point limit, and return their points, the sweeps, and notes."""
+    """Read sweeps up to the point limit, and return the points, the sweeps and notes."""
     recordings = [*sensors.values()]
     ordered, is_timed = _sort_sweeps(recordings)
     frame_poses = [_frame_poses(recording) for recording in recordings]
@@ -275,7 +275,10 @@ def _read_sweeps(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[
 
 
 def _frame_poses(recording: Recording) -> Floats | None:
-    """Return the sweep poses from the frames of a bag, of shape (n, 4, 4), or None."""
+    """Return the pose of each sweep from the frames of a bag, or None.
+
+    The array has shape (n, 4, 4).
+    """
     has_frames = recording.read_poses is not None
     return recording.poses(range(len(recording))) if has_frames else None
 
@@ -283,7 +286,7 @@ def _frame_poses(recording: Recording) -> Floats | None:
 def recorded_sweeps(
     ordered: Sequence[_TimedSweep], poses: Sequence[Floats | None], names: Sequence[str]
 ) -> Sweeps:
-    """Return sweeps that consist of one scan each, without actors.
+    """Return sweeps without actors, each of which consists of a single scan.
 
     `names` are the names of the sensors.
     """

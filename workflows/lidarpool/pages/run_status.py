@@ -1,4 +1,4 @@
-"""Status of a run: its state, rate, stages, and the load of its partitions."""
+"""Status of a run, including its state, rate, stages and partition loads."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAX_LOADS = 6  # number of polls that are averaged
 
 
 class RunStatus:
-    """State of a run with its latest progress, rate, and remaining time."""
+    """State of a run, with its latest progress, its rate and the remaining time."""
 
     def __init__(self) -> None:
         self.state = "starting"
@@ -37,7 +37,7 @@ class RunStatus:
         self._time_left = ""
 
     def update(self, progress: Progress) -> None:
-        """Record the progress, and derive the rate and the remaining time."""
+        """Record the progress, and estimate the rate and the remaining time."""
         self.progress = progress
         counts = (progress.collected, progress.scans)
         unit = ""
@@ -53,7 +53,7 @@ class RunStatus:
             self._time_left = self._pace.time_left(progress.seconds, *counts)
 
     def finish(self, seconds: float, points: int | None) -> None:
-        """Record the end of the run, and the number of points in the result of a survey."""
+        """Record that the run has ended, and how many points the result of a survey has."""
         if self.progress is not None:
             points = self.progress.points if points is None else points
             self.progress = replace(self.progress, seconds=seconds, points=points)
@@ -86,7 +86,7 @@ class RunStatus:
 
 
 class PartitionLoads:
-    """Recent load statistics of the partitions of a run."""
+    """Recent loads of the partitions of a run."""
 
     def __init__(self) -> None:
         self.partitions: Mapping[str, Partition] = {}
@@ -94,7 +94,7 @@ class PartitionLoads:
         self._poll_at = 0.0
 
     def poll(self) -> None:
-        """Poll the partitions if the last statistics are old."""
+        """Poll the partitions if the latest statistics are old."""
         time_s = time.monotonic()
         if time_s < self._poll_at:
             return
@@ -104,16 +104,16 @@ class PartitionLoads:
             self._loads.append((time_s, stats))
 
     def clear(self) -> None:
-        """Discard the statistics at the end of the run."""
+        """Discard the statistics when the run has ended."""
         self._loads.clear()
 
     def slots(self) -> list[Any]:
-        """Return the busy slots (see `busy_slots`)."""
+        """Return the busy slots as described in `busy_slots`."""
         return busy_slots(list(self._loads))
 
 
 def busy_slots(loads: Sequence[tuple[float, Mapping[str, PartitionStats]]]) -> list[Any]:
-    """Return the label, the fraction of busy slots, and the number of slots of each partition.
+    """Return each partition's label, its fraction of busy slots, and its number of slots.
 
     `loads` are pairs of a time in seconds and the statistics at that time. Short tasks may end
     between two polls, and long tasks only end after all polls. The load is therefore estimated both

@@ -1,4 +1,4 @@
-"""Live page of scanners, which shows their sweeps in the browser while a program runs.
+"""Live page that shows the sweeps of scanners in the browser while a program runs.
 
 The program hands over a sweep and continues. The page keeps only the newest sweep of each scanner,
 and prepares it when a browser requests an update, within a small share of a CPU core. Sweeps in
@@ -56,7 +56,7 @@ _RATE_SWEEPS = 20  # number of sweeps over which the rate is averaged
 def show(
     scanner: Scanner | Sequence[Scanner], *, to: str | None = None, browser: bool = False
 ) -> ScannerPage:
-    """Show the sweeps of a scanner in the browser, in real time, on the page of `lidarpool view`.
+    """Show the sweeps of a scanner in the browser in real time.
 
     Scripts print the address of the page. In a notebook, the page is shown in the cell if the
     returned object is the value of the cell or is passed to `display`.
@@ -97,7 +97,7 @@ def show(
 
 
 class ScannerPage(ScannerView):
-    """Live page of scanners in real time, which is created by `show`."""
+    """Live page created by `show`, which displays sweeps in real time."""
 
     def __init__(self, scanners: Sequence[Scanner], to: str | None, browser: bool) -> None:
         names = [_name(scanner) for scanner in scanners]
@@ -123,7 +123,7 @@ class ScannerPage(ScannerView):
 
     @property
     def description(self) -> str:
-        """Message for users that contains the address."""
+        """Message for users, which contains the address of the page."""
         return f"The page is available at {self.url}"
 
     @property
@@ -132,7 +132,6 @@ class ScannerPage(ScannerView):
         return self._page.url
 
     def _repr_html_(self) -> str:
-        """Return the page as a frame for a notebook cell."""
         if self._is_closed:
             return "<p>This page has been closed.</p>"
         return notebook_html(self._page, f"sweeps of {self._scanner.survey.sensor.model}")
@@ -145,13 +144,12 @@ class ScannerPage(ScannerView):
 
 
 def _name(scanner: Scanner) -> str:
-    """Return the name of a scanner, which may be empty."""
     return scanner.survey.carried[0].name
 
 
 @dataclass(eq=False)
 class _Sensor:
-    """Newest sweep of a scanner, and the recent positions of its sensor."""
+    """Newest sweep of a scanner, and recent positions of its sensor."""
 
     scanner: Scanner
     cloud: Cloud | None = None  # None before the first sweep
@@ -161,7 +159,7 @@ class _Sensor:
 
     @property
     def positions(self) -> SensorPositions:
-        """Positions of the sensor at its recent sweeps."""
+        """Positions of the sensor during its recent sweeps."""
         rows = np.array(self.trail or [(0.0, *self.pose.position)])
         (mounted,) = self.scanner.survey.carried
         return SensorPositions(
@@ -169,7 +167,7 @@ class _Sensor:
         )
 
     def points(self, columns: Sequence[str], origin: Floats) -> tuple[AnyFloats, list[AnyArray]]:
-        """Return the points of the sweep in world coordinates, and some of their columns."""
+        """Return the points of the sweep in world coordinates, with values of the given columns."""
         if self.cloud is None:
             kinds = {column.name: column.dtype for column in self.scanner.survey.stored_columns}
             return np.zeros((0, 3)), [np.zeros(0, kinds[name]) for name in columns]
@@ -181,7 +179,7 @@ class _Sensor:
 
 
 class SweepFeed:
-    """Newest sweeps of scanners, and the request handler of their page."""
+    """Newest sweeps of several scanners, and the request handler of their page."""
 
     def __init__(self, scanners: Sequence[Scanner]) -> None:
         self._sensors = [_Sensor(scanner) for scanner in scanners]
@@ -200,7 +198,7 @@ class SweepFeed:
     # -- called by the program ----------------------------------------------------------
 
     def put(self, scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> None:
-        """Replace the newest sweep of a scanner."""
+        """Replace the newest sweep of the given scanner."""
         name = _name(scanner)
         names = [_name(sensor.scanner) for sensor in self._sensors]
         if name not in names:
@@ -238,7 +236,7 @@ class SweepFeed:
 
     @property
     def view(self) -> View:
-        """View of the newest sweeps, which is created at the first request."""
+        """View of the newest sweeps, which is created for the first request."""
         with self._making:
             if self._view is None:
                 scanner = self._sensors[0].scanner
@@ -254,7 +252,7 @@ class SweepFeed:
             return self._view
 
     def _news(self) -> dict[str, Any]:
-        """Return the number and rate of sweeps as JSON-compatible objects.
+        """Return the number of sweeps and their rate as JSON-compatible objects.
 
         The displayed points are updated if necessary.
         """
@@ -286,7 +284,7 @@ class SweepFeed:
         }
 
     def _version(self) -> int:
-        """Update the displayed points if newer ones are due, and return their version."""
+        """Update the displayed points if newer ones are available, and return their version."""
         if not self._count:
             return 0
         view = self.view
@@ -300,7 +298,7 @@ class SweepFeed:
         return view.version
 
     def _cloud(self) -> Cloud:
-        """Merge the newest sweeps of all sensors, with the columns that all sensors have."""
+        """Merge the newest sweeps of all sensors, using the columns that all sensors have."""
         with self._lock:
             sensors = [replace(sensor) for sensor in self._sensors]
         tables = [[column.name for column in s.scanner.survey.stored_columns] for s in sensors]
@@ -317,7 +315,7 @@ class SweepFeed:
         return Cloud(np.concatenate([positions for positions, _ in parts]), columns, custom)
 
     def _moving_objects(self) -> dict[str, AnyArray]:
-        """Return arrays of sensor positions, in local coordinates, and of actor poses."""
+        """Return the sensor positions in local coordinates and the actor poses, as named arrays."""
         with self._lock:
             scene = self._scene
             time_ns = self._time_ns
@@ -330,7 +328,7 @@ class SweepFeed:
 
 
 def _actor_poses(scene: Scene, time_ns: float) -> dict[str, AnyArray]:
-    """Return the poses, animation frames and presence of actors at a time."""
+    """Return the poses, animation frames and presence of the actors at a given time."""
     poses = [pose_at(actor.trajectory, time_ns) for actor in scene.actors]
     rotations = np.array([pose.rotation_matrix for pose in poses]).reshape(-1, 3, 3)
     frames = np.zeros(len(poses))

@@ -1,4 +1,4 @@
-"""Show a run in Foxglove or Rerun, with its trajectories, planned path, and sweeps as they finish.
+"""Show a run in Foxglove or Rerun, with its trajectories, planned path and finished sweeps.
 
 The thread of the run only records which sweeps are finished. A separate thread reads their parts
 and sends them, within a small share of a CPU core. If sweeps finish faster than that, every second
@@ -54,7 +54,7 @@ _WAIT_S = 0.05
 
 
 class ViewerPage(RunPage):
-    """Sweeps of a run in a viewer.
+    """Page that shows the sweeps of a run in a viewer.
 
     The sweeps of a survey are shown as they finish, and those of a campaign job by job.
     """
@@ -65,28 +65,28 @@ class ViewerPage(RunPage):
         self._share = CpuShare(READING_SHARE)
 
     def begun(self, job: StoredJob) -> None:
-        """Show the only job of a run."""
+        """Show the only job of the run."""
         self._survey = SurveyFeed(job, self._viewer)
 
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
-        """Record committed parts of the only job."""
+        """Record parts that the only job has committed."""
         if self._survey is not None:
             self._survey.add(receipts)
 
     def on_frame(self, frame: ScanFrame) -> None:
-        """Record that a scan of the only job, and all earlier scans, are in storage."""
+        """Record that a scan of the only job, and all earlier scans, have been stored."""
         if self._survey is not None:
             self._survey.finish_scan(frame.scan)
 
     def on_progress(
         self, progress: Progress, under_way: Callable[[], Sequence[Mapping[str, Any]]]
     ) -> None:
-        """Show the planned path once all trials have ended."""
+        """Show the planned path when all trials have ended."""
         if self._survey is not None:
             self._survey.show_path()
 
     def look(self, row: JobRow, job: StoredJob) -> None:
-        """Show a finished job of a campaign before its parts are removed."""
+        """Show a finished job of a campaign before its parts are deleted."""
         if self._share.due:
             with self._share.use(SHOW_EVERY_S), suppress(LidarError):
                 reader = SweepReader(job)
@@ -110,14 +110,14 @@ class ViewerPage(RunPage):
             self._survey.stop()
 
     def stay(self, cloud: Path | None = None) -> None:
-        """Keep the viewer open until Ctrl-C."""
+        """Keep the viewer open until Ctrl-C is pressed."""
         click.echo(f"{self._viewer.description}. Press Ctrl-C to stop.", err=True)
         wait_for_interrupt()
 
 
 @contextmanager
 def viewer_page(name: str, title: str) -> Iterator[ViewerPage]:
-    """Show a run in a viewer while the body runs, and print how to open the viewer."""
+    """Show a run in a viewer during the body, and print how to open the viewer."""
     with open_viewer(name, title=title) as viewer:
         click.echo(viewer.description, err=True)
         page = ViewerPage(viewer)
@@ -128,7 +128,7 @@ def viewer_page(name: str, title: str) -> Iterator[ViewerPage]:
 
 
 class SweepReader:
-    """Reader for the sweeps of a job, which are stored in parts."""
+    """Reader for the sweeps of a job that are stored in parts."""
 
     def __init__(self, job: StoredJob) -> None:
         self._job = job.job
@@ -139,19 +139,19 @@ class SweepReader:
         self._last: tuple[str, Cloud] | None = None  # most recently read part
 
     def add(self, receipts: Sequence[Receipt]) -> None:
-        """Record stored parts without reading them."""
+        """Record that parts have been stored, without reading them."""
         with self._lock:
             self._parts |= {receipt.first: receipt for receipt in receipts}
 
     def surroundings(self) -> Surroundings:
-        """Return the scene and trajectories of the job, which takes a moment for large scenes."""
+        """Return the scene and trajectories of the job, which is slow for large scenes."""
         surroundings = Surroundings.from_sweeps(self.sequence.sweeps)
         if self._job.survey.coordinates != "world":
             return surroundings
         return replace(surroundings, surface=Surface.from_scene(self._job.scene))
 
     def read_sweep(self, sweep: int) -> ShownSweep:
-        """Return a sweep whose parts are in storage.
+        """Read a sweep whose parts have all been stored.
 
         Raises
         ------
@@ -168,17 +168,13 @@ class SweepReader:
         return self.sequence.show(sweep, Cloud.concatenate(selected))
 
     def _read(self, name: str) -> Cloud:
-        """Return the points of a part.
-
-        The most recent part is cached, because a part may contain many sweeps.
-        """
         if self._last is None or self._last[0] != name:
             self._last = name, self._points.cloud_of(read_part(self._points.storage, name))
         return self._last[1]
 
 
 class SurveyFeed:
-    """Thread that sends the finished sweeps of the only job of a run to a viewer."""
+    """Thread that sends the finished sweeps of a run's only job to a viewer."""
 
     def __init__(self, job: StoredJob, viewer: Viewer) -> None:
         self._under_way = job
@@ -199,11 +195,11 @@ class SurveyFeed:
     # -- called by the run --------------------------------------------------------------
 
     def add(self, receipts: Sequence[Receipt]) -> None:
-        """Record stored parts without reading them."""
+        """Record that parts have been stored, without reading them."""
         self._reader.add(receipts)
 
     def finish_scan(self, scan: int) -> None:
-        """Record that a scan and all earlier scans are in storage."""
+        """Record that a scan and all earlier scans have been stored."""
         if scan in self._last_scans:
             with self._lock:
                 self._waiting.append(self._last_scans[scan])
@@ -211,7 +207,7 @@ class SurveyFeed:
                     del self._waiting[1::2]
 
     def show_path(self) -> None:
-        """Show the planned path once all trials have ended."""
+        """Show the planned path when all trials have ended."""
         planning = self._under_way.job.planning
         if planning is None or self._has_path or not self._has_surroundings.is_set():
             return
@@ -221,7 +217,7 @@ class SurveyFeed:
             self._viewer.show_path(path_in_world(path, self._under_way.job.scene.origin))
 
     def close(self, result: RunResult | None) -> None:
-        """Send pending sweeps until a timeout, then the path and points of the result."""
+        """Send the pending sweeps until a timeout, then the path and points of the result."""
         self.stop()
         give_up_at = time.monotonic() + LAST_S
         while self._waiting and time.monotonic() < give_up_at:
@@ -259,7 +255,7 @@ class SurveyFeed:
             self._viewer.show_sweep(self._reader.read_sweep(sweep))
 
     def _whole_cloud(self, result: RunResult) -> ShownSweep:
-        """Return evenly spaced points of a result, in a frame at the origin of the scene."""
+        """Return evenly spaced points of the result, relative to the origin of the scene."""
         cloud = result.points.sample(CLOUD_POINTS, CLOUD_PARTS)
         sequence = self._reader.sequence
         end_ns = sequence.start_ns + round(float(sequence.sweeps.ends_ns.max()))

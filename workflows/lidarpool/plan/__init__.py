@@ -1,4 +1,4 @@
-"""Path planning with particle swarms, which search for a short 2D path around discs."""
+"""Path planning with particle swarms, which search for a short path around discs in the plane."""
 
 from .planning import Planning
 from .tangents import shortest_path_length

@@ -1,4 +1,4 @@
-"""Cost of a path, which is its length plus a penalty for entering discs.
+"""Cost of a path, which is the path length plus a penalty for entering discs.
 
 The penalty outweighs any shortcut through a disc.
 
@@ -30,7 +30,7 @@ _BLOCK_DISCS = 16  # minimum number of discs in a block; more particles make lon
 
 
 class PathCost:
-    """Cost of many paths between the same two end points, in the coordinates of `PathAxes`.
+    """Cost of many paths with the same end points, in the coordinates of `PathAxes`.
 
     The cost of a path that enters no disc is its length. Otherwise a penalty is added. Its fixed
     part exceeds the length of the longest detour around all discs, so a path that enters a disc
@@ -74,7 +74,7 @@ class PathCost:
 
 
 def _enlarged_radii(centers: Floats, radii: Floats) -> Floats:
-    """Return radii with a margin for rounding errors.
+    """Enlarge radii by a margin for rounding errors without covering the path's end points.
 
     The enlarged discs do not contain the end points of the path.
     """
@@ -85,7 +85,7 @@ def _enlarged_radii(centers: Floats, radii: Floats) -> Floats:
 
 
 class _Workspace:
-    """Buffers for a block of paths and a block of discs, and the computations that use them.
+    """Buffers and computations for a block of paths and a block of discs.
 
     For a segment with unit direction e, midpoint M and half length h, and a disc with center C, let
     u = (C - M) · e and c = (C - M) x e. The distance from C to the closest point of the segment is
@@ -126,7 +126,9 @@ class _Workspace:
         self._zeros = np.zeros(width, np.float32)  # an array, for speed (see the class docstring)
 
     def evaluate(self, points: Floats32, cost: Floats32, entry_price: float) -> None:
-        """Write the cost of each path to `cost`, which has shape (width,).
+        """Write the cost of each path to `cost`.
+
+        `cost` has shape (width,).
 
         `points` contains the points of the paths, including their ends. Shape (k + 2, 2, width).
         """

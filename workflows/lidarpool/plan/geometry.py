@@ -27,14 +27,14 @@ def segment_distances(first: Floats, last: Floats, centers: Floats) -> Floats:
 
 
 def path_length(points: Floats) -> float:
-    """Return the length of the polyline through points in the plane."""
+    """Return the length of the polyline through the given points."""
     steps = np.diff(points, axis=0)
     # The order of additions in np.sum varies between machines, but Python's sum is reproducible.
     return float(sum(np.sqrt(steps[:, 0] ** 2 + steps[:, 1] ** 2).tolist()))
 
 
 def clearance(points: Floats, centers: Floats, radii: Floats) -> float:
-    """Return the minimum distance from a path to the edge of a disc.
+    """Return the smallest distance between a path and the edge of a disc.
 
     The path is the polyline through `points`, with shape (p, 2). Discs have `centers` of shape (m,
     2) and `radii` of shape (m,). If the path enters a disc, the result is negative, and its
@@ -46,7 +46,7 @@ def clearance(points: Floats, centers: Floats, radii: Floats) -> float:
 
 
 class PathAxes:
-    """Axes in which the path starts at (-½, 0) and ends at (½, 0).
+    """Coordinate system in which the path starts at (-½, 0) and ends at (½, 0).
 
     The swarm computes in single precision and uses fixed distances. In these axes, its results
     depend neither on the size of georeferenced coordinates nor on the size of the scene. Start and
@@ -63,7 +63,7 @@ class PathAxes:
         self._middle = (np.array(start) + np.array(target)) / 2
 
     def to_local(self, points: Floats) -> Floats:
-        """Convert points in the plane to these axes.
+        """Convert points from the plane to this coordinate system.
 
         Both arrays have shape (p, 2).
         """
@@ -72,7 +72,7 @@ class PathAxes:
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=1)
 
     def to_plane(self, points: Floats) -> Floats:
-        """Convert points in these axes to the plane.
+        """Convert points from this coordinate system to the plane.
 
         Both arrays have shape (p, 2).
         """

@@ -1,4 +1,4 @@
-"""Planning problems, which consist of two end points, the discs to avoid, and the search effort."""
+"""Planning problems, each with two end points, discs to avoid and the search effort."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .geometry import segment_distances
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Search:
-    """Effort of a search by particle swarms.
+    """Effort of a search with particle swarms.
 
     With more waypoints, a path can go around more discs. The run time is proportional to the number
     of waypoints, and the swarms converge more slowly.
@@ -40,7 +40,7 @@ class Search:
 
 @dataclass(frozen=True, eq=False)
 class Planning(Search):
-    """Search for a 2D path from `start` to `target` that avoids all discs.
+    """Search for a path in the plane from `start` to `target` that avoids all discs.
 
     The search uses `trials` independent particle swarms (`run_trial`).
 
@@ -110,7 +110,7 @@ class Planning(Search):
 def _checked(
     name: str, value: ArrayLike, fits: Callable[[Floats], bool], requirement: str
 ) -> Floats:
-    """Convert `value` to a new array, or raise LidarError unless it is finite and `fits`."""
+    """Convert `value` to a new array of finite numbers that satisfy `fits`, or raise LidarError."""
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -123,7 +123,7 @@ def _checked(
 def _check_outside(
     end_points: dict[str, tuple[float, float]], centers: Floats, radii: Floats
 ) -> None:
-    """Raise LidarError if an end point of the path lies inside a disc."""
+    """Raise LidarError if a disc contains an end point of the path."""
     for name, end in end_points.items():
         point = np.array([end])
         within = np.flatnonzero(segment_distances(point, point, centers)[0] < radii)

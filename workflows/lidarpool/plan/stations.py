@@ -1,4 +1,4 @@
-"""Plan the stations of a terrestrial scan, from which a sensor sees as much surface as possible."""
+"""Plan the stations of a terrestrial scan so that they cover as much surface as possible."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _SECTORS = 36  # azimuth sectors, all of which contain rays if the sensor scans 
 
 
 class StationVisibility:
-    """Visibility of surfaces from a station.
+    """Visibility of surfaces from a sensor at a station.
 
     A surface is visible if it is within the sensor's range and field of view, and not occluded. The
     field of view extends from the lowest to the highest ray of the sensor. `slant_deg` is the
@@ -59,7 +59,7 @@ class StationVisibility:
         self._highest = highest + 1e-9
 
     def visible_sides(self, station: Floats, points: Floats, normals: Floats) -> NDArray[np.int8]:
-        """Determine the side of the surface at each point that is visible from a station.
+        """Determine which side of the surface at each point is visible from a station.
 
         `station` has shape (3,), `points` and the unit vectors `normals` have shape (n, 3).
         Positions are local, in meters, and points lie on triangles of the scene. The result has
@@ -84,7 +84,7 @@ class StationVisibility:
 
 
 def sensor_elevations(sensor: Sensor) -> tuple[float, float]:
-    """Return the sines of the lowest and the highest elevation of a sensor's rays.
+    """Return the sines of the elevations of a sensor's lowest and highest rays.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def sensor_elevations(sensor: Sensor) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class StationPlan:
-    """Stations in the order in which they were chosen, and the area that they cover.
+    """Stations in the order in which they were selected, and the area that they cover.
 
     The reachable area consists of all sides of target surfaces that at least one candidate sees
     within the range, the field of view and the maximum angle of incidence. Coverage is the fraction
@@ -129,7 +129,7 @@ class StationPlan:
 
 @dataclass(frozen=True, eq=False)
 class SurveyCoverage:
-    """The area that stations see, and the part of it where a cloud has points.
+    """Area visible from the stations, and the part of this area in which a cloud has points.
 
     Areas count the sides of target surfaces. The two sides of a thin wall count separately.
     """
@@ -246,7 +246,7 @@ def survey_coverage(
     within_m: float = 0.1,
     slant_deg: float = 80.0,
 ) -> SurveyCoverage:
-    """Compare the area that stations see with the points of a cloud.
+    """Compare the area visible from stations with the points of a cloud.
 
     Parameters
     ----------
@@ -334,7 +334,7 @@ class _Visibility(NamedTuple):
 def _visibility(
     samples: _SurfaceSamples, sight: StationVisibility, positions: Floats
 ) -> _Visibility:
-    """Return the sides of the surface samples that candidates at local `positions` see."""
+    """Return the sides of surface samples that are visible from local `positions`."""
     sides = np.stack([sight.visible_sides(p, samples.points, samples.normals) for p in positions])
     # Each side of a surface counts separately, because a thin wall has a side in each room.
     visible = np.concatenate([sides > 0, sides < 0], axis=1)
@@ -344,7 +344,7 @@ def _visibility(
 
 
 class _Choice(NamedTuple):
-    """Chosen rows of `_Visibility`, in order of choice."""
+    """Selected rows of `_Visibility`, in the order of their selection."""
 
     row_indices: list[int]
     shares: list[float]  # fraction of the area that is covered after each row
@@ -354,7 +354,7 @@ class _Choice(NamedTuple):
 def _choose_rows(
     visibility: _Visibility, max_rows: int, max_share: float, min_gain: float
 ) -> _Choice:
-    """Choose candidates greedily by the area that each one adds.
+    """Select candidates greedily by the area that each of them adds.
 
     Stops after `max_rows` candidates, when the fraction `max_share` of the area is covered, or when
     the next candidate would add less than the fraction `min_gain`.
@@ -381,7 +381,7 @@ def _choose_rows(
 
 
 def _default_spacing_m(scene: Scene) -> float:
-    """Return a round spacing of candidates in meters that suits the size of the scene."""
+    """Return a round candidate spacing in meters that suits the size of the scene."""
     width_m, depth_m, _ = np.ptp(scene.bounds, axis=0)
     spacing = max(math.sqrt(width_m * depth_m / _CANDIDATES), _MIN_SPACING_M)
     power = 10.0 ** math.floor(math.log10(spacing))
@@ -389,7 +389,7 @@ def _default_spacing_m(scene: Scene) -> float:
 
 
 def candidates(scene: Scene, caster: RayCaster, height_m: float, spacing_m: float) -> Floats:
-    """Return grid positions where an instrument can be set up, in local meters.
+    """Return grid positions at which an instrument can be set up, in local meters.
 
     The result has shape (c, 3). The floor is the lowest surface. If the lowest surface is the
     underside of a slab, the floor is the top of the slab. Excluded are floors that can be reached
@@ -426,7 +426,7 @@ def candidates(scene: Scene, caster: RayCaster, height_m: float, spacing_m: floa
 
 
 def _grid_positions(scene: Scene, spacing_m: float) -> tuple[Floats, tuple[int, int]]:
-    """Return local positions on a grid over the scene, and the grid's shape along x and y."""
+    """Return local positions on a grid over the scene, and their number along x and y."""
     lower, upper = scene.bounds
     columns, rows = np.maximum((upper - lower)[:2] / spacing_m, 1).astype(int).tolist()
     if columns * rows > _MAX_CANDIDATES:
@@ -444,7 +444,7 @@ def _grid_positions(scene: Scene, spacing_m: float) -> tuple[Floats, tuple[int, 
 
 
 def _floor_heights(scene: Scene, caster: RayCaster, positions: Floats) -> Floats:
-    """Return the height of the floor at each position, or infinity where there is no floor."""
+    """Return the floor height at each position, or infinity where there is no floor."""
     origins = positions.copy()
     up = np.tile([0.0, 0.0, 1.0], (len(origins), 1))
     origins[:, 2] = scene.bounds[0, 2] - 1
@@ -465,7 +465,7 @@ def _floor_heights(scene: Scene, caster: RayCaster, positions: Floats) -> Floats
 
 
 def _largest_level(floor: Floats, spacing_m: float) -> Bools:
-    """Return a mask of the largest connected floor on a grid without steep slopes.
+    """Return a mask of the largest connected part of the floor without steep slopes.
 
     `floor` contains the height of each grid position, which is infinite if there is no floor.
     """
@@ -493,7 +493,7 @@ def _largest_level(floor: Floats, spacing_m: float) -> Bools:
 
 
 def _free_positions(scene: Scene, caster: RayCaster, positions: Floats) -> Ints:
-    """Return the indices of positions with free space around them that are not inside an object.
+    """Return the indices of positions that have free space around them and are outside all objects.
 
     A position is considered to be inside an object if most of its rays above the horizon hit back
     faces of the object. This does not apply to objects that contain most positions, such as a hall
@@ -522,7 +522,7 @@ def _free_positions(scene: Scene, caster: RayCaster, positions: Floats) -> Ints:
 
 
 def _object_areas(scene: Scene, is_target: Bools) -> Floats:
-    """Return the area of each object, which is 0 for objects that are not targets."""
+    """Return the area of each object, or 0 for objects that are not targets."""
     areas = triangle_areas(scene.vertices[scene.faces])
     return np.where(is_target, np.bincount(scene.face_object, areas, len(scene.names)), 0.0)
 
@@ -537,7 +537,7 @@ class _SurfaceSamples(NamedTuple):
 
 
 def _sample_surfaces(scene: Scene, is_target: Bools) -> _SurfaceSamples:
-    """Return sample points that are evenly distributed by area within each target.
+    """Return sample points that are evenly distributed over the area of each target.
 
     The samples are reproducible. `is_target` is a mask of the objects.
     """
@@ -565,7 +565,7 @@ def _sample_surfaces(scene: Scene, is_target: Bools) -> _SurfaceSamples:
 def _sample_triangles(
     rng: np.random.Generator, face_areas: Floats, areas: Floats, counts: Ints
 ) -> Ints:
-    """Draw `counts` triangles for each object in proportion to their areas, sorted by object."""
+    """Draw triangles of each object with probabilities proportional to area, sorted by object."""
     owner = np.repeat(np.arange(len(counts)), counts)
     nth = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
     offsets = (nth + rng.random(len(owner))) / counts[owner] * areas[owner]

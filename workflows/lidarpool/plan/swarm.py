@@ -1,4 +1,4 @@
-"""A particle swarm that searches for a short path, and its reproducible random numbers."""
+"""Particle swarm that searches for a short path, and its reproducible random numbers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _STARTS = 1021  # number of block starts before they repeat
 
 
 class Randoms:
-    """Reproducible single-precision random numbers from a seed below 2**64.
+    """Reproducible random numbers in single precision, for seeds below 2**64.
 
     NumPy guarantees that the raw output of its bit generators does not change, but gives no such
     guarantee for `Generator` (NEP 19). Therefore the distributions are computed here.
@@ -34,12 +34,12 @@ class Randoms:
         self._bits = np.random.SFC64(seed)
 
     def uniform(self, count: int) -> Floats32:
-        """Return `count` uniform numbers in [0, 1), which are multiples of 2**-24."""
+        """Return `count` uniformly distributed numbers in [0, 1), which are multiples of 2**-24."""
         leading_bits = self._bits.random_raw(count) >> np.uint64(40)
         return leading_bits.astype(np.float32) * np.float32(2**-24)
 
     def normal(self, count: int) -> Floats32:
-        """Return `count` approximately normal numbers with mean 0 and variance 1.
+        """Return `count` approximately normally distributed numbers with mean 0 and variance 1.
 
         Each number is the sum of four uniform numbers (Irwin-Hall distribution), which are the
         16-bit quarters of a raw number. All values lie within ±3.5. The exact normal distribution
@@ -54,12 +54,12 @@ class Randoms:
         return centered * np.float32(math.sqrt(3) / 2**16)
 
     def below(self, end: int, count: int) -> list[int]:
-        """Return `count` random integers from 0 to `end` - 1, for an `end` far below 2**64."""
+        """Return `count` random integers from 0 to `end` - 1, where `end` is far below 2**64."""
         return (self._bits.random_raw(count) % np.uint64(end)).tolist()
 
 
 class Swarm:
-    """A bare-bones particle swarm (Kennedy 2003), divided into independent groups.
+    """Bare-bones particle swarm (Kennedy 2003) that is divided into independent groups.
 
     A particle has no velocity. In each step, it jumps to a random position around the midpoint
     between its own best position and the best position of its group. In each coordinate, the
@@ -104,16 +104,19 @@ class Swarm:
         self._best_cost_by_group = self._best_cost.reshape(self.groups, -1)
 
     def step(self) -> None:
-        """Evaluate all particles, record the best positions, and move the particles."""
+        """Evaluate all particles, record the best positions and move the particles."""
         self._remember(self.paths.evaluate())
         self._move()
 
     def best(self) -> Floats32:
-        """Return the corners of the best path found so far. Shape (waypoints, 2)."""
+        """Return the corners of the best path found so far.
+
+        The array has shape (waypoints, 2).
+        """
         return self._best[:, self._best_cost.argmin()].reshape(-1, 2)
 
     def _remember(self, cost: Floats32) -> None:
-        """Update the best position of each particle and the leader of each group."""
+        """Update the best position of each particle, and the leader of each group."""
         np.less(cost, self._best_cost, out=self._better)  # 1.0 or 0.0
         np.minimum(cost, self._best_cost, out=self._best_cost)
         # Multiplying and adding takes half as long as a masked copy. The sum is the same as in
@@ -132,7 +135,7 @@ class Swarm:
 
 
 def _group_count(particles: int) -> int:
-    """Return the number of groups of equal size that the particles are divided into."""
+    """Return the number of equal groups into which the particles are divided."""
     return max(
         groups
         for groups in range(1, _GROUPS + 1)
@@ -141,7 +144,7 @@ def _group_count(particles: int) -> int:
 
 
 def _spreads(groups: int, widest: float) -> Floats:
-    """Return the initial spread of each group around the straight line."""
+    """Return the initial spread of each group about the straight line."""
     widest = max(_MIN_LAST_SPREAD, widest)
     if groups == 1:
         return np.array([widest])
@@ -150,11 +153,12 @@ def _spreads(groups: int, widest: float) -> Floats:
 
 
 def _scatter_paths(corners: int, particles: int, spreads: Floats, randoms: Randoms) -> Floats32:
-    """Return the initial positions of all particles. Shape (corners, 2, groups, size).
+    """Return the initial positions of all particles.
 
-    The paths of the first group bend at one point, those of the second group at two points, and so
-    on. Bends are drawn within the group's spread around the straight line, and corners are evenly
-    spaced. Paths with few bends pass between discs more often than paths with independent corners.
+    The array has shape (corners, 2, groups, size). The paths of the first group bend at one point,
+    those of the second group at two points, and so on. Bends are drawn within the group's spread
+    around the straight line, and corners are evenly spaced. Paths with few bends pass between discs
+    more often than paths with independent corners.
     """
     groups = len(spreads)
     size = particles // groups

@@ -1,4 +1,4 @@
-"""Exact length of the shortest path around discs, from the graph of their tangents.
+"""Exact length of the shortest path around discs, computed with a graph of their tangents.
 
 Like a taut string, a shortest path around discs consists of straight segments that touch discs and
 of arcs along their edges. It is therefore a shortest path in a graph. The nodes are the contact
@@ -98,7 +98,7 @@ def shortest_path_length(
 
 
 def _length_around(end_points: Floats, centers: Floats, radii: Floats, tolerance: float) -> float:
-    """Return the length of the shortest path around discs between two end points."""
+    """Return the length of the shortest path between two end points that enters no disc."""
     # The end points are circles 0 and 1, with radius 0.
     circles = np.vstack([end_points, centers])
     widths = np.concatenate([[0.0, 0.0], radii])
@@ -107,7 +107,6 @@ def _length_around(end_points: Floats, centers: Floats, radii: Floats, tolerance
 
 
 def _remove_nested(centers: Floats, radii: Floats) -> tuple[Floats, Floats]:
-    """Return the discs that are not contained in a larger disc."""
     order = np.argsort(-radii, kind="stable")
     outermost: list[int] = []
     for disc in order:
@@ -118,7 +117,7 @@ def _remove_nested(centers: Floats, radii: Floats) -> tuple[Floats, Floats]:
 
 
 def _all_tangents(centers: Floats, radii: Floats) -> _Tangents:
-    """Return the common tangents of every pair of circles.
+    """Return the common tangents of all pairs of circles.
 
     The line {x: n·x = c} touches circle i at center_i + side_i · radius_i · n. Two circles share
     the line if n · (center_j - center_i) = side_i · radius_i - side_j · radius_j. For given sides,
@@ -155,7 +154,7 @@ def _all_tangents(centers: Floats, radii: Floats) -> _Tangents:
 def _free_tangents(
     tangents: _Tangents, centers: Floats, radii: Floats, tolerance: float
 ) -> _Tangents:
-    """Return the tangents that enter no disc."""
+    """Return the tangents that do not enter any disc."""
     free = []
     for start in range(0, len(tangents.circles), _TANGENTS_AT_ONCE):
         part = slice(start, start + _TANGENTS_AT_ONCE)
@@ -202,7 +201,7 @@ def _graph(tangents: _Tangents, centers: Floats, radii: Floats) -> Graph:
 def _open_arcs(
     angles: Floats, circle: int, centers: Floats, radii: Floats
 ) -> list[tuple[int, int, float]]:
-    """Return the arcs of `circle` between adjacent contact points that no disc blocks.
+    """Return the unblocked arcs between adjacent contact points of `circle`.
 
     `angles` contains the sorted angles of the contact points. Each arc is returned as the indices
     of its two angles, and the angle between them. A contact point never lies inside another disc,
@@ -227,7 +226,7 @@ def _open_arcs(
 
 
 def _dijkstra(graph: Graph, source: int, sink: int) -> float:
-    """Return the length of the shortest path from `source` to `sink`, or inf without a path."""
+    """Return the length of the shortest path from `source` to `sink`, or inf if there is none."""
     best = {source: 0.0}
     queue = [(0.0, source)]
     while queue:

@@ -1,4 +1,4 @@
-"""Planning trials, each of which runs one particle swarm, and the best plan of all trials."""
+"""Planning trials that run one particle swarm each, and the best plan of all trials."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .tangents import shortest_path_length
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """Result of one particle swarm.
+    """Result of a planning trial, in which one particle swarm searches for a path.
 
     The same `Planning` and trial index produce the same trial, bit for bit, except for `seconds`.
     """
@@ -61,12 +61,15 @@ def run_trial(planning: Planning, trial: int) -> Trial:
 
 
 def with_ends(planning: Planning, waypoints: Floats) -> Floats:
-    """Return the complete path of start, waypoints and target. Shape (k + 2, 2)."""
+    """Return the entire path, with its start, waypoints and target.
+
+    The array has shape (k + 2, 2).
+    """
     return np.vstack([planning.start, waypoints, planning.target])
 
 
 def prepare_swarm(planning: Planning, axes: PathAxes, seed: int) -> Swarm:
-    """Return the swarm for `planning`, spread as widely as a path around the discs may require."""
+    """Return a swarm for `planning` that is spread as widely as a path around the discs can be."""
     centers = axes.to_local(planning.centers)
     radii = planning.radii / axes.unit_m
     cost = PathCost(centers, radii, planning.waypoints, planning.particles)
@@ -80,7 +83,7 @@ def prepare_swarm(planning: Planning, axes: PathAxes, seed: int) -> Swarm:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The best path of all planning trials.
+    """Best path of all planning trials.
 
     Parameters
     ----------
@@ -110,12 +113,12 @@ class Plan:
 
     @property
     def collision_free(self) -> bool:
-        """Whether the path does not enter any disc."""
+        """Whether the path enters no disc."""
         return self.clearance >= 0
 
     @property
     def excess(self) -> float:
-        """Relative excess of the path length over the shortest possible length.
+        """Relative difference between the path length and the shortest possible length.
 
         For example, 0.01 is 1 %.
         """

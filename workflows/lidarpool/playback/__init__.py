@@ -1,1 +1,1 @@
-"""Play back sweeps in real time over sensor protocols and to viewers."""
+"""Play back sweeps in real time, using sensor protocols or viewers."""

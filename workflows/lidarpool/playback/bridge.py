@@ -1,4 +1,4 @@
-"""Interface of bridges, which send played sweeps in the protocol selected with `--as`."""
+"""Interface of bridges, which play sweeps in the protocol selected with `--as`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .schedule import Schedule
 
 @dataclass(frozen=True)
 class BridgeOptions:
-    """Command-line options of bridges."""
+    """Options of bridges from the command line."""
 
     # addresses; empty for the default of the bridge on the loopback interface
     to: tuple[str, ...] = ()
@@ -69,7 +69,7 @@ class Bridge(ABC):
 
     @classmethod
     def format_of(cls, settings: Mapping[str, Any]) -> ExportSpec | None:
-        """Return the format whose columns are sent, which may depend on `settings`.
+        """Return the format whose columns are sent. It may depend on `settings`.
 
         Raises
         ------
@@ -81,15 +81,15 @@ class Bridge(ABC):
 
     @classmethod  # noqa: B027 - most need none
     def check_installed(cls) -> None:
-        """Raise LidarError if a package that the bridge imports lazily is not installed."""
+        """Raise LidarError if a package that the bridge imports lazily is missing."""
 
     @property
     @abstractmethod
     def description(self) -> str:
-        """Address at which receivers find the sweeps, for the "ready" message."""
+        """Address at which receivers find the sweeps, which is part of the "ready" message."""
 
     def due_ns(self, sweep: int) -> float:
-        """Return when a sweep is due, in nanoseconds since the start of the survey.
+        """Return the time at which a sweep is due, in nanoseconds since the start of the survey.
 
         By default, a sweep is due after its last firing. A bridge that sends a sweep over its whole
         duration overrides this method, and receives the sweep `lead_ns` earlier.
@@ -105,7 +105,7 @@ class Bridge(ABC):
     def show_content(  # noqa: B027 - most receivers have no use for a scene
         self, content: Callable[[], PictureContent | None]
     ) -> None:
-        """Show the scene and the planned path before the first sweep.
+        """Show the scene and the planned path before the first sweep is sent.
 
         `content` is a function that returns both.
         """
@@ -118,11 +118,14 @@ class Bridge(ABC):
         """
 
     def finish(self) -> None:  # noqa: B027 - messages are sent at once
-        """Send the remaining data after the last sweep, and wait until everything has been sent."""
+        """Send the remaining data after the last sweep, and wait until all data has been sent."""
 
     @property
     def summary(self) -> str:
-        """Summary of what was sent, available after the context has ended, or an empty string."""
+        """Summary of what was sent, which is available after the context has ended.
+
+        It may be an empty string.
+        """
         return ""
 
     def __enter__(self) -> Self:

@@ -1,4 +1,4 @@
-"""Table of bridges, which can be imported quickly for shell completion."""
+"""Table of bridges that can be imported quickly, for example for shell completion."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class BridgeEntry(NamedTuple):
-    """Location of a bridge class, and the extra that installs its packages."""
+    """Location of a bridge class, and the extra that installs the packages that it requires."""
 
     target: str  # MODULE:CLASS
     extra: str = ""

@@ -1,4 +1,4 @@
-"""Publish ROS 2 topics without ROS, by sending serialized messages with cyclonedds."""
+"""Publish ROS 2 topics without a ROS installation, sending serialized messages with cyclonedds."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ _DEPTH = 10
 
 @dataclass(frozen=True)
 class Network:
-    """Network interface, peers, and domain of ROS 2 topics."""
+    """Network interface, peers and domain of ROS 2 topics."""
 
     address: str = LOOPBACK  # address of the network interface
     peers: tuple[str, ...] = ()  # machines to which the topics are announced
@@ -71,7 +71,7 @@ class Network:
     def for_hosts(
         cls, hosts: Sequence[str], environment: Mapping[str, str] = os.environ
     ) -> Network:
-        """Return the network through which all hosts can be reached.
+        """Return the network in which all hosts can be reached.
 
         Without hosts, the loopback interface is used. The domain is ROS_DOMAIN_ID.
 
@@ -100,7 +100,7 @@ class Network:
 
     @property
     def configuration(self) -> str:
-        """Configuration of cyclonedds as XML."""
+        """Configuration of cyclonedds in XML."""
         peers = dict.fromkeys((self.address, *self.peers))
         return _CONFIGURATION.format(
             domain=self.domain,
@@ -128,7 +128,7 @@ def _ipv4_address(host: str) -> str:
 
 
 def _interface_to(address: str) -> str:
-    """Return the address of the local interface through which an address is reached."""
+    """Return the address of the local interface that routes to `address`."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect((address, 9))  # sends nothing
@@ -163,14 +163,14 @@ class RosPublisher:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Remove the topics."""
+        """Remove all topics."""
         self._writers.clear()
         for entity in (self._participant, self._domain):
             with suppress(DDSException):
                 entity._delete(entity._ref)
 
     def publish(self, message: RosMessage) -> None:
-        """Publish a message, and create its topic if necessary."""
+        """Publish a message, creating its topic if necessary."""
         if message.topic not in self._writers:
             self._writers[message.topic] = self._writer(message.topic, message.kind)
         writer = self._writers[message.topic]
@@ -200,7 +200,7 @@ class RosPublisher:
 
 
 def _serialized(kind: Any, cdr: bytes) -> Any:
-    """Return a message that is already serialized.
+    """Create a message whose serialized form is already known.
 
     Serialization by cyclonedds would take 72 to 96 ms for a cloud of 2 MB.
     """
@@ -211,7 +211,7 @@ def _serialized(kind: Any, cdr: bytes) -> Any:
 
 @cache
 def message_class(kind: str) -> Any:
-    """Return the cyclonedds class of a message type, such as sensor_msgs/msg/PointCloud2.
+    """Return the cyclonedds class of a message type such as sensor_msgs/msg/PointCloud2.
 
     As in the ROS 2 middleware, the names of the type and of its fields end with an underscore.
     """
@@ -225,7 +225,7 @@ def message_class(kind: str) -> Any:
 
 
 def _idl_type(description: Any) -> Any:
-    """Return the cyclonedds type of a field, given its description by rosbags."""
+    """Convert a field description from rosbags to the corresponding cyclonedds type."""
     node, content = description
     if node == Nodetype.BASE:
         return _BASE_TYPES[content[0]]

@@ -1,4 +1,4 @@
-"""Play a scanner as a live sensor, in programs that move the sensor themselves."""
+"""Play a scanner as a live sensor in a program that moves the sensor itself."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def play(
     ready: Callable[[str], Any] | None = None,
     note: Callable[[str], Any] | None = None,
 ) -> Lateness:
-    """Send the packets of a scanner in real time, as its sensor would.
+    """Send the packets of a scanner in real time, like a real sensor.
 
     Parameters
     ----------
@@ -126,7 +126,6 @@ def _sweeps(
 
 
 def _cast(scanner: Scanner, pose: Any, number: int, start_s: float) -> _NumberedSweep:
-    """Simulate a sweep that starts at a time in seconds."""
     return number, start_s, scanner.sweep(pose, number=number)
 
 
@@ -138,14 +137,13 @@ def _send_all(
     ready: Callable[[str], Any] | None,
     note: Callable[[str], Any] | None,
 ) -> None:
-    """Pass the packets of all sweeps to the sender, up to one sweep before they are due."""
+    """Pass the packets of all sweeps to the sending process, up to one sweep in advance."""
 
     def send(groups: list[Datagrams]) -> None:
-        """Pass datagrams to the process that sends them."""
         transmitter.sender.send(0, groups, deadlines_ns)
 
     def deadlines_ns(due_ns: Ints) -> Ints:
-        """Convert times with the schedule, which starts with the first datagrams."""
+        """Convert packet times to deadlines. The schedule starts with the first datagrams."""
         if not schedule.started:
             schedule.start(float(due_ns.min()), _START_NS)
         return schedule.deadlines_ns(due_ns)

@@ -1,4 +1,4 @@
-"""Bridge that sends packets like a live sensor, each at its own time."""
+"""Bridge that sends each packet at the same time as a live sensor would."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LEAD_NS = 0.3e9  # time before its first packet at which a sweep is passed to t
 
 
 class PacketsBridge(Bridge):
-    """Bridge that sends packets in the protocol of each sensor, and simulates its interface.
+    """Bridge that sends packets in each sensor's protocol, and simulates the sensors' interfaces.
 
     The setting `api` contains the addresses on which the sensor interfaces listen, as
     NAME=HOST:PORT or HOST:PORT. The setting `lateness` is a file for statistics on how late packets
@@ -53,35 +53,35 @@ class PacketsBridge(Bridge):
 
     @property
     def description(self) -> str:
-        """Destinations of the packets, and the available sensor interfaces."""
+        """Destinations of the packets, and available sensor interfaces."""
         return self._transmitter.description
 
     def due_ns(self, sweep: int) -> float:
-        """Return the start of the sweep, shortly before its first packet is sent."""
+        """Return the start of the sweep, which is shortly before its first packet is sent."""
         return float(self.sweeps.begins_ns[sweep])
 
     def prepare(self, sweep: int, points: Cloud) -> None:
-        """Encode a sweep with a temporary encoder, which compiles loops."""
+        """Encode a sweep with a temporary encoder, in order to compile the loops."""
         source = PacketSource.for_sensor(self.sweeps, int(self.sweeps.sensor[sweep]))
         encoder = encoder_of(replace(source, instruments=None))
         encoder.encode(self._shots(encoder, sweep, points))
 
     def send(self, sweep: int, points: Cloud, shift_ns: int) -> None:
-        """Pass the packets of a sweep to the process that sends them."""
+        """Pass the packets of a sweep to the sending process."""
         number = int(self.sweeps.sensor[sweep])
         encoder = self._encoders[number]
         shots = self._shots(encoder, sweep, points).shifted(shift_ns)
         self._transmitter.sender.send(number, encoder.encode(shots), self.schedule.deadlines_ns)
 
     def finish(self) -> None:
-        """Send the remaining packets, and wait until all have been sent."""
+        """Send the remaining packets, and wait until all packets have been sent."""
         for number, encoder in enumerate(self._encoders):
             self._transmitter.sender.send(number, encoder.finish(), self.schedule.deadlines_ns)
         self._transmitter.sender.finish()
 
     @property
     def summary(self) -> str:
-        """Number of packets that were sent, and how late they were."""
+        """Number of sent packets and their delays."""
         return self._transmitter.summary
 
     def __enter__(self) -> Self:
@@ -98,7 +98,7 @@ class PacketsBridge(Bridge):
 
 @dataclass(frozen=True)
 class RepeatedInstruments(Instruments):
-    """Instruments whose IMU samples repeat endlessly, `period_ns` later each time.
+    """Instruments whose IMU samples repeat indefinitely, with a period of `period_ns`.
 
     Positions do not repeat. Instead, the receiver keeps reporting its last position.
     """
@@ -107,11 +107,11 @@ class RepeatedInstruments(Instruments):
 
     @classmethod
     def from_instruments(cls, instruments: Instruments, period_ns: int) -> RepeatedInstruments:
-        """Create repeated instruments."""
+        """Create repeated instruments from the given instruments."""
         return cls(instruments.imu, instruments.gnss, instruments.folder, period_ns)
 
     def rows(self, name: str) -> Iterator[list[str]]:
-        """Yield the rows of a file. Rows of the IMU are repeated with later times."""
+        """Yield the rows of a file, repeating those of the IMU with later times."""
         if name != IMU_FILE:
             yield from super().rows(name)
             return

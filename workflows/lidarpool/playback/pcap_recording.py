@@ -1,4 +1,4 @@
-"""Play back the UDP datagrams of a packet capture with their original timing."""
+"""Play back UDP datagrams from a packet capture with their original timing."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .transmitter import Stream, Transmitter, streams_to
 
 
 class PcapRecording:
-    """UDP datagrams of a packet capture, in file order.
+    """UDP datagrams from a packet capture, in file order.
 
     Times are relative to the first datagram.
 
@@ -51,7 +51,7 @@ class PcapRecording:
         self.period_ns = last_ns + last_ns // max(1, packet_count - 1)  # duration of one repetition
 
     def batches(self, length_ns: int) -> Iterator[tuple[int, dict[str, list[Datagrams]]]]:
-        """Yield the start and the datagrams of each interval of the given length.
+        """Yield the start time and the datagrams of each interval of `length_ns`.
 
         The datagrams are grouped by source.
         """
@@ -70,7 +70,6 @@ class PcapRecording:
             )
 
     def _datagrams(self) -> Iterator[CapturedDatagram]:
-        """Yield all datagrams, with times since the first datagram."""
         first_ns: int | None = None
         for datagram in self._capture.datagrams():
             first_ns = datagram.time_ns if first_ns is None else first_ns
@@ -84,7 +83,7 @@ _START_NS = 50e6  # time between the start of the schedule and the first datagra
 def recorded_streams(
     recording: PcapRecording, to: Sequence[str], api: Sequence[str]
 ) -> list[Stream]:
-    """Return a stream for each sensor of a recording, named after its address.
+    """Return a stream for each sensor of the recording, named after the sensor's address.
 
     The streams are directed with `streams_to`. For an Ouster sensor, the sensor interface is
     simulated if there is a .json file with its metadata next to the recording.
@@ -103,7 +102,7 @@ def recorded_streams(
 
 
 def _service_of(recording: PcapRecording) -> Callable[..., Service | None]:
-    """Return a function that creates the interface of the sensor, or returns None."""
+    """Return a function that creates the sensor's interface, or returns None if it is unknown."""
     path = recording.path.with_suffix(".json")
     if len(recording.sources) > 1 or not path.exists():
         return lambda *_: None
@@ -119,7 +118,6 @@ def _service_of(recording: PcapRecording) -> Callable[..., Service | None]:
     def make_service(
         address: str, destination: Destination, send_to: Callable[[Destination], None]
     ) -> Service:
-        """Return the interface of an Ouster sensor."""
         return OusterApi(address, destination, send_to, metadata, ports)
 
     return make_service
@@ -128,7 +126,7 @@ def _service_of(recording: PcapRecording) -> Callable[..., Service | None]:
 def play_recording(
     recording: PcapRecording, transmitter: Transmitter, schedule: Schedule, *, loop: bool = False
 ) -> None:
-    """Send the datagrams of a recording on time, and repeat them if `loop` is set."""
+    """Send the datagrams of a recording on time, repeating them if `loop` is set."""
     schedule.start(0, _START_NS)
     for lap in count() if loop else range(1):
         shift_ns = lap * recording.period_ns
@@ -142,7 +140,7 @@ def play_recording(
 
 
 def _stack_datagrams(datagrams: list[CapturedDatagram]) -> Datagrams:
-    """Combine datagrams with the same size and port into arrays."""
+    """Combine datagrams of the same size and port into arrays."""
     payloads = np.frombuffer(b"".join(datagram.payload for datagram in datagrams), np.uint8)
     times_ns = np.array([datagram.time_ns for datagram in datagrams], np.int64)
     return Datagrams(

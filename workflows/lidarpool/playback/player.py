@@ -1,4 +1,4 @@
-"""Play sweeps through a bridge in real time."""
+"""Play back sweeps in real time through a bridge."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def play_sweeps(
     loop: bool = False,
     start_at_ns: int = 0,
 ) -> None:
-    """Send each sweep through a bridge when it is due.
+    """Send each sweep through a bridge at its scheduled time.
 
     A sweep that is not simulated in time is sent late, and the user is notified once.
 
@@ -73,7 +73,7 @@ def play_sweeps(
 
 
 def _laps(played: PlaybackSource, *, loop: bool) -> Iterator[Callable[[], _ShiftedSweep]]:
-    """Yield functions that simulate or read the sweeps of each repetition."""
+    """Yield functions that return the sweeps of each repetition."""
     period_ns = played.period_ns
     for lap in count() if loop else range(1):
         for sweep in played.order:
@@ -81,5 +81,4 @@ def _laps(played: PlaybackSource, *, loop: bool) -> Iterator[Callable[[], _Shift
 
 
 def _read_sweep(played: PlaybackSource, sweep: int, shift_ns: int) -> _ShiftedSweep:
-    """Return the number and points of a sweep, and its time shift in nanoseconds."""
     return sweep, played.points(sweep), shift_ns

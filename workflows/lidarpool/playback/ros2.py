@@ -1,4 +1,4 @@
-"""Bridge that publishes sweeps, frames, instruments and the clock as ROS 2 topics."""
+"""Bridge that publishes sweeps, frames, instruments and the clock on ROS 2 topics."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _CLOCK_NS = 10_000_000  # period of clock messages in survey time
 
 
 class Ros2Bridge(Bridge):
-    """Bridge that publishes sweeps like a driver, with navigation data and a clock.
+    """Bridge that publishes sweeps like a sensor driver, with navigation data and a clock.
 
     Each sweep is published when it ends. Messages of the IMU, of the GNSS receiver, and of the
     clock are published between sweeps. Topics, types and layouts are the same as in bags
@@ -54,7 +54,7 @@ class Ros2Bridge(Bridge):
 
     @classmethod
     def format_of(cls, settings: Mapping[str, Any]) -> ExportSpec:
-        """Return the bag format with the same messages."""
+        """Return the bag format that contains the same messages."""
         organized = bool(settings.get("organized"))
         return ExportSpec(
             "mcap",
@@ -65,13 +65,13 @@ class Ros2Bridge(Bridge):
 
     @property
     def description(self) -> str:
-        """Domain and interface of the topics."""
+        """Domain and network interface of the topics."""
         network = self._publisher.network
         peers = f", with the peers {joined(network.peers)}" if network.peers else ""
         return f"ROS 2 topics in domain {network.domain} on {network.address}{peers}"
 
     def prepare(self, sweep: int, points: Cloud) -> None:
-        """Publish static messages.
+        """Publish the static messages.
 
         Raises
         ------
@@ -111,14 +111,14 @@ class Ros2Bridge(Bridge):
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Stop the thread, and remove the topics."""
+        """Stop the thread and remove the topics."""
         self._stopped.set()
         if self._between.is_alive():
             self._between.join()
         self._publisher.__exit__(*error)
 
     def _lap_messages(self, shift_ns: int) -> SurveyMessages:
-        """Return the messages of a repetition, whose times are `shift_ns` later."""
+        """Return the messages of a repetition, with times shifted by `shift_ns`."""
         start_ns = survey_start_ns(self.sweeps) + shift_ns
         return SurveyMessages(
             replace(self.sweeps, start_ns=start_ns),
@@ -137,7 +137,7 @@ class Ros2Bridge(Bridge):
             self._publisher.publish(message)
 
     def _clock(self) -> Iterator[RosMessage]:
-        """Yield endless clock messages from the start of the first sweep."""
+        """Yield an unlimited number of clock messages, starting with the first sweep."""
         messages = self._lap_messages(0)
         first_ns = survey_start_ns(self.sweeps) + round(self.sweeps.begins_ns.min())
         for time_ns in count(first_ns, _CLOCK_NS):

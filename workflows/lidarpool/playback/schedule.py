@@ -1,4 +1,4 @@
-"""Scheduling of playback: deadlines on a clock that all processes share, and prefetching."""
+"""Schedules for playback on a clock that all processes share, and prefetching of sweeps."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def casting_threads() -> int:
 
 
 class Schedule:
-    """Conversion of survey times to `time.monotonic_ns`, which is the same in all processes.
+    """Schedule that converts survey times to `time.monotonic_ns`, which all processes share.
 
     `rate` is the playback speed. At a rate of 2, two seconds of the survey take one second.
     """
@@ -46,11 +46,11 @@ class Schedule:
 
     @property
     def started(self) -> bool:
-        """Whether the schedule has been started."""
+        """Whether the schedule has started."""
         return self._origin_ns is not None
 
     def start(self, time_ns: float, delay_ns: float = 0.0) -> None:
-        """Start the schedule so that `time_ns` is reached after `delay_ns`."""
+        """Start the schedule such that the survey time `time_ns` is reached after `delay_ns`."""
         self._origin_ns = time.monotonic_ns() + delay_ns - time_ns / self.rate
 
     def deadline_ns(self, time_ns: float) -> float:
@@ -66,16 +66,16 @@ class Schedule:
         return (self.deadline_ns(0.0) + times_ns / self.rate).astype("<i8")
 
     def late_s(self, time_ns: float) -> float:
-        """Return the seconds that have passed since a survey time, negative before that time."""
+        """Return the time since a survey time in seconds, which is negative before that time."""
         return (time.monotonic_ns() - self.deadline_ns(time_ns)) / 1e9
 
     def wait_until(self, time_ns: float) -> None:
-        """Sleep until a survey time, unless it has passed."""
+        """Sleep until a survey time is reached."""
         time.sleep(max(0.0, -self.late_s(time_ns)))
 
 
 class Prefetcher(Generic[Item]):
-    """Iterator over the results of tasks that run in threads in advance, as a context manager.
+    """Iterator over the results of tasks that threads execute in advance.
 
     If a task fails, its exception is raised in place of its result. Leaving the context waits for
     running tasks, and cancels the others.
@@ -119,6 +119,5 @@ class Prefetcher(Generic[Item]):
             yield first.result()
 
     def _start_tasks(self) -> None:
-        """Submit tasks until `count` of them are pending or none remain."""
         for task in islice(self._tasks, self._count - len(self._futures)):
             self._futures.append(self._pool.submit(task))

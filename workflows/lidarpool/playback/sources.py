@@ -1,4 +1,4 @@
-"""Sources of playback, which are the sweeps of a result or of a scenario.
+"""Sources of playback, which provide the sweeps of a result or a scenario.
 
 The sweeps of a scenario are simulated during playback.
 """
@@ -44,7 +44,7 @@ CLOUD = "cloud.ply"
 
 @dataclass(frozen=True, eq=False)
 class PlaybackSource:
-    """Sweeps to play, with their points.
+    """Sweeps for playback, with their points.
 
     Iterating yields the number and points of each sweep, in order of their start times.
     """
@@ -65,13 +65,13 @@ class PlaybackSource:
 
     @property
     def order(self) -> list[int]:
-        """Numbers of the sweeps in order of their start times."""
+        """Numbers of the sweeps, sorted by start time."""
         order: list[int] = np.argsort(self.sweeps.begins_ns, kind="stable").tolist()
         return order
 
     @property
     def period_ns(self) -> int:
-        """Time after which playback repeats with `--loop`, in nanoseconds."""
+        """Period of the repetitions with `--loop`, in nanoseconds."""
         ends_ns = []
         for number in range(len(self.sweeps.sensors)):
             rows = np.flatnonzero(self.sweeps.sensor == number)
@@ -130,7 +130,7 @@ def open_source(
 
 
 def _stored_sweeps(folder: Path, source: Path | Storage) -> PlaybackSource:
-    """Return the sweeps of a result in a folder.
+    """Return the sweeps of a result that is stored in a folder.
 
     Raise LidarError if files are missing.
     """
@@ -144,7 +144,6 @@ def _stored_sweeps(folder: Path, source: Path | Storage) -> PlaybackSource:
     cloud = CloudFile(folder / CLOUD)
 
     def read(sweep: int) -> Cloud:
-        """Read only the points of a sweep."""
         first, stop = (cloud.row_of(scan) for scan in sweeps.scans[sweep : sweep + 2].tolist())
         if stop <= first:  # The scans may not be sorted.
             return next(sweeps.points(cloud, sweep, sweep + 1))
@@ -160,7 +159,7 @@ def scenario_job(
     of_mesh: Mapping[str, Any] = MappingProxyType({}),
     tell: Callable[[str], None] = lambda note: None,
 ) -> Job:
-    """Return the job of a scenario or mesh file, or the first job of a campaign.
+    """Return the job of a scenario or mesh file, or a campaign's first job.
 
     The cloud has the columns that the format `needs` requires, instead of those for the formats
     that the scenario writes. For `of_mesh` and `tell`, see `open_source`.
@@ -183,7 +182,7 @@ def scenario_job(
 
 
 def _simulated_sweeps(job: Job, stack: ExitStack) -> PlaybackSource:
-    """Return the sweeps of a job, which are simulated when their points are requested."""
+    """Return the sweeps of a job, each of which is simulated when its points are requested."""
     survey = job.survey
     sweeps = job.sweeps
     if sweeps.instruments is not None:
@@ -195,13 +194,11 @@ def _simulated_sweeps(job: Job, stack: ExitStack) -> PlaybackSource:
     origin = job.scene.origin if survey.coordinates == "world" else np.zeros(3)
 
     def cast(sweep: int) -> Cloud:
-        """Simulate a sweep in this process."""
         start, stop = sweeps.scans[sweep : sweep + 2].tolist()
         part = columns_of([*rig.cast(start, stop)])
         return part.cloud(table, survey.precision_m, origin)
 
     def content() -> PictureContent | None:
-        """Return the scene and the planned path."""
         return PictureContent.before_casting(job.scene, survey)[0]
 
     return PlaybackSource(sweeps, cast, content, casting_threads())

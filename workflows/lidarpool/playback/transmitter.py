@@ -1,4 +1,4 @@
-"""Transmission of packets: destinations of sensors, the sending process, and sensor interfaces."""
+"""Transmission of packets by a separate process, and simulation of sensor interfaces."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MakeService = Callable[[str, Destination, Callable[[Destination], None]], Servic
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """Datagrams of a sensor, with their destination and the address of the sensor interface."""
+    """Datagrams of a sensor, with their destination and the address of the sensor's interface."""
 
     name: str
     model: str
@@ -37,7 +37,7 @@ class Stream:
 
     @property
     def source_address(self) -> str:
-        """Address from which datagrams are sent.
+        """Address from which the datagrams are sent.
 
         This is the address of the sensor interface, or an empty string for any address.
         """
@@ -46,17 +46,17 @@ class Stream:
 
     @property
     def ports(self) -> list[int]:
-        """Ports of the receiver, starting with that of the returns."""
+        """Destination ports, starting with that of the returns."""
         return list(self.destination.ports.values())
 
     def describe(self) -> str:
-        """Describe the destination of the datagrams for the user."""
+        """Describe the destination of the datagrams in a message for the user."""
         words = f"{self.model} sends to {self.destination.host}"
         ports = " and ".join(map(str, self.ports))
         return f"{words}, port {ports}" if ports else words
 
     def to(self, receiver: ReceiverAddress) -> Stream:
-        """Return a copy of the stream with a new destination.
+        """Return a copy of the stream that has a new destination.
 
         The port of the receiver is that of the returns. Ports of other kinds of datagrams are
         shifted by the same amount.
@@ -86,7 +86,7 @@ class Stream:
 def sensor_streams(
     encoders: Sequence[PacketEncoder], to: Sequence[str], api: Sequence[str]
 ) -> list[Stream]:
-    """Create the streams of sensors, and direct them with `streams_to`."""
+    """Create the sensors' streams, and set their destinations with `streams_to`."""
     streams = [
         Stream(
             encoder.source.name or "lidar",
@@ -102,7 +102,7 @@ def sensor_streams(
 
 
 def streams_to(streams: Sequence[Stream], to: Sequence[str], api: Sequence[str]) -> list[Stream]:
-    """Direct streams to the addresses that a user specifies as [NAME=]HOST[:PORT].
+    """Set the destinations of streams from the user's addresses, in the form [NAME=]HOST[:PORT].
 
     By default, sensor interfaces listen on 127.0.0.1, 127.0.0.2 and so on. Interfaces that require
     a separate address start at 127.0.0.2.
@@ -130,14 +130,13 @@ def streams_to(streams: Sequence[Stream], to: Sequence[str], api: Sequence[str])
 
 
 def _loopback_address(number: int, has_own_address: bool) -> ReceiverAddress:
-    """Return the default address of the interface of a sensor."""
     return ReceiverAddress(f"127.0.0.{number + (2 if has_own_address else 1)}")
 
 
 def _parse_addresses(
     texts: Sequence[str], names: Sequence[str], option: str
 ) -> dict[str, ReceiverAddress]:
-    """Parse addresses, and return them by sensor name.
+    """Parse addresses, and return them keyed by sensor name.
 
     An address without a name applies to all sensors.
     """
@@ -156,7 +155,7 @@ def _parse_addresses(
 
 
 def _check_distinguishable(stream: Stream, other: Stream) -> None:
-    """Raise LidarError if receivers could not distinguish two sensors."""
+    """Raise LidarError if a receiver cannot distinguish two sensors."""
     shared = {*stream.ports} & {*other.ports}
     host = stream.destination.host
     if host != other.destination.host or not shared:
@@ -172,7 +171,7 @@ def _check_distinguishable(stream: Stream, other: Stream) -> None:
 
 
 class Transmitter:
-    """Context manager for the process that sends datagrams, and for sensor interfaces.
+    """Context manager that runs the sending process and the sensor interfaces.
 
     If `lateness` is set, statistics on how late datagrams were are written to this file as JSON.
     """
@@ -188,12 +187,12 @@ class Transmitter:
 
     @property
     def description(self) -> str:
-        """Destinations of the datagrams, and the available sensor interfaces."""
+        """Destinations of the datagrams, and available sensor interfaces."""
         return "; ".join([*(stream.describe() for stream in self._streams), *self._services])
 
     @property
     def summary(self) -> str:
-        """Number of sent datagrams and how late they were, once the context has ended."""
+        """Number of sent datagrams and their delays, available after the context has ended."""
         return f"{self.sender.lateness}."
 
     def __enter__(self) -> Self:
@@ -221,7 +220,7 @@ class Transmitter:
         self._write_lateness()
 
     def _write_lateness(self) -> None:
-        """Write the statistics on late datagrams.
+        """Write statistics about late datagrams.
 
         Raise LidarError if the file cannot be written.
         """
@@ -232,7 +231,7 @@ class Transmitter:
                 file.write_text(text, encoding="utf-8")
 
     def _redirect(self, number: int, destination: Destination) -> None:
-        """Change the destination of a stream on behalf of its sensor interface."""
+        """Change the destination of a stream when its sensor interface requests it."""
         stream = replace(self._streams[number], destination=destination)
         with suppress(LidarError):  # sending the next packets raises the same error
             self.sender.redirect(number, destination, stream.source_address)

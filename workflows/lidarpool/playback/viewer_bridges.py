@@ -17,7 +17,7 @@ from .schedule import Schedule
 
 
 class ViewerBridge(Bridge):
-    """Bridge that sends sweeps, with their frames and boxes, to the viewer `name`."""
+    """Bridge that sends sweeps with their frames and boxes to the viewer `name`."""
 
     name: str
 
@@ -39,7 +39,7 @@ class ViewerBridge(Bridge):
 
     @classmethod
     def check_installed(cls) -> None:
-        """Raise LidarError if the package of the viewer is not installed."""
+        """Raise LidarError if the package that the viewer requires is not installed."""
         check_installed(cls.name)
 
     def _open(self, to: str | None = None) -> Viewer:
@@ -47,11 +47,11 @@ class ViewerBridge(Bridge):
 
     @property
     def description(self) -> str:
-        """Address to open, for the "ready" message."""
+        """Address at which users open the viewer, which is part of the "ready" message."""
         return self._viewer.description
 
     def show_content(self, content: Callable[[], PictureContent | None]) -> None:
-        """Show the trajectories, the scene, and the planned path."""
+        """Show the trajectories, the scene and the planned path."""
         self._viewer.show_surroundings(Surroundings.from_sweeps(self.sweeps, content()))
 
     def send(self, sweep: int, points: Cloud, shift_ns: int) -> None:
@@ -64,12 +64,12 @@ class ViewerBridge(Bridge):
         self._viewer.show_sweep(replace(shown, **times))
 
     def __exit__(self, *error: object) -> None:
-        """Stop the server of the viewer."""
+        """Stop the viewer's server."""
         self._viewer.close()
 
 
 class FoxgloveBridge(ViewerBridge):
-    """Bridge that sends sweeps to Foxglove, whose clock shows the times of the sweeps."""
+    """Bridge that sends sweeps to Foxglove. The clock of Foxglove shows the sweep times."""
 
     name = "foxglove"
 

@@ -1,1 +1,1 @@
-"""Support for processes on one machine, such as forking, shared memory, logs and tracing."""
+"""Process utilities for a single machine, such as forking, shared memory, logs and tracing."""

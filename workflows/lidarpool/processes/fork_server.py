@@ -1,4 +1,4 @@
-"""Start and stop the process that forks the workers of a local cluster.
+"""Start and stop the server process from which the workers of a local cluster are forked.
 
 A spawned worker imports Dask, NumPy and lidarpool, which takes about one second of CPU time. The
 fork server imports them once, while the driver continues. It then forks each worker in about
@@ -49,7 +49,7 @@ def start_fork_server() -> bool:
 
 
 def keep_freed_memory() -> None:
-    """Let this process and its forks keep the memory of large arrays after they are freed.
+    """Make this process and its forks reuse the memory of large arrays after they are freed.
 
     By default, glibc returns this memory to the system, and the next large array causes page
     faults. Rendering pictures spent an eighth of its time on such page faults.
@@ -60,7 +60,7 @@ def keep_freed_memory() -> None:
 
 
 def stop_fork_server() -> None:
-    """Kill the fork server and wait until it has exited.
+    """Kill the fork server, and wait until it has exited.
 
     The CPU time of the server and its workers is then included in the CPU time that the system
     reports for the children of this process.

@@ -1,4 +1,4 @@
-"""Log messages and warnings from libraries, in the driver and in its workers."""
+"""Visibility of log messages and warnings from libraries, in the driver and in its workers."""
 
 from __future__ import annotations
 

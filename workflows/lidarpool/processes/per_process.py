@@ -1,4 +1,4 @@
-"""Values, such as open files, that each process creates for itself."""
+"""Values that each process creates for itself, such as open files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Value = TypeVar("Value")
 
 
 class PerProcess(Generic[Value]):
-    """A value that each process creates when it calls the object for the first time.
+    """Value that is created separately by each process when it is first used.
 
     Use it for open files and locks that a forked process must not share with its parent. If two
     processes share an open file, each read moves the file position of both.
@@ -27,7 +27,7 @@ class PerProcess(Generic[Value]):
         self._values: dict[int, Value] = {}  # {process: value}
 
     def __call__(self) -> Value:
-        """Return the value of this process."""
+        """Return the value that belongs to the current process."""
         process = os.getpid()
         if process not in self._values:
             # Another thread may have created the value in the meantime.

@@ -1,4 +1,4 @@
-"""Number of processors available to this process."""
+"""Number of processors that are available to this process."""
 
 from __future__ import annotations
 

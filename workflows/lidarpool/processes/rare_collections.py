@@ -1,4 +1,4 @@
-"""Reduce the frequency of garbage collection in a command and its workers, on import.
+"""Run garbage collection less often once this module has been imported.
 
 With Python's default threshold, a tenth of the import time is spent on garbage collection.
 """

@@ -1,4 +1,4 @@
-"""Pickled values in memory that all processes on a machine can share.
+"""Pickled values in memory that is shared by all processes on a machine.
 
 A large value that is sent through Dask is copied several times, and each process keeps its own
 copy. Shared memory avoids these copies. It is an anonymous file (`memfd_create`, Linux only), which
@@ -21,14 +21,14 @@ _ALIGNMENT = 64  # alignment of each array, bytes
 
 
 class Pickled(NamedTuple):
-    """A pickled value whose arrays are stored separately (pickle protocol 5)."""
+    """Pickled value whose arrays are stored separately, as in pickle protocol 5."""
 
     head: bytes  # pickle stream without the contents of arrays
     buffers: tuple[memoryview | bytearray, ...]  # contents of the arrays
 
     @classmethod
     def from_value(cls, value: object) -> Pickled:
-        """Pickle a value. The buffers are views of its arrays, which are not copied."""
+        """Pickle a value, with buffers that are views of its arrays instead of copies."""
         buffers: list[pickle.PickleBuffer] = []
         head = cloudpickle.dumps(value, protocol=5, buffer_callback=buffers.append)
         return cls(head, tuple(buffer.raw() for buffer in buffers))
@@ -39,7 +39,7 @@ class Pickled(NamedTuple):
         return len(self.head) + sum(len(buffer) for buffer in self.buffers)
 
     def copy(self) -> Pickled:
-        """Return a copy that can be sent to other processes, with writable arrays."""
+        """Return a copy with writable arrays, which can be sent to other processes."""
         return Pickled(self.head, tuple(bytearray(buffer) for buffer in self.buffers))
 
     def load(self) -> Any:
@@ -48,7 +48,7 @@ class Pickled(NamedTuple):
 
 
 class SharedHandle(NamedTuple):
-    """Location of a `SharedValue`, for loading the value in another process."""
+    """Location of a `SharedValue`, which other processes need to load the value."""
 
     path: str
     name: str  # unique name of the memory
@@ -75,7 +75,7 @@ class SharedHandle(NamedTuple):
 
 
 class SharedValue:
-    """A pickled value in shared memory, which exists as long as this object or a loaded copy.
+    """Pickled value in shared memory, which is freed with this object and all loaded copies.
 
     Raises
     ------
@@ -100,5 +100,5 @@ class SharedValue:
         self.handle = SharedHandle(path, name, tuple(spans))
 
     def close(self) -> None:
-        """Release the memory. Processes that have already loaded the value keep it."""
+        """Release the memory, except in processes that have already loaded the value."""
         self._file.close()

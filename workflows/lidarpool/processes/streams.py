@@ -1,4 +1,4 @@
-"""Output streams that tolerate a closed pipe."""
+"""Output streams that tolerate closed pipes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, TextIO
 
 
 class TolerantStream:
-    """A text stream that discards output once its reader has closed the pipe.
+    """Text stream that discards its output after the reader has closed the pipe.
 
     A run therefore continues, for example, after ``lidarpool run ... | head``. Each write is
     flushed.
@@ -29,7 +29,7 @@ class TolerantStream:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        """Write and flush a text."""
+        """Write text and flush the stream."""
         try:
             self._stream.write(text)
             self._stream.flush()

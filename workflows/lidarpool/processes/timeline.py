@@ -1,4 +1,4 @@
-"""Timeline of a command, which records when each of its steps ends.
+"""Timeline of a command, which records when each step ends.
 
 Steps are always recorded, even if the timeline is not shown, because `mark` takes only about one
 microsecond.
@@ -62,14 +62,14 @@ _ROW = (
 
 
 class TimelineStep(NamedTuple):
-    """A step of a command, which starts when the previous step ends."""
+    """Step of a command, which starts at the end of the previous step."""
 
     name: str
     end_s: float  # seconds since the start of the process
 
 
 def _age_s() -> float:
-    """Return the time since the start of this process in seconds."""
+    """Return the age of this process in seconds."""
     if not hasattr(time, "CLOCK_BOOTTIME"):  # a system other than Linux
         return time.time() - psutil.Process().create_time()
     # psutil derives the start from the boot time, which was off by a second on machines whose clock
@@ -88,12 +88,12 @@ class Timeline:
         self.steps: list[TimelineStep] = []
 
     def mark(self, name: str) -> None:
-        """Record that a step ends now, unless a step with this name has already been recorded."""
+        """Record that a step ends now, unless a step with the same name was recorded before."""
         if all(step.name != name for step in self.steps):
             self.steps.append(TimelineStep(name, time.time() - self._started))
 
     def table(self) -> str:
-        """Return a text table with the name of each step, and its duration and end in seconds."""
+        """Return a text table with the name, duration and end of each step, in seconds."""
         lines = [f"{'step':<22}{'duration':>9}{'end':>9}"]
         start_s = 0.0
         for step in self.steps:
@@ -102,7 +102,7 @@ class Timeline:
         return "\n".join(lines) + "\n"
 
     def page(self, command: str) -> str:
-        """Return an HTML page that shows the steps of a command as bars."""
+        """Return an HTML page with a bar chart of the steps."""
         total_s = max(self.steps[-1].end_s, 1e-9) if self.steps else 1.0
         rows = []
         start_s = 0.0
@@ -123,7 +123,7 @@ class Timeline:
         return _PAGE.format(command=escape(command), begun=begun, rows="\n".join(rows))
 
     def show_at_exit(self, path: Path) -> None:
-        """Write the page to a file and print the table to stderr when the process exits.
+        """When the process exits, write the page to a file and print the table to stderr.
 
         Call this before other functions are registered with `atexit`, so that their time is
         included. Functions that are registered later are called earlier.

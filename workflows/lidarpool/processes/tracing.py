@@ -1,4 +1,4 @@
-"""Trace points, which allow tests to observe and interrupt a run."""
+"""Trace points that allow tests to observe and interrupt a run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _sink: Sink | None = None  # sink of this process
 
 
 def trace(point: str, /, **fields: Any) -> None:
-    """Report that a run has reached a trace point, unless no sink is set.
+    """Report that the run has reached a trace point, if a sink is set.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ def trace(point: str, /, **fields: Any) -> None:
 
 
 def trace_to(sink: Sink | None) -> None:
-    """Set the function that is called at each trace point in this process, or None for no function.
+    """Set or remove the function that is called at each trace point in this process.
 
     The function is called as ``sink(point, fields)`` in the thread that reaches the trace point,
     before the thread continues. It can log the trace point, block the thread, or end the process.

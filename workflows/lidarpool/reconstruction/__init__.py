@@ -1,1 +1,1 @@
-"""Reconstruct static scenes from recordings, so that they can be scanned again."""
+"""Reconstruct static scenes from recordings, so that the scenes can be scanned again."""

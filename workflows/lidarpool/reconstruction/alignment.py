@@ -63,7 +63,7 @@ _MIN_ALIGNED_POINTS = 100  # The pose of a sweep with fewer points is not change
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Poses of sweeps, the motion within them, and the offsets of their rings.
+    """Poses of all sweeps, the sensor motion during each sweep, and the offsets of the rings.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class Alignment:
     def from_poses(
         cls, poses: RecordedPoses, voxel_m: float, motion: Motion, ring_count: int
     ) -> Alignment:
-        """Return an alignment with the given poses, moved to the timestamps of the sweeps.
+        """Return an alignment in which the given poses are moved to the sweeps' timestamps.
 
         The rings have no offsets.
         """
@@ -122,11 +122,11 @@ class Alignment:
         )
 
     def select(self, numbers: Ints) -> Alignment:
-        """Select the poses and times of some sweeps, in ascending order."""
+        """Select the poses and times of the sweeps with the given numbers, in ascending order."""
         return replace(self, poses=self.poses[numbers], times_s=self.times_s[numbers])
 
     def step(self, number: int, *, backward: bool = False) -> tuple[MotionStep, float]:
-        """Return the motion from a sweep to the next or previous sweep, and its duration.
+        """Return the motion to the next or previous sweep, and the duration of this motion.
 
         The duration is in seconds, and negative for a backward step. The last sweep has no next
         sweep, so the preceding step is used. The first sweep has no previous sweep, so its backward
@@ -141,7 +141,7 @@ class Alignment:
         return MotionStep.between(self.poses[first], self.poses[second]), step_s
 
     def compensate(self, sweep: Sweep, number: int) -> tuple[Floats, Floats]:
-        """Calibrate and motion-compensate the points of a sweep.
+        """Calibrate the points of a sweep, and compensate them for the motion of the sensor.
 
         Returns
         -------
@@ -183,7 +183,7 @@ class Alignment:
     def _split_by_step(
         self, number: int, times_s: Floats
     ) -> Iterator[tuple[Bools, MotionStep, Floats]]:
-        """Yield masks of points, with the step that moves them and their fractions of the step."""
+        """Yield a mask of points, the step that moves them, and their fractions of this step."""
         for backward, rows in ((False, times_s >= 0), (True, times_s < 0)):
             if rows.any():
                 step, step_s = self.step(number, backward=backward)
@@ -217,13 +217,16 @@ class AlignedSweep(NamedTuple):
 
     @property
     def range_m(self) -> Floats:
-        """Ranges along the rays in meters, of shape (n,)."""
+        """Range of each return along its ray, in meters.
+
+        The array has shape (n,).
+        """
         return np.asarray(np.linalg.norm(self.world - self.origins, axis=1))
 
 
 @dataclass(frozen=True, eq=False)
 class AlignedSweeps:
-    """Sweeps of a recording with aligned poses, which are read one at a time."""
+    """Sweeps of a recording with aligned poses. Only one sweep is read at a time."""
 
     recorded: RecordedSweeps
     alignment: Alignment
@@ -231,11 +234,11 @@ class AlignedSweeps:
 
     @property
     def name(self) -> str:
-        """Name of the recording for messages."""
+        """Name of the recording, for use in messages."""
         return self.recorded.recording.name
 
     def read(self, number: int) -> AlignedSweep:
-        """Read a sweep.
+        """Read a sweep and transform it to world coordinates.
 
         Raises
         ------
@@ -245,7 +248,7 @@ class AlignedSweeps:
         return self.align(self.recorded.read(number), number)
 
     def read_with_lost(self, number: int) -> tuple[AlignedSweep, AlignedSweep]:
-        """Read a sweep, and find its lost pulses.
+        """Read a sweep, and determine which of its pulses were lost.
 
         The lost pulses are represented by points at a range of one meter.
         """
@@ -261,7 +264,7 @@ class AlignedSweeps:
         return self.align(sweep, number), aligned
 
     def align(self, sweep: Sweep, number: int) -> AlignedSweep:
-        """Transform the points of a sweep to the world frame."""
+        """Transform the points of a sweep to world coordinates."""
         points, origins = self.alignment.compensate(sweep, number)
         pose = self.alignment.poses[number]
         return AlignedSweep(
@@ -275,7 +278,7 @@ class AlignedSweeps:
 
 
 def first_alignment(sweeps: RecordedSweeps, poses: RecordedPoses) -> Alignment:
-    """Determine how the points were stored, and return the initial poses of all sweeps.
+    """Determine how the points are stored, and return the initial poses of all sweeps.
 
     Raises
     ------
@@ -291,7 +294,7 @@ def first_alignment(sweeps: RecordedSweeps, poses: RecordedPoses) -> Alignment:
 def align(
     sweeps: RecordedSweeps, first: Alignment, numbers: Ints, mapped: Collection[int]
 ) -> Alignment:
-    """Align some sweeps to a map of the sweeps in `mapped`.
+    """Align sweeps to a map that is built from the sweeps in `mapped`.
 
     Parameters
     ----------
@@ -366,7 +369,7 @@ def _filled_voxels(
     motion: Motion,
     scale: tuple[int, int, int] = (1, 1, 1),
 ) -> int:
-    """Count the voxels that contain points of the sweeps at their poses.
+    """Count the voxels that contain points when the sweeps are placed at their poses.
 
     The points are multiplied by `scale` first. Poses from registration are aligned before the
     voxels are counted. Given poses are not, because alignment would make even mirrored sweeps
@@ -391,7 +394,7 @@ def _filled_voxels(
 
 
 def _fastest_window(poses: RecordedPoses) -> slice:
-    """Return the window of consecutive sweeps with the most motion."""
+    """Return the consecutive sweeps during which the sensor moves the most."""
     steps = np.diff(poses.matrices, axis=0)
     size = np.linalg.norm(steps[:, :3, 3], axis=1)
     size += _TURN_M * np.linalg.norm(steps[:, :3, :3], axis=(1, 2))
@@ -419,13 +422,11 @@ def _align_iteratively(
 
 
 def _sample(sweep: Sweep, number: int) -> Sweep:
-    """Return a reproducible random sample of the points of a sweep."""
     order = np.random.default_rng(number).permutation(len(sweep))[:_MAP_POINTS]
     return sweep.select(order)
 
 
 def _voxel_m(samples: Sequence[Sweep]) -> float:
-    """Return the edge length of the map voxels in meters, based on the median range."""
     ranges = np.concatenate([np.linalg.norm(sample.points, axis=1) for sample in samples])
     return float(np.clip(_VOXEL_SHARE * np.median(ranges), _MIN_VOXEL_M, _MAX_VOXEL_M))
 
@@ -436,7 +437,7 @@ def _map_planes(
     alignment: Alignment,
     mapped: Sequence[int],
 ) -> VoxelPlanes:
-    """Return the planes of a map of the `mapped` sweeps, or raise LidarError if it has none."""
+    """Return the planes of a map of the `mapped` sweeps, or raise LidarError if there are none."""
     parts = [
         transform_points(alignment.compensate(samples[number], number)[0], alignment.poses[number])
         for number in mapped
@@ -464,7 +465,7 @@ class _PlanePoints:
     def from_sweep(
         cls, points: Floats, pose: Floats, planes: VoxelPlanes, voxel_m: float
     ) -> _PlanePoints:
-        """Find the points of a sweep that are close to planes."""
+        """Find the points of a sweep that are close to planes of the map."""
         distances, plane, rows = planes.distances(
             transform_points(points, pose), _MAX_VOXELS * voxel_m
         )
@@ -477,7 +478,7 @@ class _PlanePoints:
 def _register_to_planes(
     alignment: Alignment, sample: Sweep, planes: VoxelPlanes, number: int
 ) -> tuple[Floats, _PlanePoints]:
-    """Register a sweep to the planes.
+    """Register a sweep to the planes of the map.
 
     Return its pose and its points on planes.
     """
@@ -509,7 +510,7 @@ def _align_to_planes(
     planes: VoxelPlanes,
     mapped: Sequence[int],
 ) -> Alignment:
-    """Align the sweeps to the planes, and calibrate the rings with the `mapped` sweeps."""
+    """Align all sweeps to the planes, and use the `mapped` sweeps to calibrate the rings."""
     poses = alignment.poses.copy()
     ring_count = len(alignment.ring_offsets)
     normal = np.zeros((ring_count, 3, 3))
@@ -545,7 +546,7 @@ def _align_to_planes(
 
 
 def _ring_design(on_planes: _PlanePoints, pose: Floats) -> Floats:
-    """Return the derivatives of distances to planes.
+    """Return the derivatives of the distances to planes with respect to the ring offsets.
 
     The array has shape (k, 3), for range, elevation and azimuth.
     """
@@ -573,5 +574,8 @@ def _spherical_derivatives(points: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def transform_points(points: Floats, pose: Floats) -> Floats:
-    """Transform points of shape (n, 3) with a pose of shape (4, 4)."""
+    """Transform points from the frame of a pose.
+
+    The points have shape (n, 3), and the pose has shape (4, 4).
+    """
     return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])

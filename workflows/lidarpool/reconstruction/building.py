@@ -1,4 +1,4 @@
-"""Reconstruct a scene, the drive and the sensor from a recording, and measure the accuracy."""
+"""Reconstruct the scene, drive and sensor of a recording, and measure the accuracy."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ _MIN_DRIVE_M = 0.3  # On a shorter drive, the sensor counts as stationary.
 
 
 class TwinPose(NamedTuple):
-    """Pose of the sensor at a time."""
+    """Pose of the sensor at a given time."""
 
     pose: Floats  # (4, 4)
     time_s: float
@@ -97,7 +97,7 @@ class TwinPose(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Twin:
-    """Static scene that was reconstructed from a recording, with the recorded drive and sensor.
+    """Static scene reconstructed from a recording, and the drive and sensor of the recording.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ class Twin:
         return render_template("twin.txt", report=self.figures).rstrip("\n")
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write the scene, the drive, the sensor, a scenario that combines them, and a report.
+        """Write the scene, drive and sensor, a scenario that uses all three, and a report.
 
         The folder is created if it does not exist.
 
@@ -174,7 +174,7 @@ class Twin:
             return [(staged / name).replace(path / name) for name in (SCENE_FILE, *texts)]
 
     def _classes(self) -> dict[int, str]:
-        """Return the material names of surfels with a recorded class, by class number."""
+        """Return the material names of surfels with a recorded class, keyed by class number."""
         materials = self.scene.materials
         names = () if materials is None else sorted({*chain.from_iterable(materials.names)})
         numbers = {int(name.removeprefix(CLASS_MATERIAL)): name for name in names if name}
@@ -196,7 +196,7 @@ class Twin:
         return "\n".join(lines) + "\n"
 
     def _scenario(self) -> str:
-        """Format a scenario that simulates the recorded sensor on its drive through the scene."""
+        """Format a scenario that simulates the recorded drive of the sensor through the scene."""
         scenario: dict[str, Any] = {
             "scene": SCENE_FILE,
             "sensor": SENSOR_FILE,
@@ -240,7 +240,7 @@ def twin(
     resume: bool = False,
     tell: Callable[[str], None] | None = None,
 ) -> Twin:
-    """Reconstruct the static scene of a recording, so that it can be scanned again.
+    """Reconstruct the static scene of a recording, so that the scene can be scanned again.
 
     The drive is divided into submaps, which processes reconstruct one by one. For the statistics,
     every second sweep is first held out, and the rays of some of these sweeps are cast in the scene
@@ -321,7 +321,7 @@ def twin(
 
 
 def _check_sweeps(recorded: RecordedSweeps) -> None:
-    """Raise LidarError if the sweeps cannot be reconstructed."""
+    """Raise LidarError if the recording is unsuitable for a reconstruction."""
     recording = recorded.recording
     if recording.thinned:
         raise LidarError(f"{recording.notes[0]}.")
@@ -334,7 +334,7 @@ def _check_sweeps(recorded: RecordedSweeps) -> None:
 
 
 def _fingerprint_inputs(recorded: RecordedSweeps, trajectory: Path | None) -> list[object]:
-    """Return what determines a twin: its source, and the names, sizes and change times of files.
+    """Return the data that determines a twin, including names, sizes and change times of files.
 
     A recording in memory has no such identity, so it never matches a previous one.
     """
@@ -355,7 +355,7 @@ def _fingerprint_inputs(recorded: RecordedSweeps, trajectory: Path | None) -> li
 
 @dataclass(frozen=True, eq=False)
 class _Building:
-    """Steps that reconstruct a twin, with their settings."""
+    """Steps of reconstructing a twin, and their settings."""
 
     recorded: RecordedSweeps
     base: SensorModel | None
@@ -365,7 +365,6 @@ class _Building:
     tell: Callable[[str], None]
 
     def twin(self, trajectory: Path | None) -> Twin:
-        """Reconstruct the twin."""
         recorded = self.recorded
         self.tell(f"estimating the poses of {plural(recorded.count, 'sweep')}")
         poses = self._find_poses(trajectory)
@@ -404,7 +403,6 @@ class _Building:
     def _align_submaps(
         self, run: MapFunction, task: BuildTask, submaps: Sequence[Submap]
     ) -> Alignment:
-        """Align all sweeps, submap by submap."""
         self.tell(f"aligning the sweeps in {plural(len(submaps), 'submap')}")
         tasks = [
             SubmapTask(task.recorded, task.alignment, submap, task.mapped) for submap in submaps
@@ -415,7 +413,6 @@ class _Building:
     def _build_submaps(
         self, run: MapFunction, task: BuildTask, submaps: Sequence[Submap]
     ) -> _Built:
-        """Build the surface maps of all submaps."""
         sizes = [len(task.recorded.read(int(one.numbers[0]))) for one in submaps]
         count = sum(sizes) / len(sizes) * sum(len(one.own_numbers) for one in submaps)
         share = STATIONARY_DOTS / max(count, 1.0)
@@ -428,12 +425,11 @@ class _Building:
         return _Built(parts, submaps)
 
     def _load_observations(self, index: int) -> Observations:
-        """Load the rays that end on the surfels of a submap."""
         observations: Observations = self.steps.load(_BUILD, index)[1]
         return observations
 
     def _assemble(self, built: _Built, sweeps: AlignedSweeps, poses: RecordedPoses) -> Twin:
-        """Fit the response and the noise of the sensor, and assemble the twin."""
+        """Fit the sensor's response and noise, and assemble the twin."""
         recorded = self.recorded
         alignment = sweeps.alignment
         self.tell("fitting the sensor model")
@@ -503,7 +499,7 @@ class _Building:
         response: Response | None,
         timing: SweepTiming,
     ) -> tuple[SensorModel, list[str]]:
-        """Return the sensor with noise that is fitted to the middle of the drive, and notes."""
+        """Fit the sensor's noise to the middle of the drive, and return the sensor and notes."""
         middle = len(built.parts) // 2
         numbers = built.submaps[middle].own_numbers
         sizes = built.parts[middle].surfels.points
@@ -524,7 +520,7 @@ class _Building:
         return model, notes
 
     def _figures(self, built: _Built, alignment: Alignment) -> dict[str, Any]:
-        """Return statistics of the reconstruction and of the drive."""
+        """Return statistics of the reconstruction and the drive."""
         path = alignment.poses[:, :3, 3]
         surfels = [part.surfels for part in built.parts]
         return {
@@ -548,7 +544,7 @@ class _Building:
 
 
 class _BuiltSubmap(NamedTuple):
-    """Results of a submap that are kept in memory."""
+    """Those results of a submap that are kept in memory."""
 
     surfels: SubmapSurfels
     held_out: HeldOutRays | None
@@ -558,24 +554,21 @@ class _BuiltSubmap(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Built:
-    """Results of all submaps."""
-
     parts: Sequence[_BuiltSubmap]
     submaps: Sequence[Submap]
 
     def held_out(self) -> HeldOutRays:
-        """Return the rays of all held-out sweeps that were compared."""
         return HeldOutRays.concatenate(
             [part.held_out for part in self.parts if part.held_out is not None]
         )
 
     def dark(self) -> list[SceneMesh]:
-        """Return at most one mesh, which contains the surfels that return no pulses."""
+        """Return a list with the mesh of all surfels that return no pulses, or an empty list."""
         corners = np.concatenate([part.surfels.dark_corners for part in self.parts])
         return [surfel_mesh(NO_RETURN, corners)] if len(corners) else []
 
     def images(self) -> SweepImages:
-        """Return the images of a held-out sweep in the middle of the drive.
+        """Return the images of a held-out sweep from the middle of the drive.
 
         Raise LidarError if there is none.
         """
@@ -589,7 +582,7 @@ class _Built:
 
 
 class SweepTiming(NamedTuple):
-    """Start times of sweeps relative to their timestamps, and the rotation of the sensor."""
+    """Time from a sweep's timestamp to its start, and the rotation of the sensor."""
 
     rate_hz: float  # revolutions per second
     revolutions: int  # includes dropped sweeps
@@ -598,7 +591,7 @@ class SweepTiming(NamedTuple):
 
     @classmethod
     def from_sweeps(cls, sweeps: AlignedSweeps) -> SweepTiming:
-        """Determine the timing of sweeps."""
+        """Determine the timing of the recorded sweeps."""
         recorded = sweeps.recorded
         alignment = sweeps.alignment
         span_s = float(alignment.times_s[-1] - alignment.times_s[0])
@@ -615,13 +608,13 @@ class SweepTiming(NamedTuple):
         return cls(rate_hz, steps + 1, first_s, rotation)
 
     def start(self, alignment: Alignment) -> TwinPose:
-        """Return the pose and time at the start of the first sweep."""
+        """Return the sensor pose and the time at the start of the first sweep."""
         step, step_s = alignment.step(0)
         pose = alignment.poses[0] @ step.fraction(self.first_s / step_s)
         return TwinPose(pose, float(alignment.times_s[0]) + self.first_s)
 
     def stop(self, alignment: Alignment) -> TwinPose:
-        """Return the pose and time at the end of the last sweep, extrapolating its motion."""
+        """Return the extrapolated sensor pose and the time at the end of the last sweep."""
         span_s = float(alignment.times_s[-1] - alignment.times_s[0])
         rest_s = self.first_s + self.revolutions / self.rate_hz - span_s
         step, step_s = alignment.step(len(alignment.poses) - 1)
@@ -659,7 +652,7 @@ def fit_sensor(
     response: Response | None,
     sensor: SensorModel | None,
 ) -> tuple[SensorModel, list[str]]:
-    """Fit the noise of a sensor to its pulses on reconstructed surfaces.
+    """Fit a sensor's noise to its pulses that hit reconstructed surfaces.
 
     Parameters
     ----------
@@ -711,7 +704,7 @@ def fit_sensor(
 def _fit_to_sweeps(
     sweeps: AlignedSweeps, chosen: Ints, scene: Scene, response: Response | None
 ) -> Fit:
-    """Fit a sensor to the chosen sweeps, or raise LidarError.
+    """Fit a sensor to the selected sweeps, or raise LidarError if this is not possible.
 
     Points as fired have a firing pose for each pulse. Motion-compensated points have none, so their
     rings are blurred, and parallax at close objects looks like lost pulses.
@@ -758,7 +751,7 @@ def _fit_to_sweeps(
 
 
 def _stationary_notes(alignment: Alignment) -> list[str]:
-    """Return a note if the sensor was stationary."""
+    """Return a note if the sensor was stationary during the recording."""
     if np.ptp(alignment.poses[:, :3, 3], axis=0).max() > _MIN_DRIVE_M:
         return []
     return [
@@ -770,13 +763,12 @@ def _stationary_notes(alignment: Alignment) -> list[str]:
 
 
 def _median(values: Floats) -> float | None:
-    """Return the median of the finite values, or None if there are none."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else None
 
 
 def colored(mesh: SceneMesh, reflectances: Reflectances | None) -> SceneMesh:
-    """Color the surfels of a mesh by their reflectances."""
+    """Color the surfels of a mesh according to their reflectances."""
     if reflectances is None:
         return mesh
     light = reflectances.surfels[:, None].repeat(3, axis=1)

@@ -1,4 +1,4 @@
-"""Charts of a reconstruction: a held-out sweep and its simulation, a top view, and range errors."""
+"""Charts of a held-out sweep and its simulation, and of the accuracy of a reconstruction."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _PATH_COLOR = "#08519c"
 
 
 class _Image(NamedTuple):
-    """Image of a sweep with its caption and colors."""
+    """Image of a sweep, with a caption and colors."""
 
     words: str
     values: Floats32  # (r, c)
@@ -46,7 +46,7 @@ class _Image(NamedTuple):
 
 
 class SweepImages(NamedTuple):
-    """Images of a recorded sweep and of its simulation.
+    """Images of a recorded sweep and its simulation.
 
     The images have a row for each ring and a column for each azimuth. Their shape is (r, c), and
     pixels without a return are NaN.
@@ -66,7 +66,7 @@ class SweepImages(NamedTuple):
         reflectances: Reflectances | None,
         number: int,
     ) -> SweepImages:
-        """Render a sweep and its simulation on a surface map."""
+        """Create images of a sweep and of its simulation on a surface map."""
         sweep = sweeps.read(number)
         cells = _cells(sweep, sweeps)
         hits = surface_map.cast(sweep)
@@ -80,7 +80,7 @@ class SweepImages(NamedTuple):
         return cls(np.array([number]), range_m, in_twin_m, intensity, in_twin)
 
     def pictures(self) -> list[_Image]:
-        """Return the images to draw."""
+        """Return the images of the recorded and the simulated sweep, and of their differences."""
         near_m, far_m = np.nanquantile(self.range_m, (0.01, 0.98)).tolist()
         ranges = LogNorm(max(near_m, 0.1), max(far_m, 1.0))
         differences = Normalize(-_DIFFERENCE_M, _DIFFERENCE_M)
@@ -100,7 +100,7 @@ class SweepImages(NamedTuple):
 
 
 class TopViewPoints(NamedTuple):
-    """Horizontal positions of some points in world coordinates."""
+    """Horizontal positions of sampled points in world coordinates."""
 
     still: Floats32  # (n, 2), stationary points, meters
     moved: Floats32  # (k, 2), points on moving objects, meters
@@ -109,7 +109,7 @@ class TopViewPoints(NamedTuple):
     def from_sweeps(
         cls, sweeps: AlignedSweeps, stationary: Mapping[int, Bools], numbers: Ints, share: float
     ) -> TopViewPoints:
-        """Sample points of some sweeps.
+        """Sample points from several sweeps.
 
         `share` is the fraction of the stationary points that are chosen. The number of points on
         moving objects is limited for each sweep.
@@ -127,7 +127,7 @@ class TopViewPoints(NamedTuple):
 
 
 def draw_sweep(sweep: SweepImages) -> Page:
-    """Draw the ranges and intensities of a recorded sweep, its simulation, and the differences."""
+    """Draw the ranges and intensities of a recorded and a simulated sweep, and the differences."""
     images = sweep.pictures()
     height = _TOP + len(images) * _IMAGE_HEIGHT + (len(images) - 1) * _GAP + _BOTTOM
     page = Page((_WIDTH, height))
@@ -148,7 +148,7 @@ def draw_sweep(sweep: SweepImages) -> Page:
 
 
 def _cells(sweep: AlignedSweep, sweeps: AlignedSweeps) -> tuple[Ints, tuple[int, int]]:
-    """Return the pixel index of each point of a sweep, and the shape of the image."""
+    """Return the pixel index of each point, and the shape of the image."""
     row_count = sweeps.recorded.ring_count
     row = sweep.ring
     if not len(sweeps.recorded.elevation_rad):
@@ -165,7 +165,7 @@ def _cells(sweep: AlignedSweep, sweeps: AlignedSweeps) -> tuple[Ints, tuple[int,
 
 
 def _image(values: Floats, cells: tuple[Ints, tuple[int, int]]) -> Floats32:
-    """Return an image of the values at their pixels.
+    """Return an image with the values at their pixels.
 
     If several values share a pixel, the last one is used. Empty pixels are NaN.
     """
@@ -176,7 +176,7 @@ def _image(values: Floats, cells: tuple[Ints, tuple[int, int]]) -> Floats32:
 
 
 def draw_top_view(parts: Sequence[TopViewPoints], path: Floats) -> Page:
-    """Draw a top view of stationary and moving points and the path of the sensor.
+    """Draw stationary and moving points and the sensor path, as seen from above.
 
     `path` has the sensor positions, of shape (s, 3).
     """
@@ -203,7 +203,7 @@ def draw_top_view(parts: Sequence[TopViewPoints], path: Floats) -> Page:
 
 
 def draw_errors(figures: Mapping[str, Any]) -> Page:
-    """Draw the range errors over the sweep number and over the range."""
+    """Draw the range errors as functions of sweep number and range."""
     page = Page((_WIDTH, 560))
     page.title(
         "Range differences",

@@ -27,7 +27,7 @@ MapFunction = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
 class TwinStep(NamedTuple):
-    """Name of a step, and the types of its results."""
+    """Name of a reconstruction step, and types of its results."""
 
     name: str
     kinds: tuple[type, ...]  # NamedTuples or dataclasses whose fields are arrays or None
@@ -35,13 +35,13 @@ class TwinStep(NamedTuple):
 
 @dataclass(frozen=True)
 class FinishedSteps:
-    """Folder that contains the results of finished steps."""
+    """Folder with the results of finished reconstruction steps."""
 
     folder: Path
 
     @classmethod
     def begin(cls, folder: Path, made_of: object, *, resume: bool) -> FinishedSteps:
-        """Create the folder, or resume from a folder whose steps have the same inputs.
+        """Create the folder, or open an existing one with results of the same inputs.
 
         Parameters
         ----------
@@ -79,13 +79,13 @@ class FinishedSteps:
         return cls(folder)
 
     def remove(self) -> None:
-        """Remove the folder and its results."""
+        """Remove the folder and the results that it contains."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def each(
         self, step: TwinStep, run: MapFunction, function: Callable[[Any], Any], items: Sequence[Any]
     ) -> Iterator[tuple[Any, ...]]:
-        """Yield the results of a step for each item.
+        """Yield the results of a reconstruction step for each item.
 
         Items without a stored result are processed by `run`, which has the signature of `map`. The
         function returns a record or None for each type of the step.
@@ -100,13 +100,13 @@ class FinishedSteps:
             yield self.load(step, index)
 
     def once(self, step: TwinStep, call: Callable[[], tuple[Any, ...]]) -> tuple[Any, ...]:
-        """Return the results of a step that runs once, from the folder or by calling `call`."""
+        """Load the results of a step that runs once, calling `call` if it has not run yet."""
         if not self._file(step, 0).exists():
             self._save(step, 0, call())
         return self.load(step, 0)
 
     def load(self, step: TwinStep, index: int) -> tuple[Any, ...]:
-        """Load the results of a step for an item."""
+        """Load the results that a step has computed for an item."""
         with np.load(self._file(step, index)) as arrays:
             return tuple(
                 _record(kind, f"{number}.", arrays) for number, kind in enumerate(step.kinds)
@@ -133,7 +133,7 @@ class FinishedSteps:
 
 
 def _record(kind: type, prefix: str, arrays: Any) -> Any:
-    """Create a record from arrays, or return None if the record has none."""
+    """Create a record from arrays, or return None if there are no arrays with the given prefix."""
     found = {name: arrays.get(prefix + name) for name in _names(kind)}
     return None if all(value is None for value in found.values()) else kind(**found)
 
@@ -146,7 +146,6 @@ def _names(kind: type) -> list[str]:
 
 
 def _replace(file: Path, write: Callable[[Path], Any]) -> None:
-    """Write a file atomically."""
     part = file.with_name(f"{file.name}.part")
     write(part)
     Path(part).replace(file)

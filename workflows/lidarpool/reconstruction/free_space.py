@@ -1,4 +1,4 @@
-"""Detect points on moving objects, which are not part of the static scene.
+"""Detect points on moving objects, so that they can be excluded from the static scene.
 
 The rays of a sweep form a range image. A point of another sweep is in front of, among, or behind
 the surfaces in the image around its direction. If the point is in front of them, a ray passed
@@ -30,7 +30,7 @@ _MIN_PASSING = 2  # From this number of passing rays, a tie counts as motion.
 
 @dataclass(frozen=True, eq=False)
 class RangeImage:
-    """Ranges of the nearest and farthest surfaces of a sweep around each direction.
+    """Ranges of the nearest and farthest surfaces around each direction of a sweep.
 
     The neighborhood of a direction is three rows by three columns. Beams are wide, so a point next
     to an edge is neither in front of nor behind it.
@@ -43,7 +43,7 @@ class RangeImage:
 
     @classmethod
     def from_points(cls, points: Floats, row_elevation_rad: Floats) -> RangeImage:
-        """Create an image of points in the sensor frame.
+        """Create a range image from points in sensor coordinates.
 
         The points have shape (n, 3). The row elevations have shape (r,), highest first.
         """
@@ -67,7 +67,7 @@ class RangeImage:
         )
 
     def classify(self, points: Floats) -> tuple[Bools, Bools]:
-        """Compare points in the sensor frame with the image.
+        """Compare points in sensor coordinates with the range image.
 
         Return two masks of shape (n,). The first marks points that a ray passed through, and the
         second marks points that the image confirms.
@@ -85,14 +85,13 @@ class RangeImage:
 
 
 def _cells(points: Floats, edges_rad: Floats) -> tuple[Ints, Ints]:
-    """Return the image rows and columns of points."""
     turns = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
     rows = np.searchsorted(edges_rad, -elevations(points))
     return rows, (turns * _COLUMNS).astype(np.int64) % _COLUMNS
 
 
 def find_stationary_points(sweeps: AlignedSweeps, numbers: Sequence[int]) -> dict[int, Bools]:
-    """Return a mask of the stationary points of each sweep, by sweep number.
+    """Find the stationary points of each sweep, and return their masks, keyed by sweep number.
 
     `numbers` are the sweeps to compare with each other, in ascending order. The masks have shape
     (n,).

@@ -1,4 +1,4 @@
-"""Accuracy statistics of a reconstruction, from sweeps that were held out.
+"""Measure the accuracy of a reconstruction with sweeps that were held out.
 
 The rays of a held-out sweep are cast in the map that was built from the other sweeps. The
 statistics therefore measure how well a sensor can be simulated, not how well the map fits its own
@@ -26,7 +26,7 @@ _RANGES_M = (0, 5, 10, 20, 40, 80, np.inf)  # boundaries of the range classes
 
 @dataclass(frozen=True, eq=False)
 class HeldOutRays:
-    """Rays of held-out sweeps, recorded and simulated, as arrays of n rays.
+    """Recorded and simulated rays of held-out sweeps, as arrays of n rays.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class HeldOutRays:
 
     @classmethod
     def concatenate(cls, parts: Sequence[HeldOutRays]) -> HeldOutRays:
-        """Concatenate rays."""
+        """Concatenate the rays of several sweeps."""
         return cls(
             *(
                 np.concatenate([getattr(part, column.name) for part in parts])
@@ -62,15 +62,18 @@ class HeldOutRays:
 
     @property
     def returned(self) -> Bools:
-        """Mask of shape (n,) of the rays that have a recorded return."""
+        """Mask of the rays that have a recorded return.
+
+        The array has shape (n,).
+        """
         return np.isfinite(self.range_m)
 
     def select(self, rays: Bools) -> HeldOutRays:
-        """Select rays by a mask."""
+        """Select rays with a mask."""
         return HeldOutRays(*(getattr(self, column.name)[rays] for column in fields(self)))
 
     def figures(self) -> dict[str, Any]:
-        """Return statistics of all rays, of stationary points, by range class, and by sweep."""
+        """Return statistics of all rays, stationary points, range classes and sweeps."""
         classes = [
             {"from_m": low, "to_m": None if np.isinf(high) else high}
             | self._figures((self.range_m >= low) & (self.range_m < high))
@@ -91,20 +94,20 @@ class HeldOutRays:
         }
 
     def _points(self, low_m: float, high_m: float) -> float | None:
-        """Return the ratio of simulated to recorded points within a range interval."""
+        """Return the ratio of simulated to recorded points with ranges in an interval."""
         recorded = ((self.range_m >= low_m) & (self.range_m < high_m)).sum()
         simulated = ((self.simulated_m >= low_m) & (self.simulated_m < high_m)).sum()
         return float(simulated / recorded) if recorded else None
 
     def _points_by_ring(self) -> float:
-        """Return the median deviation from 1 of the simulated-to-recorded point ratios of rings."""
+        """Return the typical relative error of the simulated point count of a ring."""
         recorded = np.bincount(self.ring, self.returned)
         simulated = np.bincount(self.ring, np.isfinite(self.simulated_m))
         known = recorded > 0
         return float(np.median(np.abs(simulated[known] / recorded[known] - 1)))
 
     def _no_return(self) -> dict[str, Any] | None:
-        """Compare recorded and simulated rays without a return.
+        """Compare the rays without a return in the recording and in the simulation.
 
         F1 is the harmonic mean of precision and recall of missing returns. Return None if no pulse
         was lost in the recording.
@@ -120,7 +123,7 @@ class HeldOutRays:
         }
 
     def _figures(self, rays: Bools) -> dict[str, Any]:
-        """Return statistics of selected rays that have a recorded return."""
+        """Return statistics of those selected rays that have a recorded return."""
         difference_m = self.simulated_m[rays] - self.range_m[rays]
         met = np.isfinite(difference_m)
         size_m = np.abs(difference_m[met])
@@ -153,7 +156,7 @@ def simulate_held_out(
     stationary: Mapping[int, Bools],
     numbers: Sequence[int],
 ) -> HeldOutRays:
-    """Simulate held-out sweeps on a map that was built from other sweeps.
+    """Simulate held-out sweeps, using a map that was built from other sweeps.
 
     Parameters
     ----------
@@ -194,7 +197,7 @@ def _rays(
     range_m: Floats,
     stationary: Bools,
 ) -> HeldOutRays:
-    """Cast the rays of a sweep, and combine them with the recorded ranges."""
+    """Cast the rays of a sweep, and combine the results with the recorded ranges."""
     hits = surface_map.cast(sweep)
     simulated_m = np.full(len(sweep.points), np.nan)
     simulated_m[hits.rays] = np.where(

@@ -1,4 +1,4 @@
-"""Labels that transfer the class and object of each point to the surfels.
+"""Labels that assign the class and object of each point to surfels.
 
 As in SemanticKITTI, the lower 16 bits of a label are the class. The upper bits are the object
 number plus 1. Class and object are combined in one number, so the most frequent label of the points
@@ -24,7 +24,7 @@ _MAX_CLASS = (1 << _CLASS_BITS) - 1
 
 
 def labels_of(sweep: Sweep) -> Ints | None:
-    """Return the labels of the points of a sweep, or None without classes and objects."""
+    """Return the label of each point in a sweep, or None if there are no classes and objects."""
     classes, objects = sweep.classes, sweep.objects
     known = objects if classes is None else classes
     if known is None:
@@ -39,7 +39,7 @@ def labels_of(sweep: Sweep) -> Ints | None:
 
 
 def split_by_object(mesh: SceneMesh) -> list[SceneMesh]:
-    """Split a mesh of surfels by object, and name the materials by class.
+    """Split a surfel mesh by object, and name its materials by class.
 
     Objects are in ascending order of their numbers. Surfels without an object are last, and keep
     the name of the mesh. Class 0 means that there is no class, so it has no material.
@@ -61,7 +61,7 @@ def split_by_object(mesh: SceneMesh) -> list[SceneMesh]:
 
 
 def _part(mesh: SceneMesh, name: str, faces: Ints, classes: Ints) -> SceneMesh:
-    """Return the surfels of some faces as a mesh with materials by class."""
+    """Return the surfels with the given faces as a mesh whose materials are named by class."""
     corners = mesh.vertices.reshape(-1, 4, 3)[faces[::2] // 2]
     present, rows = np.unique(classes, return_inverse=True)
     names = tuple(f"{CLASS_MATERIAL}{number}" if number else "" for number in present.tolist())

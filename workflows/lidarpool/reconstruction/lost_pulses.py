@@ -1,4 +1,4 @@
-"""Find pulses without a return, from gaps between the returns of a ring.
+"""Detect pulses without a return in the gaps between a ring's returns.
 
 A ring fires at even azimuth steps, so a gap of several steps between two returns contains lost
 pulses. There are two exceptions. Dropped packets leave gaps in all rings at once. In
@@ -38,7 +38,7 @@ _MIN_RINGS = 0.05  # minimum share of rings with returns in a sector that receiv
 def lost_pulses(
     sweep: Sweep, elevation_rad: Floats, coverage: SensorCoverage, moved_m: float
 ) -> tuple[Sweep, Floats]:
-    """Find the lost pulses of a sweep.
+    """Find the pulses of a sweep that were lost.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def lost_pulses(
 
 
 def _times_s(sweep: Sweep, azimuth: Floats) -> Floats:
-    """Return the times of pulses, which are taken from the returns with the closest azimuths."""
+    """Return the time of each pulse, taken from the return with the closest azimuth."""
     azimuths = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
     order = np.argsort(azimuths)
     turned = (azimuth + np.pi) % (2 * np.pi) - np.pi
@@ -95,7 +95,7 @@ def _times_s(sweep: Sweep, azimuth: Floats) -> Floats:
 
 
 def firings_per_turn(sweep: Sweep) -> int:
-    """Return the number of firings per revolution, based on the typical azimuth step."""
+    """Return the number of firings per revolution, derived from the typical azimuth step."""
     return round(2 * np.pi / float(np.median(_Gaps.from_sweep(sweep).step_rad)))
 
 
@@ -112,7 +112,7 @@ class _Lost(NamedTuple):
 
 
 class _Gaps(NamedTuple):
-    """Returns of a sweep, sorted by ring and azimuth, and the gaps between them."""
+    """Returns of a sweep sorted by ring and azimuth, and the gaps between these returns."""
 
     azimuth: Floats  # (n,), radians
     elevation: Floats  # (n,), radians
@@ -147,7 +147,7 @@ class _Gaps(NamedTuple):
         return cls(azimuth, elevation, range_m, ring, following, gap_rad, step_rad)
 
     def between(self, moved_m: float) -> _Lost:
-        """Return the lost pulses within the gaps."""
+        """Return the pulses that were lost within gaps."""
         parallax_rad = moved_m * np.abs(1 / self.range_m - 1 / self.range_m[self.following])
         steps = np.rint(self.gap_rad / self.step_rad).astype(np.int64)
         is_gap = self.gap_rad > _MIN_STEPS * self.step_rad + parallax_rad
@@ -161,7 +161,7 @@ class _Gaps(NamedTuple):
         return _Lost(azimuth, elevation, self.ring[before], self._ranges(before, share))
 
     def _ranges(self, before: Ints, share: Floats) -> Floats:
-        """Interpolate the ranges at fractions of gaps, which begin at the returns `before`.
+        """Interpolate the ranges within the gaps that begin at the returns `before`.
 
         The ranges are NaN if the gap is wide or its ends lie on different surfaces.
         """
@@ -175,12 +175,12 @@ class _Gaps(NamedTuple):
 
 
 def _step_rad(gap_rad: Floats) -> float:
-    """Return the median gap between the pulses of a ring, ignoring gaps within a pulse."""
+    """Return the median azimuth step of a ring, ignoring steps between returns of one pulse."""
     return float(np.median(gap_rad[gap_rad > _MIN_STEP_RAD]))
 
 
 def _received(gaps: _Gaps, ring_count: int) -> Bools:
-    """Mark the sectors in which enough rings have returns, so that packets were received."""
+    """Mark azimuth sectors in which enough rings have returns to show that packets arrived."""
     cells = np.unique(_sectors(gaps.azimuth) * ring_count + gaps.ring)
     rings = np.bincount(cells // ring_count, minlength=_SECTORS)
     return np.asarray(rings >= max(_MIN_RINGS * ring_count, 1))
@@ -191,14 +191,14 @@ def _sectors(azimuth: Floats) -> Ints:
 
 
 class SensorCoverage(NamedTuple):
-    """Directions in which a sensor can have returns."""
+    """Directions from which a sensor can receive returns."""
 
     cells: Bools  # (r, c), rings and azimuth cells that the vehicle does not block
     max_range_m: float  # maximum range of a return, meters
 
     @classmethod
     def from_sweeps(cls, sweeps: RecordedSweeps) -> SensorCoverage:
-        """Determine the directions in which sweeps have returns.
+        """Determine the directions from which sweeps contain returns.
 
         Raises
         ------
@@ -223,6 +223,5 @@ class SensorCoverage(NamedTuple):
 
 
 def _cells(sweep: Sweep) -> tuple[Ints, Ints]:
-    """Return the rings and azimuth cells of the rays of a sweep."""
     turns = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi) + 0.5
     return sweep.columns["row"], (turns * _COLUMNS).astype(np.int64) % _COLUMNS

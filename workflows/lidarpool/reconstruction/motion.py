@@ -1,4 +1,4 @@
-"""Motion of the sensor within a sweep, which the points are compensated for.
+"""Sensor motion during a sweep, for which points are compensated.
 
 Recordings store points either as fired, in the sensor frame at the time of each firing, or
 motion-compensated, in the sensor frame at the start of the sweep. Files do not state which. The
@@ -19,7 +19,7 @@ from lidarsim.numerics.arrays import Floats
 
 
 class Motion(StrEnum):
-    """How the points of a recording were stored."""
+    """Whether stored points are motion-compensated, and how their firing times are known."""
 
     COMPENSATED = "compensated"
     TIMED = "as fired, with point times"
@@ -32,7 +32,7 @@ class Motion(StrEnum):
         return self in (Motion.COUNTERCLOCKWISE, Motion.CLOCKWISE)
 
     def times_s(self, sweep: Sweep, sweep_s: float) -> Floats | None:
-        """Return the times of points in seconds relative to the timestamp of their sweep.
+        """Return the time of each point in seconds, relative to the sweep's timestamp.
 
         `sweep_s` is the duration of a sweep. Return None if the points are motion-compensated.
         """
@@ -48,14 +48,17 @@ class Motion(StrEnum):
 
 
 class MotionStep(NamedTuple):
-    """Motion of the sensor between the timestamps of two sweeps, in the first sensor frame."""
+    """Sensor motion between the timestamps of two sweeps, in the sensor frame of the first."""
 
     rotation: Floats  # (3,), rotation vector, radians
     translation: Floats  # (3,), meters
 
     @classmethod
     def between(cls, pose: Floats, following: Floats) -> MotionStep:
-        """Return the motion between two poses of shape (4, 4)."""
+        """Return the motion between two poses.
+
+        Both poses have shape (4, 4).
+        """
         from scipy.spatial.transform import Rotation
 
         turned = pose[:3, :3].T @ following[:3, :3]
@@ -65,7 +68,10 @@ class MotionStep(NamedTuple):
         )
 
     def fraction(self, share: float) -> Floats:
-        """Return a fraction of the motion as a transformation of shape (4, 4)."""
+        """Return a fraction of the motion as a transformation matrix.
+
+        The matrix has shape (4, 4).
+        """
         from scipy.spatial.transform import Rotation
 
         moved = np.eye(4)
@@ -74,7 +80,7 @@ class MotionStep(NamedTuple):
         return moved
 
     def compensate(self, points: Floats, shares: Floats) -> Floats:
-        """Transform points into the first frame of the step.
+        """Transform points to the first sensor frame of the step.
 
         The points have shape (n, 3) and were fired at the given fractions of the step, of shape
         (n,).

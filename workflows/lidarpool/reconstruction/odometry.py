@@ -1,4 +1,4 @@
-"""Poses of the sweeps of a recording: recorded, read from a file, or estimated by registration."""
+"""Sweep poses that are recorded, read from a file, or estimated by registration."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ DEFAULT_PERIOD_S = 0.1  # for recordings without times, since most lidars rotate
 
 
 class RecordedPoses(NamedTuple):
-    """Poses of the sweeps of a recording."""
+    """Poses of all sweeps in a recording."""
 
     matrices: Floats  # (s, 4, 4), from the sensor frame to the scene frame, meters
     times_s: Floats  # (s,), ascending from 0
@@ -45,7 +45,7 @@ class RecordedPoses(NamedTuple):
 
     @property
     def are_given(self) -> bool:
-        """Whether the poses come from the recording or a file, not from registration."""
+        """Whether the poses come from the recording or a file instead of a registration."""
         return not self.share
 
     def select(self, window: slice) -> RecordedPoses:
@@ -54,7 +54,7 @@ class RecordedPoses(NamedTuple):
 
     @classmethod
     def in_world(cls, matrices: Floats, times_s: Floats, source: str) -> RecordedPoses:
-        """Create poses from matrices in world coordinates.
+        """Create poses from transformation matrices in world coordinates.
 
         Large coordinates are reduced by a local origin. `matrices` has shape (s, 4, 4).
         """
@@ -124,7 +124,7 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
 
 
 def _read_poses(sweeps: RecordedSweeps, trajectory: Path, times_s: Floats) -> tuple[Floats, Floats]:
-    """Read the poses of a file, and return them with the times of the sweeps.
+    """Read poses from a file, and return the pose and time of each sweep.
 
     A file without times must have one pose for each sweep. Poses with times are interpolated at the
     timestamps of the sweeps. If the recording has no timestamps, there must be one pose for each
@@ -159,7 +159,9 @@ def _read_poses(sweeps: RecordedSweeps, trajectory: Path, times_s: Floats) -> tu
 
 
 def _sensor_poses(sweeps: RecordedSweeps, trajectory: Path, rows: Floats) -> Floats:
-    """Return the sensor poses, of shape (s, 4, 4), from KITTI rows of shape (k, 3, 4).
+    """Convert KITTI rows to sensor poses.
+
+    The rows have shape (k, 3, 4), and the poses have shape (s, 4, 4).
 
     The rows are camera poses if the recording, or otherwise the folder of the file, contains a
     KITTI calibration.

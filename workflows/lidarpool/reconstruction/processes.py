@@ -1,4 +1,4 @@
-"""Worker processes that reconstruct submaps, on a cluster or on this machine."""
+"""Worker processes that reconstruct submaps, either in a cluster or on this machine."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _UNLIMITED = dict.fromkeys(
 
 @contextmanager
 def parallel_map(client: Client | None, count: int) -> Iterator[MapFunction]:
-    """Yield a `map` function that runs in worker processes and keeps the order of the items.
+    """Yield a `map` function that runs in worker processes and preserves the order of items.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Sweeps of a recording with the columns that a reconstruction requires.
+"""Sweeps of a recording, with the columns that are required for a reconstruction.
 
 Worker processes read them, too. `RecordedSweeps.read` describes the columns.
 """
@@ -41,7 +41,7 @@ def _opened(file: RecordingFile) -> Recording:
 
 
 class Rotation(NamedTuple):
-    """Rotation of a sensor."""
+    """Direction and start azimuth of a sensor's rotation."""
 
     is_clockwise: bool
     start_deg: float  # azimuth at the start of a sweep, 0 to 360
@@ -49,7 +49,7 @@ class Rotation(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RecordedSweeps:
-    """The sweeps of a recording, which are read one at a time.
+    """Sweeps of a recording, only one of which is read at a time.
 
     Rings, times and timestamps are stored here, so that other processes do not have to determine
     them again.
@@ -109,12 +109,12 @@ class RecordedSweeps:
 
     @property
     def recording(self) -> Recording:
-        """The recording, which each process opens once."""
+        """Recording that each process opens once."""
         return self.source if isinstance(self.source, Recording) else _opened(self.source)
 
     @property
     def notes(self) -> list[str]:
-        """Notes for the user on information that the recording lacks."""
+        """Notes for the user about information that is missing from the recording."""
         notes = [self.rings.note]
         if self.point_times is not None and self.stamps_s is not None and not self.is_compensated:
             notes.append(self.point_times.note(self.recording.name))
@@ -127,35 +127,38 @@ class RecordedSweeps:
 
     @property
     def elevation_rad(self) -> Floats:
-        """Median elevations of the rings from the highest to the lowest, of shape (r,)."""
+        """Median elevation of each ring, from the highest to the lowest.
+
+        The array has shape (r,).
+        """
         return self.rings.elevation_rad
 
     @property
     def ring_count(self) -> int:
-        """Number of rings, which is 1 for a sensor without rings."""
+        """Number of rings, or 1 for a sensor without rings."""
         return max(len(self.rings), 1)
 
     @property
     def gap_rad(self) -> float:
-        """Typical angle between the rays of neighboring rings in radians."""
+        """Median angle between neighboring rings, in radians."""
         if len(self.rings) < MIN_RINGS:
             return _GAP_RAD
         return float(np.median(-np.diff(self.elevation_rad)))
 
     @property
     def is_compensated(self) -> bool:
-        """Whether the points are known to be motion-compensated, as in results of lidarpool."""
+        """Whether the points are certainly motion-compensated, as in results of lidarpool."""
         return self.recording.fired is not None
 
     def with_cached(self, numbers: Iterable[int]) -> RecordedSweeps:
-        """Return a copy that holds some sweeps in memory.
+        """Return a copy that keeps some sweeps in memory.
 
         `numbers` are in ascending order, because bags can only be read from their start.
         """
         return replace(self, _kept={number: _compact(self.read(number)) for number in numbers})
 
     def read(self, number: int) -> Sweep:
-        """Read the returns of a sweep whose rings are known.
+        """Read the returns of a sweep whose rings can be determined.
 
         The sweep has the following columns. All except `row` are omitted if they are unknown, and
         `time_s` and `start_rad` are also omitted if the points are known to be motion-compensated.
@@ -192,13 +195,12 @@ class RecordedSweeps:
         return sweep if known.all() or not len(self.rings) else sweep.select(known)
 
     def _returns(self, number: int) -> Sweep:
-        """Read the returns of a sweep with the columns that are used."""
         sweep = self.recording[number]
         used = {name: values for name, values in sweep.columns.items() if name in _COLUMNS}
         return sweep.with_columns(**used).returns()
 
     def _times_s(self, number: int, returns: Sweep) -> Floats | None:
-        """Return the times (n,) of the points of a sweep relative to its timestamp, or None."""
+        """Return the time of each point relative to its sweep's timestamp, or None if unknown."""
         if self.point_times is None:
             return None
         stamp_s = None if self.stamps_s is None else float(self.stamps_s[number])
@@ -207,7 +209,7 @@ class RecordedSweeps:
         return self.point_times.relative_times(returns.columns, stamp_s)
 
     def rotation(self, period_s: float, first_s: float) -> Rotation | None:
-        """Determine the rotation from the times and azimuths of points, or return None.
+        """Determine the sensor's rotation from the times and azimuths of points, if possible.
 
         A revolution takes `period_s` and starts at `first_s` relative to the timestamp. The start
         azimuth is a mean over rings and sweeps. Motion compensation hardly affects it, because it
@@ -230,14 +232,14 @@ class RecordedSweeps:
         return Rotation(best == 1, float(np.degrees(np.angle(sums[best])) % 360))
 
     def starts(self, *, is_clockwise: bool) -> Rotation:
-        """Determine the rotation from its direction and the azimuths at which rings start."""
+        """Determine the sensor's rotation from its direction and the azimuths where rings start."""
         numbers = even_indices(self.count, _REFERENCE_SWEEPS).tolist()
         starts_rad = [ring_starts(self.read(number), self.ring_count) for number in numbers]
         mean = float(np.angle(np.exp(1j * np.stack(starts_rad)).sum()))
         return Rotation(is_clockwise, float(np.degrees(mean) % 360))
 
     def cone_spread_rad(self, number: int) -> float:
-        """Return how far the rings of a sweep deviate from cones, or inf if it has no points."""
+        """Return the deviation of the rings from cones in radians, or inf for an empty sweep."""
         sweep = self.read(number)
         if not len(sweep):
             return float("inf")
@@ -245,7 +247,7 @@ class RecordedSweeps:
 
 
 def ring_starts(sweep: Sweep, ring_count: int) -> Floats:
-    """Return the azimuths (r,) in radians at which the rings of a sweep start.
+    """Return the azimuth at which each ring of a sweep starts, in radians.
 
     The points are in the order of the recording, so a ring starts at its first point. In some
     sensors, the azimuths of the lasers differ by several degrees. If the first pulses of a ring
@@ -268,7 +270,7 @@ def ring_starts(sweep: Sweep, ring_count: int) -> Floats:
 
 
 def _compact(sweep: Sweep) -> Sweep:
-    """Return a sweep that uses half as much memory."""
+    """Convert a sweep to a form that requires half as much memory."""
     columns = {name: values for name, values in sweep.columns.items() if name != "start_rad"}
     columns["row"] = columns["row"].astype(np.int16)
     if "intensity" in columns:
@@ -277,7 +279,6 @@ def _compact(sweep: Sweep) -> Sweep:
 
 
 def _wide(sweep: Sweep) -> Sweep:
-    """Return a compact sweep in double precision."""
     columns = {**sweep.columns, "row": sweep.columns["row"].astype(np.int64)}
     if "intensity" in columns:
         columns["intensity"] = columns["intensity"].astype(np.float64)
@@ -285,19 +286,17 @@ def _wide(sweep: Sweep) -> Sweep:
 
 
 def _exact32(values: AnyArray) -> AnyArray:
-    """Return values in single precision if they can be represented exactly."""
     single = values.astype(np.float32)
     return single if np.array_equal(single, values, equal_nan=True) else values
 
 
 def _has_points(recording: Recording) -> bool:
-    """Return whether any of the reference sweeps has points."""
     numbers = even_indices(len(recording), _REFERENCE_SWEEPS).tolist()
     return any(len(recording.read_fired(number)) for number in numbers)
 
 
 def _stamps_s(recording: Recording) -> Floats | None:
-    """Return the timestamps (s,) of the sweeps of a recording in seconds, or None without any."""
+    """Return the timestamps of all sweeps in seconds, or None if the recording has none."""
     if recording.stamps_ns is None:
         return None
     stamps_s = 1e-9 * recording.stamps_ns

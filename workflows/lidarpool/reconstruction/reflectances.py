@@ -1,4 +1,4 @@
-"""Estimate the reflectances of surfels from intensities.
+"""Estimate the reflectances of surfels from recorded intensities.
 
 A recorded intensity is modeled as the product of the surface reflectance, a law of range and
 incidence (`IntensityModel`), and three sensor factors. The factors depend on the range, on the
@@ -35,19 +35,19 @@ _WHITE_RANGE_M = 10.0  # range at which a white surface has a simulated intensit
 
 
 class IntensityModel(StrEnum):
-    """How intensities depend on range and incidence, apart from the sensor factors."""
+    """Model of how intensities depend on range and angle of incidence."""
 
     COMPENSATED = "compensated for range"
     ENERGIES = "energies"
 
     def law(self, range_m: AnyFloats, cosine: AnyFloats) -> Floats:
-        """Return the relative intensities of surfaces with the same reflectance."""
+        """Return the relative intensities of surfaces that have equal reflectance."""
         if self is IntensityModel.COMPENSATED:
             return np.ones(len(range_m))
         return self.simulated(range_m, cosine)
 
     def simulated(self, range_m: AnyFloats, cosine: AnyFloats) -> Floats:
-        """Return the intensities that a simulation writes for white surfaces.
+        """Return the intensities that a simulation stores for white surfaces.
 
         Energies correspond to the simulated column `intensity`. Intensities that are compensated
         for range correspond to the column `reflectance`, to which `reflectivity` is proportional.
@@ -60,7 +60,7 @@ class IntensityModel(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """Relationship between the intensities of a sensor and surface reflectances.
+    """Relationship between the intensities of a sensor and the reflectances of surfaces.
 
     Attributes
     ----------
@@ -91,16 +91,19 @@ class Response:
     scale: float
 
     def factors(self, range_m: AnyFloats, cosine: AnyFloats, ring: Integers) -> Floats:
-        """Return the expected intensities of white surfaces, of shape (k,)."""
+        """Return the expected intensities of white surfaces.
+
+        The array has shape (k,).
+        """
         factors = self.by_range[_range_bin(range_m)] * self.by_incidence[_incidence_bin(cosine)]
         law = self.model.law(range_m, cosine)
         return np.asarray(factors * self.by_ring[ring] * self.white * law)
 
     def reflectances(self, observations: Observations, centers: Floats) -> Reflectances:
-        """Estimate the reflectances of surfels with centers of shape (m, 3).
+        """Estimate the reflectances of surfels, given the centers of the surfels.
 
-        A surfel that no ray hits, for example because it is occluded, has the reflectance of the
-        nearest surfel with observations.
+        The centers have shape (m, 3). A surfel that no ray hits, for example because it is
+        occluded, has the reflectance of the nearest surfel with observations.
         """
         from scipy.spatial import cKDTree
 
@@ -119,7 +122,7 @@ class Response:
         return Reflectances(np.clip(surfels, _MIN_REFLECTANCE, 1.0), self)
 
     def figures(self) -> dict[str, Any]:
-        """Return the response for the report."""
+        """Return the response as a dictionary for the report."""
         return {
             "model": self.model.value,
             "white": self.white,
@@ -131,13 +134,13 @@ class Response:
 
 @dataclass(frozen=True, eq=False)
 class Reflectances:
-    """Reflectances of surfels, with the sensor response from which intensities are computed."""
+    """Reflectances of surfels, and the sensor response that converts them to intensities."""
 
     surfels: Floats  # (m,), 0.01 to 1
     response: Response
 
     def intensities(self, sweep: AlignedSweep, hits: SurfelHits) -> Floats:
-        """Simulate the intensities of the rays of a sweep, on the scale of the recording.
+        """Simulate the intensities of a sweep's rays, on the scale of the recorded intensities.
 
         The array has shape (n,), and is NaN for rays that hit nothing.
         """
@@ -150,7 +153,7 @@ class Reflectances:
 def fit_response(
     parts: Sequence[Observations], ring_count: int, *, are_energies: bool
 ) -> Response | None:
-    """Fit the response of a sensor to rays that end on surfels.
+    """Fit a sensor's response to rays that end on surfels.
 
     Return None if there are no intensities.
 
@@ -197,7 +200,7 @@ def fit_response(
 
 
 class _Factors(NamedTuple):
-    """Fitted sensor factors and surfel reflectances, which are NaN for unobserved surfels."""
+    """Fitted sensor factors and reflectances of surfels, which are NaN for unobserved surfels."""
 
     model: IntensityModel
     intensity: Floats  # (k,), where retroreflectors are clipped to white
@@ -210,7 +213,7 @@ class _Factors(NamedTuple):
     def from_rays(
         cls, observations: Observations, model: IntensityModel, ring_count: int
     ) -> _Factors:
-        """Fit factors and reflectances alternately to the intensities of rays.
+        """Alternately fit the factors and the reflectances to the intensities of rays.
 
         A surface is observed at few ranges, incidences and rings, so what they do not determine
         remains unchanged.
@@ -245,7 +248,7 @@ class _Factors(NamedTuple):
 
 
 def _ratios(row: Integers, values: AnyFloats, expected: AnyFloats, before: Floats) -> Floats:
-    """Return the ratio of summed values to summed expected values in each row.
+    """Return the sum of values divided by the sum of expected values, for each row.
 
     Rows with too little data keep their value in `before`.
     """

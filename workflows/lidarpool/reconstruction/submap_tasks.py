@@ -1,4 +1,4 @@
-"""Tasks of worker processes, which align the sweeps of a submap and build its surface map."""
+"""Tasks of worker processes that align the sweeps of a submap or build its surface map."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .surfels import Surfels, surfel_mesh
 
 @dataclass(frozen=True, eq=False)
 class SubmapTask:
-    """A submap to align.
+    """Task of aligning the sweeps of a submap.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class SubmapTask:
 
 @dataclass(frozen=True, eq=False)
 class BuildTask(SubmapTask):
-    """A submap whose surface map is built.
+    """Task of building the surface map of a submap.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class BuildTask(SubmapTask):
 
 
 class SubmapSurfels(NamedTuple):
-    """Surfels of a submap, with point counts of its own sweeps."""
+    """Surfels of a submap, and point counts of the sweeps that belong to it."""
 
     corners: Floats  # (m, 4, 3), meters
     dark_corners: Floats  # (d, 4, 3), meters, of surfels that return no pulses
@@ -87,7 +87,7 @@ class SubmapSurfels(NamedTuple):
     def from_surfels(
         cls, surfels: Surfels, chosen: Bools, stationary: Mapping[int, Bools], own: Ints
     ) -> SubmapSurfels:
-        """Extract the chosen surfels, and count the points of the sweeps in `own`."""
+        """Extract the selected surfels, and count the points of the sweeps in `own`."""
         corners = surfels.mesh.vertices.reshape(-1, 4, 3)
         lit = chosen & ~surfels.dark
         materials = surfels.mesh.materials
@@ -103,7 +103,7 @@ class SubmapSurfels(NamedTuple):
         )
 
     def mesh(self, name: str) -> SceneMesh:
-        """Return a mesh of the surfels that return pulses."""
+        """Return a mesh of those surfels that return pulses."""
         materials = None
         if self.materials is not None:
             index = None if self.material is None else self.material.repeat(2)
@@ -129,7 +129,7 @@ def align_submap(task: SubmapTask) -> tuple[AlignedSubmap]:
 
 
 def build_submap(task: BuildTask) -> BuiltSubmap:
-    """Build the surface map of a submap, and compare its held-out sweeps.
+    """Build the surface map of a submap, and compare the held-out sweeps with a simulation.
 
     Raises
     ------
@@ -153,7 +153,7 @@ def build_submap(task: BuildTask) -> BuiltSubmap:
 def compare_held_out_sweeps(
     sweeps: AlignedSweeps, task: BuildTask, stationary: Mapping[int, Bools]
 ) -> tuple[HeldOutRays | None, SweepImages | None]:
-    """Compare the held-out sweeps of a submap with a map of its other sweeps.
+    """Compare the held-out sweeps of a submap with a map of the other sweeps.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def compare_held_out_sweeps(
 def build_map_with_reflectances(
     sweeps: AlignedSweeps, numbers: list[int], voxel_m: float
 ) -> tuple[SurfaceMap, Reflectances | None]:
-    """Build a surface map of some sweeps, and estimate its reflectances.
+    """Build a surface map from several sweeps, and estimate its reflectances.
 
     The reflectances are None if there are no intensities.
 

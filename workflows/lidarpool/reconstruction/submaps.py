@@ -1,4 +1,4 @@
-"""Divide a drive into submaps, so that only one submap has to fit in memory at a time.
+"""Divide a drive into submaps, so that only one submap must fit in memory at a time.
 
 A submap consists of consecutive sweeps of its own, and of surrounding sweeps that observe the same
 surfaces. A surface belongs to the submap whose sensor positions are closest to it. The division
@@ -31,7 +31,7 @@ _METER_SWEEPS = 80  # maximum number of sweeps that are used per section
 
 @dataclass(frozen=True, eq=False)
 class Submap:
-    """Sweeps of a part of a drive, with surrounding sweeps.
+    """Sweeps of one section of a drive, and the surrounding sweeps.
 
     Attributes
     ----------
@@ -51,11 +51,11 @@ class Submap:
 
     @property
     def own_numbers(self) -> Ints:
-        """Numbers of the sweeps of the submap itself, in ascending order."""
+        """Numbers of the sweeps that belong to the submap itself, in ascending order."""
         return self.numbers[self.own]
 
     def owns(self, points: Floats, poses: Floats) -> Bools:
-        """Return a mask of the points that belong to the submap.
+        """Return a mask of the points that belong to the submap itself.
 
         The points have shape (n, 3). `poses` are those of all sweeps, of shape (s, 4, 4).
         """
@@ -68,7 +68,10 @@ class Submap:
 
 
 def split_into_submaps(positions: Floats) -> list[Submap]:
-    """Divide a drive into submaps, given the positions of its sweeps of shape (s, 3)."""
+    """Divide a drive into submaps, given the positions of its sweeps.
+
+    The positions have shape (s, 3).
+    """
     meters = _meters(positions)
     counts = np.array([len(meter) for meter in meters])
     before = np.cumsum(counts) - counts
@@ -91,7 +94,7 @@ def split_into_submaps(positions: Floats) -> list[Submap]:
 
 
 def _meters(positions: Floats) -> list[Ints]:
-    """Return the sweeps that are used in each one-meter section of a drive."""
+    """Return the numbers of the sweeps that represent each one-meter section of a drive."""
     starts = [0]
     for number, position in enumerate(positions):
         if np.linalg.norm(position - positions[starts[-1]]) >= _METER_M:
@@ -104,7 +107,7 @@ def _meters(positions: Floats) -> list[Ints]:
 
 
 def _reach(meters: Sequence[Ints], positions: Floats, beyond: range, end: int) -> int:
-    """Return how many sections in `beyond` observe the same surfaces as the end of a submap."""
+    """Return how many sections in `beyond` contain the same surfaces as the end of a submap."""
     count = 0
     sweeps = 0
     for meter in beyond:
@@ -117,7 +120,7 @@ def _reach(meters: Sequence[Ints], positions: Floats, beyond: range, end: int) -
 
 
 class AlignedSubmap(NamedTuple):
-    """Alignment of the k sweeps of a submap, including surrounding sweeps.
+    """Alignment of the k sweeps in a submap and its surroundings.
 
     The fields have the same meaning as in `Alignment`.
     """
@@ -129,7 +132,7 @@ class AlignedSubmap(NamedTuple):
 
     @classmethod
     def from_alignment(cls, alignment: Alignment) -> AlignedSubmap:
-        """Extract the results of aligning a submap."""
+        """Extract a submap's results from an alignment."""
         return cls(
             alignment.poses,
             alignment.ring_offsets,
@@ -141,7 +144,7 @@ class AlignedSubmap(NamedTuple):
 def merge_alignments(
     first: Alignment, submaps: Sequence[Submap], aligned: Sequence[AlignedSubmap]
 ) -> Alignment:
-    """Merge the alignments of submaps.
+    """Merge the alignments of all submaps.
 
     Where submaps overlap, poses are blended from one submap to the next. Sweeps that no submap uses
     keep their initial pose relative to the nearest sweep that is used.
@@ -187,7 +190,7 @@ def merge_alignments(
 
 
 def _weights(count: int, own: slice) -> Floats:
-    """Return weights of the poses of a submap, which decrease toward its ends.
+    """Return the weights of a submap's poses, which decrease toward the ends of the submap.
 
     An end without surrounding sweeps is an end of the drive, where the weights do not decrease.
     """

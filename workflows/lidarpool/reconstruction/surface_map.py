@@ -1,4 +1,4 @@
-"""Build a map of surfels, which represents the static surfaces of a recording.
+"""Build a map of surfels that represents the static surfaces of a recording.
 
 Initial surfels extend beyond edges, and single points on moving objects remain. Ray casting
 corrects both. A ray of the recording that passes through a surfel that should have blocked it
@@ -44,7 +44,7 @@ _ON_RAY_M = 0.15  # maximum range difference of a ray that ends on a surfel
 
 
 class Observations(NamedTuple):
-    """Rays of the recording that end on surfels."""
+    """Recorded rays that end on surfels."""
 
     surfel: Integers  # (k,)
     ring: Integers  # (k,)
@@ -54,7 +54,7 @@ class Observations(NamedTuple):
 
     @classmethod
     def concatenate(cls, parts: Sequence[Observations]) -> Observations:
-        """Concatenate observations of distinct surfels, which are renumbered consecutively."""
+        """Concatenate observations of different surfels, renumbering the surfels consecutively."""
         counts = [int(part.surfel.max(initial=-1)) + 1 for part in parts]
         starts = np.cumsum(counts) - counts
         shifted = [
@@ -64,13 +64,13 @@ class Observations(NamedTuple):
         return cls(*map(np.concatenate, zip(*shifted, strict=True)))
 
     def select_surfels(self, chosen: Bools) -> Observations:
-        """Select the rays of the chosen surfels, which are renumbered."""
+        """Select the rays of some surfels, and renumber these surfels."""
         numbers = (np.cumsum(chosen) - 1).astype(np.int32)
         rays = self.select(chosen[self.surfel])
         return rays._replace(surfel=numbers[rays.surfel])
 
     def select(self, rays: Bools) -> Observations:
-        """Select rays by a mask."""
+        """Select rays with a mask."""
         return Observations(
             self.surfel[rays],
             self.ring[rays],
@@ -81,7 +81,7 @@ class Observations(NamedTuple):
 
 
 class SurfelHits(NamedTuple):
-    """Surfels that are hit by rays of a sweep, as arrays of the k rays with a hit."""
+    """Surfels hit by the rays of a sweep, as arrays of the k rays that hit a surfel."""
 
     rays: Ints  # indices of the points of the sweep
     surfel: Ints
@@ -93,25 +93,28 @@ class SurfelHits(NamedTuple):
 
     @property
     def ends(self) -> Bools:
-        """Mask of shape (k,) of the rays that end on their surfels."""
+        """Mask of the rays that end on the surfel that they hit.
+
+        The array has shape (k,).
+        """
         near = np.abs(self.distance_m - self.range_m) < _ON_RAY_M
         return np.asarray(near | (self.off_plane_m < _ON_SURFEL_M))
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMap:
-    """Surfels, with a ray caster for them."""
+    """Surfels with a ray caster."""
 
     surfels: Surfels
     caster: RayCaster
 
     @classmethod
     def from_surfels(cls, surfels: Surfels) -> SurfaceMap:
-        """Create the ray caster of surfels."""
+        """Create a map with a ray caster for the surfels."""
         return cls(surfels, RayCaster(surfels.mesh.vertices, surfels.mesh.faces))
 
     def cast(self, sweep: AlignedSweep, chosen: Bools | None = None) -> SurfelHits:
-        """Cast the rays of a sweep, or only the rays marked by `chosen`."""
+        """Cast the rays of a sweep, or only those that `chosen` marks."""
         rows = np.arange(len(sweep.world)) if chosen is None else np.flatnonzero(chosen)
         directions = sweep.world[rows] - sweep.origins[rows]
         ray_hits = self.caster.cast(sweep.origins[rows], directions)
@@ -127,7 +130,7 @@ class SurfaceMap:
         )
 
     def refine(self, sweeps: AlignedSweeps, stationary: Mapping[int, Bools]) -> Surfels:
-        """Remove surfels that more rays contradict than support, and move the others.
+        """Remove surfels that more rays contradict than support, and adjust the other surfels.
 
         Each surfel that is not dark moves along its normal to the median of the rays that end on
         it.
@@ -166,7 +169,7 @@ class SurfaceMap:
         return self.surfels.shift_along_normals(shifts_m).select(supported)
 
     def observations(self, sweeps: AlignedSweeps, stationary: Mapping[int, Bools]) -> Observations:
-        """Return the rays that end on surfels, except on dark surfels."""
+        """Return the rays that end on surfels, excluding surfels that return no pulses."""
         parts: list[Observations] = []
         for number in _evenly_chosen(stationary):
             sweep = sweeps.read(number)
@@ -190,7 +193,7 @@ class SurfaceMap:
 def build_surface_map(
     sweeps: AlignedSweeps, stationary: Mapping[int, Bools], voxel_m: float
 ) -> SurfaceMap:
-    """Build a surface map of the stationary points.
+    """Build a surface map from the stationary points.
 
     Raises
     ------
@@ -217,7 +220,7 @@ def build_surface_map(
 def _lost_positions(
     sweeps: AlignedSweeps, stationary: Mapping[int, Bools]
 ) -> tuple[Floats, Floats]:
-    """Estimate where pulses were lost, in gaps within surfaces.
+    """Estimate the positions at which pulses were lost, from gaps within surfaces.
 
     Return the positions and the vectors to the sensor, both of shape (n, 3).
     """
@@ -235,7 +238,7 @@ def _lost_positions(
 
 
 def _shifts(surfel: Ints, offset_m: Floats, count: int) -> Floats:
-    """Return the shift of each surfel, which is the damped median of the offsets of its rays."""
+    """Return the shift of each surfel, which is a damped median of the offsets of its rays."""
     shifts_m = np.zeros(count)
     order = np.lexsort((offset_m, surfel))
     surfel = surfel[order]
@@ -248,7 +251,6 @@ def _shifts(surfel: Ints, offset_m: Floats, count: int) -> Floats:
 
 
 def _evenly_chosen(stationary: Mapping[int, Bools]) -> list[int]:
-    """Return evenly spaced numbers of the sweeps."""
     numbers = np.fromiter(stationary, np.int64)
     chosen: list[int] = numbers[even_indices(len(numbers), _VOTING_SWEEPS)].tolist()
     return chosen
@@ -285,7 +287,7 @@ def _stationary_points(
 
 
 def _closest_ranges(sweeps: AlignedSweeps, stationary: Mapping[int, Bools]) -> tuple[Ints, Floats]:
-    """Return the occupied cells in ascending order, and the shortest range in each."""
+    """Return the occupied cells in ascending order, and the shortest range in each of them."""
     cells = []
     shortest_m = []
     for number, mask in stationary.items():
@@ -297,13 +299,12 @@ def _closest_ranges(sweeps: AlignedSweeps, stationary: Mapping[int, Bools]) -> t
 
 
 def _shortest(cells: Ints, range_m: Floats) -> tuple[Ints, Floats]:
-    """Return the distinct cells in ascending order, and the shortest range in each."""
+    """Return the distinct cells in ascending order, and the shortest range in each of them."""
     order = np.lexsort((range_m, cells))
     found, firsts = np.unique(cells[order], return_index=True)
     return found, range_m[order][firsts]
 
 
 def _view_cells(points: Floats) -> Ints:
-    """Return the index of the cell that contains each point."""
     cells = np.floor(points / _VIEW_CELL_M).astype(np.int64) & _CELL_MASK
     return np.asarray((cells[:, 0] << 2 * _CELL_BITS) | (cells[:, 1] << _CELL_BITS) | cells[:, 2])

@@ -1,4 +1,4 @@
-"""Create surfels from the points of many sweeps, as large as the gaps between the rays.
+"""Create surfels from the points of many sweeps, large enough to close the gaps between rays.
 
 A lidar samples a surface in lines. Points of the same ring are close together, and rings are far
 apart. The twelve nearest neighbors of a point often lie on a single line, which does not determine
@@ -39,7 +39,7 @@ _BLOCK = 1 << 16  # surfels per block
 
 @dataclass(frozen=True, eq=False)
 class Surfels:
-    """Surfels, which are represented by two consecutive triangles each."""
+    """Surfels, each of which consists of two consecutive triangles."""
 
     mesh: SceneMesh
     dark: Bools  # (m,), surfels that return no pulses, such as windows
@@ -49,19 +49,25 @@ class Surfels:
 
     @cached_property
     def centers(self) -> Floats:
-        """Centers of the surfels in meters, of shape (m, 3)."""
+        """Centers of the surfels in meters.
+
+        The array has shape (m, 3).
+        """
         return surfel_centers(self.mesh)
 
     @cached_property
     def normals(self) -> Floats:
-        """Unit normals of the surfels, of shape (m, 3)."""
+        """Unit normals of the surfels.
+
+        The array has shape (m, 3).
+        """
         corners = self.mesh.vertices.reshape(-1, 4, 3)
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         return np.asarray(normals / np.maximum(lengths, 1e-12))
 
     def select(self, rows: Bools) -> Surfels:
-        """Select surfels by a mask."""
+        """Select surfels with a mask."""
         mesh = self.mesh
         vertices = mesh.vertices.reshape(-1, 4, 3)[rows].reshape(-1, 3)
         faces = surfel_faces(int(rows.sum()))
@@ -70,7 +76,10 @@ class Surfels:
         return Surfels(SceneMesh(mesh.name, vertices, faces, materials=materials), self.dark[rows])
 
     def shift_along_normals(self, shifts_m: Floats) -> Surfels:
-        """Move the surfels along their normals by `shifts_m`, of shape (m,)."""
+        """Move each surfel along its normal by the distance in `shifts_m`.
+
+        `shifts_m` has shape (m,).
+        """
         offsets = (shifts_m[:, None] * self.normals).repeat(4, axis=0)
         return replace(self, mesh=replace(self.mesh, vertices=self.mesh.vertices + offsets))
 
@@ -81,7 +90,10 @@ class Surfels:
 
     @staticmethod
     def are_enough(points: Floats, voxel_m: float) -> bool:
-        """Return whether points of shape (n, 3) occupy enough voxels to create surfels."""
+        """Return whether points occupy enough voxels to create surfels.
+
+        The points have shape (n, 3).
+        """
         cells = np.unique(np.floor(points / voxel_m).astype(np.int64), axis=0)
         return len(cells) > 2 * _NEIGHBORS[-1]
 
@@ -95,7 +107,7 @@ class Surfels:
         gap_rad: float,
         labels: Ints | None = None,
     ) -> Surfels:
-        """Create surfels at the means of the points in voxels.
+        """Create a surfel at the mean of the points in each voxel.
 
         Parameters
         ----------
@@ -152,17 +164,23 @@ class Surfels:
 
 
 def surfel_mesh(name: str, corners: Floats) -> SceneMesh:
-    """Create a mesh of surfels from corners of shape (m, 4, 3), in meters."""
+    """Create a surfel mesh from the corners of surfels, in meters.
+
+    The corners have shape (m, 4, 3).
+    """
     return SceneMesh(name, corners.reshape(-1, 3), surfel_faces(len(corners)))
 
 
 def surfel_centers(mesh: SceneMesh) -> Floats:
-    """Return the centers of the surfels of a mesh in meters, of shape (m, 3)."""
+    """Return the centers of a mesh's surfels in meters.
+
+    The array has shape (m, 3).
+    """
     return np.asarray(mesh.vertices.reshape(-1, 4, 3).mean(axis=1))
 
 
 def merge_surfels(meshes: Sequence[SceneMesh]) -> SceneMesh:
-    """Merge meshes of surfels into one mesh, with the name of the first."""
+    """Merge surfel meshes into one mesh with the name of the first."""
     sizes = [len(mesh.faces) for mesh in meshes]
     return SceneMesh(
         meshes[0].name,
@@ -174,7 +192,7 @@ def merge_surfels(meshes: Sequence[SceneMesh]) -> SceneMesh:
 
 
 class _Planes(NamedTuple):
-    """Planes through the neighbors of m points."""
+    """Planes fitted to the neighbors of m points."""
 
     axes: Floats  # (m, 3, 3), unit vectors: normal, across the lines, along the lines
     halves: Floats  # (m, 2), half sides of surfels across and along the lines, meters
@@ -182,7 +200,7 @@ class _Planes(NamedTuple):
 
     @classmethod
     def around(cls, centers: Floats, tree: object, means: Floats) -> _Planes:
-        """Find the planes at some of the means, given a k-d tree of all means."""
+        """Fit planes to the neighbors of `centers`, given a k-d tree of all means."""
         count = len(centers)
         axes = np.empty((count, 3, 3))
         halves = np.empty((count, 2))
@@ -206,7 +224,10 @@ class _Planes(NamedTuple):
         return cls(axes, halves, radius_m)
 
     def corners(self, centers: Floats, outward: Floats, voxel_m: float, gap_rad: float) -> Floats:
-        """Return surfel corners of shape (m, 4, 3), counterclockwise as viewed from the sensor."""
+        """Return the surfel corners, counterclockwise as seen from the sensor.
+
+        The array has shape (m, 4, 3).
+        """
         range_m = np.linalg.norm(outward, axis=1)
         facing = np.einsum("mi,mi->m", self.axes[:, 0], outward)
         cosine = np.abs(facing) / np.maximum(range_m, 1e-9)
@@ -227,13 +248,15 @@ class _Planes(NamedTuple):
 
 
 def _nearest(tree: object, centers: Floats, count: int) -> Ints:
-    """Return the indices of the nearest points in a k-d tree, in order of distance."""
     _, rows = tree.query(centers, count)  # type: ignore[attr-defined]
     return np.asarray(rows)
 
 
 def _principal(around: Floats) -> tuple[Floats, Floats]:
-    """Return the ascending variances and the principal axes of point sets of shape (m, k, 3)."""
+    """Return the ascending variances and principal axes of point sets.
+
+    The point sets have shape (m, k, 3).
+    """
     offsets = around - around.mean(axis=1, keepdims=True)
     covariances = np.einsum("mki,mkj->mij", offsets, offsets) / around.shape[1]
     variances, axes = np.linalg.eigh(covariances)

@@ -1,4 +1,4 @@
-"""Planes of a map, from the means of points in voxels and the normals of their neighborhoods."""
+"""Planes of a map, which are derived from the mean points of neighboring voxels."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MIN_WIDTH = 0.05  # minimum ratio of the variances within a plane, below which 
 
 @dataclass(frozen=True, eq=False)
 class VoxelPlanes:
-    """Means of the points in voxels whose neighbors lie in a plane."""
+    """Mean points of voxels whose neighborhoods are planar."""
 
     centers: Floats  # (p, 3), meters
     normals: Floats  # (p, 3), unit vectors with arbitrary sign
@@ -28,7 +28,9 @@ class VoxelPlanes:
 
     @classmethod
     def from_points(cls, name: str, points: Floats, voxel_m: float) -> VoxelPlanes | None:
-        """Find planes in points of shape (n, 3), or return None if there are none.
+        """Find the planes in a point cloud, or return None if there are none.
+
+        The points have shape (n, 3).
 
         Raises
         ------
@@ -55,7 +57,7 @@ class VoxelPlanes:
         return cls(middles, normals, cKDTree(middles), thickness_m)
 
     def distances(self, points: Floats, max_m: float) -> tuple[Floats, Ints, Bools]:
-        """Return signed distances between points and their nearest planes.
+        """Return the signed distance between each point and its nearest plane.
 
         Parameters
         ----------
@@ -78,6 +80,5 @@ class VoxelPlanes:
 
 
 def _is_plane(variances: Floats) -> Bools:
-    """Return which neighborhoods are planes, given their ascending variances of shape (n, 3)."""
     smallest, middle, largest = variances.T
     return np.asarray((smallest < _MAX_FLAT * middle) & (middle > _MIN_WIDTH * largest))

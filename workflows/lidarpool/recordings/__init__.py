@@ -1,1 +1,1 @@
-"""Readers for clouds and recordings in any supported format."""
+"""Readers for clouds and recordings in all supported formats."""

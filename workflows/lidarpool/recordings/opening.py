@@ -1,4 +1,4 @@
-"""Open clouds and recordings in any supported format for reading sweep by sweep."""
+"""Open clouds and recordings in any supported format, and read them sweep by sweep."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def open_recording(
     unit: str | None = None,
     keep_noise: bool = False,
 ) -> Recording:
-    """Open a recording or cloud in any format for reading sweep by sweep.
+    """Open a recording or cloud in any format, and read it sweep by sweep.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""Reports, pictures and output folders of results."""
+"""Reports, plots and output folders of results."""

@@ -1,4 +1,4 @@
-"""Check and write the data set of a campaign.
+"""Validate and write the data set of a campaign.
 
 This module validates the files of an existing data set and writes the files that all jobs share.
 The files of single jobs are written by `lidarpool.datasets`.
@@ -76,7 +76,7 @@ def run_campaign(
     screen: Screen,
     page: RunPage,
 ) -> CampaignRun:
-    """Run the jobs of a campaign, write the data set and return a summary."""
+    """Run the jobs of a campaign, write the data set, and return a summary."""
     storage = replace(Storage.at(target), durable=False)
     dataset = DataSet(storage, **asdict(campaign.keep))
     output = DataSetOutput(dataset, campaign, options, screen, page)
@@ -95,7 +95,7 @@ def run_campaign(
 
 
 class FinishedDataSet(NamedTuple):
-    """A finished data set that a run extends or repairs.
+    """Finished data set that a run extends or repairs.
 
     `record` is the content of CAMPAIGN_FILE. It is empty if there is no finished data set or if the
     file is damaged, in which case `note` says so. `wrong` maps the numbers of invalid jobs to a
@@ -111,7 +111,7 @@ class FinishedDataSet(NamedTuple):
 
 @dataclass(eq=False)
 class DataSetOutput:
-    """The output of a run that creates the data set of a campaign."""
+    """Output of a run that creates a campaign's data set."""
 
     dataset: DataSet
     campaign: CampaignSpec
@@ -121,7 +121,7 @@ class DataSetOutput:
     begun_at: float = field(default_factory=time.monotonic)  # monotonic clock, seconds
 
     def check_existing(self) -> FinishedDataSet:
-        """Check the existing data set and return it if the run continues it.
+        """Check the existing data set, and return it if this run continues it.
 
         With `restart` or `overwrite`, the existing data set is removed. Raise LidarError if the
         data set is finished and may not be replaced, or if it belongs to a different campaign.
@@ -164,7 +164,7 @@ class DataSetOutput:
         return finished
 
     def _check_finished(self, record: Mapping[str, Any]) -> FinishedDataSet:
-        """Read the job rows of a finished data set and validate its jobs."""
+        """Read the job rows of a finished data set, and validate its jobs."""
         storage = self.dataset.storage
         with explained(f"{storage} cannot be read"):
             seconds = known_seconds(storage)
@@ -182,7 +182,7 @@ class DataSetOutput:
         return FinishedDataSet(record, rows, wrong, has_all and _has_shared_files(storage, rows))
 
     def report_complete(self, complete: FinishedDataSet) -> CampaignRun:
-        """Report that the data set is complete and return its totals."""
+        """Report that the data set is complete, and return its totals."""
         self.screen.tell(f"{self.dataset.storage} is already complete")
         for row in complete.rows:
             self.page.ended(row)
@@ -192,7 +192,7 @@ class DataSetOutput:
         return sums
 
     def _warn_of_empty_jobs(self, rows: Iterable[JobRow]) -> list[str]:
-        """Warn if jobs have no points, and return the warning as a list with at most one item."""
+        """Warn about jobs without points. Return a list with the warning, or an empty list."""
         empty = [row for row in rows if row.done and not row.points]
         if not empty:
             return []
@@ -205,7 +205,7 @@ class DataSetOutput:
         return [warning]
 
     def compare_with_store(self, earlier: FinishedDataSet, store: RunStore) -> None:
-        """Compare existing jobs with the run store, and add the jobs that the store lacks.
+        """Compare existing jobs with the run store, and add any jobs that the store lacks.
 
         Jobs that are invalid, or that have failed and should be retried, are removed from the
         store, so that they run again.
@@ -234,7 +234,7 @@ class DataSetOutput:
             self.page.ended(row)
 
     def _adopt_finished_jobs(self, store: RunStore) -> None:
-        """Add finished jobs to a store that has lost its database."""
+        """Add finished jobs to a run store whose database was lost."""
         names = {row.name for row in store.rows()}
         rows: list[JobRow] = []
         seconds = known_seconds(self.dataset.storage)  # available if only the record was damaged
@@ -294,7 +294,7 @@ class DataSetOutput:
 
 
 class DamagedRecordError(LidarError):
-    """Raised when CAMPAIGN_FILE is damaged or has been edited."""
+    """Raised if CAMPAIGN_FILE is damaged or was edited."""
 
 
 def write_record(storage: Storage, record: Mapping[str, Any]) -> None:
@@ -335,7 +335,7 @@ def read_record(storage: Storage) -> dict[str, Any]:
 
 
 def _has_shared_files(storage: Storage, rows: Sequence[JobRow]) -> bool:
-    """Return True if the job table contains exactly these rows, and the index as many jobs.
+    """Return True if the job table contains exactly these rows and the index has the same length.
 
     The checksum of the job table is stored in the index and is verified, too.
     """
@@ -348,7 +348,7 @@ def _has_shared_files(storage: Storage, rows: Sequence[JobRow]) -> bool:
 
 
 def read_notes(storage: Storage) -> list[str]:
-    """Return the notes in the report of a data set.
+    """Return the notes from a data set's report.
 
     If the report is damaged, return a single note that says so.
     """
@@ -368,7 +368,7 @@ def write_shared_files(
     sums: CampaignRun,
     rows: Callable[[], Iterator[JobRow]],
 ) -> tuple[CampaignRun, dict[str, Any]]:
-    """Write the files of a data set that all jobs share.
+    """Write the files that all jobs of a data set share.
 
     The last file that is written marks the data set as complete.
 
@@ -418,7 +418,7 @@ def _check_jobs(
     contents: bool,
     campaign: CampaignSpec | None = None,
 ) -> dict[int, str]:
-    """Validate jobs, and return {job number: a clause that describes the problem}.
+    """Validate jobs, and describe the problem of each invalid job, keyed by job number.
 
     Raise LidarError if a job is not part of the campaign, or if an input file of the campaign has
     changed since intact jobs were created from it.
@@ -548,7 +548,7 @@ def _remove_dataset(storage: Storage, run_folder: Storage) -> None:
 
 
 def describe_failures(sums: CampaignRun, max_errors: int = 5) -> str:
-    """Summarize the errors of failed jobs, with the varied values of these jobs."""
+    """Summarize the errors of failed jobs, including the varied values of these jobs."""
     head = f"{plural(len(sums.failed), 'job')} failed and {sums.done:,} succeeded:"
     errors = []
     for row in sums.failed:

@@ -1,4 +1,4 @@
-"""Write the reports of a data set: its dataset card (README.md), HTML page and report.json."""
+"""Write the dataset card (README.md), HTML report and report.json of a data set."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def write_card(
     versions: Mapping[str, str],
     picture: Page | None = None,
 ) -> dict[str, Any]:
-    """Write the dataset card, the reports, the pictures and the split files of a data set.
+    """Write a data set's dataset card, reports, plots and split files.
 
     report.json is written last. Only report.html, report.csv and report.json contain casting times,
     so the other files are the same in every run. The job rows are iterated once, and only a few
@@ -119,7 +119,7 @@ def write_card(
 
 
 def _with_splits(storage: Storage, jobs: Iterable[JobRow]) -> Iterator[JobRow]:
-    """Yield the rows unchanged, and write the names of finished jobs to the files of their splits.
+    """Yield the rows unchanged, and list the names of finished jobs in the file of their split.
 
     Raise LidarError if the name of a split is not a valid file name.
     """
@@ -145,7 +145,7 @@ def campaign_report(
     versions: Mapping[str, str],
     figures: DataSetStatistics,
 ) -> dict[str, Any]:
-    """Return the statistics of a data set in the form of report.json."""
+    """Return the statistics of a data set as they are stored in report.json."""
     return {
         "title": campaign["title"],
         "format": campaign["keep"]["format"],
@@ -184,7 +184,7 @@ def campaign_report(
 
 
 def _job_entry(row: JobRow, field: str) -> dict[str, Any]:
-    """Return a JSON object with the number, name and values of a job, and one field of its row."""
+    """Return a JSON object with a job's number, name, values and one field of its row."""
     values = {
         name: str(value) if isinstance(value, float) and not math.isfinite(value) else value
         for name, value in row.values.items()

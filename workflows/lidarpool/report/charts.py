@@ -1,4 +1,4 @@
-"""Draw charts of the jobs in a data set, and a picture of one of its sweeps."""
+"""Draw charts of a data set's jobs, and an image of one of its sweeps."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def draw_varied(figures: DataSetStatistics) -> Page | None:
 
 
 class _Layout(NamedTuple):
-    """Layout of the charts on a page, in pixels."""
+    """Pixel positions and sizes of the charts on a page."""
 
     row_count: int
     column_count: int
@@ -97,7 +97,7 @@ class _Layout(NamedTuple):
 
     @classmethod
     def for_scales(cls, scales: Sequence[VariedQuantity]) -> _Layout:
-        """Lay out two charts for each quantity."""
+        """Return a layout with two charts for each quantity."""
         rows = -(-len(scales) // MAX_COLUMNS)
         columns = -(-len(scales) // rows)
         width = (WIDTH - LEFT - RIGHT - COLUMN_GAP * (columns - 1)) / columns
@@ -107,11 +107,10 @@ class _Layout(NamedTuple):
 
     @property
     def page_height(self) -> int:
-        """Height of the page in pixels."""
         return TOP + self.row_count * self.row_height + (self.row_count - 1) * ROW_GAP
 
     def add_charts(self, page: Page, number: int) -> tuple[Axes, Axes]:
-        """Add the histogram and the scatter plot of a quantity, and return their axes."""
+        """Add axes for the histogram and the scatter plot of a quantity."""
         row, column = divmod(number, self.column_count)
         x = LEFT + column * (self.width + COLUMN_GAP)
         y = TOP + row * (self.row_height + ROW_GAP)
@@ -122,7 +121,7 @@ class _Layout(NamedTuple):
     def label_charts(
         self, page: Page, number: int, scale: VariedQuantity, upper: Axes, lower: Axes
     ) -> None:
-        """Label the axes of both charts of a quantity, and add its name as a heading."""
+        """Label the axes of both charts of a quantity, and add the quantity's name as a heading."""
         is_first = number % self.column_count == 0
         for axes, quantity in ((upper, "jobs"), (lower, "points per job")):
             _set_labels(page, axes, scale, self.width)
@@ -136,7 +135,7 @@ class _Layout(NamedTuple):
 
 
 def _dot_colors(informative: VariedQuantity | None, count: int) -> Floats:
-    """Return one RGB color per job, by the labels of the informative quantity if there is one.
+    """Return an RGB color for each job, based on the labels of the informative quantity if given.
 
     The result has shape (jobs, 3).
     """
@@ -149,7 +148,7 @@ def _dot_colors(informative: VariedQuantity | None, count: int) -> Floats:
 
 
 def _remarks(figures: DataSetStatistics, informative: VariedQuantity | None, hidden: int) -> str:
-    """Return a sentence about the colors, failed jobs, and omitted dots and quantities."""
+    """Return a sentence about colors, failed jobs, and omitted dots and quantities."""
     remarks = []
     if informative is not None:
         remarks.append(f"colored by {shorten_name(informative.name, 40)}")
@@ -166,7 +165,7 @@ def _remarks(figures: DataSetStatistics, informative: VariedQuantity | None, hid
 def _most_informative(
     scales: Sequence[VariedQuantity], points: Floats, is_done: Bools
 ) -> VariedQuantity | None:
-    """Return the quantity with few labels whose groups differ most in their mean number of points.
+    """Return the quantity whose groups differ most in their mean number of points.
 
     Return None if no quantity has between two and MAX_COLORS labels.
     """
@@ -181,7 +180,7 @@ def _most_informative(
 
 
 def draw_results(figures: DataSetStatistics) -> Page | None:
-    """Draw histograms of the points and of the hit rates of jobs.
+    """Draw histograms of the number of points and the hit rate of each job.
 
     Return None if no job has succeeded.
     """
@@ -196,7 +195,7 @@ def draw_results(figures: DataSetStatistics) -> Page | None:
 
 
 def draw_times(figures: DataSetStatistics) -> Page | None:
-    """Draw a histogram of the casting times of jobs, or return None if no times are known."""
+    """Draw a histogram of the jobs' casting times, or return None if no times are known."""
     seconds = figures.per_job("seconds")[~figures.failures]
     seconds = seconds[np.isfinite(seconds)]
     quantity = VariedQuantity("casting time per job (all tasks), s", seconds)
@@ -206,7 +205,7 @@ def draw_times(figures: DataSetStatistics) -> Page | None:
 def _draw_distributions(
     quantities: Sequence[VariedQuantity], title: str, caption: str
 ) -> Page | None:
-    """Draw histograms of jobs side by side, one for each quantity.
+    """Draw one histogram of all jobs for each quantity, side by side.
 
     Return None if there are no jobs.
     """
@@ -249,7 +248,6 @@ def _add_axes(page: Page, x: float, y: float, chart_width: float, chart_height: 
 
 
 def _format_tick(value: float, _: object = None) -> str:
-    """Format a tick label, for example "1.5 M"."""
     for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if abs(value) >= 10 * size or (abs(value) >= size and letter != "k"):
             return f"{value / size:.4g}{NARROW}{letter}"
@@ -257,7 +255,7 @@ def _format_tick(value: float, _: object = None) -> str:
 
 
 def _draw_counts(axes: Axes, scale: VariedQuantity, failures: Bools, colors: Iterable[Any]) -> None:
-    """Draw a histogram with bars in `colors`, and a histogram of the failed jobs on top of it."""
+    """Draw a histogram with bars in `colors`, and stack a histogram of failed jobs on top."""
     bar_width = 0.7 if scale.labels else 1.0  # gaps show that labels have no order
     edges = scale.edges.tolist()
     failed = scale.values[failures & np.isfinite(scale.values)]
@@ -271,7 +269,7 @@ def _draw_counts(axes: Axes, scale: VariedQuantity, failures: Bools, colors: Ite
 def _draw_points(
     page: Page, axes: Axes, scale: VariedQuantity, points: Floats, failures: Bools, colors: Floats
 ) -> None:
-    """Draw a scatter plot with a dot for each job, and crosses at the bottom for failed jobs.
+    """Draw a dot for each job, and crosses at the bottom for failed jobs.
 
     `points` has shape (jobs,), and `colors` has shape (jobs, 3).
     """
@@ -319,7 +317,7 @@ def _draw_percentiles(
     done_jobs: Indices,
     line_width: float,
 ) -> None:
-    """Plot percentiles of `points`, grouping jobs by label or by similar `x`.
+    """Draw percentiles of `points` for groups of jobs with equal labels or similar `x`.
 
     Both arrays have shape (jobs,). Each group is drawn as a separate horizontal bar. A line that
     connects the groups would suggest a trend where the jobs differ in other quantities.
@@ -339,7 +337,7 @@ def _draw_percentiles(
 
 
 def _group_similar_jobs(x: Floats, jobs: Indices) -> list[Indices]:
-    """Divide jobs into groups with similar values of `x`, ordered by value.
+    """Divide jobs into groups with similar values of `x`, in ascending order.
 
     `x` has shape (all jobs,), and `jobs` contains indices into it. Jobs with equal values are in
     the same group. Return an empty list if there are too few jobs.
@@ -354,7 +352,7 @@ def _group_similar_jobs(x: Floats, jobs: Indices) -> list[Indices]:
 
 
 def _adjoining_bars(groups: Sequence[Floats]) -> Floats:
-    """Return the left end and the right end of the bar of each group, followed by NaN.
+    """Return the left and right ends of each group's bar, followed by NaN.
 
     Bars of adjacent groups meet halfway between the groups. NaN interrupts the line that is drawn
     through the ends. The result has shape (groups, 3).
@@ -368,7 +366,7 @@ def _adjoining_bars(groups: Sequence[Floats]) -> Floats:
 
 
 def _axis_limits(points: Floats) -> tuple[float, float]:
-    """Return the axis limits for numbers of points.
+    """Return axis limits for the numbers of points.
 
     The axis starts at 0 unless all jobs have similar numbers of points.
     """
@@ -383,7 +381,7 @@ def _axis_limits(points: Floats) -> tuple[float, float]:
 
 
 def _set_labels(page: Page, axes: Axes, scale: VariedQuantity, width: float) -> None:
-    """Set the limits and the tick labels of the x-axis."""
+    """Set the limits and tick labels of the x-axis."""
     axis = axes.xaxis
     lower, upper = scale.edges[[0, -1]].tolist()
     if scale.labels:

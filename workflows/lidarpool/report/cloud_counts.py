@@ -1,4 +1,4 @@
-"""Statistics of a point cloud for its report, computed while the cloud is written."""
+"""Statistics of a point cloud for its report, which are computed while the cloud is written."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MIN_DENSITY_SQUARES = 16  # grids of at most this size are not coarsened for th
 
 
 class Density(NamedTuple):
-    """Horizontal point density in points per square meter, over the squares that contain points."""
+    """Horizontal point density per square meter, computed over squares that contain points."""
 
     mean: float  # number of points divided by the total area of the squares
     median: float  # median over the squares
@@ -29,7 +29,7 @@ class Density(NamedTuple):
 
 
 class CloudCounts:
-    """Statistics of a point cloud whose points are added in batches.
+    """Statistics of a point cloud, to which points are added in batches.
 
     Parameters
     ----------
@@ -71,7 +71,10 @@ class CloudCounts:
         self._squares = GridCounts(_SQUARES)
 
     def add(self, columns: Mapping[str, AnyArray]) -> None:
-        """Add the values of points, as {column name: array of shape (n,)} with n > 0."""
+        """Add the columns of at least one point, as {column name: values}.
+
+        The values have shape (n,).
+        """
         self.no_surface += count_labels(columns["object"], self.by_object)
         if "class" in columns:
             count_labels(columns["class"], self.by_class)
@@ -89,7 +92,7 @@ class CloudCounts:
         self.limits[name] = (min(limits[0], lower) + 0, max(limits[1], upper) + 0)
 
     def widen(self, cell_box: Ints) -> None:
-        """Extend the grid to the box of points that will be added.
+        """Extend the grid to a box that contains the points to be added.
 
         `cell_box` contains the lowest and the highest cell of the box. Shape (2, 3).
         """
@@ -105,7 +108,7 @@ class CloudCounts:
         self._squares.add(cells[0], cells[1])
 
     def merge(self, other: CloudCounts) -> None:
-        """Add the statistics of other points of the same cloud.
+        """Add the statistics of other points in the same cloud.
 
         `other` must not be used afterward.
         """
@@ -119,19 +122,22 @@ class CloudCounts:
 
     @property
     def point_count(self) -> int:
-        """Total number of points, including points that do not belong to an object."""
+        """Total number of points, including those that do not belong to an object."""
         return int(self.by_object.sum()) + self.no_surface
 
     @property
     def bounds(self) -> Floats:
-        """Minimum and maximum world coordinates in meters, or zeros if empty. Shape (2, 3)."""
+        """Minimum and maximum world coordinates in meters, or zeros for an empty cloud.
+
+        The array has shape (2, 3).
+        """
         if self._squares.box is None:
             return np.zeros((2, 3))
         return cell_positions(self._squares.box, self._precision_m, self._origin)
 
     @property
     def above(self) -> Ints:
-        """Number of points per pixel in the top view, with the southernmost row first.
+        """Number of points in each pixel of the top view, with the southernmost row first.
 
         Shape (rows, columns).
         """
@@ -139,17 +145,20 @@ class CloudCounts:
 
     @property
     def pixel_m(self) -> float:
-        """Side length of a pixel of `above` in meters."""
+        """Side length of each pixel in `above`, in meters."""
         return self._pixels.side * self._precision_m
 
     @property
     def corner(self) -> Floats:
-        """World position of the southwest corner of `above` in meters. Shape (2,)."""
+        """World position of the southwest corner of `above`, in meters.
+
+        The array has shape (2,).
+        """
         return cell_positions(self._pixels.lowest, self._precision_m, self._origin[:2])
 
     @property
     def _pixels(self) -> GridCounts:
-        """Grid for `above`, coarsened to about one point per pixel."""
+        """Grid for `above`, with pixels large enough to contain about one point each."""
         pixels = deepcopy(self._squares)
         across = max(_MIN_SQUARES, (2 * pixels.total) ** 0.5)
         while max(pixels.shape) > across:
@@ -173,7 +182,7 @@ class CloudCounts:
 
 
 class GridCounts:
-    """Number of points in each square of a grid that coarsens as the points spread.
+    """Number of points in each square of a grid that becomes coarser as the points spread.
 
     The grid is always the finest grid with at most `across` squares along each axis. The side of a
     square is a power of two in cells, so coarser squares consist of whole finer squares. Therefore
@@ -197,7 +206,10 @@ class GridCounts:
         self._array = np.zeros((across, across), np.int64)
 
     def widen(self, cell_box: Ints) -> None:
-        """Extend the grid to a box, given by its lowest and highest cells. Shape (2, axes)."""
+        """Extend the grid to a box, given its lowest and highest cells.
+
+        The box has shape (2, axes).
+        """
         earlier = self.box
         if earlier is not None:
             lowest = np.minimum(earlier[0], cell_box[0])
@@ -210,7 +222,7 @@ class GridCounts:
         self.box = cell_box
 
     def add(self, x: Ints32, y: Ints32) -> None:
-        """Add points by their cells along each axis.
+        """Add points, given their cells along each axis.
 
         Both arrays have shape (n,). The points must lie within the box passed to `widen`.
         """
@@ -219,7 +231,7 @@ class GridCounts:
         count_cells(x, y, self._level, bits, self._array)
 
     def merge(self, other: GridCounts) -> None:
-        """Add the points of another grid, whose squares may be coarsened in the process."""
+        """Add the points of another grid, coarsening its squares if necessary."""
         if other.box is None:
             return
         self.widen(other.box)
@@ -238,12 +250,11 @@ class GridCounts:
         self._level += 1
 
     def _indices(self, numbers: Sequence[Ints]) -> tuple[Ints, ...]:
-        """Return array indices of all combinations of square numbers along each axis."""
         return np.ix_(*(along_axis % self._across for along_axis in numbers))
 
     @property
     def total(self) -> int:
-        """Number of points."""
+        """Total number of points."""
         return int(self._array.sum())
 
     @property
@@ -263,27 +274,30 @@ class GridCounts:
 
     @property
     def lowest(self) -> Ints:
-        """Lowest cell of `counts` along each axis. Shape (2,)."""
+        """Lowest cell of `counts` along each axis.
+
+        The array has shape (2,).
+        """
         box = np.zeros((2, 2), np.int64) if self.box is None else self.box
         return (_numbers(box[0], self._level) << self._level) - SHIFT
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Number of squares along each axis between the lowest and the highest point."""
+        """Number of squares along each axis between the outermost points."""
         if self.box is None:
             return 1, 1
         return tuple((np.diff(_numbers(self.box, self._level), axis=0)[0] + 1).tolist())
 
     @property
     def counts(self) -> Ints:
-        """Number of points in each square between the lowest and the highest point."""
+        """Number of points in each square between the outermost points."""
         lowest = (self.lowest + SHIFT) >> self._level
         numbers = [low + np.arange(n) for low, n in zip(lowest, self.shape, strict=True)]
         return self._array[self._indices(numbers)]
 
 
 def _numbers(cells: Ints, level: int) -> Ints:
-    """Return the numbers of the squares that contain cells, along x and y.
+    """Return the x and y numbers of the squares that contain the given cells.
 
     `cells` has shape (…, axes), and the result has shape (…, 2).
     """

@@ -18,7 +18,7 @@ _TILE = 1024  # points per iteration, so that their indices stay in the L1 cache
 
 @noinline
 def _find_parts(cells, level, bits, indices):
-    """Append the number of the square of each cell along one axis to the bits of its index."""
+    """Append the number of each cell's square along one axis to the bits of the square's index."""
     mask = np.int32((1 << bits) - 1)
     shift = np.int32(level)
     wide = np.uint32(bits)
@@ -30,7 +30,7 @@ def _find_parts(cells, level, bits, indices):
 
 @compiled()
 def count_cells(x, y, level, bits, counts):
-    """Count the points in each square of a grid (see `GridCounts`).
+    """Count the points in each square of a grid, as `GridCounts` describes.
 
     `x` and `y` are the cells of the points along each axis, int32 arrays with shape (n,). `counts`
     is updated in place and has shape (2**bits, 2**bits).
@@ -49,7 +49,7 @@ def count_cells(x, y, level, bits, counts):
 
 @compiled()
 def count_labels(labels, counts):
-    """Count the points with each label, and return the number of negative labels.
+    """Count the points that have each label, and return the number of negative labels.
 
     `labels` is an integer array with shape (n,). `counts` is updated in place. Labels that exceed
     its length are ignored.

@@ -1,4 +1,4 @@
-"""Write the point cloud of a survey to a file while the survey is still running.
+"""Write the point cloud of a survey to a file while the survey is running.
 
 Parts are appended as soon as they are committed, so most of the cloud has been written when the
 last scan is finished.
@@ -48,7 +48,7 @@ _POLL_INTERVAL_S = 0.05
 
 
 class _PartWriter:
-    """Writes parts to a file, one at a time, and computes statistics of their points.
+    """Writer that adds parts to a file one at a time, and computes statistics of their points.
 
     Each thread has a separate instance.
     """
@@ -100,7 +100,7 @@ class _PartWriter:
 
 
 class CloudWriter:
-    """Writes the points of parts to a PLY file, and computes statistics in the same pass.
+    """Writer of a PLY file that computes statistics of the points in the same pass.
 
     Parts are appended in scan order, so the file offset of each part is known in advance and
     several threads can write parts concurrently. An error in a thread is raised by a later call.
@@ -145,7 +145,7 @@ class CloudWriter:
         self.close()
 
     def append(self, name: str, row_count: int, cell_box: Ints) -> None:
-        """Append the points of a part.
+        """Append the points of a part to the file.
 
         If all threads are busy, wait until one of them has finished.
 
@@ -190,12 +190,12 @@ class CloudWriter:
             self._idle.put(part_writer)
 
     def wait(self) -> None:
-        """Wait until all appended parts have been written. Raises the same errors as `append`."""
+        """Wait until all parts have been written, and raise the same errors as `append`."""
         while self._being_written:
             self._being_written.popleft().result()
 
     def finish(self) -> CloudCounts:
-        """Complete the file and return its statistics.
+        """Complete the file, and return the statistics of its points.
 
         Raises
         ------
@@ -217,13 +217,13 @@ class CloudWriter:
         return counts
 
     def close(self) -> None:
-        """Wait for the threads, and close the file."""
+        """Wait for all threads, and close the file."""
         self._executor.shutdown(cancel_futures=True)
         self.file.close()
 
 
 def write_cloud(path: Path, points: StoredCloud, sweeps: Sweeps, scene: Scene) -> CloudCounts:
-    """Write all points to a new PLY file, and return their statistics.
+    """Write all points to a new PLY file, and return statistics of the points.
 
     Raises
     ------
@@ -245,7 +245,7 @@ def write_cloud(path: Path, points: StoredCloud, sweeps: Sweeps, scene: Scene) -
 
 
 class GrowingCloud:
-    """A PLY file to which a background thread appends the committed parts of a job.
+    """PLY file to which a background thread appends the committed parts of a job.
 
     Parts are appended in scan order. The file is temporary until `finish` is called. If the file
     cannot be written, for example because the disk is full, it is removed and the run continues. In
@@ -282,14 +282,14 @@ class GrowingCloud:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop the thread, and remove the file unless `finish` has moved it into place."""
+        """Stop the thread, and remove the file unless `finish` has moved it to its path."""
         self._is_stopped = True
         self._queue.put(None)
         self._thread.join()
         self._discard()
 
     def append_committed(self, _: Sequence[Receipt] = ()) -> None:
-        """Queue the committed parts that are next in scan order, without waiting for the thread."""
+        """Queue the committed parts that follow in scan order, without waiting for the thread."""
         parts = self._job.parts
         with suppress(KeyError):  # the next scan is not committed yet
             while True:
@@ -299,7 +299,7 @@ class GrowingCloud:
                     self._queue.put(part)
 
     def finish(self, path: Path, points: StoredCloud) -> CloudCounts | None:
-        """Wait for the thread, move the file to `path` and return its statistics.
+        """Wait for the thread, move the file to `path`, and return the statistics of its points.
 
         Return None if the file is missing or does not contain all `points`, for example because it
         could not be written.
@@ -328,7 +328,7 @@ class GrowingCloud:
         return counts
 
     def _run(self) -> None:
-        """Append parts until the queue ends or the file cannot be written."""
+        """Append parts until the queue ends or writing fails."""
         try:
             # Errors can be ignored, because `write_cloud` will encounter and report them.
             with suppress(LidarError, OSError):
@@ -342,7 +342,7 @@ class GrowingCloud:
                 self._discard()
 
     def _append(self, part: Receipt) -> None:
-        """Append a part, or restart the file if the positions require a different data type."""
+        """Append a part, or rewrite the file if its positions require another data type."""
         self._appended.append(part)
         self._check_disk_space(part)
         cells = np.array(part.cell_box, np.int64).reshape(2, 3)
@@ -371,7 +371,7 @@ class GrowingCloud:
             self._appended_rows += appended.point_count
 
     def _check_disk_space(self, part: Receipt) -> None:
-        """Raise OSError unless the disk has enough space for this part and all remaining parts.
+        """Raise OSError if the disk space is insufficient for this part and all remaining parts.
 
         Without this check, the growing file could fill the disk before all scans are stored.
         """

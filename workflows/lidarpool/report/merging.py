@@ -1,4 +1,4 @@
-"""Merge shards that were run separately into a single data set or result."""
+"""Merge shards that ran separately into a single data set or result."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ _MISSING_NOTE = "these shards are missing: "  # start of a note
 
 @dataclass(frozen=True)
 class _ShardFolder:
-    """A folder with one or more shards of a run.
+    """Folder with one or more shards of a run.
 
     For a data set, `record` is the content of CAMPAIGN_FILE. For a survey, it contains the
     corresponding metadata of the run. `run_size` is the number of jobs or scans in the whole run,
@@ -78,16 +78,14 @@ class _ShardFolder:
 
     @cached_property
     def ranges(self) -> Sequence[range]:
-        """Numbers of the jobs or scans in each shard."""
         return [self.numbers(shard) for shard in self.shards]
 
     def has(self, number: int) -> bool:
-        """Return True if one of the shards includes this job or scan."""
         return any(number in numbers for numbers in self.ranges)
 
     @property
     def common(self) -> dict[str, Any]:
-        """Properties that must be the same in all shard folders, as {name: value}."""
+        """Properties that must be equal in all shard folders, as {name: value}."""
         record = self.record
         properties = {"kind": [*record["identity"]]} | record["identity"]
         properties |= {f"the file {name}": digest for name, digest in record["files"]}
@@ -165,7 +163,7 @@ def merge(
 
 
 def _real_path(storage: Storage) -> str:
-    """Return the URL of a remote storage, or the absolute path of a local folder without links."""
+    """Return a remote storage's URL, or a local folder's absolute path without symbolic links."""
     scheme, separator, path = storage.url.partition("://")
     if separator and scheme not in ("file", "local"):
         return storage.url
@@ -173,7 +171,7 @@ def _real_path(storage: Storage) -> str:
 
 
 def _check_separate(target: Storage, shard_storages: Mapping[str, Storage]) -> None:
-    """Raise LidarError if `target` is a shard, is inside a shard or contains a shard.
+    """Raise LidarError if `target` is a shard, or is inside a shard or contains one.
 
     `shard_storages` maps the result of `_real_path` to the storage.
     """
@@ -194,7 +192,7 @@ def _check_separate(target: Storage, shard_storages: Mapping[str, Storage]) -> N
 
 
 def _read_folder(storage: Storage) -> _ShardFolder:
-    """Read a finished shard, or a data set of several shards.
+    """Read a finished shard, or a data set that consists of several shards.
 
     Raise LidarError if the folder contains no finished shard.
     """
@@ -214,7 +212,7 @@ def _read_folder(storage: Storage) -> _ShardFolder:
 
 
 def _read_dataset(storage: Storage, shard_count: int = 1) -> _ShardFolder:
-    """Read a data set. A complete data set is treated as `shard_count` shards."""
+    """Read a data set, treating a complete data set as `shard_count` shards."""
     record = read_record(storage)
     shards = [Shard.parse(text) for text in record["shards"]]
     if shards == [ALL]:
@@ -303,7 +301,7 @@ def _check_same_run(
 
 
 def _collect_notes(shard_folders: Sequence[_ShardFolder], *, partial: bool) -> list[str]:
-    """Return the notes of all folders, and a note about missing shards if there are any.
+    """Return the notes of all folders, with a note about missing shards if there are any.
 
     Raise LidarError if shards are missing and `partial` is False.
     """
@@ -410,7 +408,7 @@ def _add_rows(
     rows: Iterable[JobRow],
     seconds: Mapping[int, float],
 ) -> None:
-    """Add the job rows of a shard folder, with their casting times, to the database.
+    """Add a shard folder's job rows and casting times to the database.
 
     `seconds` maps job numbers to casting times. A failed job does not replace a row that already
     exists. Raise LidarError if a job does not belong to the shards in the folder, or if two
@@ -472,7 +470,7 @@ def _read_casting_times(shard_folder: _ShardFolder, notes: list[str]) -> Mapping
 
 
 def _missing_manifests(shard_folders: Sequence[_ShardFolder], db: RunDatabase) -> list[str]:
-    """Describe the manifests that are missing, because their jobs have no row in the database."""
+    """Describe the missing manifests of jobs that have no row in the database."""
     return [
         f"the manifest of job {number} in {folder.storage}"
         for folder in shard_folders
@@ -529,7 +527,7 @@ def _merge_survey(
 def _copy_points(
     store: RunStore, shard_folders: Sequence[_ShardFolder], notes: Sequence[str]
 ) -> None:
-    """Copy the points in all folders to a store.
+    """Copy the points from all folders to a store.
 
     Raise LidarError if files are missing or damaged.
     """
@@ -539,7 +537,7 @@ def _copy_points(
     assert only is not None, "the store of a survey has a single job"
 
     def copy_part(source: Storage, part_file: Receipt) -> Receipt | None:
-        """Copy a part and return its receipt, or None if the part is missing or damaged."""
+        """Copy a part and return its receipt, or return None if the part is missing or damaged."""
         name = part_name(mark, 0, part_file.first, part_file.stop)
         with (
             explained(f"{source.path(part_file.name)} cannot be copied"),

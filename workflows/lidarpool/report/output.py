@@ -67,7 +67,7 @@ def run_survey(
     page: RunPage,
     compare: Callable[[RunResult], str] | None = None,
 ) -> tuple[RunResult, dict[str, Any]]:
-    """Run a survey, write its result and remove the run store.
+    """Run a survey, write its result, and remove the run store.
 
     The point cloud is written while the survey is running.
 
@@ -117,7 +117,7 @@ def run_survey(
 
 @dataclass(eq=False)
 class SurveyOutput:
-    """The output folder or storage of a survey.
+    """Output folder or storage of a survey.
 
     `formats` are written in addition to the cloud. `extent` selects the other files:
 
@@ -144,20 +144,19 @@ class SurveyOutput:
 
     @property
     def _requested(self) -> Sequence[str]:
-        """Optional columns that the user requested, without those that only formats require."""
         columns = self.survey.columns if self.scenario is None else self.scenario.cloud.columns
         return [column.name for column in optional_columns(columns)]
 
     @contextmanager
     def lock(self) -> Iterator[Path]:
-        """Lock the output folder while the body runs, and yield the local folder to write to."""
+        """Lock the output folder during the body, and yield the local folder for output files."""
         for output_format in self.formats:
             output_format.check_installed()
         with result_folder(self.target) as folder:
             yield folder
 
     def check_existing(self, inputs: SingleJob | RunResult, *, overwrite: bool = False) -> None:
-        """Check that the target contains nothing that must not be replaced.
+        """Raise LidarError if the target contains anything that must not be replaced.
 
         Raises
         ------
@@ -205,7 +204,7 @@ class SurveyOutput:
         cluster: Cluster | None = None,
         growing: GrowingCloud | None = None,
     ) -> tuple[RunResult, dict[str, Any]]:
-        """Write the result of a run and remove the run store.
+        """Write the result of a run, and remove the run store.
 
         Parameters
         ----------
@@ -255,7 +254,7 @@ class SurveyOutput:
         growing: GrowingCloud | None = None,
         show: WritingProgress = lambda *_: None,
     ) -> dict[str, Any]:
-        """Write the cloud, the pictures and the report to the target.
+        """Write the cloud, the images and the report to the target.
 
         In a local folder, files are first written to a temporary folder within `folder`. They are
         moved into place after all of them have been flushed to the disk, so an earlier result stays
@@ -346,7 +345,7 @@ class SurveyOutput:
         staged: Path,
         show: WritingProgress,
     ) -> None:
-        """Write the HTML report, the picture content and, if requested, the pictures."""
+        """Write the HTML report, the data for images and, if requested, the images."""
         from .page.rendering import write_page  # imports jinja2
 
         shown = picture_content(result)
@@ -365,7 +364,7 @@ def _write_cloud(
     result: RunResult,
     growing: GrowingCloud | None,
 ) -> CloudCounts:
-    """Write the cloud, or move the cloud that was written during the run to `path`.
+    """Write the cloud, or move it to `path` if it was written during the run.
 
     Returns the statistics of the cloud.
     """
@@ -382,7 +381,7 @@ def _write_formats(
     workers: LidarWorkers | None,
     show: WritingProgress,
 ) -> dict[str, float]:
-    """Write formats to a temporary folder. Formats that consist of many files are written last.
+    """Write formats to a temporary folder, ending with those that consist of many files.
 
     Returns {format: intensity} for formats with integer intensities. The value is the intensity
     that is stored as the largest integer.
@@ -416,7 +415,7 @@ def _points_with_progress(result: RunResult, file: str, show: WritingProgress) -
 
 
 def _write_sweeps(staged: Path, result: RunResult, sweeps: Sweeps) -> Sweeps:
-    """Write the sweeps and the instrument files, if any, and return sweeps that refer to them."""
+    """Write the sweeps and any instrument files, and return sweeps that refer to these files."""
     sweeps.save(staged / SWEEPS_FILE)
     instruments = sweeps.instruments
     if instruments is None:
@@ -426,7 +425,6 @@ def _write_sweeps(staged: Path, result: RunResult, sweeps: Sweeps) -> Sweeps:
 
 
 def _write_report(staged: Path, report: dict[str, Any], further: Sequence[str]) -> None:
-    """Add the names of all files to the report, and write report.json."""
     present = [name for name in FILES[1:] if name == REPORT or (staged / name).exists()]
     report["files"] = [CLOUD, *further, *present]
     text = json.dumps(report, indent=1, allow_nan=False) + "\n"
@@ -434,7 +432,7 @@ def _write_report(staged: Path, report: dict[str, Any], further: Sequence[str]) 
 
 
 def _upload(staged: Path, storage: Storage, further: Collection[str]) -> None:
-    """Upload the files of a result to a storage, with report.json last."""
+    """Upload the files of a result to a storage, ending with report.json."""
     for name in (*_known_optional_files(further), *FILES):
         if (staged / name).exists():
             storage.put(staged / name, name)
@@ -448,7 +446,7 @@ def _optional_files(survey: Survey, formats: Sequence[ExportSpec]) -> list[str]:
 
 
 def _formats_of_files(names: Collection[str]) -> list[str]:
-    """Return the formats whose file or folder is in a list of names."""
+    """Return the formats whose file or folder is in `names`."""
     unknown = {*names} - {*FILES, *INSTRUMENT_FILES, *_FORMAT_OF_FILE}
     return [name for file, name in _FORMAT_OF_FILE.items() if file in names] + plugin_formats(
         unknown
@@ -462,7 +460,7 @@ def _known_optional_files(names: Collection[str]) -> list[str]:
 
 
 class _EarlierResult(NamedTuple):
-    """Properties of an existing result."""
+    """Properties of a result that exists before the run."""
 
     identity: Mapping[str, str] = MappingProxyType({})  # hashes of the scene and the survey
     files: frozenset[str] = frozenset()  # files that may be removed
@@ -488,7 +486,7 @@ def _move_into_place(
     earlier: Collection[str],
     on_written: Callable[[], object],
 ) -> None:
-    """Move all files of a result into place, with report.json last.
+    """Move all files of a result into place, ending with report.json.
 
     If the process is killed, the run can be resumed, because its parts are only removed afterward.
     """
@@ -504,7 +502,7 @@ def _move_into_place(
 
 
 def _remove_earlier(target: Storage, files: Collection[str], earlier: Collection[str]) -> None:
-    """Remove the files of an earlier result before new `files` are moved into place.
+    """Remove the files of an earlier result before the new `files` are moved into place.
 
     report.json and the page are removed first, and a local folder is flushed afterward, because
     report.json marks a complete result. Next, files and folders of formats are removed if `files`

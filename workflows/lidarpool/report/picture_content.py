@@ -1,4 +1,4 @@
-"""Convert the result of a run to the content from which its pictures are drawn."""
+"""Convert the result of a run to the data from which its images are drawn."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..run.run_result import RunResult
 
 
 def picture_content(result: RunResult) -> PictureContent:
-    """Return the content of the pictures of a result."""
+    """Return the data from which the images of a result are drawn."""
     planning = planning_picture(result.planning, result.plan, result.trials)
     content, drawn = PictureContent.before_casting(result.scene, result.survey, planning)
     return replace(
@@ -25,7 +25,7 @@ def picture_content(result: RunResult) -> PictureContent:
 def planning_picture(
     planning: Planning | None, plan: Plan | None = None, trials: Sequence[Trial] = ()
 ) -> PlanningPicture | None:
-    """Return the planning problem for pictures, including the best path and all trials if known.
+    """Return a drawable planning problem, with the best path and all trials if they are known.
 
     Return None if the run plans no path.
     """

@@ -1,4 +1,4 @@
-"""Create the report of a run, as plain data that can be serialized to JSON."""
+"""Create the report of a run as a dictionary for JSON."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def versions() -> dict[str, str]:
 
 
 def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
-    """Return the report of a run as plain data for JSON.
+    """Return the report of a run as a dictionary for JSON.
 
     Lengths are in meters and times are in seconds. Infinite and unknown values are None.
     """
@@ -118,7 +118,7 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
 
 
 def summarize_report(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:
-    """Return the main statistics of a report and the paths of its files, as printed by `--json`."""
+    """Return the main statistics and the file paths of a report, as `--json` prints them."""
     planning = report["planning"]
     return {
         "folder": str(folder),
@@ -129,7 +129,7 @@ def summarize_report(folder: Path | Storage, report: dict[str, Any]) -> dict[str
 
 
 def _describe_parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
-    """Describe the scene, the sensors and the options of a survey."""
+    """Describe the scene, sensors and options of a survey."""
     options = declared_values(survey, CloudOptions) | declared_values(survey, Weather)
     del options["columns"]  # the report has a separate entry for the columns
     sensors = [
@@ -182,7 +182,7 @@ def _describe_columns(cloud: CloudCounts) -> list[dict[str, Any]]:
 
 
 def _describe_sensor(sensor: Sensor) -> dict[str, Any]:
-    """Describe a sensor: its beams, and the numeric and text properties of its scan head."""
+    """Describe the beams of a sensor, and the numeric and text properties of its scan head."""
     firings = np.arange(ELEVATION_RAYS // sensor.channels + 1)
     elevations = np.degrees(np.arcsin(sensor.directions(firings)[..., 2].clip(-1, 1)))
     head = {
@@ -204,7 +204,7 @@ def _describe_sensor(sensor: Sensor) -> dict[str, Any]:
 
 
 def stage_statistics(totals: Iterable[StageTotals]) -> dict[str, dict[str, Any]]:
-    """Return the statistics of each stage: tasks, items, task time, elapsed time and workers."""
+    """Return the tasks, items, task time, elapsed time and workers of each stage."""
     return {
         stage.stage: {
             "partition": stage.partition,
@@ -224,14 +224,14 @@ def sort_stages(totals: Iterable[StageTotals]) -> list[StageTotals]:
 
 
 def overlap_seconds(totals: Iterable[StageTotals]) -> float:
-    """Return the time in seconds during which casting and planning trials ran concurrently."""
+    """Return the time during which casting overlapped with planning trials, in seconds."""
     busy = {stage.stage: union(stage.busy) for stage in totals}
     casting, planning = (busy.get(stage, []) for stage in (INTERSECT, TRIAL))
     return sum(max(0.0, min(a[1], b[1]) - max(a[0], b[0])) for a in casting for b in planning)
 
 
 def _describe_planning(result: RunResult) -> dict[str, Any] | None:
-    """Describe the planning problem and the planned path, in world coordinates.
+    """Describe the planning problem and the planned path in world coordinates.
 
     Return None if no path was planned.
     """

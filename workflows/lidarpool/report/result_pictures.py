@@ -1,4 +1,4 @@
-"""Draw the pictures of a result: scene, hits, point cloud, intensity and planned path."""
+"""Draw images of a result, which show the scene, hits, points, intensity and planned path."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def draw_pictures(
     color: str = Z.name,
     show: WritingProgress = lambda *_: None,
 ) -> Iterator[Path]:
-    """Draw the pictures of a result, save them in a folder and insert them into its report.html.
+    """Draw images of a result, save them in a folder, and insert them into its report.html.
 
     All pictures of the scene have the same viewpoint. The path is only drawn if one was planned.
     Points in sensor coordinates are not drawn, because they cannot be combined with the scene.
@@ -131,7 +131,10 @@ def draw_pictures(
 def _picture_makers(
     shown: PictureContent, cloud: Path, size: tuple[int, int], color: str
 ) -> dict[str, Callable[[], Page]]:
-    """Return {picture name: function that draws it}. The file `cloud` is read on demand."""
+    """Return the function that draws each image, keyed by the name of the image.
+
+    The functions read the file `cloud` on demand.
+    """
     columns = [column.name for column in CloudFile(cloud).table] if cloud.exists() else []
     alone = shown.coordinates == "sensor"
     middle = shown.duration_ns / 2
@@ -245,7 +248,7 @@ def draw_path(
 
 
 def max_deviation(path: Floats, other: Floats) -> float:
-    """Return the maximum distance from one path to another path (directed Hausdorff distance).
+    """Return the maximum distance from one path to another (directed Hausdorff distance).
 
     `path` and `other` contain the corners of the paths. Shape (w, 2). `path` is sampled at a
     spacing of about a hundredth of the length of `other`, with at most 100 points per segment.
@@ -266,7 +269,6 @@ def max_deviation(path: Floats, other: Floats) -> float:
 
 
 def _path_legend(unit: float, trial_count: int, obstacle_count: int) -> list[Line2D]:
-    """Return the legend handles for a planned path."""
     handles = [Line2D([], [], color=PATH_COLOR, lw=_BEST_WIDTH * unit, label="Best path")]
     if trial_count:
         label = plural(trial_count, "other trial")
@@ -289,7 +291,7 @@ def _path_legend(unit: float, trial_count: int, obstacle_count: int) -> list[Lin
 
 
 def _path_caption(best: PlannedPath, trials: Sequence[Floats]) -> str:
-    """Return the caption: the length, the shortest possible length, and the number of trials."""
+    """Return a caption with the path length, the shortest possible length and the trial count."""
     shortest = "the discs block every path to the target"
     if math.isfinite(best.shortest_m) and best.shortest_m > 0:
         shortest = f"shortest possible length {best.shortest_m:.2f} m ({best.excess:+.2%})"
@@ -305,7 +307,7 @@ def _path_caption(best: PlannedPath, trials: Sequence[Floats]) -> str:
 def _plot_limits(
     best: Floats, trials: Sequence[Floats], planning: PlanningPicture, size: tuple[int, int]
 ) -> Floats:
-    """Return the minimum and maximum x and y of the plot, with the aspect ratio of the page.
+    """Return the x and y limits of the plot, using the aspect ratio of the page.
 
     The result has shape (2, 2).
     """
@@ -353,7 +355,7 @@ def _draw_ends(axes: Axes, page: Page, planning: PlanningPicture) -> None:
 
 
 def draw_stations(plan: StationPlan) -> Page:
-    """Draw the scene of a station plan, with each pixel colored by its visibility."""
+    """Draw the scene of a station plan, coloring each pixel by its visibility."""
     shot = take_shot(plan.scene, plan.stations)
     page = Page(SIZE)
     axes = page.show(shot, _classify_by_coverage(shot, plan).paint(COLORS, 0.6))
@@ -373,7 +375,7 @@ def draw_stations(plan: StationPlan) -> Page:
 
 
 def _classify_by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
-    """Replace the triangle index of each sample by COVERED, UNCOVERED, HIDDEN or OTHER."""
+    """Replace the triangle index of each sample with COVERED, UNCOVERED, HIDDEN or OTHER."""
     stations, candidates = (p - shot.scene.origin for p in (plan.stations, plan.candidates))
     visible_from_any = _pixel_visibility(shot, plan)
     kinds, surface = _initial_kinds(shot, plan, shot.pixel_samples)
@@ -398,7 +400,7 @@ def _classify_by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
 
 
 def _initial_kinds(shot: SurfaceView, plan: StationPlan, samples: RaySamples) -> tuple[Ints, Ints]:
-    """Return HIDDEN or OTHER for each sample, and the indices of the samples on targets.
+    """Return HIDDEN or OTHER for each sample, and the indices of samples on targets.
 
     The first array has shape (n,).
     """
@@ -409,7 +411,7 @@ def _initial_kinds(shot: SurfaceView, plan: StationPlan, samples: RaySamples) ->
 
 
 def _choose_block_pixels(shot: SurfaceView, pixels: Ints) -> tuple[Ints, Ints]:
-    """Choose one pixel for each triangle in each block of pixels.
+    """Choose one pixel per triangle in each block of pixels.
 
     Returns
     -------
@@ -424,14 +426,14 @@ def _choose_block_pixels(shot: SurfaceView, pixels: Ints) -> tuple[Ints, Ints]:
 
 
 def _replace_triangles(samples: RaySamples, kinds: Ints) -> RaySamples:
-    """Replace the triangle index of each sample that hits a surface by its kind."""
+    """Replace the triangle indices of samples that hit a surface with their kinds."""
     return replace(samples, triangle=np.where(samples.triangle >= 0, kinds, samples.triangle))
 
 
 def _pixel_visibility(
     shot: SurfaceView, plan: StationPlan
 ) -> Callable[[Floats, RaySamples, Ints], Bools]:
-    """Return a function that tests the visibility of samples by the same rules as the plan.
+    """Return a function that tests whether samples are visible, using the same rules as the plan.
 
     The function takes sensor positions with shape (p, 3), samples, and indices of samples with
     shape (k,). It returns a mask with shape (k,), which is True for samples whose drawn side is

@@ -1,1 +1,1 @@
-"""Runs, which process jobs on a cluster and can be resumed."""
+"""Runs that process jobs on a cluster and can be resumed."""

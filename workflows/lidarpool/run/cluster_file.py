@@ -1,4 +1,4 @@
-"""Cluster files, which describe in YAML the cluster and workers to start for a run."""
+"""YAML files that describe the cluster and workers to start for a run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _CONNECT_TIMEOUT = "30s"  # time limit for connecting to a host
 
 
 class WorkerGroup(BaseModel):
-    """Workers of a partition.
+    """Workers of a partition in a cluster file.
 
     Extra fields override the arguments of the cluster for these workers.
     """
@@ -45,7 +45,7 @@ class WorkerGroup(BaseModel):
 
     @property
     def worker_limit(self) -> int:
-        """Maximum number of workers."""
+        """Maximum number of workers in the group."""
         if self.adapt:
             return self.adapt[1]
         counted = self.hosts and "workers" not in self.model_fields_set
@@ -55,7 +55,7 @@ class WorkerGroup(BaseModel):
         return f"{self.adapt[0]} to {self.worker_limit}" if self.adapt else str(self.worker_limit)
 
     def describe_mistake(self) -> str:
-        """Return an error message if the number of workers is invalid, or an empty string."""
+        """Return an error message if the number of workers is invalid, or else an empty string."""
         if self.adapt is None:
             return "" if self.idle_s is None else "idle_s requires adapt, such as `adapt: [0, 8]`."
         if "workers" in self.model_fields_set:
@@ -70,7 +70,7 @@ class WorkerGroup(BaseModel):
 
 
 class ClusterFile(BaseModel):
-    """Description of a cluster to start.
+    """Description of a cluster that can be started.
 
     See docs/how-to/queues.md for the format.
     """
@@ -84,7 +84,7 @@ class ClusterFile(BaseModel):
 
     @classmethod
     def load(cls, path: Path) -> ClusterFile:
-        """Read a cluster file and import the class of the cluster, without starting workers.
+        """Read a cluster file, and import the cluster's class without starting workers.
 
         Raises
         ------
@@ -133,7 +133,7 @@ class ClusterFile(BaseModel):
 
     @contextmanager
     def start(self, tell: Callable[[str], object]) -> Iterator[SpecCluster]:
-        """Start the cluster and its workers, and stop them when the context exits.
+        """Start the cluster and its workers, and stop them at the end of the context.
 
         Workers may still be waiting in the queue of a batch system when the body starts.
 
@@ -182,7 +182,7 @@ class ClusterFile(BaseModel):
             yield cluster
 
     def _import_class(self) -> Any:
-        """Import the class of the cluster. Raise LidarError if it is not a supported cluster."""
+        """Import the cluster's class, or raise LidarError if it is not supported."""
         package, _, name = self.cluster.rpartition(".")
         try:
             # dask-jobqueue installs signal handlers, which must not replace those of this process.
@@ -210,7 +210,10 @@ class ClusterFile(BaseModel):
 
 @contextmanager
 def _capture_ssh_output(lines: list[str]) -> Iterator[None]:
-    """Append the output of processes that are started over SSH to `lines`. Dask only logs it."""
+    """Append the output of processes that Dask starts over SSH to `lines`.
+
+    Dask only logs this output.
+    """
 
     def info(line: str, *arguments: object) -> None:
         lines.append(line)

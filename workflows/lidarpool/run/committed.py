@@ -1,4 +1,4 @@
-"""Committed run, and the result of a survey that is created from it."""
+"""Committed run, and the result that is created from it if the run is a survey."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .store.run_store import RunStore
 
 @dataclass(frozen=True)
 class CommittedRun:
-    """Run whose jobs have all been committed to its store.
+    """Run whose jobs are all committed to its store.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class CommittedRun:
         return tuple(dict.fromkeys(filter(None, notes)))
 
     def result(self, screen: Screen) -> RunResult:
-        """Return the result of a survey, and warn if it has no points."""
+        """Create the result of a survey, and warn the user if it has no points."""
         only_job = self.store.only_job
         assert only_job is not None, "the run is a survey"
         job = only_job.job
@@ -77,7 +77,7 @@ class CommittedRun:
         )
 
     def _warn_of_empty_cloud(self, screen: Screen) -> None:
-        """Warn that the survey has no points, and add a note unless the run is a shard."""
+        """Warn that the survey has no points, and also add a note unless the run is a shard."""
         store = self.store
         assert store.only_job is not None
         job = store.only_job.job

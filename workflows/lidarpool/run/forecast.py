@@ -1,4 +1,4 @@
-"""Estimates of the scans, points, memory and disk space of a run, without starting workers."""
+"""Estimate the scans, points, memory and disk space of a run without starting workers."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def forecast(
     *,
     refuse: Callable[[], object] | None = None,
 ) -> dict[str, Any]:
-    """Estimate the scans, rays, points, memory and disk space of a run, and whether it can run.
+    """Estimate the scans, points, memory and disk space of a run, and whether it can run.
 
     No cluster is started, and nothing is written to the output folder.
 
@@ -174,7 +174,7 @@ def forecast(
 
 
 class _Cluster(NamedTuple):
-    """Properties of a run's cluster that are known before the run starts."""
+    """Properties of the run's cluster that are known before the run starts."""
 
     slots: dict[str, dict[str, int]]  # {partition: {"needed": …, "there": …}}
     casters: int  # number of casting workers
@@ -227,7 +227,7 @@ def _cluster_of(
 def _disk(
     job: Job, points: int, scans_per_batch: int, exports: int, result: Path | Storage
 ) -> dict[str, Any]:
-    """Estimate the disk space in bytes of a run and its result, and return the free space.
+    """Estimate the disk space that a run and its result require, and the available space.
 
     The run requires space for its parts and its database. Large parts contain `scans_per_batch`
     scans.
@@ -255,7 +255,7 @@ def _disk(
 def _shortages(
     disk: dict[str, Any], available_bytes: int, required_bytes: int, *, stored: bool
 ) -> list[str]:
-    """Return messages if the disk space or the memory is insufficient.
+    """Return messages about insufficient disk space or memory.
 
     Parameters
     ----------
@@ -283,7 +283,7 @@ def _shortages(
 
 
 def _performance(survey: Survey) -> dict[str, str]:
-    """Describe by sensor name whether each sensor is ideal or matches its data sheet."""
+    """Describe whether each sensor is ideal or corresponds to its data sheet, keyed by name."""
     performance = {}
     pairs = zip(survey.carried, survey.noise_each, survey.returns_each, strict=True)
     for carried, noise, returns in pairs:
@@ -297,7 +297,7 @@ def _performance(survey: Survey) -> dict[str, str]:
 
 
 def _unseen(job: Job) -> dict[str, list[str]]:
-    """Return the names of the objects that are hidden from each sensor.
+    """Return the names of the objects that each sensor cannot see.
 
     Sensors that see all objects are omitted.
     """
@@ -312,7 +312,7 @@ def _unseen(job: Job) -> dict[str, list[str]]:
 
 
 def _drive(survey: Survey) -> dict[str, Any] | None:
-    """Describe the trajectory of a moving platform and the revolutions of each sensor.
+    """Describe the trajectory of a moving platform, and the revolutions of each sensor.
 
     For airborne scanners, the distance per revolution is computed from the speed on flight lines
     while the sensor fires.
@@ -354,12 +354,11 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
 
 
 def _closest_existing(folder: Path) -> Path:
-    """Return a folder, or its closest parent that exists."""
     return next(path for path in (folder, *folder.absolute().parents) if path.exists())
 
 
 def _folder_notes(location: Path | Storage) -> list[str]:
-    """Return notes on the output folder. Raise LidarError if it is not writable."""
+    """Return notes on the output folder, or raise LidarError if it is not writable."""
     if isinstance(location, Storage):
         location.claim()  # leaves no files behind
     elif not (folder := _closest_existing(location)).is_dir():
@@ -382,7 +381,7 @@ def _worker_bytes(job: Job) -> int:
 
 
 def _rest_bytes(job: Job, points: int, planners: int) -> int:
-    """Estimate the memory in bytes of all processes on this machine except casting workers."""
+    """Estimate the memory, in bytes, of all processes on this machine except casting workers."""
     scene = job.scene
     swarm = job.planning.particles * job.planning.waypoints if job.planning else 0
     planning = PROCESS_BYTES + PARTICLE_BYTES * swarm

@@ -1,4 +1,4 @@
-"""Sources of jobs for a run, which is either the single job of a survey or a campaign."""
+"""Sources of a run's jobs, which are either the single job of a survey or a campaign."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def input_fingerprints(job: Job) -> dict[str, str]:
 
 
 def describe_inputs(scene: Scene, survey: Survey, planning: Planning | None) -> dict[str, str]:
-    """Describe the fields that a result depends on, by their path in a scenario.
+    """Describe the fields that determine a result, keyed by their path in a scenario.
 
     Positions are in the local coordinates of the scene.
     """
@@ -80,7 +80,7 @@ def describe_inputs(scene: Scene, survey: Survey, planning: Planning | None) -> 
 
 @dataclass(frozen=True, eq=False)
 class SingleJob:
-    """Survey as the only job of a run, or one shard of a survey."""
+    """Source whose only job is a survey or one of its shards."""
 
     survey_job: Job
     shard: Shard = ALL
@@ -91,18 +91,18 @@ class SingleJob:
 
     @cached_property
     def only_job(self) -> Job:
-        """Job of this shard. It includes path planning only in the first shard."""
+        """Job of this shard, which includes path planning only in the first shard."""
         job = self.survey_job
         return job if self.shard.number == 1 else job.with_fields(planning=None)
 
     @cached_property
     def identity(self) -> Mapping[str, str]:
-        """Fingerprints of the scene, the survey and the planning."""
+        """Fingerprints of the scene, survey and planning."""
         return input_fingerprints(self.survey_job)
 
     @cached_property
     def fields(self) -> Mapping[str, str]:
-        """Descriptions of the fields of the scene, the survey and the planning."""
+        """Descriptions of the fields in the scene, survey and planning."""
         job = self.survey_job
         return describe_inputs(job.scene, job.survey, job.planning)
 
@@ -111,7 +111,7 @@ Jobs = SingleJob | CampaignSpec  # source of the jobs in a run
 
 
 def failed_row(jobs: Jobs, number: int, error: object) -> JobRow:
-    """Create the table row of a failed job in a campaign."""
+    """Return the table row of a campaign job that has failed."""
     assert isinstance(jobs, CampaignSpec), "a survey fails together with its job"
     values: Mapping[str, Value | None] = {}
     with suppress(Exception):  # the values may be the cause of the error
@@ -121,7 +121,7 @@ def failed_row(jobs: Jobs, number: int, error: object) -> JobRow:
 
 
 class JobProducer:
-    """Thread that creates the jobs of a campaign and their sweeps in advance.
+    """Thread that prepares the jobs of a campaign and their sweeps in advance.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ class JobProducer:
         return entry
 
     def has_ready(self, jobs: int) -> bool:
-        """Return True if this number of jobs is ready, or if no more jobs can become ready."""
+        """Return True if this number of jobs is ready, or if no further jobs will be ready."""
         waits = self._full or not self._thread.is_alive()
         return waits or self._ready.qsize() >= min(jobs, MAX_READY)
 

@@ -1,4 +1,4 @@
-"""Live output of a run, which passes on committed parts and frames at the pace of the scanner."""
+"""Live output of a run, which forwards committed parts and frames at the speed of the scanner."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .run_page import RunPage
 
 
 class Listener:
-    """Listener that passes committed parts and frames of a survey to the live page and the caller.
+    """Listener that forwards a survey's committed parts and frames to the live page and the caller.
 
     The methods are called in the thread of the run.
 
@@ -41,7 +41,7 @@ class Listener:
         self._unshown: list[Receipt] = []  # parts whose frames are not due yet
 
     def on_frame(self, frame: ScanFrame) -> None:
-        """Wait until a frame is due, and pass it on."""
+        """Wait until a frame is due, and forward it."""
         if self._pacer is not None:
             self._pacer.wait(frame.time_ns)
             self._show_parts(frame.scan + 1)
@@ -50,7 +50,7 @@ class Listener:
             self._on_frame(frame)
 
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
-        """Pass on committed parts."""
+        """Forward committed parts."""
         if self._pacer is None:
             self.page.on_parts(receipts)
         else:
@@ -59,7 +59,7 @@ class Listener:
             self._on_parts(receipts)
 
     def _show_parts(self, stop: int) -> None:
-        """Show the pending parts with scans before `stop`, whose frames are due."""
+        """Show the pending parts that contain scans before `stop`, because their frames are due."""
         due = sorted((part for part in self._unshown if part.first < stop), key=lambda p: p.first)
         if due:
             self._unshown = [part for part in self._unshown if part.first >= stop]
@@ -67,7 +67,7 @@ class Listener:
 
 
 class Pacer:
-    """Timer that delays frames to a speed relative to the scanner.
+    """Timer that delays frames to simulate a multiple of the scanner's speed.
 
     The first frame and frames that arrive late are due immediately. Later frames do not catch up,
     so that the display is never faster than the scanner.

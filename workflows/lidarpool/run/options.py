@@ -1,4 +1,4 @@
-"""Options of a run on the command line and in Python."""
+"""Options of a run, as used on the command line and in Python."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Live = bool | Literal["page", "foxglove", "rerun"]
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(TaskOptions):
-    """Options for casting, for the cluster, and for the treatment of an earlier run.
+    """Options that control casting, the cluster, and what happens to an earlier run.
 
     `simulate`, `Campaign.run` and `Campaign.stream` accept most of them as keywords (`RunKeywords`)
     and document them. Commands have corresponding command-line options.
@@ -71,12 +71,12 @@ class RunOptions(TaskOptions):
 
     @property
     def may_continue(self) -> bool:
-        """True if the options allow the run to continue an earlier run."""
+        """True if the options allow continuing an earlier run."""
         return self.resume or self.retry_failed or self.verify
 
     @property
     def continues_run(self) -> bool:
-        """True if the run continues an unfinished run in `folder`."""
+        """True if the run will continue an unfinished run in `folder`."""
         folder = self.folder
         return self.may_continue and folder is not None and FILE in Storage.at(folder).sizes()
 
@@ -95,12 +95,12 @@ class RunOptions(TaskOptions):
 
     @property
     def starts_workers(self) -> bool:
-        """True if a cluster on this machine is started for the run."""
+        """True if the run starts a cluster on this machine."""
         return self.client is None and self.scheduler is None and self.cluster is None
 
 
 class RunKeywords(TypedDict, total=False):
-    """Keywords of Python functions that correspond to `RunOptions`.
+    """Keyword arguments of Python functions that correspond to `RunOptions`.
 
     A client replaces the options with which commands connect to a cluster or start one.
     """
@@ -129,7 +129,7 @@ class RunKeywords(TypedDict, total=False):
 def check_keywords(
     call: str, keywords: RunKeywords, without: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Validate the keywords of a call, and return those that are not None.
+    """Validate the keyword arguments of a call, and return those that are not None.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Planning trials, which the driver submits to the OTHER partition a few at a time."""
+"""Planning trials, which the driver gradually submits to the OTHER partition."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LOOK_EVERY_S = 1.0
 
 
 class TrialRunner:
-    """Planning trials of a survey, which run on the workers of a partition.
+    """Runner of a survey's planning trials on the workers of a partition.
 
     Call `step` repeatedly until `finished` is True. Trials in `earlier_trials`, which an earlier
     run has finished, are not repeated.
@@ -46,7 +46,7 @@ class TrialRunner:
         return len(self.trials) == self.planning.trials
 
     def step(self) -> None:
-        """Collect results and submit more trials. Raise LidarError if a trial has failed."""
+        """Collect results and submit further trials, or raise LidarError if a trial has failed."""
         running = self.tasks.running
         if running and time.monotonic() - self._located_at > LOOK_EVERY_S:
             self._leave_silent_workers()

@@ -1,4 +1,4 @@
-"""Progress of a run and its display in a terminal or notebook."""
+"""Progress of a run, and its display in a terminal or notebook."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Progress:
 
     @property
     def sweeps_text(self) -> str:
-        """Number of finished sweeps, such as "12 of 100 sweeps". Empty for a campaign."""
+        """Number of finished sweeps, such as "12 of 100 sweeps", or "" for a campaign."""
         return f"{self.sweeps_done:,} of {plural(self.sweeps, 'sweep')}" if self.sweeps else ""
 
 
@@ -67,7 +67,7 @@ def format_rate(rate: float) -> str:
 
 
 def format_duration(seconds: float) -> str:
-    """Format a duration, such as 8 s, 3 min or 2 h 05 min."""
+    """Format a duration, for example as 8 s, 3 min or 2 h 05 min."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
@@ -75,13 +75,13 @@ def format_duration(seconds: float) -> str:
 
 
 class ProgressRate:
-    """Rate of a count since its first value, from which the remaining time is estimated."""
+    """Rate at which a count has increased since its first value, and the remaining time."""
 
     def __init__(self) -> None:
         self._first: tuple[float, int] | None = None
 
     def rate(self, seconds: float, count: int) -> float:
-        """Return the rate per second, or 0 before any time has passed."""
+        """Return the rate per second, or 0 if no time has passed yet."""
         start_s, first_count = self._first = self._first or (seconds, count)
         return (count - first_count) / (seconds - start_s) if seconds > start_s else 0.0
 
@@ -95,14 +95,14 @@ class ProgressRate:
         return format_duration((total - count) / rate) if sure else ""
 
     def text(self, seconds: float, count: int, total: int) -> str:
-        """Format the rate and the remaining time, or return an empty string if the rate is 0."""
+        """Format the rate and remaining time, or return an empty string if the rate is 0."""
         rate = self.rate(seconds, count)
         time_left = self.time_left(seconds, count, total)
         return f"{format_rate(rate)}/s{f'  {time_left} left' if time_left else ''}" if rate else ""
 
 
 def waiting_reason(progress: Progress) -> str:
-    """Return the reason why the run is waiting, or an empty string if it is not."""
+    """Return the reason why the run is waiting, or an empty string if it is not waiting."""
     slots = progress.waits_for
     return f"waiting for {slots} slots held by other runs" if slots else ""
 
@@ -133,7 +133,7 @@ def progress_rows(console: Console) -> Iterator[Callable[..., None]]:
 
 @contextmanager
 def bars(console: Console) -> Iterator[Show]:
-    """Show progress bars with rates and remaining times, and yield their update function."""
+    """Show progress bars with rates and remaining times, and yield a function to update them."""
     paces = {label: ProgressRate() for label, _, _ in STAGES}
     with progress_rows(console) as move:
 
@@ -154,7 +154,7 @@ def bars(console: Console) -> Iterator[Show]:
 
 @contextmanager
 def local_progress_bars() -> Iterator[Show]:
-    """Show progress bars in a notebook cell or a terminal, and yield their update function.
+    """Show progress bars in a notebook or terminal, and yield a function to update them.
 
     The function has no effect if the output is neither a terminal nor a notebook.
     """
@@ -194,24 +194,24 @@ class Screen:
         logger.info(words)
 
     def warn(self, words: str) -> None:
-        """Log a warning and append it to `warnings`, unless it was already reported."""
+        """Log a warning and append it to `warnings`, unless it has been reported before."""
         if words not in self.warnings:
             self.warnings.append(words)
             logger.warning(words)
 
     def status(self, words: str) -> AbstractContextManager[None]:
-        """Return a context manager that shows the current activity."""
+        """Return a context manager that displays the current activity."""
         return nullcontext()
 
     def writing(self, words: str) -> AbstractContextManager[WritingProgress]:
-        """Return a context manager that shows the progress of writing.
+        """Return a context manager that displays the progress of writing.
 
         It yields the function that updates the progress.
         """
         return nullcontext(lambda *_: None)
 
     def progress(self) -> AbstractContextManager[Show]:
-        """Return a context manager that shows the progress of a run.
+        """Return a context manager that displays the progress of a run.
 
         It yields the function that updates the progress.
         """
@@ -222,7 +222,7 @@ class Screen:
     def starting(
         self, cluster: AbstractContextManager[Client], words: str, *, shares_terminal: bool = False
     ) -> AbstractContextManager[Client]:
-        """Return a context manager that starts a cluster and shows this activity.
+        """Return a context manager that starts a cluster and displays this activity.
 
         `shares_terminal` is True if the workers write to the same terminal.
         """

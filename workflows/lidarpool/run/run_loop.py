@@ -50,7 +50,7 @@ EXTRA_JOBS = 64  # maximum number of jobs in flight in addition to two per GPU s
 
 
 class RunLoop:
-    """Main loop of a run, which moves its jobs through the pipeline.
+    """Main loop of a run, which moves the run's jobs through the pipeline.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ class RunLoop:
         )
 
     def _loop(self, first: Job, show: Show) -> None:
-        """Advance the jobs and the planning until everything has finished, and show the progress.
+        """Advance and display all jobs and the planning until everything has finished.
 
         Once the last job has ended, the pipeline stages are closed, and the loop waits until they
         have exited.
@@ -195,7 +195,7 @@ class RunLoop:
         return self._maker.ended and not self._store.in_flight
 
     def _step_jobs(self, started: float, watch: Watch) -> None:
-        """Begin, cast, write and commit jobs as far as possible without waiting.
+        """Begin, cast, write and commit jobs as far as this is possible without waiting.
 
         Raise LidarError if a failure affects all jobs. `started` is the monotonic time in seconds
         at which the loop started.
@@ -238,7 +238,6 @@ class RunLoop:
             watch.forget([OTHER])
 
     def _save(self) -> None:
-        """Store finished trials and the number of delivered frames in the run's database."""
         if self._trials is not None and (only_job := self._store.only_job) is not None:
             new_trials = self._trials.trials[len(only_job.trials) :]
             self._store.db.add_trials(only_job.committed, new_trials)
@@ -265,7 +264,7 @@ class RunLoop:
         )
 
     def _states(self) -> list[dict[str, Any]]:
-        """Return the states of the jobs that are being cast, followed by those being written.
+        """Return the states of jobs that are being cast, followed by those being written.
 
         See `RunPage.on_progress` for the fields of a state.
         """
@@ -286,7 +285,7 @@ class RunLoop:
         return sorted(states, key=itemgetter("writing"))
 
     def _stop(self, reason: str) -> None:
-        """Stop all tasks after an error, if the cluster can still be reached."""
+        """Stop all tasks after an error if the cluster is still reachable."""
         client = self._cluster.client
         pipeline = self._pipeline
         trials = self._trials
@@ -303,7 +302,7 @@ class RunLoop:
     # -- jobs --------------------------------------------------------------------------------
 
     def _hand_out(self, job: PipelineJob, summaries: Summaries) -> None:
-        """Deliver new frames of a job to the listener, in scan order."""
+        """Deliver the new frames of a job to the listener in scan order."""
         stored = self._store.in_flight[job.number]
         for frame in stored.frames(summaries):
             job.trace("frame", SORT, [frame.scan])
@@ -329,7 +328,7 @@ class RunLoop:
         return error_of_all
 
     def _admit(self) -> None:
-        """Begin jobs that are ready if the pipeline has room for them."""
+        """Begin the jobs that are ready, as long as the pipeline has room for them."""
         max_in_flight = EXTRA_JOBS + 2 * self._pipeline.workers.slot_count
         # Small jobs begin together, so that they can share tasks and messages.
         together = self._pipeline.dispatcher.per_task if self._pipeline.jobs else 1
@@ -344,7 +343,7 @@ class RunLoop:
                 self._begin(entry)
 
     def _begin(self, job: Job) -> None:
-        """Add a job to the pipeline and begin its planning.
+        """Add a job to the pipeline, and begin its planning.
 
         The job fails if its scans are too large for the workers, or if it cannot be pickled.
         """
@@ -384,7 +383,7 @@ class RunLoop:
         self._scans_to_come = to_come * self._scans_begun // self._jobs_begun
 
     def _write_request(self, casting: PipelineJob) -> WriteRequest:
-        """Create the write request for a job whose scans are all committed."""
+        """Create a write request for a job whose scans have all been committed."""
         stored = self._store.in_flight[casting.number]
         job = stored.job
         row = JobRow(
@@ -408,7 +407,7 @@ class RunLoop:
         self._rows.append(failed_row(self._store.jobs, number, error))
 
     def _commit(self) -> None:
-        """Commit the rows of ended jobs to the run's database, and remove the parts of the jobs."""
+        """Commit the rows of ended jobs to the run's database, and delete the jobs' parts."""
         rows = self._rows
         self._rows = []
         if not rows:
@@ -420,7 +419,7 @@ class RunLoop:
         self._remover.submit(self._remove, ended)
 
     def _remove(self, ended: Sequence[tuple[JobRow, StoredJob]]) -> None:
-        """Remove the parts of ended jobs after the page has read their points."""
+        """Delete the parts of ended jobs after the page has read their points."""
         for row, job in ended:
             with suppress(LidarError, OSError):  # leftover files are harmless
                 if row.done:

@@ -17,7 +17,7 @@ from .store.stored_job import StoredJob
 
 
 class RunPage:
-    """Live page of a run.
+    """Interface of the live page of a run.
 
     The methods of this base class do nothing. They are called in the thread of the run and must
     return immediately, except for `look`, which is called in the thread that removes the parts of
@@ -25,10 +25,10 @@ class RunPage:
     """
 
     def begun(self, job: StoredJob) -> None:
-        """Show the job of a survey, including results from an earlier run."""
+        """Show the job of a survey, including any results from an earlier run."""
 
     def follow(self, partitions: Mapping[str, Partition], dataset: DataSet | None = None) -> None:
-        """Start showing the tasks on these partitions.
+        """Start showing the tasks on the given partitions.
 
         `dataset` is the data set that the jobs of a campaign are written to.
         """
@@ -61,19 +61,19 @@ class RunPage:
         """
 
     def ended(self, row: JobRow) -> None:
-        """Show a job that has ended, in this run or in an earlier run."""
+        """Show a job that has ended in this run or in an earlier run."""
 
     def look(self, row: JobRow, job: StoredJob) -> None:
-        """Read the points to show for a finished job before its parts are removed."""
+        """Read the points of a finished job before its parts are deleted."""
 
     def finish(self, seconds: float, result: RunResult | None = None) -> None:
-        """Show that the run has ended, its duration in seconds, and the result of a survey.
+        """Show that the run has ended, with its duration in seconds and any result of a survey.
 
         The parts may be removed afterwards.
         """
 
     def stay(self, cloud: Path | None = None) -> None:
-        """Keep the page open until the user ends it.
+        """Keep the page open until the user closes it.
 
         Points are read from the written file `cloud`.
         """

@@ -1,4 +1,4 @@
-"""Results of runs, which are the points of a survey or the totals of a campaign."""
+"""Results of runs, each with the points of a survey or the totals of a campaign."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from .pipeline.task_records import TaskRecord
 
 @dataclass(frozen=True, eq=False)
 class RunResult:
-    """Result of a survey, without files.
+    """Result of a survey that has not been written to files.
 
     `lidarpool.Result` adds methods to this class.
 
@@ -77,7 +77,7 @@ class RunResult:
 
     @property
     def thinned(self) -> str:
-        """Clause on points that were thinned out, to follow their number.
+        """Clause about omitted points, which follows the number of points in messages.
 
         The clause is empty if all points are kept.
         """
@@ -86,7 +86,7 @@ class RunResult:
 
     @property
     def records(self) -> tuple[TaskRecord, ...]:
-        """Tasks of the run, with their worker and time.
+        """Records of the tasks in the run, with their workers and times.
 
         If a stage has thousands of tasks, only every n-th task is included.
         """
@@ -94,17 +94,17 @@ class RunResult:
 
     @property
     def fields(self) -> Mapping[str, str]:
-        """Descriptions of the fields of the scene, the survey and the planning."""
+        """Descriptions of the fields in the scene, survey and planning."""
         return describe_inputs(self.scene, self.survey, self.planning)
 
     @cached_property
     def cloud(self) -> Cloud:
-        """Points of the survey, which are read into memory on first use."""
+        """Points of the survey, which are read into memory when they are first used."""
         return self.points.load()
 
     @cached_property
     def hit_counts(self) -> Ints:
-        """Number of hits for each hit counter of the scene, which are read on first use."""
+        """Values of all hit counters of the scene, which are read when they are first used."""
         return self._hit_counts()
 
 
@@ -151,7 +151,7 @@ class CampaignRun:
     def from_rows(
         cls, rows: Iterable[JobRow], seconds: float, resumed: int | None = None, **details: Any
     ) -> CampaignRun:
-        """Summarize the table rows of the jobs in a campaign.
+        """Summarize the table rows of a campaign's jobs.
 
         By default, all jobs are considered to come from an earlier run. `details` are further
         fields of the result.

@@ -1,4 +1,4 @@
-"""Cast the jobs of a run and commit their points to a store.
+"""Cast the jobs of a run, and commit their points to a store.
 
 `cast_to_store` leaves the points in the store. `run_survey` (`report/output.py`) and `run_campaign`
 (`report/campaign_output.py`) also publish a result, such as `cloud.ply`, and then remove the store.
@@ -35,7 +35,7 @@ def cast_to_store(
     scenario_source: Mapping[str, Any] | None = None,
     target: object = None,
 ) -> RunResult:
-    """Cast the only job of a run and leave its points in the run store.
+    """Cast the only job of a run, leaving its points in the run store.
 
     `on_frame` is called with each frame, in scan order. The store records `scenario_source`, the
     path and settings of the scenario, so that shards can be merged later. Messages refer to the
@@ -96,7 +96,7 @@ def cast(
     listener: Listener,
     dataset: DataSet | None = None,
 ) -> CommittedRun:
-    """Cast the scans of a run that have not been committed yet.
+    """Cast those scans of a run that have not been committed.
 
     Parameters
     ----------

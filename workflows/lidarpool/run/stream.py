@@ -1,4 +1,4 @@
-"""Streams of sweeps, which a campaign delivers without writing files.
+"""Streams of sweeps that a campaign delivers without writing files.
 
 A stream replaces stages 1 and 4 of the pipeline. It passes the scans of the next sweeps to a
 `Dispatcher`, which offers them to workers and offers them again if workers die. The stream then
@@ -62,7 +62,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class SweepStream:
-    """Sweeps of a campaign's jobs, which are cast while they are read.
+    """Sweeps of a campaign's jobs, which are cast while they are being read.
 
     Each iteration casts all sweeps again, with the same result. When an iteration ends, its tasks
     are canceled, and the workers that it has started are stopped. A pickled copy connects to the
@@ -82,7 +82,7 @@ class SweepStream:
         return self.__dict__ | {"options": options}
 
     def of_jobs(self, numbers: Sequence[int]) -> SweepStream:
-        """Return the stream of a subset of the jobs."""
+        """Return a stream of only the given jobs."""
         return replace(self, numbers=numbers)
 
     def __iter__(self) -> Generator[Sweep]:
@@ -101,7 +101,7 @@ class SweepStream:
                 raise LidarError(f"The stream lost its cluster: {message_of(error)}") from error
 
     def torch(self, transform: Callable[[Sweep], Any] | None = None) -> Any:
-        """Return a `torch.utils.data.IterableDataset` of the sweeps, in the order of jobs.
+        """Return a `torch.utils.data.IterableDataset` of the sweeps, ordered by job.
 
         The DataLoader must have ``num_workers=0``, because the cluster already prepares sweeps in
         advance. If torch.distributed is initialized when the loader starts, each rank receives the
@@ -126,7 +126,7 @@ class SweepStream:
 
 @dataclass(eq=False)
 class _StreamedSweeps:
-    """Sweeps of a job that are being cast, and the columns that are ready to be read."""
+    """Sweeps of a job that are being cast, and the columns that have already been fetched."""
 
     job: Job
     keep: DatasetFormat  # data set format of the campaign, which determines the points
@@ -136,7 +136,7 @@ class _StreamedSweeps:
     points_read: int = 0
 
     def pop(self, number: int) -> Sweep | None:
-        """Remove and return a sweep, or return None if some of its scans have not been cast yet."""
+        """Remove and return a sweep, or return None if not all of its scans have been cast."""
         job = self.job
         survey = job.survey
         sweeps = job.sweeps
@@ -169,7 +169,7 @@ class _StreamedSweeps:
 
 
 class _Casting:
-    """One iteration over a stream, which casts its sweeps."""
+    """Single iteration over a stream, during which the stream's sweeps are cast."""
 
     def __init__(self, stream: SweepStream, client: Client, waiting: WaitTimer) -> None:
         self._stream = stream
@@ -205,7 +205,7 @@ class _Casting:
             yield sweep
 
     def close(self) -> None:
-        """Stop casting and release the workers."""
+        """Stop casting, and release the workers."""
         self._maker.close()
         for streamed in [*self._jobs.values()]:
             self._end(streamed)
@@ -214,7 +214,7 @@ class _Casting:
             self._casting.release()
 
     def _step(self) -> None:
-        """Begin, cast and fetch sweeps as far as possible without waiting."""
+        """Begin, cast and fetch sweeps as far as this is possible without waiting."""
         self._begin_sweeps()
         self._dispatcher.check()
         if (locations := self._casting.refresh()) is not None:
@@ -233,7 +233,7 @@ class _Casting:
         self._watch.check()
 
     def _begin_sweeps(self) -> None:
-        """Begin further sweeps until `ahead` sweeps are in flight."""
+        """Begin more sweeps until `ahead` sweeps are in flight."""
         while len(self._in_flight) < self._stream.ahead and (self._next or self._begin_job()):
             if (streamed := self._next) is not None:  # None if the job has failed
                 number = streamed.sweeps_begun
@@ -247,7 +247,7 @@ class _Casting:
                     self._next = None
 
     def _begin_job(self) -> bool:
-        """Begin the next job, unless it fails. Return False if no job is ready."""
+        """Begin the next job unless it fails, and return False if no job is ready."""
         if (entry := self._maker.pop()) is None:
             return False
         if isinstance(entry, JobRow):
@@ -298,7 +298,7 @@ class _Casting:
         self._casting.remove(streamed.job.number)
 
     def _warn_if_empty(self, streamed: _StreamedSweeps) -> None:
-        """Warn about the first job without points, and cast rays locally to find the reason."""
+        """Warn about the first job without points, casting rays locally to find the reason."""
         if streamed.points_read or self._warned:
             return
         self._warned = True

@@ -1,4 +1,4 @@
-"""Writing on LIDAR workers, which write the jobs of a data set and ranges of multi-file formats."""
+"""Writing of data set jobs, and of ranges of multi-file formats, by LIDAR workers."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ MAX_STALL_S = 10.0  # time without progress after which the driver writes jobs i
 
 
 class WriteRequest(NamedTuple):
-    """Request to write the files of a job, with the arguments of `DataSet.write_job`."""
+    """Request to write a job's files, with the arguments of `DataSet.write_job`."""
 
     row: JobRow  # table row without point counts
     cloud: StoredCloud
@@ -85,7 +85,7 @@ def write_jobs(
 
 
 def _write_job(dataset: DataSet, job: WriteRequest) -> JobOutcome:
-    """Write a job and return its table row.
+    """Write the files of a job, and return its table row.
 
     If this fails, return a LidarError for a storage error, or a JobError for any other error.
     """
@@ -104,7 +104,7 @@ def _write_job(dataset: DataSet, job: WriteRequest) -> JobOutcome:
 
 
 class DataSetWriter:
-    """Writer that has LIDAR workers write jobs to a data set.
+    """Writer that lets LIDAR workers write jobs to a data set.
 
     Workers that cannot access the parts or the data set write no jobs. The driver writes their jobs
     instead.
@@ -148,7 +148,7 @@ class DataSetWriter:
 
     @property
     def jobs(self) -> Iterator[JobRow]:
-        """Rows of the jobs that are waiting or being written."""
+        """Table rows of the jobs that wait to be written or are being written."""
         yield from (job.row for jobs in self.tasks.running.values() for job in jobs)
         yield from (job.row for job in (*self._driver_writes.values(), *self._waiting))
 
@@ -312,13 +312,13 @@ class LidarWorkers:
         return written
 
     def recorded(self, result: RunResult) -> RunResult:
-        """Return a copy of a result that includes the tasks that wrote ranges."""
+        """Return a copy of a result that includes the tasks that wrote ranges of files."""
         return replace(result, stages=(*result.stages, *self._tasks.book.stages.values()))
 
 
 @lru_cache(maxsize=1)
 def _fetch_writer(key: str) -> RangeWriter:
-    """Fetch the writer, which is cached for all ranges in this process.
+    """Fetch the writer, which this process caches for all ranges.
 
     Dask recreates the writer if the worker that holds it has died.
     """
@@ -332,7 +332,7 @@ def _fetch_writer(key: str) -> RangeWriter:
 
 
 def _write_range(key: str, span: PieceRange) -> tuple[Range | None, TaskRecord]:
-    """Write a range on a worker and return its result and the record of the task."""
+    """Write a range on a worker, and return its result with the record of the task."""
     recorder = Recorder(EXPORT, LIDAR)
     with explained(f"The worker {recorder.finish().worker} cannot write the output"):
         written_range = _fetch_writer(key)(span)

@@ -1,1 +1,1 @@
-"""Scenario and campaign files, and the jobs that are created from them."""
+"""Scenario and campaign files, and the jobs that are created from these files."""

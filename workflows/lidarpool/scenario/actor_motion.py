@@ -1,4 +1,4 @@
-"""Scenario sections for motion, such as mounts, trajectories and actors."""
+"""Scenario sections for mounts, trajectories, actors and other motion."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class MountSection(Section, InstrumentPose):
     ] = None
 
     def pose(self) -> Pose:
-        """Return the position and angles as a pose."""
+        """Convert the position and angles to a pose."""
         return Pose(**declared_values(self, Pose))
 
 
@@ -286,7 +286,7 @@ class TrajectorySection(Section):
         )
 
     def footprint(self, path: ResolvePath) -> Floats:
-        """Return horizontal positions on the trajectory during the survey.
+        """Return horizontal positions along the trajectory during the survey.
 
         The positions are in world coordinates, in meters, and have shape (n, 2). If the trajectory
         is that of a vehicle in traffic, the array is empty. `path` is a function that returns the
@@ -304,7 +304,7 @@ class TrajectorySection(Section):
     def _track_without_surfaces(
         self, path: ResolvePath, origin: Floats, start_s: float | None
     ) -> Track:
-        """Return the trajectory in local coordinates, with heights as in the file or points."""
+        """Return the trajectory in local coordinates, with heights as in the file or pose list."""
         options: dict[str, Any] = {
             "smooth": self.interpolation == "smooth",
             "start_s": self.start_s if start_s is None else start_s,
@@ -419,12 +419,12 @@ class ActorSection(DeformingSection):
 
     @property
     def is_platform(self) -> bool:
-        """Whether the actor is the platform, which follows the trajectory of the survey."""
+        """Whether the actor is the platform, which follows the survey's trajectory."""
         return self.trajectory is None and self.at is None
 
     @property
     def robot(self) -> MeshFile | None:
-        """File of the actor if it describes a robot, otherwise None."""
+        """File of the actor if it describes a robot, or None otherwise."""
         return self.file if self.file and self.file.file.lower().endswith(ROBOTS) else None
 
     def track(
@@ -434,7 +434,7 @@ class ActorSection(DeformingSection):
         platform_track: Track | None,
         without_angles: dict[str, bool],
     ) -> Track:
-        """Return the trajectory of the actor from the start of the survey, in local coordinates.
+        """Return the actor's trajectory from the start of the survey, in local coordinates.
 
         Parameters
         ----------

@@ -40,7 +40,7 @@ MIN_STEPS = 100  # minimum length of a scene in units of the precision
 
 
 def advice(prepared: PreparedScenario) -> list[str]:
-    """Return notes about likely mistakes, such as a size that suggests a wrong unit.
+    """Return notes about likely mistakes, such as a wrong unit that results in an unusual size.
 
     The notes also cover skipped objects, files whose up axis was assumed, default poses, and
     settings that have no effect.
@@ -77,7 +77,7 @@ def advice(prepared: PreparedScenario) -> list[str]:
 
 
 def unlabeled_notes(scene: Scene, survey: Survey) -> list[str]:
-    """Return a note if static objects have no class, for clouds that contain the class column.
+    """Return a note if static objects have no class although the cloud stores classes.
 
     The list is empty if the survey assigns a name to class 0, for example "background".
     """
@@ -110,20 +110,19 @@ def unlabeled_notes(scene: Scene, survey: Survey) -> list[str]:
 
 
 def _is_mesh_survey(scenario: Scenario) -> bool:
-    """Return whether a mesh file was passed in place of a scenario."""
     files = [scenario.path(entry.file) for entry in scenario.scene.files]
     return scenario.source in map(mesh_survey_name, files)
 
 
 def _with_command_option(remark: str) -> str:
-    """Return a remark about axes with the command-line option instead of the field."""
+    """Replace the field in a remark about axes with the corresponding command-line option."""
     return re.sub(r'<file\.up_axis="(\w)">', r"`--up-axis \1`", remark).replace(
         "set up_axis explicitly", "pass `--up-axis` explicitly"
     )
 
 
 def _unnamed_classes(survey: Survey) -> Iterator[str]:
-    """Yield a note if only some of the classes in a survey have names."""
+    """Yield a note if some but not all classes of a survey have names."""
     used = {material.semantic_class for material in survey.materials}
     if unnamed := sorted(used - {0, *survey.classes}) if survey.classes else []:
         noun = "classes" if unnamed[1:] else "class"
@@ -135,14 +134,13 @@ def _unnamed_classes(survey: Survey) -> Iterator[str]:
 
 
 def _format_notes(prepared: PreparedScenario) -> list[str]:
-    """Return notes about data that the output formats cannot store."""
     specs = prepared.scenario.output.write
     notes = (note for spec in specs for note in spec.cloud_format.survey_notes(prepared.survey))
     return [*dict.fromkeys(notes)]
 
 
 def _size_note(prepared: PreparedScenario, side: float) -> str:
-    """Return a note if the length of the scene suggests a wrong unit, otherwise an empty string.
+    """Return a note if the scene's length suggests a wrong unit, or an empty string otherwise.
 
     `side` is the length of the longest side in meters.
     """
@@ -174,13 +172,12 @@ def _size_note(prepared: PreparedScenario, side: float) -> str:
 
 
 def _lacks_unit(path: Path) -> bool:
-    """Return whether neither a mesh file nor its format specifies a unit."""
     row = format_of(path)
     return row is not None and row.unitless and not written_by_lidarpool(path)
 
 
 def _color_note(prepared: PreparedScenario) -> str:
-    """Return a note about objects without colors that settings require, or an empty string."""
+    """Return a note about objects that lack colors required by a setting, or an empty string."""
     scene = prepared.scene
     if not prepared.scenario.needs_colors:
         return ""
@@ -237,7 +234,7 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
 
 
 def _single_returns(prepared: PreparedScenario) -> Iterator[str]:
-    """Yield a note if sensors report several returns, but no pulse can have a second return.
+    """Yield a note if sensors report several returns, but each pulse can have only one return.
 
     False alarms are ignored, although they are also returns.
     """
@@ -265,7 +262,7 @@ def _single_returns(prepared: PreparedScenario) -> Iterator[str]:
 
 
 def _dark_fog(survey: Survey) -> Iterator[str]:
-    """Yield a note if fog attenuates light but causes no returns."""
+    """Yield a note if fog attenuates the light without causing returns."""
     if survey.visibility_km is None or survey.visibility_km > HAZE_KM:
         return
     if survey.fog_lidar_ratio_sr is None:
@@ -290,7 +287,7 @@ def _dark_fog(survey: Survey) -> Iterator[str]:
 
 
 def _heading_notes(without_angles: Mapping[str, bool]) -> Iterator[str]:
-    """Yield a note about trajectories without angles.
+    """Yield a note about trajectories that do not specify angles.
 
     `without_angles` maps the name of each trajectory to whether its path has corners.
     """
@@ -316,7 +313,7 @@ def _heading_notes(without_angles: Mapping[str, bool]) -> Iterator[str]:
 
 
 def _timing_notes(prepared: PreparedScenario) -> Iterator[str]:
-    """Yield notes about times.
+    """Yield notes about implausible or inconsistent times.
 
     The notes concern dates that are not stored, faults during which no sweep starts, actors that
     are absent during the survey, and animations that end before the survey.

@@ -1,4 +1,4 @@
-"""Campaigns, which run many jobs with different values and write a data set."""
+"""Campaigns that run many jobs with varied values and write a data set."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ MAX_SHOWN_FILES = 5  # maximum number of file names in the recorded command
 
 
 class CampaignSpec:
-    """A set of jobs whose results are written to a data set.
+    """Set of jobs whose results are written to a data set.
 
     Each job is a survey. `Campaign.load` reads a campaign file, and `Campaign.from_scenarios` uses
     scenario files as jobs. The constructor uses a Python function that returns each job.
@@ -148,7 +148,7 @@ class CampaignSpec:
         license: str = "",  # noqa: A002 - same name as in campaign files
         title: str = "",
     ) -> CampaignSpec:
-        """Create a campaign from scenario or mesh files, one job per file.
+        """Create a campaign from scenario or mesh files, with one job per file.
 
         Each job is named after its file.
 
@@ -167,14 +167,14 @@ class CampaignSpec:
         return self
 
     def for_shard(self, shard: Shard) -> Self:
-        """Return the campaign restricted to the jobs in a shard."""
+        """Return the campaign restricted to the jobs of a shard."""
         campaign = self if shard == self.shard else copy(self)
         campaign.shard = shard
         return campaign
 
     @property
     def card_content(self) -> dict[str, Any]:
-        """Content of the data set card, which can be serialized as JSON."""
+        """Content of the dataset card as a dictionary for JSON."""
         names = ("title", "license", "command", "description", "seed", "count", "names")
         return {name: getattr(self, name) for name in names} | {"keep": asdict(self.keep)}
 
@@ -185,7 +185,7 @@ class CampaignSpec:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the values that differ between jobs, in the order of the table columns.
+        """Names of the values that vary between jobs, in the order of the table columns.
 
         If a function creates the jobs, the names are taken from the first job that it can create.
         """
@@ -200,7 +200,7 @@ class CampaignSpec:
         return self._jobs.values(self._checked_number(number))
 
     def name(self, number: int) -> str:
-        """Return the name of a job, which is used in file names.
+        """Return the name of a job for use in file names.
 
         The name is that of the scenario file, or a number such as 0017.
         """
@@ -211,7 +211,7 @@ class CampaignSpec:
         return self._splits(self._checked_number(number))
 
     def scenario(self, number: int) -> Scenario | None:
-        """Return the scenario of a job, or None if a function creates the job.
+        """Return the scenario of a job, or None if the job is created by a function.
 
         Raises
         ------
@@ -222,7 +222,7 @@ class CampaignSpec:
 
     @property
     def pool(self) -> PoolSection:
-        """The `pool` section of the first job, which applies to all jobs."""
+        """Section `pool` of the first job, which applies to all jobs."""
         scenario = self.scenario(0)
         return PoolSection() if scenario is None else scenario.pool
 
@@ -254,7 +254,7 @@ class CampaignSpec:
         return self._for_dataset(self._jobs.job(number, cache, columns, self._fields(number)))
 
     def prepare(self, number: int, columns: Sequence[str] = ()) -> PreparedScenario:
-        """Create a job as `job` does, and return it with its prepared scenario.
+        """Create a job like `job`, and return it with its prepared scenario.
 
         This method must not be called if a function creates the jobs, because such jobs have no
         scenario.
@@ -264,7 +264,7 @@ class CampaignSpec:
         return replace(prepared, job=self._for_dataset(prepared.job))
 
     def _fields(self, number: int) -> dict[str, Any]:
-        """Return the fields of a job that depend only on its number."""
+        """Return those fields of a job that depend only on its number."""
         return {"number": number, "name": self.name(number), "split": self.split(number)}
 
     def _for_dataset(self, job: Job) -> Job:
@@ -292,7 +292,7 @@ class CampaignSpec:
         return message
 
     def _checked_number(self, number: int) -> int:
-        """Return the number of a job as an integer. Raise LidarError if the job does not exist."""
+        """Return the number of a job as an integer, or raise LidarError if there is no such job."""
         if not 0 <= number < self.count:
             raise LidarError(
                 f"Job {number} does not exist. The jobs of the campaign are 0 to {self.count - 1}."
@@ -300,7 +300,7 @@ class CampaignSpec:
         return int(number)  # the number may be a NumPy integer
 
     def check_files(self) -> None:
-        """Raise LidarError if a file that jobs may read does not exist."""
+        """Raise LidarError if a file that a job may read does not exist."""
         mistakes = Mistakes()
         # `Path.exists` raises an error for names that are not valid file names.
         missing = [path for path in self.files if not os.path.exists(path)]  # noqa: PTH110
@@ -312,7 +312,7 @@ class CampaignSpec:
 
     @cached_property
     def identity(self) -> dict[str, str]:
-        """Hexadecimal SHA-256 hashes of the content that the data set depends on, by name.
+        """Names and SHA-256 hashes of the contents that determine the data set.
 
         Campaigns with the same content have the same hashes, regardless of their folder and their
         number of jobs. The hashes include tables of rows. Other files are part of the identity of
@@ -327,13 +327,13 @@ class CampaignSpec:
 
     @property
     def fields(self) -> dict[str, str]:
-        """Mapping from the path of each field that the data set depends on to its value as text."""
+        """Values of the fields that determine the data set, as text, keyed by field path."""
         own_fields = {"seed": self.seed, "keep": asdict(self.keep), "splits": self.splits}
         return dict(describe_fields({**own_fields, "vary": self.choices})) | self._jobs.fields
 
 
 def _section(**fields: Any) -> CampaignSection:
-    """Validate arguments from Python, and return them as a section."""
+    """Validate arguments from Python, and convert them to a section."""
     plain = {name: dict(v) if isinstance(v, Mapping) else v for name, v in fields.items()}
     with convert_validation_errors(CampaignSection):
         return CampaignSection.model_validate({"base": "-", **plain})

@@ -1,4 +1,4 @@
-"""Job sources of campaigns.
+"""Sources that create the jobs of a campaign.
 
 The jobs of a campaign come from a Python function, from a list of scenario files, or from base
 scenarios with sampled values.
@@ -57,7 +57,7 @@ _UNSAFE = re.compile(r"[^\w.-]+", re.ASCII)  # characters that file names must n
 
 
 class JobSource:
-    """Base class of the sources that create the jobs of a campaign by number."""
+    """Base class of sources that create the jobs of a campaign by number."""
 
     count: int
     names: tuple[str, ...] = ()
@@ -67,23 +67,23 @@ class JobSource:
     identity: Mapping[str, str]
 
     def name(self, number: int) -> str:
-        """Return the name of a job, which is used in file names.
+        """Return the name of a job for use in file names.
 
         By default, the name is the number of the job with at least four digits.
         """
         return f"{number:04}"
 
     def values(self, number: int) -> dict[str, Value | None]:
-        """Return those values of a job that differ between jobs."""
+        """Return those values of a job that vary between jobs."""
         return {}
 
     def scenario(self, number: int) -> Scenario | None:
-        """Return the scenario of a job, or None if a function creates the job."""
+        """Return the scenario of a job, or None if the job is created by a function."""
         return None
 
     @property
     def fields(self) -> dict[str, str]:
-        """Fields of the scenarios that jobs are created from, as text."""
+        """Fields, as text, of the scenarios from which jobs are created."""
         return {}
 
     def message_prefix(self, file: Path) -> str:
@@ -96,7 +96,7 @@ class JobSource:
     def prepare(
         self, number: int, cache: SceneCache | None, columns: Sequence[str], fields: Any
     ) -> PreparedScenario:
-        """Prepare the scenario of a job. The arguments are those of `job`."""
+        """Prepare the scenario of a job, using the same arguments as `job`."""
         scenario = self.scenario(number)
         assert scenario is not None, "only jobs with a scenario can be prepared"
         hashes = file_hashes(scenario.files)
@@ -106,12 +106,12 @@ class JobSource:
     def job(
         self, number: int, cache: SceneCache | None, columns: Sequence[str], fields: Any
     ) -> Job:
-        """Create a job with additional cloud columns and additional fields of `Job`."""
+        """Create a job, adding cloud columns and fields of `Job`."""
         return self.prepare(number, cache, columns, fields).job
 
 
 class FunctionJobs(JobSource):
-    """Jobs created by a Python function."""
+    """Source that creates jobs with a Python function."""
 
     def __init__(self, make: Callable[..., Any], count: int, seed: int) -> None:
         self._make = make
@@ -120,7 +120,7 @@ class FunctionJobs(JobSource):
 
     @cached_property
     def names(self) -> tuple[str, ...]:  # type: ignore[override]  # computed on first use
-        """Names of the values of the first job that can be created."""
+        """Names of the values in the first job that can be created."""
         for number in range(self.count):
             with suppress(LidarError):  # a failed job must not stop the others
                 return tuple(self._call(number).values)
@@ -132,13 +132,13 @@ class FunctionJobs(JobSource):
         return {"make": fingerprint(self._make)}
 
     def values(self, number: int) -> dict[str, Value | None]:
-        """Create a job and return its values."""
+        """Create a job, and return its values."""
         return dict(self.job(number, None, (), {}).values)
 
     def job(
         self, number: int, cache: SceneCache | None, columns: Sequence[str], fields: Any
     ) -> Job:
-        """Create a job and validate its values.
+        """Create a job, and validate its values.
 
         If the seed of the noise is 0, it is replaced by a seed that depends on the job.
         """
@@ -172,7 +172,7 @@ class FunctionJobs(JobSource):
         return Job(job.scene, survey, values=values, **fields)
 
     def _call(self, number: int) -> Job:
-        """Call the function.
+        """Call the function that creates a job.
 
         Raise LidarError if the function fails or does not return a job.
         """
@@ -192,7 +192,7 @@ class FunctionJobs(JobSource):
 
 
 class ScenarioJobs(JobSource):
-    """Jobs created from scenario and mesh files, one per file."""
+    """Source that creates one job from each scenario or mesh file."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
         if not paths:
@@ -222,11 +222,11 @@ class ScenarioJobs(JobSource):
         return _describe_scenarios({path.name: Scenario.load(path) for path in paths})
 
     def name(self, number: int) -> str:
-        """Return the name of a job, which is the name of its file without the suffix."""
+        """Return the name of a job, which is its file name without the extension."""
         return self._names[number]
 
     def message_prefix(self, file: Path) -> str:
-        """Return a message prefix with the scenario and the field that name a file."""
+        """Return a message prefix with the scenario and the field in which a file is named."""
         return next(
             filter(None, (Scenario.load(path).message_prefix(file) for path in self.paths)), ""
         )
@@ -237,7 +237,7 @@ class ScenarioJobs(JobSource):
 
 
 def _unique_names(stems: Iterable[str]) -> list[str]:
-    """Return unique job names for file names, such as "hall" and "hall-2"."""
+    """Return unique job names that are derived from file names, such as "hall" and "hall-2"."""
     unique_names: list[str] = []
     lower_case: set[str] = set()  # some file systems are case-insensitive
     for stem in stems:
@@ -250,7 +250,7 @@ def _unique_names(stems: Iterable[str]) -> list[str]:
 
 
 class SampledJobs(JobSource):
-    """Jobs of a campaign file, which are its base scenarios with sampled values."""
+    """Source of the jobs in a campaign file, which are base scenarios with sampled values."""
 
     def __init__(self, section: CampaignSection, path: Path) -> None:
         self._vary = section.vary
@@ -314,7 +314,7 @@ class SampledJobs(JobSource):
         return _describe_scenarios({base.name: base.scenario for base in bases}) | dict(words)
 
     def message_prefix(self, file: Path) -> str:
-        """Return a message prefix with the field that names a file.
+        """Return a message prefix with the field in which a file is named.
 
         If the file is named in a table, the prefix also contains the table and the line.
         """
@@ -332,7 +332,7 @@ class SampledJobs(JobSource):
         return self._draw(number)[0]
 
     def scenario(self, number: int) -> Scenario:
-        """Return the base scenario of a job with the values of the job."""
+        """Return the base scenario of a job, modified by the job's values."""
         values, changes = self._draw(number)
         base = self._bases[number % len(self._bases)]
         noise_seed = _noise_seed(self._seed, number)
@@ -347,7 +347,7 @@ class SampledJobs(JobSource):
             ) from error
 
     def _draw(self, number: int) -> tuple[dict[str, Value | None], dict[str, Any]]:
-        """Draw the values of a job, and return them for the job table and for the scenario."""
+        """Draw the values of a job, as written to the job table and as used in the scenario."""
         base = self._bases[number % len(self._bases)]
         values: dict[str, Value | None] = {"base": base.name} if len(self._bases) > 1 else {}
         changes: dict[str, Any] = {}  # {path: value, or rows to append}
@@ -368,7 +368,7 @@ class SampledJobs(JobSource):
 
 
 class _Base:
-    """A base scenario and the fields that a campaign varies in it."""
+    """Base scenario, and the fields that a campaign varies in it."""
 
     def __init__(
         self, path: Path, vary: Mapping[str, ValueRule], tables: dict[Any, list[Any]], label: str
@@ -405,7 +405,7 @@ class _Base:
         mistakes.tell()
 
     def _check_disjoint(self) -> None:
-        """Raise LidarError if two paths overlap.
+        """Raise LidarError if two varied paths overlap.
 
         Paths overlap if they refer to the same field, or if one field contains the other and is
         replaced as a whole.
@@ -424,7 +424,7 @@ class _Base:
                 )
 
     def check(self, source: str, mistakes: Mistakes) -> None:
-        """Add invalid values to `mistakes`, and collect the files that jobs may read.
+        """Add any invalid values to `mistakes`, and collect the files that jobs may read.
 
         The first values of all paths are tried together, then the second values, and so on. If a
         trial fails, the paths are tried one by one to identify the invalid value.
@@ -444,7 +444,7 @@ class _Base:
             self.files |= dict.fromkeys(scenario.files, scenario)
 
     def _trials(self, text: str) -> list[Any]:
-        """Return representative values of a path, which are validated instead of all values.
+        """Return representative values for a path, which are validated instead of all values.
 
         The rows of a table are divided into groups that are as large as the largest sample.
         """
@@ -458,7 +458,7 @@ class _Base:
         return [table[:min_rows], *groups]
 
     def _invalid_values(self, text: str) -> Iterator[str]:
-        """Yield a line for each value of a path that is not valid in the base."""
+        """Yield a line for each value that is not valid at a path in the base scenario."""
         choice = self._vary[text]
         field = dotted([key for key, _ in self._steps[text]])
         for value in () if choice.sample else choice.limit_values:
@@ -479,7 +479,7 @@ class _Base:
                     yield f"{value_line}: {message}"
 
     def with_values(self, changes: Mapping[str, Any], source: str, noise_seed: int = 0) -> Scenario:
-        """Return the scenario with other values.
+        """Return the scenario with some of its values replaced.
 
         If the seed of the noise is 0, it is replaced by `noise_seed`.
         """
@@ -501,17 +501,16 @@ class _Base:
 
 
 def _noise_seed(seed: int, number: int) -> int:
-    """Return the noise seed of a job, which is never 0."""
     return JobRandom(seed, number, _NOISE_SEED).bits(63) or 1
 
 
 def _with_seed(noise: Any, seed: int) -> Any:
-    """Return noise with `seed` in place of a seed of 0. If `noise` is None, return None."""
+    """Return noise in which `seed` replaces a seed of 0, or return None if `noise` is None."""
     return noise if noise is None or noise.seed else replace(noise, seed=seed)
 
 
 def _describe_scenarios(scenarios: Mapping[str, Scenario]) -> dict[str, str]:
-    """Return the fields of scenarios as text, without the `pool` sections.
+    """Return the fields of scenarios as text, excluding the `pool` sections.
 
     `scenarios` is a mapping from scenario names to scenarios.
     """
@@ -523,12 +522,12 @@ def _describe_scenarios(scenarios: Mapping[str, Scenario]) -> dict[str, str]:
 
 
 def _fingerprint(scenario: Scenario) -> str:
-    """Return the fingerprint of a scenario without its `pool` section."""
+    """Return the fingerprint of a scenario, excluding its `pool` section."""
     return fingerprint(scenario.model_dump(exclude={"pool"}))
 
 
 def file_hashes(files: Iterable[Path]) -> list[tuple[str, str]]:
-    """Return the names and SHA-256 hashes of files, sorted.
+    """Return the names and SHA-256 hashes of files, sorted by name.
 
     The result does not depend on the folder of the files, and skips files that cannot be read. For
     each mesh file that a plug-in reads, it also contains the distribution of the plug-in with its

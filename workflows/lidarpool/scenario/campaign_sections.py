@@ -1,4 +1,4 @@
-"""Sections of campaign files, and the random numbers that determine the values of jobs."""
+"""Sections of campaign files, and random numbers that determine the values of jobs."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ class JobRandom:
                 return number
 
     def _standard_normal(self) -> float:
-        """Draw a standard normal number with the polar method of Marsaglia and Bray (1964)."""
+        """Draw a standard normal number with the polar method (Marsaglia and Bray, 1964)."""
         while True:
             x, y = (_as_fraction(2 * self.bits(53) + 1 - 2**53) for _ in range(2))
             square = _EXACT.fma(x, x, _EXACT.multiply(y, y))
@@ -150,7 +150,7 @@ class JobRandom:
                 return float(_EXACT.multiply(x, _EXACT.sqrt(ratio)))
 
     def index(self, count: int, weights: Sequence[float] = ()) -> int:
-        """Draw an index below `count`, uniformly or with the given weights."""
+        """Draw an index below `count`, either uniformly or with the given weights."""
         if not weights:
             return self.below(count)
         cumulative = list(accumulate(weights))
@@ -158,7 +158,7 @@ class JobRandom:
         return next((i for i, upper in enumerate(cumulative) if number < upper), count - 1)
 
     def subset(self, count: int, chosen: int) -> list[int]:
-        """Draw distinct integers below `count`, and return them in ascending order (Floyd 1987).
+        """Draw distinct integers below `count`, and return them in ascending order (Floyd, 1987).
 
         `chosen` is the number of integers to draw.
         """
@@ -177,17 +177,15 @@ class JobRandom:
         return numbers
 
     def generator(self) -> np.random.Generator:
-        """Return a NumPy generator for functions that draw their own numbers."""
+        """Return a NumPy generator for functions that draw random numbers themselves."""
         return np.random.Generator(np.random.Philox(key=self.bits(128)))
 
 
 def _as_fraction(bits: int) -> Decimal:
-    """Return an integer divided by 2**53 as a decimal number."""
     return _EXACT.divide(Decimal(bits), Decimal(2**53))
 
 
 def _round(value: float) -> float:
-    """Round a number to `_DIGITS` significant digits."""
     return float(f"{value:.{_DIGITS}g}")
 
 
@@ -225,7 +223,7 @@ class NormalDistribution(Section):
 
     @model_validator(mode="after")
     def _check_limits(self) -> NormalDistribution:
-        """Raise ValueError if the limits exclude nearly all numbers, or if numbers overflow."""
+        """Raise ValueError if numbers would overflow or the limits exclude nearly all of them."""
         if self.limits is not None:
             lower_share, upper_share = map(NormalDist(self.mean, self.std).cdf, self.limits)
             if upper_share - lower_share < MIN_SHARE:
@@ -314,7 +312,7 @@ class ValueRule(Section):
 
     @model_validator(mode="after")
     def _check_weights(self) -> ValueRule:
-        """Raise ValueError if the weights do not match the values of `choice`."""
+        """Raise ValueError unless there is one weight for each value of `choice`."""
         if self.weights is not None:
             if self.choice is None or len(self.weights) != len(self.choice):
                 raise ValueError("`weights` must have one weight for each value of `choice`.")
@@ -361,7 +359,7 @@ class ValueRule(Section):
         return value, value
 
     def hint(self, error: str) -> str:
-        """Return advice to append to the error message for an invalid limit, or an empty string."""
+        """Return advice for the error message about an invalid limit, or an empty string."""
         if self.integer is None and "whole number" in error and not self.options:
             return " Use `integer: [MIN, MAX]`."
         has_limits = self.normal is None or self.normal.limits is not None
@@ -392,7 +390,7 @@ class ValueRule(Section):
 
 
 def _check_rule(value: Any) -> Any:
-    """Return an entry of `vary`. Raise an error if the entry is not a choice."""
+    """Return an entry of `vary`, or raise an error if it does not define a choice."""
     if not isinstance(value, (dict, ValueRule)):
         raise not_allowed_error(
             "a mapping that defines the choice, such as {uniform: [0, 1]} or {choice: [1, 4]}"
@@ -535,7 +533,7 @@ class CampaignSection(Section):
 
     @model_validator(mode="after")
     def _check_splits(self) -> CampaignSection:
-        """Raise ValueError if the name or share of a split is invalid."""
+        """Raise ValueError if the name or fraction of a split is invalid."""
         for name in self.splits:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
                 raise ValueError(
@@ -584,7 +582,6 @@ class Splits:
 
 @lru_cache
 def _block_order(seed: int, block: int, count: int) -> list[int]:
-    """Return the random order of the jobs in a block."""
     return JobRandom(seed, block, "splits").permutation(count)
 
 
@@ -595,7 +592,7 @@ _WORDS = {"true": True, "false": False}
 
 
 def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
-    """Read entries of a list from a table.
+    """Read the entries of a list from a table.
 
     Each column contains the values of a field, such as `box` or `at.0.position`. A cell contains a
     number, true, false, a list or mapping in YAML, or text. If a cell is empty, the field is
@@ -651,8 +648,6 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
 
 
 class _Cells(NamedTuple):
-    """Cells of a table."""
-
     header: list[str]
     rows: list[tuple[int, list[str]]]  # (line in the file, cells without surrounding spaces)
 
@@ -677,7 +672,7 @@ def _read_cells(path: Path) -> _Cells:
 
 
 def _check_columns(names: Sequence[str], model: Any) -> None:
-    """Raise ValueError if a column is neither a field of an entry nor a list index."""
+    """Raise ValueError if a column name is neither a field of an entry nor a list index."""
     fields = [field.alias or name for name, field in getattr(model, "model_fields", {}).items()]
     unknown = [
         name
@@ -696,7 +691,7 @@ def _check_columns(names: Sequence[str], model: Any) -> None:
 
 
 def _validate_row(adapter: TypeAdapter[Any], cells: dict[str, str]) -> Any:
-    """Return the entry for the cells of a row, which are a mapping from columns to cells.
+    """Convert the cells of a row, keyed by column, to a validated entry.
 
     Raise ValidationError if the row is not a valid entry.
     """
@@ -713,7 +708,7 @@ def _validate_row(adapter: TypeAdapter[Any], cells: dict[str, str]) -> Any:
 
 
 def _parse_cell(cell: str) -> Any:
-    """Convert a cell to a number, truth value, list or mapping, or return it as text."""
+    """Convert a cell to a number, truth value, list or mapping, or else return its text."""
     if _INTEGER.fullmatch(cell):
         with suppress(ValueError):  # Python does not convert integers with thousands of digits
             return int(cell)
@@ -728,7 +723,7 @@ def _parse_cell(cell: str) -> Any:
 
 
 def _nest(values: dict[str, Any]) -> Any:
-    """Expand dotted names to mappings and lists, such as {"box.0": 4} to {"box": [4]}."""
+    """Convert dotted names to nested mappings and lists, such as {"box.0": 4} to {"box": [4]}."""
     result: dict[str, Any] = {}
     for name, value in values.items():
         *outer, last = name.split(".")
@@ -742,7 +737,7 @@ def _nest(values: dict[str, Any]) -> Any:
 
 
 def _convert_to_lists(node: Any) -> Any:
-    """Convert mappings with the keys "0", "1", … to lists, at any depth."""
+    """Convert all mappings with the keys "0", "1", … to lists, including nested ones."""
     if not isinstance(node, dict):
         return node
     inner = {key: _convert_to_lists(value) for key, value in node.items()}
@@ -751,7 +746,7 @@ def _convert_to_lists(node: Any) -> Any:
 
 
 def _entry_types(kind: Any) -> Iterator[Any]:
-    """Yield the types of the entries of all lists in an annotation.
+    """Yield the entry types of all lists in a type annotation.
 
     For example, yield X for `tuple[X, ...] | None`.
     """

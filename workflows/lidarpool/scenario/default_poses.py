@@ -76,7 +76,7 @@ class SensorPlacement:
 
     @property
     def notes(self) -> list[str]:
-        """The note, followed by a note that lists the poses if there are any."""
+        """Notes about the choice of poses, including a list of any poses."""
         if not self.poses:
             return [self.note]
         return [
@@ -94,7 +94,7 @@ def place_sensor(
     roads: Sequence[str] = (),
     narrow: bool = False,
 ) -> SensorPlacement:
-    """Choose poses of a sensor in a scene from mesh files.
+    """Choose the poses of a sensor in a scene that was read from mesh files.
 
     In a room or landscape, the poses are at the center, or beside an object at the center, such as
     a tree. They are 1, 2 and 3 m above the floor or ground. If the room is too low, they are at a
@@ -148,7 +148,7 @@ def place_sensor(
 
 
 def _object_note(scene: Scene, poses: Sequence[Pose], grid: Mapping[str, Any]) -> str:
-    """Return a note about poses around an object and the sensor grid, if there is one."""
+    """Return a note about default poses around an object and about any default sensor grid."""
     lower_m, upper_m = scene.bounds + scene.origin
     distance_m = np.linalg.norm(poses[-1].position - (lower_m + upper_m) / 2)
     lengths_m = (*(upper_m - lower_m), distance_m)
@@ -170,7 +170,7 @@ def _object_note(scene: Scene, poses: Sequence[Pose], grid: Mapping[str, Any]) -
 def _narrow_grid(
     scene: Scene, surroundings: PlacementChecker, poses: Sequence[Pose]
 ) -> dict[str, Any]:
-    """Return arguments of `Sensor.grid` that result in about `_POINTS` points on an object."""
+    """Return arguments of `Sensor.grid` that yield about `_POINTS` points on an object."""
     placed = [
         *zip(_local_positions(poses, scene), [pose.rotation_matrix for pose in poses], strict=True)
     ]
@@ -198,7 +198,7 @@ def _narrow_grid(
 
 
 def _poses_above_floor(scene: Scene, position: Floats) -> tuple[Pose, ...]:
-    """Return poses above the floor at the x and y of a position.
+    """Return poses above the floor at a horizontal position.
 
     The position and the poses are in world coordinates.
     """
@@ -211,7 +211,7 @@ def _poses_above_floor(scene: Scene, position: Floats) -> tuple[Pose, ...]:
 
 
 def _select_objects(scene: Scene, patterns: Sequence[str]) -> Scene | None:
-    """Return a scene with only the objects whose names match a pattern.
+    """Return a scene that contains only the objects whose names match a pattern.
 
     Return None if there are no such objects.
     """
@@ -225,7 +225,7 @@ def _select_objects(scene: Scene, patterns: Sequence[str]) -> Scene | None:
 
 
 def _poses_beside(scene: Scene, center: Floats, buildings: Sequence[str] = ()) -> tuple[Pose, ...]:
-    """Return unobstructed poses beside the center of a scene, or an empty tuple.
+    """Return unobstructed poses near the center of a scene, or an empty tuple.
 
     The center, which has shape (3,), and the poses are in world coordinates. If objects match the
     name patterns in `buildings`, the poses are outdoors, which means above a surface and neither
@@ -256,12 +256,11 @@ def _poses_beside(scene: Scene, center: Floats, buildings: Sequence[str] = ()) -
 
 
 def _local_positions(poses: Sequence[Pose], scene: Scene) -> Floats:
-    """Return the positions of poses in the local coordinates of a scene. Shape (k, 3)."""
     return np.array([pose.position for pose in poses]) - scene.origin
 
 
 def build_placement_checker(scene: Scene, positions: ArrayLike) -> PlacementChecker | None:
-    """Return the surroundings of positions, or None if the scene has too many triangles.
+    """Return a checker for sensor positions, or None if the scene has too many triangles.
 
     `positions` has shape (k, 3) and is in local coordinates.
     """
@@ -271,7 +270,7 @@ def build_placement_checker(scene: Scene, positions: ArrayLike) -> PlacementChec
 def _inside_note(
     surroundings: PlacementChecker | None, positions: ArrayLike, scene: Scene, mounted: Mounted
 ) -> str:
-    """Return a note if a position is inside a closed body, otherwise an empty string.
+    """Return a note if a position is inside a closed body, or an empty string otherwise.
 
     `positions` has shape (k, 3) and is in local coordinates.
     """
@@ -286,7 +285,7 @@ def _inside_note(
 def find_free_position_above(
     scene: Scene, surroundings: PlacementChecker, position: Floats
 ) -> Floats | None:
-    """Return the lowest free position above a surface at the x and y of a position.
+    """Return the lowest free position above a surface at a horizontal position.
 
     The result is as high above the surface as the second default pose. Return None if there is no
     free position. Positions have shape (3,) and are in local coordinates.
@@ -301,19 +300,19 @@ def find_free_position_above(
 
 
 def outside_view_hint(scene: Scene, mounted: Mounted) -> str:
-    """Return a sentence that suggests two poses outside a scene, without the final period."""
+    """Return a sentence, without its period, that suggests two poses outside a scene."""
     poses = [pose_entry(pose) for pose in poses_around(scene, mounted)[0:4:2]]
     return f"To view the scene from outside, use poses: {as_yaml_line(poses)}"
 
 
 def as_yaml_line(value: Any) -> str:
-    """Return a value as YAML on a single line."""
+    """Format a value as YAML on a single line."""
     text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10_000)
     return text.removesuffix("\n").removesuffix("...").removesuffix("\n")
 
 
 def pose_entry(pose: Pose) -> list[float] | dict[str, object]:
-    """Return a pose without roll as an entry of a scenario.
+    """Convert a pose without roll to an entry of a scenario.
 
     If all angles are 0, the entry is the position alone.
     """
@@ -323,7 +322,7 @@ def pose_entry(pose: Pose) -> list[float] | dict[str, object]:
 
 
 def poses_around(scene: Scene, mounted: Mounted) -> tuple[Pose, ...]:
-    """Return poses on four sides of a scene and above it, facing its center.
+    """Return poses on four sides of a scene and above it, facing the center of the scene.
 
     The distance from the center is 1.5 times the diagonal of the scene. The poses are farther away
     if the field of view of the sensor is too narrow for the scene, and closer if they would be out
@@ -347,7 +346,10 @@ def poses_around(scene: Scene, mounted: Mounted) -> tuple[Pose, ...]:
 
 
 def _direction(azimuth_deg: float, elevation_deg: float) -> Floats:
-    """Return the unit vector with the given azimuth and elevation. Shape (3,)."""
+    """Return the unit vector with the given azimuth and elevation.
+
+    The array has shape (3,).
+    """
     angles = np.radians([azimuth_deg, elevation_deg])
     cosines = np.cos(angles)
     sines = np.sin(angles)
@@ -355,7 +357,7 @@ def _direction(azimuth_deg: float, elevation_deg: float) -> Floats:
 
 
 def _viewing_distance_m(mounted: Mounted, diagonal_m: float, field_deg: float) -> float:
-    """Return the distance at which an object with the given diagonal fills the field of view."""
+    """Return the distance at which an object of the given diagonal fills the field of view."""
     sensor = mounted.sensor
     half = np.radians(max(field_deg, 1e-3) / 2)
     diagonals = float(np.clip(0.5 / np.sin(half), *_DIAGONALS))
@@ -364,7 +366,7 @@ def _viewing_distance_m(mounted: Mounted, diagonal_m: float, field_deg: float) -
 
 
 def _forward_elevations_deg(mounted: Mounted) -> tuple[float, float]:
-    """Return the minimum and maximum elevation of the forward rays in the platform frame."""
+    """Return the elevation limits of rays that point forward in the platform frame."""
     sensor = mounted.sensor
     count = min(sensor.period or _MAX_FIRINGS, _MAX_FIRINGS)
     firings = np.linspace(0, sensor.period or count, count, endpoint=False).astype(np.int64)
@@ -377,7 +379,7 @@ def _forward_elevations_deg(mounted: Mounted) -> tuple[float, float]:
 
 
 def _instances_to_meshes(scene: Scene, positions: ArrayLike) -> Scene:
-    """Return a scene whose instances are meshes, simplified at a distance from `positions`.
+    """Replace the instances of a scene with meshes, simplifying those far from `positions`.
 
     `positions` has shape (k, 3) and is in local coordinates.
     """
@@ -387,7 +389,7 @@ def _instances_to_meshes(scene: Scene, positions: ArrayLike) -> Scene:
 
 
 def _build_placement_checker(scene: Scene) -> PlacementChecker | None:
-    """Return the surroundings of a scene, or None if the scene has too many triangles."""
+    """Return a checker for sensor positions, or None if the scene has too many triangles."""
     count = len(scene.faces)
     if count > _MAX_TRIANGLES or (count > _MAX_SHEET_TRIANGLES and is_open(scene)):
         return None

@@ -1,4 +1,4 @@
-"""The scenario of `lidarpool demo`."""
+"""Scenario of `lidarpool demo`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _DATA: dict[str, Any] = {
 
 
 def demo_scenario() -> Scenario:
-    """Return the scenario of the demo.
+    """Return the scenario of `lidarpool demo`.
 
     The scene has six objects. The scenario simulates 108 scans from three poses, and plans a path.
     """

@@ -1,4 +1,4 @@
-"""Diagnosis of surveys that produce no points."""
+"""Determine why a survey produces no points."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def empty_cloud_reason(scene: Scene, survey: Survey, scans: range | None = None)
 
 
 def empty_jobs_warning(empty: Sequence[JobRow], reason: str) -> str:
-    """Return a warning that lists jobs without points.
+    """Return a warning that lists the jobs without points.
 
     `reason` is the most likely reason for the first job, or an empty string.
     """
@@ -77,7 +77,7 @@ def empty_jobs_warning(empty: Sequence[JobRow], reason: str) -> str:
 
 
 def _limits(survey: Survey, ranges: Floats) -> Iterator[str]:
-    """Yield clauses about the range limits if they exclude all surfaces."""
+    """Yield clauses about the sensors' range limits if these exclude all surfaces."""
     lower = [carried.sensor.min_range_m for carried in survey.carried]
     upper = [carried.sensor.max_range_m for carried in survey.carried]
     too_close = ranges < min(lower)
@@ -97,7 +97,7 @@ def _limits(survey: Survey, ranges: Floats) -> Iterator[str]:
 
 
 def _effects(survey: Survey) -> Iterator[str]:
-    """Yield the names of settings that may suppress all returns."""
+    """Yield the names of settings that could suppress all returns."""
     if any(noise.detection_range_m is not None for noise in survey.noise_each):
         yield "noise.detection_range_m"
     if any(noise.dropout for noise in survey.noise_each):
@@ -117,6 +117,5 @@ def _span(ranges: Floats) -> str:
 
 
 def _start_position(scene: Scene, survey: Survey) -> str:
-    """Return a sentence with the first position of the sensor in scenario coordinates."""
     (x, y, z) = survey.pose(0).position + scene.origin
     return f"The sensor starts at ({x:,.3f}, {y:,.3f}, {z:,.3f})"

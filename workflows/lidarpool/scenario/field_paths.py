@@ -1,4 +1,4 @@
-"""Paths to fields of a scenario, such as ``sensors.roof.model``."""
+"""Paths of fields in a scenario, such as ``sensors.roof.model``."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def _find_in_section(
 
 
 def _path_hint(scenario: Scenario, name: str) -> str:
-    """Return a hint with the paths of fields with a given name, or an empty string.
+    """Return a hint with the paths of all fields that have the given name, or an empty string.
 
     For example, return " Did you mean 'sensor.performance'?".
     """
@@ -126,7 +126,7 @@ def _path_in(scenario: Scenario, names: Sequence[str], name: str) -> str:
 
 
 def _match_name(names: Sequence[str], path_parts: Sequence[str], path: str) -> tuple[str, int]:
-    """Return the longest name at the start of a path, and its number of parts.
+    """Return the longest name with which a path starts, and the number of its parts.
 
     Names may contain dots, and therefore consist of several parts. Raise LidarError if no name
     matches.
@@ -141,7 +141,7 @@ def _match_name(names: Sequence[str], path_parts: Sequence[str], path: str) -> t
 
 
 def _match_entry(entries: Sequence[Any], path_parts: Sequence[str], path: str) -> tuple[int, int]:
-    """Return the index of the list entry at the start of a path, and its number of path parts.
+    """Return the index of the list entry with which a path starts, and its number of parts.
 
     The path contains the index or the name of the entry. Raise LidarError if there is no such
     entry.
@@ -163,7 +163,7 @@ def _match_entry(entries: Sequence[Any], path_parts: Sequence[str], path: str) -
 
 
 def replace_value(node: Any, steps: FieldSteps, change: Callable[[Any], Any]) -> Any:
-    """Return a section in which the value at the end of `steps` is replaced by `change(value)`.
+    """Return a section in which `change(value)` replaces the value at the end of `steps`.
 
     The section itself is not modified. In the result, sections along the steps are mappings from
     field names to values, which have to be validated again. Other sections are unchanged.

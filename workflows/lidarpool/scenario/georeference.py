@@ -1,4 +1,4 @@
-"""Checks of a scene's location in the coordinate system of a scenario."""
+"""Check the location of a scene in the coordinate system of a scenario."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _PROJECTED_M = 100_000.0  # coordinates this far from zero are probably projecte
 
 
 def check_epsg(epsg: int, scene: Scene) -> None:
-    """Check that a coordinate system is in true meters at the location of a scene.
+    """Raise LidarError unless a coordinate system is in true meters at the scene's location.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def check_epsg(epsg: int, scene: Scene) -> None:
 
 
 def location_warning(scene: Scene, epsg: int | None) -> str:
-    """Return a warning if a scene is probably at the wrong location, otherwise an empty string.
+    """Return a warning if a scene is probably at a wrong location, or an empty string.
 
     The location is probably wrong if it is far outside the area of use of the coordinate system, or
     if `world.origin` was added to coordinates that are already world coordinates.
@@ -67,7 +67,7 @@ def location_warning(scene: Scene, epsg: int | None) -> str:
 
 
 def missing_epsg_note(scene: Scene, epsg: int | None) -> str:
-    """Return a note if a scene is in projected coordinates, but the coordinate system is not set.
+    """Return a note if projected coordinates have no coordinate system, or an empty string.
 
     Otherwise, return an empty string. `scene` is in world coordinates. Coordinates of 100 km and
     more are probably projected.
@@ -83,13 +83,13 @@ def missing_epsg_note(scene: Scene, epsg: int | None) -> str:
 
 
 def _center(scene: Scene) -> Floats:
-    """Return the x and y of the center of a scene in world coordinates. Shape (2,)."""
+    """Return the horizontal center of a scene in world coordinates."""
     center: Floats = (scene.bounds.mean(axis=0) + scene.origin)[:2]
     return center
 
 
 def _is_added_twice(scene: Scene) -> bool:
-    """Return whether `world.origin` was probably added to coordinates that already include it."""
+    """Return whether the coordinates in the files probably include `world.origin` already."""
     origin = scene.world_origin[:2]
     in_files = _center(scene) - origin
     distance_m = float(np.linalg.norm(origin))
@@ -99,7 +99,7 @@ def _is_added_twice(scene: Scene) -> bool:
 
 
 def _remedies(epsg: int, scene: Scene) -> str:
-    """Return advice for a scene that is outside the area of use of its coordinate system."""
+    """Return advice for a scene outside the area of use of its coordinate system."""
     placed = _center(scene)
     in_files = placed - scene.world_origin[:2]
     zone = zone_in_area(epsg, *placed.tolist())

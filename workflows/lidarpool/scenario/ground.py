@@ -36,11 +36,14 @@ class SupportSurfaces:
 
     @property
     def origin(self) -> Floats:
-        """Scene origin in world coordinates, in meters. Shape (3,)."""
+        """Origin of the scene in world coordinates, in meters.
+
+        The array has shape (3,).
+        """
         return np.zeros(3) if self._scene is None else self._scene.origin
 
     def select(self, names: Sequence[str]) -> SupportSurfaces:
-        """Return the surfaces of the objects whose names match one of the patterns.
+        """Return the surfaces of objects whose names match one of the patterns.
 
         Raise LidarError if no object matches a pattern, or if none of the triangles faces up.
         """
@@ -72,7 +75,7 @@ class SupportSurfaces:
 
     @cached_property
     def _tops(self) -> tuple[Floats, Ints32]:
-        """Upward-facing triangles and the indices of their objects.
+        """Upward-facing triangles, and the index of each triangle's object.
 
         The triangles are in local coordinates and have shape (f, 3, 3). The indices have shape
         (f,).
@@ -102,7 +105,10 @@ class SupportSurfaces:
 
     @property
     def rectangle(self) -> Floats:
-        """Minimum x and y, and maximum x and y of the surfaces. Shape (4,), world coordinates."""
+        """Minimum x and y, and maximum x and y, in world coordinates.
+
+        The array has shape (4,).
+        """
         assert self._scene is not None
         x, y = self._tops[0][..., :2].reshape(-1, 2).T
         origin = self._scene.origin[[0, 1, 0, 1]]
@@ -110,11 +116,11 @@ class SupportSurfaces:
 
     @cached_property
     def owners(self) -> Ints32:
-        """Indices of the objects that have upward-facing triangles, in ascending order."""
+        """Indices of the objects with upward-facing triangles, in ascending order."""
         return np.unique(self._tops[1])
 
     def heights_below(self, positions: Floats) -> tuple[Floats, Ints32]:
-        """Return the height of the highest surface at each position, and its object.
+        """Return the height of the highest surface at each position, and the object it belongs to.
 
         Parameters
         ----------
@@ -193,7 +199,7 @@ def follow_surfaces(track: Track, support: SupportSurfaces) -> list[Track]:
 
 
 def _step_times(track: Track) -> Floats:
-    """Return the times, in seconds, of poses that are at most `STEP_M` apart.
+    """Return pose times in seconds, such that poses are at most `STEP_M` apart.
 
     Raise LidarError if there are too many.
     """
@@ -213,7 +219,7 @@ def _step_times(track: Track) -> Floats:
 def _surface_poses(
     positions: Floats, forward: Floats, support: SupportSurfaces
 ) -> tuple[Floats, Floats]:
-    """Return the height of the surface at each position, and the axes of a pose on its slope.
+    """Return the surface height at each position, and the axes of a pose on its slope.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Jobs, which combine a scene and a survey and validate them together."""
+"""Jobs, which combine a scene with a survey and validate both."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A survey of a scene, optionally with path planning.
+    """Survey of a scene, optionally with path planning.
 
     A function that creates the jobs of a `Campaign` sets only the scene, the survey and the values.
     The campaign sets the number, name and split of each job.
@@ -105,11 +105,11 @@ class Job:
 
     @cached_property
     def location_warning(self) -> str:
-        """Warning that the scene is probably at the wrong location, or an empty string."""
+        """Warning that the scene is probably at a wrong location, or an empty string."""
         return location_warning(self.scene, self.survey.epsg)
 
     def with_fields(self, **fields: Any) -> Self:
-        """Return a copy in which some fields are replaced.
+        """Return a copy in which the given fields are replaced.
 
         The job is not validated again, so only use this method for fields that do not affect the
         validation, such as `number`.
@@ -133,7 +133,7 @@ class Job:
 
 
 def _outlier_advice(scene: Scene) -> str:
-    """Return advice to remove an object that is far from all others, or an empty string."""
+    """Return advice to remove an object far away from all others, or an empty string."""
     with np.errstate(invalid="ignore"):  # the bounds of objects without triangles are infinite
         centers = scene.object_bounds.mean(axis=1)
     distances_m = np.linalg.norm(centers - np.nanmedian(centers, axis=0), axis=1)

@@ -1,4 +1,4 @@
-"""Traffic from traces of the Open Simulation Interface (ASAM OSI)."""
+"""Traffic from traces in the Open Simulation Interface (ASAM OSI)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _ROW = 6
 
 @dataclass(frozen=True, eq=False)
 class OsiPassage:
-    """Consecutive messages in a trace that contain a moving object."""
+    """Consecutive messages of a trace that contain the same moving object."""
 
     name: str  # ID of the object
     kind: str  # type of the object, such as "heavy_truck"
@@ -48,7 +48,7 @@ class OsiPassage:
     rows: array[float] = field(default_factory=lambda: array("d"))  # `_ROW` values at each time
 
     def entry(self, section: TrafficSection) -> VehicleSection | None:
-        """Return the first entry that matches the type, otherwise a box with the object's size.
+        """Return the first entry that matches the type, or a box with the object's size.
 
         Return None if no entry matches and the size is unknown. In this case, the object is the
         platform, because other objects without a shape are skipped.
@@ -61,7 +61,7 @@ class OsiPassage:
     def track(
         self, section: TrafficSection, mesh: SceneMesh | None, origin: Floats, start_s: float
     ) -> Track:
-        """Return the trajectory of the origin of a mesh, in local coordinates.
+        """Return the trajectory of a mesh's origin in local coordinates.
 
         Positions in OSI refer to the center of the bounding box of the object. The mesh is placed
         on the bottom of this box and centered horizontally. If `mesh` is None, the trajectory is
@@ -87,7 +87,7 @@ class OsiPassage:
 
 
 class _PassageCollector:
-    """Collector of passages from messages.
+    """Collector that combines messages into passages.
 
     Of the messages before the first time, only the last is kept.
     """
@@ -105,7 +105,7 @@ class _PassageCollector:
         self.left_out: set[str] = set()  # IDs that the filter excludes
 
     def add_message(self, truth: Any) -> None:
-        """Add the moving objects in a GroundTruth message.
+        """Add the moving objects of a GroundTruth message.
 
         Raise ValueError if the message is invalid.
         """
@@ -141,7 +141,7 @@ class _PassageCollector:
         passage.rows.extend(row)
 
     def _passage(self, identity: int, moving: Any) -> OsiPassage | None:
-        """Return the passage that an object continues, or a new passage.
+        """Return the passage that an object continues, or start a new passage.
 
         Return None if the object has no shape, unless it is the only object to read.
         """
@@ -166,7 +166,7 @@ def read_osi(
     last_s: float,
     travelers: TravelerFilter = TravelerFilter(),  # noqa: B008 - immutable
 ) -> TrafficContent:
-    """Read the moving objects between two times from an OSI trace.
+    """Read the moving objects between two times in an OSI trace.
 
     The data includes the last message before and the first message after this interval. Other
     messages are discarded while the file is read.
@@ -220,7 +220,7 @@ def read_osi(
 
 
 def _iter_ground_truth(path: Path) -> Iterator[Any]:
-    """Yield the ground truth in each message of a trace.
+    """Yield the ground truth of each message in a trace.
 
     Raise LidarError if the type of the messages is unknown or not supported.
     """
@@ -249,7 +249,7 @@ def _iter_ground_truth(path: Path) -> Iterator[Any]:
 
 
 def _message_type(osi: Any, path: Path) -> str | None:
-    """Return the message type that the file name of a trace indicates, or None if it has none.
+    """Return the message type that is part of a trace's file name, or None if there is none.
 
     Raise LidarError if messages of this type contain no ground truth.
     """

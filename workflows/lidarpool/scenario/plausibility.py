@@ -1,4 +1,4 @@
-"""Warnings about implausible poses, motions and noise, which are likely mistakes."""
+"""Warnings about implausible poses, motions and noise, which are probably mistakes."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ _FAR_PERCENT = 95  # percentile of distances that replaces a missing range limit
 
 
 class _Motion(NamedTuple):
-    """Motion of the platform at the midpoints between the poses of its trajectory."""
+    """Motion of the platform halfway between the poses of its trajectory."""
 
     times_ns: Floats  # (k,)
     durations_s: Floats  # (k,), time between the poses
@@ -69,12 +69,15 @@ class _Motion(NamedTuple):
 
     @property
     def speeds(self) -> Floats:
-        """Speeds in m/s. Shape (k,)."""
+        """Speed of the platform in m/s.
+
+        The array has shape (k,).
+        """
         return np.asarray(np.linalg.norm(self.velocities, axis=1))
 
 
 class _SensorPosition(NamedTuple):
-    """Position of a sensor at a point in time."""
+    """Position of a sensor at a given time."""
 
     time_ns: float
     position: Floats  # (3,), local coordinates
@@ -83,7 +86,7 @@ class _SensorPosition(NamedTuple):
 
 
 def plausibility_warnings(prepared: PreparedScenario) -> list[str]:
-    """Return warnings about poses, motions, noise and coordinates that are implausible.
+    """Return warnings about implausible poses, motions, noise and coordinates.
 
     Default poses are not checked. Unless the scene has too many triangles, a few thousand rays are
     cast.
@@ -112,7 +115,7 @@ def plausibility_warnings(prepared: PreparedScenario) -> list[str]:
 
 
 def _sample_positions(survey: Survey) -> list[_SensorPosition]:
-    """Return sampled positions of the sensors in local coordinates."""
+    """Return sample positions of all sensors in local coordinates."""
     path = survey.path
     mounts = [*enumerate(carried.mount for carried in survey.carried)]
     if path.moves:
@@ -136,7 +139,7 @@ def _position_warnings(
     surroundings: PlacementChecker | None,
     samples: list[_SensorPosition],
 ) -> Iterator[str]:
-    """Yield warnings about sensors that are below the scene, or inside a closed body or an actor.
+    """Yield warnings about sensors that are below the scene, or inside a closed body or actor.
 
     Objects that a sensor does not see are ignored.
     """
@@ -204,7 +207,7 @@ def _exit_advice(
 def _free_pose_hint(
     scene: Scene, survey: Survey, sample: _SensorPosition, free: Floats | None
 ) -> str:
-    """Return a hint with the pose at which the sensor is at a free position.
+    """Return a hint with the pose that moves the sensor to a free position.
 
     The hint starts with a period, so that it can be appended to a sentence. It is empty if `free`
     is None.
@@ -224,7 +227,7 @@ def _surroundings_of_sensors(
     samples: list[_SensorPosition],
     unseen: Sequence[Bools | None],
 ) -> list[PlacementChecker | None]:
-    """Return the surroundings that are visible to each sensor.
+    """Return a checker for each sensor, which contains only the objects that the sensor sees.
 
     An entry is None if the sensor sees no objects. `surroundings` contains all objects, and
     `unseen` contains a mask of the invisible objects for each sensor.
@@ -242,7 +245,7 @@ def _surroundings_of_sensors(
 def _bad_positions(
     scene: Scene, samples: list[_SensorPosition], is_bad: Bools, *, moves: bool
 ) -> str:
-    """Describe the number of bad positions and the first of them.
+    """Describe how many positions are bad, and the first of them.
 
     If the platform moves, the description includes the time since the start of the survey.
     """
@@ -254,7 +257,10 @@ def _bad_positions(
 
 
 def _inside_actor(actor: Actor, samples: list[_SensorPosition]) -> Bools:
-    """Return whether each sensor position is inside the closed mesh of an actor. Shape (k,)."""
+    """Mark the sensor positions that are inside the closed mesh of an actor.
+
+    The mask has shape (k,).
+    """
     times = np.array([sample.time_ns for sample in samples])
     inside = np.zeros(len(samples), np.bool_)
     if not samples:
@@ -285,7 +291,7 @@ def _visible_range_m(
 
 
 def _noise_warnings(survey: Survey, visible_range_m: float) -> Iterator[str]:
-    """Yield warnings about noise that exceeds a tenth of the range."""
+    """Yield warnings about noise that is greater than a tenth of the range."""
     for carried, noise in zip(survey.carried, survey.noise_each, strict=True):
         range_m = min(carried.sensor.max_range_m, visible_range_m)
         name = f" of {carried.name}" * bool(carried.name)
@@ -307,7 +313,7 @@ def _noise_warnings(survey: Survey, visible_range_m: float) -> Iterator[str]:
 
 
 def _motion(survey: Survey) -> _Motion:
-    """Return the motion of the platform, including the part of the path after the last scan."""
+    """Return the motion of the platform, including the path after the last scan."""
     path = survey.path
     end_ns = path.duration_ns if np.isfinite(path.duration_ns) else survey.duration_ns
     if isinstance(path, Track):
@@ -340,7 +346,7 @@ def _is_airborne(
 
 
 def _speed_warnings(motion: _Motion, *, is_airborne: bool) -> Iterator[str]:
-    """Yield warnings about speeds and angular rates that platforms do not reach."""
+    """Yield warnings about speeds and angular rates that no platform reaches."""
     limit_m_s = AIR_SPEED_M_S if is_airborne else GROUND_SPEED_M_S
     medium = "in the air" if is_airborne else "on the ground"
     speeds = motion.speeds
@@ -366,7 +372,7 @@ def _time(motion: _Motion, row: int) -> str:
 
 
 def _up_axis_warnings(motion: _Motion, lowest_m: float) -> Iterator[str]:
-    """Yield a warning if the path is steep along z and flat along x or y.
+    """Yield a warning if the path is steep along z but flat along x or y.
 
     Vertical paths, such as those of elevators and drones, are plausible unless they extend below
     the scene.
@@ -390,7 +396,7 @@ def _up_axis_warnings(motion: _Motion, lowest_m: float) -> Iterator[str]:
 
 
 def _orientation_warnings(motion: _Motion) -> Iterator[str]:
-    """Yield a warning if the platform lies on its side or does not face its direction of travel."""
+    """Yield a warning if the platform lies on its side or faces away from its path."""
     as_read = _MeanOrientation.measure(motion, motion.rotations)
     # If the quaternions in the file have the order w, x, y, z, then w was read as x, x as y, and so
     # on.
@@ -434,7 +440,10 @@ class _MeanOrientation(NamedTuple):
 
     @classmethod
     def measure(cls, motion: _Motion, rotations: Floats) -> _MeanOrientation:
-        """Return the mean orientation along a path. `rotations` has shape (k, 3, 3)."""
+        """Return the mean orientation along a path.
+
+        `rotations` has shape (k, 3, 3).
+        """
         level = float(np.average(rotations[:, 2, 2], weights=motion.durations_s))
         forward = rotations[:, :2, 0]
         travel = motion.velocities[:, :2]

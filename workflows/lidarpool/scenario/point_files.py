@@ -1,4 +1,4 @@
-"""Reader of point cloud files from which scenes are created."""
+"""Read point cloud files from which scenes are created."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def read_points(
     epsg: int | None = None,
     keep_noise: bool = False,
 ) -> tuple[Sweep, int | None]:
-    """Read the finite points of a file in true meters, and their EPSG code if it is known.
+    """Read the finite points of a file in true meters, and the EPSG code if it is known.
 
     Scans are merged in the frame of the file. The sweep contains the following columns if the file
     has them:
@@ -113,7 +113,7 @@ def read_points(
 
 
 def vectors(points: Sweep, names: Sequence[str]) -> AnyArray | None:
-    """Return columns as an array of vectors, or None if the first column is missing.
+    """Stack columns to an array of vectors, or return None if the first column is missing.
 
     The result has shape (n, k), where k is the number of columns.
     """
@@ -123,7 +123,7 @@ def vectors(points: Sweep, names: Sequence[str]) -> AnyArray | None:
 
 
 def _check_points(path: Path, points: Sweep, omitted: OmittedPoints) -> None:
-    """Raise LidarError if there are too few points, or if a coordinate is implausibly large."""
+    """Raise LidarError if there are too few points or a coordinate is implausibly large."""
     if len(points) < MIN_POINTS and (note := omitted.note()):
         raise LidarError(
             f"{path} must have at least {MIN_POINTS} usable points, but has {len(points)}: {note}."
@@ -148,7 +148,7 @@ class _Content(NamedTuple):
 
 
 def _read_scans(recording: Recording, keep_noise: bool) -> _Content:
-    """Read the scans or parts of a file, and merge them in the frame of the file.
+    """Read the scans or parts of a file, and merge them in file coordinates.
 
     Raise LidarError if there is not enough memory for the points.
     """
@@ -184,7 +184,7 @@ def _read_scans(recording: Recording, keep_noise: bool) -> _Content:
 
 
 def _check_count(count: int) -> None:
-    """Raise LidarError if there is not enough memory for a number of points."""
+    """Raise LidarError if the memory is insufficient for a number of points."""
     if (size := count * POINT_BYTES) > memory():
         raise LidarError(
             f"it has {count:,} points, which require {bytes_of(size)} of memory. Downsample "
@@ -193,7 +193,7 @@ def _check_count(count: int) -> None:
 
 
 def _without_zeros(scan: Sweep) -> Sweep:
-    """Return a scan without pulses that have no return, for which drivers write zeros.
+    """Return a scan without points at the origin, which drivers write for lost pulses.
 
     If there are fewer than `MIN_POINTS` points at the origin, they are kept, because they may have
     been measured.
@@ -204,7 +204,7 @@ def _without_zeros(scan: Sweep) -> Sweep:
 
 
 def _with_used_columns(scan: Sweep, missing_if_zero: Iterable[Sequence[str]]) -> Sweep:
-    """Return a scan with only the columns of `_QUANTITIES`, which keep their names.
+    """Return a scan with only the columns of `_QUANTITIES`, whose names are preserved.
 
     The quantities in `missing_if_zero` are removed if all of their values are zero.
     """
@@ -225,7 +225,7 @@ def _with_used_columns(scan: Sweep, missing_if_zero: Iterable[Sequence[str]]) ->
 
 
 def _to_file_frame(scan: Sweep) -> Sweep:
-    """Return a scan in the frame of the file, with the position of its scanner as origins."""
+    """Transform a scan to file coordinates, and add the scanner position as ray origins."""
     points = np.asarray(scan.points, np.float64)
     columns = dict(scan.columns)
     if scan.pose is not None:
@@ -290,7 +290,7 @@ def _to_meters(
 
 
 def _convert_points(stored: Sweep, to_meters: Callable[[Floats], Floats]) -> Sweep:
-    """Return the finite points of a file in meters, with the columns of `read_points`.
+    """Convert stored points to finite points in meters, with the columns of `read_points`.
 
     `notes` are clauses that follow the name of the file, and `skipped` lists unused columns.
     """
@@ -326,14 +326,14 @@ def _convert_points(stored: Sweep, to_meters: Callable[[Floats], Floats]) -> Swe
 
 
 def _unused_columns(stored: Sweep, used: Collection[str]) -> list[str]:
-    """Return the names in `skipped` that are not used, except columns that contain only zeros."""
+    """Return the unused names in `skipped`, except those of columns that contain only zeros."""
     names = [name for name in stored.skipped if name not in used]
     columns = stored.columns
     return [name for name in names if name not in columns or _has_values(columns[name])]
 
 
 def _column_groups(columns: Columns, names: Sequence[str]) -> list[Columns]:
-    """Return groups of columns, each of which contains the components of a quantity.
+    """Return groups of columns, each of which stores the components of the same quantity.
 
     If there are several groups, the group with the standard names is the first.
     """
@@ -342,7 +342,7 @@ def _column_groups(columns: Columns, names: Sequence[str]) -> list[Columns]:
 
 
 def _first_with_values(columns: Columns, *quantities: Sequence[str]) -> Columns:
-    """Return the columns of the first quantity that has values other than zero, if any.
+    """Return the columns of the first quantity that has any values other than zero.
 
     LAS files contain columns of zeros for quantities that were not measured.
     """
@@ -351,17 +351,15 @@ def _first_with_values(columns: Columns, *quantities: Sequence[str]) -> Columns:
 
 
 def _stack(group: Columns) -> AnyArray:
-    """Return columns as an array of vectors. Shape (n, k)."""
     return np.stack([*group.values()], axis=1)
 
 
 def _has_values(values: AnyArray) -> bool:
-    """Return whether any value is neither 0 nor NaN."""
     return bool(np.any((values != 0) & (values == values)))
 
 
 def _as_integers(classes: AnyArray) -> Ints:
-    """Return classes as integers, with `NO_CLASS` for NaN.
+    """Convert classes to integers, and NaN to `NO_CLASS`.
 
     Raise ValueError if a class is not an integer.
     """
@@ -374,9 +372,10 @@ def _as_integers(classes: AnyArray) -> Ints:
 
 
 def _as_srgb(colors: AnyArray) -> Floats32:
-    """Convert colors to the range from 0 to 255. Shape (n, 3).
+    """Convert colors to sRGB values between 0 and 255.
 
-    The input has 8 or 16 bits, or consists of floats from 0 to 1 or from 0 to 255.
+    The result has shape (n, 3). The input has 8 or 16 bits, or consists of floats from 0 to 1 or
+    from 0 to 255.
     """
     if colors.dtype == np.uint8:
         return colors.astype(np.float32)

@@ -1,4 +1,4 @@
-"""Conversion of point clouds to scenes of surfels.
+"""Convert point clouds to scenes of surfels.
 
 A surfel is a small rectangle in the plane of neighboring points. Poisson surface reconstruction
 (Kazhdan and Hoppe 2013), which Open3D also provides, was tested as an alternative on a simulated
@@ -61,7 +61,7 @@ def scene_from_points(
     color: Literal["rgb", "intensity"] | None = None,
     tell: Callable[[str], None] = warn,
 ) -> Scene:
-    """Convert a point cloud to a scene of surfels, for example a scan of a real site.
+    """Convert a point cloud, such as a scan of a real site, to a scene of surfels.
 
     Each surfel is fitted to the 12 nearest points by principal component analysis, and is about as
     large as the gaps between the points in both directions. If the file contains scanner positions,
@@ -134,7 +134,7 @@ def scene_from_points(
 
 
 class PointScene(NamedTuple):
-    """A scene that was created from a point cloud.
+    """Scene that was created from a point cloud.
 
     Attributes
     ----------
@@ -153,7 +153,7 @@ class PointScene(NamedTuple):
 
     @property
     def gap_note(self) -> str:
-        """Note on returns that are lost in gaps between points, or an empty string."""
+        """Note about returns that are lost in gaps between points, or an empty string."""
         larger_m = rounded(2 * self.voxel_m, 2)
         advice = f"To close gaps, increase `--voxel-m` (`voxel_m` in Python), such as to {larger_m}"
         if self.loss is None:
@@ -181,7 +181,7 @@ def points_to_scene(
     color: str | None,
     tell: Callable[[str], None],
 ) -> PointScene:
-    """Convert a point cloud to a scene, and estimate the share of lost returns.
+    """Convert a point cloud to a scene, and estimate the fraction of lost returns.
 
     The parameters are those of `scene_from_points`.
     """
@@ -200,7 +200,7 @@ def points_to_scene(
 
 
 def surfel_mesh(path: Path, points: Floats, voxel_m: float | None, size: float = 1.0) -> SceneMesh:
-    """Return the surfels of points as a mesh.
+    """Create a mesh of surfels from points.
 
     `path` is the file of the points, which is used for the name of the mesh and in messages.
     `points` has shape (n, 3).
@@ -209,8 +209,6 @@ def surfel_mesh(path: Path, points: Floats, voxel_m: float | None, size: float =
 
 
 class _Surfels(NamedTuple):
-    """Surfels of a point cloud."""
-
     mesh: SceneMesh
     voxel_m: float  # edge length of the voxels
 
@@ -218,7 +216,7 @@ class _Surfels(NamedTuple):
 def _select_color(
     path: Path, points: Sweep, color: str | None, tell: Callable[[str], None]
 ) -> Sweep:
-    """Return points with either colors or intensities.
+    """Return points that have either colors or intensities, but not both.
 
     Raise LidarError if the selected quantity is missing.
     """
@@ -250,7 +248,10 @@ def _select_color(
 def _note_unknown(
     path: Path, quantity: str, unknown: Bools, outcome: str, tell: Callable[[str], None]
 ) -> None:
-    """Call `tell` if some points lack a quantity. `unknown` has shape (n,)."""
+    """Notify the user if some points lack a quantity.
+
+    The mask `unknown` has shape (n,).
+    """
     if count := int(unknown.sum()):
         tell(
             f"{path}: {count:,} of {plural(len(unknown), 'point')} have no {quantity}. Surfels of "
@@ -259,7 +260,7 @@ def _note_unknown(
 
 
 def _compute_surfels(path: Path, points: Sweep, voxel_m: float | None, size: float) -> _Surfels:
-    """Return the surfels of the points in a file, with their colors and classes."""
+    """Compute the surfels of the points in a file, with their colors and classes."""
     # Points are centered, because Open3D loses precision in covariances far from the origin.
     positions = points.points
     origin = np.round((positions.min(axis=0) + positions.max(axis=0)) / 2)
@@ -309,7 +310,7 @@ def surfel_faces(count: int) -> Ints:
 
 @dataclass(frozen=True, eq=False)
 class PointVoxels:
-    """Assignment of points to voxels. Only voxels that contain points are stored."""
+    """Assignment of points to voxels, of which only those with points are stored."""
 
     order: Ints  # (n,), indices of the points, sorted by voxel
     starts: Ints  # (v,), index of the first point of each voxel in `order`
@@ -317,9 +318,9 @@ class PointVoxels:
 
     @classmethod
     def from_points(cls, path: Path, positions: Floats, voxel_m: float) -> PointVoxels:
-        """Assign the points in a file to voxels. `positions` has shape (n, 3).
+        """Assign the points in a file to voxels.
 
-        Raise LidarError if there are too many voxels.
+        The positions have shape (n, 3). Raise LidarError if there are too many voxels.
         """
         lower = positions.min(axis=0)
         spans = (positions.max(axis=0) - lower) / voxel_m + 1
@@ -337,7 +338,10 @@ class PointVoxels:
         return cls(order, starts, np.diff(starts, append=len(order)))
 
     def means(self, values: AnyArray) -> Floats:
-        """Return the mean value in each voxel. `values` has shape (n, k), and the result (v, k)."""
+        """Return the mean of the values in each voxel.
+
+        `values` has shape (n, k), and the means have shape (v, k).
+        """
         sums = np.add.reduceat(values[self.order].astype(np.float64), self.starts, axis=0)
         means: Floats = sums / self.counts[:, None]
         return means
@@ -352,11 +356,11 @@ class PointVoxels:
             return self.means(np.where(known, values, 0.0)) / self.means(known)
 
     def most_frequent(self, numbers: Ints, distinct: int, unknown: int | None = None) -> Ints:
-        """Return the most frequent number in each voxel. Shape (v,).
+        """Return the number that occurs most often in each voxel.
 
-        Ties are resolved in favor of the lowest number. `numbers` has shape (n,) and contains
-        integers from 0 to `distinct` - 1. The number `unknown` is returned only if a voxel contains
-        no other number.
+        The array has shape (v,). Ties are resolved in favor of the lowest number. `numbers` has
+        shape (n,) and contains integers from 0 to `distinct` - 1. The number `unknown` is returned
+        only if a voxel contains no other number.
         """
         voxel = np.repeat(np.arange(len(self.counts)), self.counts)
         pairs, repeats = np.unique(voxel * distinct + numbers[self.order], return_counts=True)
@@ -369,7 +373,7 @@ class PointVoxels:
 
 
 def _outward(points: Sweep) -> Floats | None:
-    """Return vectors from the points to the scanner, or else the normals.
+    """Return vectors from the points to the scanner, or the normals if these are unknown.
 
     Return None if neither is known. If the scanner position of a point is unknown, its vector is
     zero. The result has shape (n, 3).
@@ -379,13 +383,16 @@ def _outward(points: Sweep) -> Floats | None:
 
 
 def _normalize(outward: Floats) -> Floats:
-    """Scale vectors to length 1. Zero vectors are not changed. Shape (n, 3)."""
+    """Scale vectors to length 1, leaving zero vectors unchanged.
+
+    The vectors have shape (n, 3).
+    """
     lengths = np.sqrt((outward * outward).sum(axis=1, keepdims=True))
     return np.divide(outward, lengths, out=np.zeros_like(outward), where=lengths > 0)
 
 
 def _surfel_colors(o3d: Any, points: Sweep, voxels: PointVoxels, centers: Floats) -> Colors | None:
-    """Return the colors of surfels from the mean colors or intensities of their points.
+    """Derive the colors of surfels from the mean colors or intensities of their points.
 
     Colors are averaged in linear light. A surfel without a color has the mean color of its
     neighbors, or the default gray if they have no color either. Return None if the points have
@@ -407,7 +414,7 @@ def _surfel_colors(o3d: Any, points: Sweep, voxels: PointVoxels, centers: Floats
 
 
 def _fill_from_neighbors(o3d: Any, light: Floats, centers: Floats) -> None:
-    """Replace NaN in `light` by the mean of the neighboring surfels whose light is known.
+    """Replace NaN in `light` with the mean of neighboring surfels whose light is known.
 
     `light` and `centers` have shape (v, 3). `light` is modified in place.
     """
@@ -424,14 +431,17 @@ def _fill_from_neighbors(o3d: Any, light: Floats, centers: Floats) -> None:
 
 
 def _to_linear(colors: AnyArray) -> Floats:
-    """Convert sRGB colors from 0 to 255 to linear light. NaN is preserved. Shape (n, 3)."""
+    """Convert sRGB colors from 0 to 255 to linear light, preserving NaN.
+
+    The colors have shape (n, 3).
+    """
     known = np.isfinite(colors)
     light = LINEAR[np.where(known, colors, 0).astype(np.uint8)]
     return np.where(known, light, np.nan)
 
 
 def surfel_materials(point_classes: Ints | None, voxels: PointVoxels) -> FaceMaterials | None:
-    """Return the most frequent class of each surfel as a material name, such as "class 2".
+    """Return a material for each surfel, named after its most frequent class, or None.
 
     `point_classes` contains the classes of the points, which are `NO_CLASS` for points without a
     class. Its shape is (n,). If it is None, return None.
@@ -452,7 +462,7 @@ def surfel_materials(point_classes: Ints | None, voxels: PointVoxels) -> FaceMat
 def _surfel_corners(
     points: Floats, covariances: Floats, voxel_m: float, size: float, outward: Floats | None
 ) -> Floats:
-    """Return the corners of surfels, counterclockwise as seen from the direction of `outward`.
+    """Return the corners of surfels, counterclockwise as seen from the direction `outward`.
 
     `outward` has shape (n, 3), and the result has shape (n, 4, 3).
     """

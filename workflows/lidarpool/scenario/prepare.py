@@ -1,4 +1,4 @@
-"""Conversion of scenarios to jobs.
+"""Convert scenarios to jobs.
 
 Preparing a scenario means reading its files, and creating a job with its scene, survey and
 planning.
@@ -75,7 +75,7 @@ MESH_PRECISION_M = 0.001
 
 @dataclass(frozen=True, eq=False)
 class PreparedScenario:
-    """A scenario whose files have been read and validated.
+    """Scenario whose files have been read and validated.
 
     Attributes
     ----------
@@ -178,7 +178,7 @@ def _prepare(
 
 
 class _SurveyParts(NamedTuple):
-    """Parts of a survey that do not depend on the materials."""
+    """Parts of a survey that do not depend on materials."""
 
     scenario: Scenario
     findings: FileFindings
@@ -192,7 +192,7 @@ class _SurveyParts(NamedTuple):
 
 
 def _survey_parts(shapes: ShapeLoader, static: StaticScene) -> _SurveyParts:
-    """Return the sensors of a scenario, and their trajectory, poses or default poses."""
+    """Return the sensors of a scenario, with their trajectory or poses."""
     scenario = shapes.scenario
     scene = static.scene
     findings = shapes.findings
@@ -212,7 +212,7 @@ def _survey_parts(shapes: ShapeLoader, static: StaticScene) -> _SurveyParts:
 
 
 def _platform_track(shapes: ShapeLoader, support: SupportSurfaces) -> Track | None:
-    """Return the trajectory of the platform in local coordinates, or None if there is none."""
+    """Return the platform's trajectory in local coordinates, or None if it has none."""
     scenario = shapes.scenario
     entry = scenario.trajectory
     if entry is None:
@@ -233,7 +233,7 @@ def _platform_track(shapes: ShapeLoader, support: SupportSurfaces) -> Track | No
 def _read_traffic(
     scenario: Scenario, first_s: float, last_s: float, travelers: TravelerFilter
 ) -> TrafficContent:
-    """Read the traffic of a scenario between two times, which refer to the clock of the file."""
+    """Read the traffic between two times, which refer to the clock of the traffic file."""
     section = scenario.traffic
     assert section is not None
     file = scenario.path(section.file)
@@ -245,7 +245,7 @@ def _read_traffic(
 def _place_sensor(
     scenario: Scenario, scene: Scene, findings: FileFindings, sensor: Mounted
 ) -> SensorPlacement:
-    """Choose poses for a scenario that defines neither poses nor a trajectory.
+    """Choose poses for a scenario that specifies neither poses nor a trajectory.
 
     Scenes with rasters or road networks are landscapes. If the scenario does not specify the
     sensor, and the scene is a single object, the sensor is a grid that is as wide as the object.
@@ -264,7 +264,7 @@ def _place_sensor(
 def _build_traffic(
     survey_parts: _SurveyParts, shapes: ShapeLoader, support: SupportSurfaces
 ) -> list[tuple[Actor, VehicleSection]]:
-    """Build the actors of the traffic during the survey.
+    """Create the actors of the traffic during the survey.
 
     Each actor is returned with the entry that defines its shape. The list is empty if the scenario
     has no traffic.
@@ -376,7 +376,7 @@ def _mount_pose(section: SensorSection, shapes: ShapeLoader) -> Pose:
 
 
 def _joint_arguments(entry: ActorSection, scenario: Scenario) -> dict[str, Any]:
-    """Return the arguments of `Robot.path` and `Robot.actors` for the joint table of an actor."""
+    """Return the arguments of `Robot.path` and `Robot.actors` that describe a joint table."""
     if entry.joints is None:
         return {}
     return {
@@ -389,7 +389,7 @@ def _joint_arguments(entry: ActorSection, scenario: Scenario) -> dict[str, Any]:
 def _build_actors(
     shapes: ShapeLoader, support: SupportSurfaces, track: Track | None
 ) -> list[Actor]:
-    """Build the actors of a scenario, without traffic.
+    """Create the actors of a scenario, excluding traffic.
 
     `track` is the trajectory of the platform, or None. It is also the trajectory of actors that
     have neither a trajectory nor a pose. All trajectories start at the start of the survey.
@@ -415,7 +415,7 @@ def _build_actors(
 def _robot_actors(
     entry: ActorSection, robot: Robot, trajectory: Track, shapes: ShapeLoader
 ) -> Sequence[Actor]:
-    """Return the actors of a robot, one per link.
+    """Return the actors of a robot, one for each link.
 
     If the robot is on the platform, links on which sensors are mounted are omitted.
     """
@@ -438,7 +438,7 @@ def _traffic_actors(
     start_s: float,
     duration_s: float,
 ) -> list[tuple[Actor, VehicleSection]]:
-    """Return the vehicles and persons in the traffic during the survey, with their entries.
+    """Return the actors of the traffic during the survey, with their scenario entries.
 
     `start_s` and `duration_s` are the start and duration of the survey in seconds. The start refers
     to the clock of the platform's trajectory.
@@ -469,7 +469,7 @@ def _materials(
     scene: Scene,
     vehicles: Sequence[tuple[Actor, VehicleSection]],
 ) -> list[Material]:
-    """Return the materials of a scenario, with additional entries for the classes of objects.
+    """Return the materials of a scenario, including entries for the classes of objects.
 
     The classes of actors, copies and traffic are set in the scenario, and the classes of other
     objects are read from files. `vehicles` contains the last actors of the scene, with their
@@ -505,7 +505,7 @@ def _materials(
 
 
 class _ClassedObject(NamedTuple):
-    """An object with a class that is set in `scene.copies` or `actors`."""
+    """Object whose class is set in `scene.copies` or `actors`."""
 
     name: str  # name of the entry or the robot link
     patterns: list[str]  # match the names of the object and its numbered copies in the scene
@@ -513,7 +513,7 @@ class _ClassedObject(NamedTuple):
 
 
 def _classed_objects(scenario: Scenario, scene: Scene) -> list[_ClassedObject]:
-    """Return the objects whose entries in `scene.copies` and `actors` set a class.
+    """Return the objects whose entries in `scene.copies` or `actors` set a class.
 
     All copies of an entry are treated as one object, and each link of a robot as a separate object.
     """
@@ -567,7 +567,7 @@ def _with_object_class(
 def _build_survey(
     survey_parts: _SurveyParts, materials: Sequence[Material], columns: Sequence[str] = ()
 ) -> Survey:
-    """Build the survey along a trajectory or at poses, in local coordinates.
+    """Create the survey in local coordinates, with a trajectory or poses.
 
     `columns` contains the names of columns to add to the cloud, besides those that the scenario and
     the formats require.
@@ -609,7 +609,7 @@ def _build_survey(
 def _class_names(
     survey_parts: _SurveyParts, materials: Sequence[Material], columns: Sequence[str]
 ) -> dict[int, str]:
-    """Return the names of the classes of a survey, as a mapping from numbers to names.
+    """Return the names of a survey's classes, keyed by class number.
 
     The names are taken from `scenario.classes`, and from the classes that files assign to objects,
     unless the scenario uses the number or the name for a different class. `columns` are the columns
@@ -631,7 +631,7 @@ def _class_names(
 
 
 def _build_planning(scenario: Scenario, scene: Scene) -> Planning | None:
-    """Build the planning in local coordinates. Return None if the scenario does not plan a path.
+    """Create the planning problem in local coordinates, or return None if no path is planned.
 
     Raise LidarError if the start or target is inside an obstacle.
     """
@@ -661,7 +661,7 @@ def _build_planning(scenario: Scenario, scene: Scene) -> Planning | None:
 
 
 def _obstacle_discs(scenario: Scenario, scene: Scene) -> tuple[Floats, list[str]]:
-    """Return the obstacles as discs, with their labels.
+    """Return the obstacles as discs, with a label for each disc.
 
     Each row of the discs contains x, y and radius in local coordinates, in meters. The shape is
     (m, 3). By default, all static objects that are at least `FLAT_M` high are obstacles. The radii

@@ -61,7 +61,7 @@ MESH_OPTIONS = {
 
 
 def mesh_data(files: Sequence[Path], folder: Path, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a scenario file for mesh files.
+    """Return the content of a scenario file that uses mesh files.
 
     Sections without an option are omitted, and the scene is omitted if there are no files.
 
@@ -93,7 +93,7 @@ def mesh_data(files: Sequence[Path], folder: Path, options: Mapping[str, Any]) -
 
 
 def _with_sensor(path: Path, data: Any, options: Mapping[str, Any]) -> Any:
-    """Return the content of a scenario file with a different sensor.
+    """Return the content of a scenario file in which the sensor is replaced.
 
     Raise LidarError if there are options other than `sensor`.
     """
@@ -115,7 +115,7 @@ def _with_sensor(path: Path, data: Any, options: Mapping[str, Any]) -> Any:
 
 
 def mesh_survey_name(mesh_file: Path) -> str:
-    """Return the survey name for messages if a mesh file is simulated without a scenario."""
+    """Return the name used in messages for a survey of a mesh file without a scenario."""
     return f"survey of {mesh_file}"
 
 
@@ -251,13 +251,13 @@ class Scenario(Section):
 
     @property
     def title(self) -> str:
-        """Title of the survey, which is the name of its file without the extension."""
+        """Title of the survey, which is the scenario's file name without the extension."""
         path = Path(self._source)
         return path.stem if path.suffix in (".yaml", ".yml") else self._source
 
     @classmethod
     def load(cls, path: str | Path, options: Mapping[str, Any] = MappingProxyType({})) -> Scenario:
-        """Read a scenario file, or create a scenario for a mesh file with `mesh_data`.
+        """Read a scenario file, or create a scenario from a mesh file with `mesh_data`.
 
         Parameters
         ----------
@@ -321,7 +321,7 @@ class Scenario(Section):
         return scenario
 
     def _check(self) -> None:
-        """Raise LidarError if fields cannot be combined or the model of a sensor is invalid."""
+        """Raise LidarError if fields cannot be combined or a sensor model is invalid."""
         mistakes = Mistakes()
         for reason in self._contradictions():
             mistakes.lines.append(f"{self._source}: {reason}")
@@ -333,7 +333,7 @@ class Scenario(Section):
         mistakes.tell()
 
     def _contradictions(self) -> Iterator[str]:
-        """Yield a sentence for each reason why fields cannot be combined."""
+        """Yield a sentence for each contradiction between fields."""
         yield from self._planning_contradictions()
         yield from self._platform_contradictions()
         copies = [entry.name for entry in self.scene.copies]
@@ -356,7 +356,7 @@ class Scenario(Section):
             )
 
     def _planning_contradictions(self) -> Iterator[str]:
-        """Yield a sentence if the planning has no start or target."""
+        """Yield a sentence if the planning lacks a start or target."""
         planning = self.planning
         if planning.enabled is False or (planning.start and planning.target):
             return
@@ -367,7 +367,7 @@ class Scenario(Section):
             )
 
     def _platform_contradictions(self) -> Iterator[str]:
-        """Yield a sentence for each contradiction in the trajectory, poses, platform and mounts."""
+        """Yield a sentence for each contradiction of trajectory, poses, platform and mounts."""
         if self.trajectory is not None and self.trajectory.beyond != "refuse":
             yield (
                 "`trajectory.beyond` is only allowed for actors, because the trajectory of the "
@@ -399,7 +399,7 @@ class Scenario(Section):
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Unique paths of the files of the scenario.
+        """Paths of all files that the scenario uses, without duplicates.
 
         They include meshes, tables, trajectories, traffic, and sensor models and calibrations.
         """
@@ -423,7 +423,7 @@ class Scenario(Section):
         return tuple(dict.fromkeys(paths))
 
     def message_prefix(self, file: Path) -> str:
-        """Return a message prefix with the scenario and the field that name a file.
+        """Return a message prefix with the scenario and the field in which a file is named.
 
         The prefix is empty if no field names the file, or for the mesh file of a survey without a
         scenario.
@@ -435,7 +435,7 @@ class Scenario(Section):
 
     @contextmanager
     def explain_missing_files(self) -> Iterator[None]:
-        """Context manager that adds missing files and their fields to a LidarError of its body.
+        """Add missing files and their fields to a LidarError that the body raises.
 
         Errors that do not concern missing files are raised unchanged.
         """
@@ -468,7 +468,7 @@ class Scenario(Section):
         return self._source
 
     def path(self, file: str) -> Path:
-        """Return the path of a file whose name is relative to the folder of the scenario."""
+        """Return the path of a file, given its name relative to the folder of the scenario."""
         # `Path.expanduser` raises an error for unknown users.
         return self._folder / os.path.expanduser(file)  # noqa: PTH111
 
@@ -480,19 +480,18 @@ class Scenario(Section):
 
     @property
     def needs_colors(self) -> bool:
-        """Whether a column or `reflectance: texture` requires the colors of meshes."""
+        """Whether a column or `reflectance: texture` requires the meshes' colors."""
         columns = {*self.cloud.columns, *self.output.needs}
         return bool(columns & {*COLORS}) or any(m.reflectance == "texture" for m in self.materials)
 
     @property
     def needs_material_names(self) -> bool:
-        """Whether a column or an entry of `materials` requires the material names of meshes."""
+        """Whether a column or an entry of `materials` requires the meshes' material names."""
         columns = {*self.cloud.columns, *self.output.needs}
         return "material" in columns or any(m.material is not None for m in self.materials)
 
 
 def _is_contradictory(content: Any) -> bool:
-    """Return whether sections of a scenario contradict each other."""
     try:
         return any(Scenario.model_validate(content)._contradictions())
     except ValidationError:  # the content has another error
@@ -500,7 +499,7 @@ def _is_contradictory(content: Any) -> bool:
 
 
 def _find_file_field(section: Any, is_file: Callable[[str], bool]) -> str:
-    """Return the path of the first field that contains the name of a file, or an empty string.
+    """Return the path of the first field that contains a file name, or an empty string.
 
     The path is, for example, ``scene.files[0].file``.
 

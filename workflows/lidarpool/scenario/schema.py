@@ -1,4 +1,4 @@
-"""JSON Schemas of scenarios and campaigns, and the scenario files that `lidarpool init` writes."""
+"""JSON Schemas of scenarios and campaigns, and scenario files for `lidarpool init`."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def _section_schema(section: type[Section], title: str) -> dict[str, Any]:
 
 
 def schema_text(schema: dict[str, Any]) -> str:
-    """Return a schema as JSON with a final newline."""
+    """Format a schema as JSON with a final newline."""
     return json.dumps(schema, indent=2, allow_nan=False) + "\n"
 
 
@@ -136,7 +136,7 @@ def short_scenario(data: Mapping[str, Any], note: str) -> str:
 
 
 def scenario_template(data: Mapping[str, Any], note: str) -> str:
-    """Return a scenario in YAML with comments, which contains all fields.
+    """Return a scenario in YAML with all fields and comments.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def scenario_template(data: Mapping[str, Any], note: str) -> str:
 
 
 def _section_lines(name: str, field: FieldInfo, values: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines of a section or top-level field. `values` replaces the default values."""
+    """Yield the lines of a section or top-level field, replacing default values by `values`."""
     section = field.annotation
     if not (isinstance(section, type) and is_section(section)):
         yield from _field_lines(name, field, "", values)
@@ -175,7 +175,7 @@ def _section_lines(name: str, field: FieldInfo, values: dict[str, Any]) -> Itera
 
 
 def _pose_lines(poses: Sequence[Any], note: str) -> Iterator[str]:
-    """Yield a comment with the note, followed by the poses, one per line."""
+    """Yield the note as a comment, followed by one line for each pose."""
     if note:
         note = f"{note[:1].upper()}{note[1:]}."
         # Poses in the note are kept on a single line, so that they can be copied.
@@ -204,7 +204,7 @@ def _field_lines(name: str, field: FieldInfo, indent: str, values: dict[str, Any
 
 
 def _commented(code: str, comment: str, indent: str) -> Iterator[str]:
-    """Yield code with a comment on its right, or above it if there is not enough space."""
+    """Yield code with a comment, placed on the right if it fits and otherwise above the code."""
     line = f"{indent}{code}".ljust(_COMMENT_COLUMN - 1) + f" # {comment}"
     if len(line) <= _WIDTH and len(indent + code) < _COMMENT_COLUMN:
         yield line

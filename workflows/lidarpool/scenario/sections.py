@@ -1,4 +1,4 @@
-"""Sections of scenario files, with the limits, defaults and descriptions of their fields."""
+"""Sections of scenario files, with limits, defaults and descriptions of their fields."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ class MeshFile(Section):
     @model_validator(mode="wrap")
     @classmethod
     def _with_options(cls, value: Any, handler: Callable[[Any], MeshFile]) -> MeshFile:
-        """Validate a file with the options of its format.
+        """Validate a file and the options of its format.
 
         Raise ValueError if an option belongs to a different format.
         """
@@ -163,7 +163,7 @@ class MeshFile(Section):
         return handler(value) if kind is MeshFile else kind.model_validate(value)
 
     def __reduce__(self) -> Any:
-        """Return the content to pickle.
+        """Return the content for pickling.
 
         The subclasses for file formats are created at run time, so they cannot be pickled by
         reference.
@@ -172,20 +172,20 @@ class MeshFile(Section):
 
     @staticmethod
     def kinds() -> list[type[MeshFile]]:
-        """Return the subclasses for all file formats that have options, including plug-ins."""
+        """Return the subclasses for all file formats with options, including those of plug-ins."""
         options = dict.fromkeys(row.own_options for row in formats_with_plugins())
         return [kind for kind in map(_kind_of_file, options) if kind is not MeshFile]
 
     @property
     def reading_options(self) -> dict[str, Any]:
-        """Keyword arguments for `load_objects`, except for folders."""
+        """Keyword arguments for `load_objects`, excluding folders."""
         own = type(self).model_fields.keys() - MeshFile.model_fields.keys()
         shared = {field.name for field in fields(MeshOptions)} & MeshFile.model_fields.keys()
         return self.model_dump(include={*own, *shared} - {"assets"}, exclude_unset=True)
 
     @model_validator(mode="after")
     def _check_placement(self) -> MeshFile:
-        """Raise ValueError if the mesh is placed twice or a scale is 0."""
+        """Raise ValueError if the mesh is placed twice or has a scale of 0."""
         placed = self.model_fields_set & {"translation", "rotation_deg", "scale"}
         if self.matrix is not None and placed:
             raise ValueError(f"`matrix` and `{min(placed)}` cannot be combined.")
@@ -194,7 +194,7 @@ class MeshFile(Section):
         return self
 
     def transform(self) -> Transform:
-        """Return the transform from the coordinates of the file to world coordinates."""
+        """Return the transformation from file coordinates to world coordinates."""
         if self.matrix is not None:
             return Transform.from_matrix(self.matrix)
         return Transform.from_parts(self.translation, self.rotation_deg, self.scale)
@@ -202,7 +202,7 @@ class MeshFile(Section):
 
 @cache
 def _kind_of_file(options: type | None) -> type[MeshFile]:
-    """Return the `MeshFile` subclass for a file format.
+    """Return the `MeshFile` subclass for a file format with the given options.
 
     Its fields include those options of the format that are declared with `about`.
     """
@@ -219,7 +219,7 @@ MeshEntries = Several[MeshEntry]
 
 
 def _as_pose_mapping(value: Any) -> Any:
-    """Convert a list, which is the position of a pose, to a mapping."""
+    """Convert a list with the position of a pose to a mapping."""
     if isinstance(value, list):
         return {"position": value}
     if not isinstance(value, (dict, Pose)):
@@ -231,7 +231,7 @@ def _as_pose_mapping(value: Any) -> Any:
 
 
 def by_position(kind: Any, position: Any = Triple) -> BeforeValidator:
-    """Return a validator that also accepts the position of a pose alone, such as [0, 0, 1]."""
+    """Return a validator that accepts a position such as [0, 0, 1] in place of a pose."""
     return BeforeValidator(_as_pose_mapping, json_schema_input_type=position | kind)
 
 
@@ -371,7 +371,7 @@ class DeformingSection(ShapeSection):
 
     @model_validator(mode="after")
     def _check_deformation(self) -> DeformingSection:
-        """Raise ValueError if a deformation has no file, or if there are two deformations."""
+        """Raise ValueError if a deformation has no file or there are two deformations."""
         deformations = [name for name in ("animation", "wheels") if getattr(self, name) is not None]
         if deformations and self.file is None:
             raise ValueError(f"`{deformations[0]}` requires a mesh file. Set `file`.")
@@ -471,7 +471,7 @@ class SceneSection(Section):
 
     @property
     def has_seed(self) -> bool:
-        """Whether the scene has the six objects of the demo."""
+        """Whether the scene contains the six objects of the demo."""
         return self.preset == "seed"
 
 
@@ -621,7 +621,7 @@ class SensorSection(Section):
 
     @property
     def has_custom_model(self) -> bool:
-        """Whether the model is a file that the user provides."""
+        """Whether the model is a file provided by the user."""
         return self.model is not None and self.model.endswith(MODEL_FILES)
 
     def mounted(
@@ -695,13 +695,16 @@ _grid_sensor = lru_cache(Sensor.grid)
 
 @lru_cache
 def _load_sensor(_: object, **options: Any) -> Sensor:
-    """Load a sensor. The first argument contains the states of its files, as a cache key."""
+    """Load a sensor.
+
+    The first argument contains the states of its files and serves as a cache key.
+    """
     return load_sensor(**options)
 
 
 @lru_cache
 def _with_packets(sensor: Sensor, section: str) -> Sensor:
-    """Return a sensor with the ports and identifiers of a `PacketSection`.
+    """Return a sensor with the ports and identifiers that a `PacketSection` specifies.
 
     `section` is the section as JSON, so that it can be a cache key.
     """
@@ -722,7 +725,7 @@ class OutputSection(Section):
 
     @model_validator(mode="after")
     def _check_formats(self) -> OutputSection:
-        """Raise ValueError if a format occurs twice."""
+        """Raise ValueError if a format is listed twice."""
         names = [entry.format for entry in self.write]
         if twice := next((name for name in names if names.count(name) > 1), None):
             raise ValueError(
@@ -772,7 +775,7 @@ Obstacles = Several[Annotated[Obstacle, accept_text("object", Obstacle)]]
 
 
 class _Route:
-    """Fields of `PlanningSection` that precede the fields of `Search`.
+    """Fields of `PlanningSection` before the fields of `Search`.
 
     Positions are in world coordinates, and obstacles may be selected by name.
     """
@@ -835,7 +838,7 @@ class TaskOptions:
 
 
 class _WorkerCounts:
-    """Fields of `PoolSection` that precede the fields of `TaskOptions`."""
+    """Fields of `PoolSection` before the fields of `TaskOptions`."""
 
     gpu: Annotated[
         int | None,
@@ -862,7 +865,7 @@ class PoolSection(Section, TaskOptions, _WorkerCounts):
 
 
 def allow_empty(kind: Any) -> Any:
-    """Return a validator that accepts an empty section or mapping.
+    """Return a validator that also accepts an empty section or mapping.
 
     In YAML, the value of a section is null if all of its lines are commented out.
     """

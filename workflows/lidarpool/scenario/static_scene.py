@@ -1,4 +1,4 @@
-"""The static scene of a scenario.
+"""Static scene of a scenario.
 
 The static scene consists of mesh files, copies of objects, the ground and the objects of the demo.
 It can be cached and shared between scenarios.
@@ -73,7 +73,7 @@ class FileCrs(NamedTuple):
 
 @dataclass
 class FileFindings:
-    """Notes and metadata that are collected while the files of a scene are read."""
+    """Notes and metadata collected from the files of a scene."""
 
     notes: list[str] = field(default_factory=list)  # notes for the user, such as skipped objects
     remarks: list[str] = field(default_factory=list)  # remarks on the up axes of files
@@ -86,7 +86,7 @@ class FileFindings:
     without_angles: dict[str, bool] = field(default_factory=dict)
 
     def copy(self) -> FileFindings:
-        """Return a copy whose lists and dictionaries can be extended separately."""
+        """Return a copy whose lists and dictionaries can be extended independently."""
         return FileFindings(*(values.copy() for values in vars(self).values()))
 
     def class_patterns(self, number: int) -> tuple[str, ...]:
@@ -101,7 +101,7 @@ class FileFindings:
 
     @property
     def class_names(self) -> dict[int, str]:
-        """Names of the classes that files assign to objects, by class number in ascending order."""
+        """Names of the classes that files assign to objects, keyed by class number."""
         names = {
             number: entry.name
             for classes in self.classes.values()
@@ -111,7 +111,7 @@ class FileFindings:
 
 
 class StaticScene(NamedTuple):
-    """The scene of a scenario without its actors and traffic, with the findings from its files."""
+    """Scene without actors and traffic, with the findings from its files."""
 
     scene: Scene
     support: SupportSurfaces
@@ -119,7 +119,7 @@ class StaticScene(NamedTuple):
 
 
 class _StaticObjects(NamedTuple):
-    """Objects of a static scene, without the ground."""
+    """Objects of a static scene, excluding the ground."""
 
     objects: Objects
     findings: FileFindings
@@ -138,7 +138,7 @@ class SceneCache:
         self._scenes = _LeastRecentlyUsedCache[StaticScene](max_scenes)
 
     def find(self, scenario: Scenario) -> StaticScene:
-        """Return the static scene of a scenario, from the cache or read from its files."""
+        """Return the static scene of a scenario, reading its files if it is not cached."""
         key = _cache_key(scenario)
         if scenario.scene.ground is None:
             return self._scenes.find(key, lambda: read_static_scene(scenario))
@@ -156,7 +156,7 @@ class _LeastRecentlyUsedCache(Generic[Value]):
         self._values = dict[object, Value]()
 
     def find(self, key: object, make: Callable[[], Value]) -> Value:
-        """Return the value of a key, after creating it if it is not in the cache."""
+        """Return the value for a key, creating it if it is not cached."""
         value = self._values.pop(key) if key in self._values else make()
         self._values[key] = value  # dictionaries are ordered, so the most recent value is the last
         while len(self._values) > self._max_count:
@@ -165,7 +165,7 @@ class _LeastRecentlyUsedCache(Generic[Value]):
 
 
 def _cache_key(scenario: Scenario) -> object:
-    """Return a key that is equal for scenarios that can share their static objects.
+    """Return a key that is equal for all scenarios that can share their static objects.
 
     The key consists of the scene section, the reading options, and the sizes and modification times
     of the files.
@@ -203,7 +203,7 @@ def read_static_scene(scenario: Scenario) -> StaticScene:
 
 
 def _static_scene(static: _StaticObjects, ground: SceneMesh | None) -> StaticScene:
-    """Return a scene that consists of static objects and optionally a ground."""
+    """Create a scene from static objects and an optional ground."""
     objects = static.objects
     findings = static.findings.copy()
     if ground is not None:
@@ -257,7 +257,7 @@ def _file_crs(entry: MeshFile, objects: Objects) -> FileCrs | None:
 
 
 def _check_not_empty(scenario: Scenario) -> None:
-    """Raise LidarError if a scenario has no static objects."""
+    """Raise LidarError if a scenario contains no static objects."""
     section = scenario.scene
     if section.has_seed or section.files or section.copies or section.ground is not None:
         return
@@ -273,7 +273,7 @@ def _check_not_empty(scenario: Scenario) -> None:
 
 
 class ShapeLoader:
-    """Reader of the meshes and robots of a scenario.
+    """Reader for the meshes and robots of a scenario.
 
     Shapes are cached, so that entries with the same shape share it. Notes are added to `findings`.
     """
@@ -285,7 +285,7 @@ class ShapeLoader:
         self._robots: dict[MeshFile, Robot] = {}
 
     def load_mesh(self, entry: ShapeSection) -> SceneMesh:
-        """Return the mesh of a copy, an actor or a vehicle.
+        """Return the mesh of a copy, actor or vehicle.
 
         The mesh is a box, or all objects in a file, which are merged. Entries with the same file,
         animation and wheels share a mesh, which has the name of the first of these entries. Objects
@@ -316,7 +316,7 @@ class ShapeLoader:
         return meshes[key]
 
     def load_robot(self, entry: MeshFile) -> Robot:
-        """Return the robot in a file.
+        """Return the robot that a file describes.
 
         Raise LidarError if the file cannot be used.
         """
@@ -341,7 +341,7 @@ class ShapeLoader:
         return None if entry.assets is None else self.scenario.path(entry.assets)
 
     def read_objects(self, entry: MeshFile, animation: str | None = None) -> Objects:
-        """Read the objects in a file in world coordinates.
+        """Read the objects of a file in world coordinates.
 
         `animation` is the name of the animation that the meshes play. An empty string selects the
         first animation in the file, and None selects no animation. Raise LidarError if the file
@@ -375,7 +375,7 @@ class ShapeLoader:
         return objects
 
     def _stationary_robot(self, entry: MeshFile, transform: Transform) -> Objects:
-        """Return the links of a robot as static objects, with all joints at zero."""
+        """Return the links of a robot as static objects, with all joint values at zero."""
         if refused_fields := sorted(entry.model_fields_set - _ROBOT_FIELDS):
             raise LidarError(
                 f"{self.scenario.path(entry.file)} is a robot, which is always in meters with z "
@@ -395,7 +395,7 @@ class ShapeLoader:
 def _place_copies(
     shapes: ShapeLoader, static_objects: list[SceneMesh | SceneInstance]
 ) -> list[SceneInstance]:
-    """Place the copies of a scenario on its static objects and ground, but not on other copies.
+    """Place the copies of a scenario on static objects and the ground, but not on other copies.
 
     `static_objects` are the objects of the demo and of mesh files, in world coordinates.
     """
@@ -423,7 +423,7 @@ def _place_copies(
 
 
 def _copy_extents(section: SceneSection) -> list[Floats]:
-    """Return the corners of scatter rectangles and the listed positions of copies.
+    """Return the corners of scatter rectangles and the given positions of copies.
 
     Each array has shape (n, 2) and contains world coordinates in meters.
     """
@@ -436,7 +436,7 @@ def _copy_extents(section: SceneSection) -> list[Floats]:
 
 
 def _footprints(scenario: Scenario) -> list[Floats]:
-    """Return horizontal positions that the ground of a scenario must cover.
+    """Return the horizontal positions that a scenario's ground must cover.
 
     They are the rectangles and positions of copies, the poses of the sensor and of actors, and the
     trajectories of the platform and of actors. Vehicles in traffic are not included. Each array has
@@ -456,7 +456,7 @@ def _footprints(scenario: Scenario) -> list[Floats]:
 
 
 def _horizontal_bounds(scene: Scene) -> Floats:
-    """Return the minimum and maximum x and y of a scene in world coordinates, in meters.
+    """Return the horizontal bounds of a scene in world coordinates, in meters.
 
     The result has shape (2, 2).
     """
@@ -464,7 +464,7 @@ def _horizontal_bounds(scene: Scene) -> Floats:
 
 
 def _build_ground(scenario: Scenario, static: _StaticObjects) -> SceneMesh:
-    """Return the ground of a scenario.
+    """Create the ground of a scenario.
 
     Raise LidarError if the scenario has nothing that determines the extent of the ground.
     """
@@ -479,7 +479,7 @@ def _build_ground(scenario: Scenario, static: _StaticObjects) -> SceneMesh:
 
 
 def _build_ground_mesh(section: SceneSection, footprints: Sequence[Floats]) -> SceneMesh:
-    """Return the ground in world coordinates.
+    """Create the ground mesh in world coordinates.
 
     The ground consists of two triangles. It covers all points in `footprints` with a margin.
     """
@@ -512,7 +512,7 @@ _COPY_COLUMNS = (
 def place_copies(
     entry: CopiesSection, mesh: SceneMesh, support: SupportSurfaces, path: ResolvePath
 ) -> list[SceneInstance]:
-    """Place the copies of an entry.
+    """Place the copies that an entry describes.
 
     Parameters
     ----------
@@ -549,14 +549,14 @@ def place_copies(
 
 
 class _CopyPoses(NamedTuple):
-    """Poses and scales of the copies of an entry."""
+    """Poses and scales of the copies that an entry describes."""
 
     positions: Floats  # (n, 3), world coordinates in meters; z is NaN for copies on a surface
     angles_deg: Floats  # (n, 3), yaw, pitch and roll
     scales: Floats  # (n, 3)
 
     def set_missing_heights(self, support: SupportSurfaces) -> None:
-        """Place copies without a z coordinate on the highest surface at their x and y.
+        """Place copies without a z coordinate on the highest surface at their horizontal position.
 
         Raise LidarError if there is no such surface.
         """
@@ -572,7 +572,7 @@ class _CopyPoses(NamedTuple):
             )
 
     def check_scales(self) -> None:
-        """Raise LidarError if a scale is nearly 0."""
+        """Raise LidarError if a scale is almost 0."""
         scales = self.scales
         if (np.abs(scales) < MIN_SCALE).any():
             raise LidarError(
@@ -614,7 +614,7 @@ def _read_copies(path: Path, table: CopyTable) -> _CopyPoses:
 
 
 def _scatter_copies(scatter: Scatter, name: str, support: SupportSurfaces) -> _CopyPoses:
-    """Draw random poses and scales of copies.
+    """Draw random poses and scales for copies.
 
     Positions are drawn in a rectangle, and rejected where the highest surface is not one of
     `scatter.surfaces`. Only sums, products and comparisons are used, so that the result is the same
@@ -637,7 +637,7 @@ def _scatter_copies(scatter: Scatter, name: str, support: SupportSurfaces) -> _C
 
 
 def _scatter_positions(scatter: Scatter, seeds: list[int], support: SupportSurfaces) -> Floats:
-    """Draw random positions on surfaces, in world coordinates in meters.
+    """Draw random positions on surfaces in world coordinates, in meters.
 
     `support` contains the surfaces of all objects. If none of the first positions is on a surface
     in `scatter.surfaces`, for example because these surfaces are under a roof, all other surfaces
@@ -678,7 +678,7 @@ def _scatter_positions(scatter: Scatter, seeds: list[int], support: SupportSurfa
 
 
 class _OccupiedPositions:
-    """Horizontal positions that are at least `spacing_m` apart."""
+    """Set of horizontal positions that are at least `spacing_m` apart."""
 
     def __init__(self, spacing_m: float) -> None:
         self._spacing_m = spacing_m
@@ -686,7 +686,7 @@ class _OccupiedPositions:
         self._cells: dict[tuple[int, int], list[tuple[float, float]]] = {}
 
     def try_occupy(self, x: float, y: float) -> bool:
-        """Occupy a position unless an occupied position is too close.
+        """Occupy a position, unless it is too close to an occupied position.
 
         Return whether the position was occupied by this call.
         """

@@ -1,4 +1,4 @@
-"""Estimate of the returns that a scene of surfels loses in the gaps between its surfels.
+"""Estimate of the returns that a scene of surfels loses in gaps between surfels.
 
 The points of a scanner are dense along each ring, but the rings are far apart. Surfels close gaps
 of a few point spacings, so rays can pass between distant rings. The loss is estimated for rays from
@@ -27,7 +27,7 @@ _MIN_NEIGHBORHOODS = 50  # minimum number of neighborhoods for an estimate
 
 
 def expected_loss(positions: Floats, scanners: Floats, corners: Floats) -> float | None:
-    """Estimate the share of returns that are lost in the gaps between surfels.
+    """Estimate the fraction of returns that are lost in gaps between surfels.
 
     Parameters
     ----------
@@ -63,14 +63,14 @@ def expected_loss(positions: Floats, scanners: Floats, corners: Floats) -> float
 
 
 class _Rays(NamedTuple):
-    """Rays from a scanner at the origin in directions between its points."""
+    """Rays from a scanner at the origin, with directions between the scanner's points."""
 
     directions: Floats  # (k, _RAYS, 3), unit vectors
     nearest: Floats  # (k,), minimum range of the neighbors, meters
     farthest: Floats  # (k,), maximum range of the neighbors, meters
 
     def covered_by(self, corners: Floats) -> Bools:
-        """Return whether each ray hits one of its surfels.
+        """Mark the rays that hit one of their surfels.
 
         `corners` has shape (k * _RAYS, s, 4, 3) and contains s surfels for each ray. The result has
         shape (k, _RAYS).
@@ -93,7 +93,7 @@ class _Rays(NamedTuple):
 
 
 def _rays_between(points: Floats, count: int, rng: np.random.Generator) -> Iterator[_Rays]:
-    """Yield rays around about `count` random points of a scanner at the origin.
+    """Yield rays near about `count` random points of a scanner at the origin.
 
     Points at the edge of the visible area, for example against the sky, are skipped. `points` has
     shape (n, 3).
@@ -124,19 +124,24 @@ def _rays_between(points: Floats, count: int, rng: np.random.Generator) -> Itera
 
 
 def _normalize(vectors: Floats) -> Floats:
-    """Scale vectors to length 1. Zero vectors are not changed. Shape (..., 3)."""
+    """Scale vectors to length 1, leaving zero vectors unchanged.
+
+    The vectors have shape (..., 3).
+    """
     lengths = np.sqrt(_dot(vectors, vectors))[..., None]
     return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)
 
 
 def _dot(first: Floats, second: Floats) -> Floats:
-    """Return the dot products of vectors along the last axis."""
     products: Floats = (first * second).sum(axis=-1)
     return products
 
 
 def _search_tree(points: Floats) -> Any:
-    """Return a nearest-neighbor search tree of Open3D. `points` has shape (n, 3)."""
+    """Return Open3D's nearest neighbor search for the given points.
+
+    The points have shape (n, 3).
+    """
     from open3d.core import Tensor, nns
 
     tree = nns.NearestNeighborSearch(Tensor(np.ascontiguousarray(points)))
@@ -145,7 +150,7 @@ def _search_tree(points: Floats) -> Any:
 
 
 def _nearest(tree: Any, positions: Floats, count: int) -> Ints:
-    """Return the indices of the `count` nearest points in a tree.
+    """Return the indices of the `count` points in a tree that are nearest to each position.
 
     `positions` has shape (k, 3), and the result has shape (k, count).
     """

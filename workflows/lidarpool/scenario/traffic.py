@@ -1,4 +1,4 @@
-"""Traffic from simulations, whose vehicles and persons become actors.
+"""Traffic from simulations, in which vehicles and persons become actors.
 
 This module reads floating car data (FCD) of SUMO. `osi_traffic` reads traces of ASAM OSI.
 """
@@ -127,7 +127,7 @@ class TrafficSection(Section):
     ] = "linear"
 
     def find_entry(self, vehicle_type: str) -> VehicleSection | None:
-        """Return the first entry that matches a vehicle type, or None if no entry matches."""
+        """Return the first entry that matches a vehicle type, or None if there is none."""
         for entry in self.vehicles:
             if any(matches_pattern(vehicle_type, pattern) for pattern in entry.types):
                 return entry
@@ -135,18 +135,18 @@ class TrafficSection(Section):
 
 
 class TrafficPassage(Protocol):
-    """An uninterrupted period in which a vehicle or person is in a simulation."""
+    """Uninterrupted period during which a vehicle or person is in a simulation."""
 
     @property
     def name(self) -> str:
-        """ID of the vehicle or person in the simulation."""
+        """Identifier of the vehicle or person in the simulation."""
 
     @property
     def kind(self) -> str:
         """Type of the vehicle or person in the simulation."""
 
     def entry(self, section: TrafficSection) -> VehicleSection | None:
-        """Return the entry that defines the shape.
+        """Return the entry that defines the shape of the vehicle or person.
 
         Return None for a platform without dimensions in an OSI trace. Raise LidarError if no entry
         matches a vehicle in SUMO.
@@ -155,14 +155,14 @@ class TrafficPassage(Protocol):
     def track(
         self, section: TrafficSection, mesh: SceneMesh | None, origin: Floats, start_s: float
     ) -> Track:
-        """Return the trajectory of the origin of a mesh, in local coordinates.
+        """Return the trajectory of a mesh's origin in local coordinates.
 
         If `section.surfaces` is set, the heights are relative to these surfaces.
         """
 
 
 class TravelerFilter(NamedTuple):
-    """Selection of the vehicles and persons that are read from a simulation.
+    """Selection of vehicles and persons that are read from a simulation.
 
     Attributes
     ----------
@@ -176,7 +176,7 @@ class TravelerFilter(NamedTuple):
     without: str | None = None
 
     def matches(self, *identities: str) -> bool:
-        """Return whether a vehicle or person with the given IDs is read."""
+        """Return whether the vehicle or person with the given identifiers is read."""
         if self.only is not None:
             return self.only in identities
         return self.without not in identities
@@ -193,7 +193,7 @@ class TrafficContent(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SumoPassage:
-    """Consecutive time steps with a vehicle or person in SUMO."""
+    """Consecutive SUMO time steps that contain the same vehicle or person."""
 
     name: str
     kind: str
@@ -217,7 +217,7 @@ class SumoPassage:
     def track(
         self, section: TrafficSection, mesh: SceneMesh | None, origin: Floats, start_s: float
     ) -> Track:
-        """Return the trajectory of the origin of a mesh, in local coordinates.
+        """Return the trajectory of a mesh's origin in local coordinates.
 
         If `section.surfaces` is set, the heights are relative to these surfaces.
         """
@@ -237,14 +237,14 @@ class SumoPassage:
 
 
 class TrafficClock:
-    """Converter from the times in a traffic file, which are passed one by one, to seconds."""
+    """Clock that converts consecutive times of a traffic file to seconds."""
 
     def __init__(self, time_unit: TimeUnit | None) -> None:
         self._time_unit = time_unit
         self._times: list[float] = []  # the first and the most recent time
 
     def seconds(self, time: float) -> float:
-        """Return the next time in seconds.
+        """Convert the next time to seconds.
 
         Raise ValueError if the times are implausible in seconds (see `seconds_of`).
         """
@@ -262,7 +262,7 @@ _READABLE_TIME = re.compile(r"(-?)(?:(\d+):)?(\d+):(\d\d):(\d\d(?:\.\d*)?)")
 
 
 def _readable_seconds(text: str) -> float | None:
-    """Convert a time such as 1:02:30:00.50 to seconds. The number of days may be omitted.
+    """Convert a time such as 1:02:30:00.50 to seconds, where the number of days is optional.
 
     Return None if the text has a different format.
     """
@@ -275,7 +275,7 @@ def _readable_seconds(text: str) -> float | None:
 
 
 class _PassageCollector:
-    """Collector of passages from the elements of floating car data.
+    """Collector that combines elements of floating car data into passages.
 
     Of the rows before the first time, only the last is kept.
     """
@@ -303,7 +303,7 @@ class _PassageCollector:
         self._vehicle_xy: tuple[str, str] | None = None  # of the last vehicle in the time step
 
     def collect(self, elements: Iterable[tuple[str, Mapping[str, str]]], last_s: float) -> None:
-        """Collect the passages up to a time, including the first time step after that time.
+        """Collect the passages up to a time, including the first time step after it.
 
         `elements` yields the tag and the attributes of each element. Raise ValueError if they are
         invalid.
@@ -338,7 +338,7 @@ class _PassageCollector:
         self._vehicle_xy = None
 
     def add_row(self, tag: str, attributes: Mapping[str, str]) -> None:
-        """Add the row of a vehicle or person.
+        """Add the data of a vehicle or person in the current time step.
 
         Raise ValueError or KeyError if the row is invalid.
         """
@@ -371,7 +371,7 @@ class _PassageCollector:
         passage.rows.extend(row)
 
     def _passage(self, tag: str, attributes: Mapping[str, str]) -> SumoPassage:
-        """Return the passage that an element continues, or a new passage."""
+        """Return the passage that an element continues, or start a new passage."""
         traveler = tag, attributes["id"]
         last_step, passage = self.travelers.get(traveler, (-2, None))
         # SUMO omits vehicles while they are teleported.
@@ -384,7 +384,7 @@ class _PassageCollector:
 
 
 def _parse_number(element: str, key: str, text: str) -> float:
-    """Return the value of an attribute.
+    """Return the value of an attribute as a number.
 
     Raise ValueError if the value is not a number.
     """
@@ -403,7 +403,7 @@ def read_fcd(
     last_s: float,
     travelers: TravelerFilter = TravelerFilter(),  # noqa: B008 - immutable
 ) -> TrafficContent:
-    """Read the vehicles and persons between two times from floating car data of SUMO.
+    """Read the vehicles and persons between two times from SUMO's floating car data.
 
     The rows include the last time step before and the first time step after this interval. The file
     can have any length, because other rows are discarded while the file is read. An `Allowance`
@@ -446,7 +446,7 @@ def read_fcd(
 
 
 def _check_ignored(tag: str, names: Set[str], ignore: Sequence[str]) -> None:
-    """Raise ValueError if an attribute name does not match any pattern in `ignore`."""
+    """Raise ValueError if an attribute name matches none of the patterns in `ignore`."""
     for name in sorted(names):
         if not any(matches_pattern(name, pattern) for pattern in ignore):
             raise ValueError(
@@ -456,7 +456,7 @@ def _check_ignored(tag: str, names: Set[str], ignore: Sequence[str]) -> None:
 
 
 def _iter_elements(path: Path) -> Iterator[tuple[str, Mapping[str, str]]]:
-    """Yield the tag and attributes of each element in an XML file, which is read in chunks.
+    """Read an XML file in chunks, and yield the tag and attributes of each element.
 
     Raise LidarError if a .gz file decompresses to far more than its size.
     """
@@ -482,7 +482,7 @@ def platform_track(
     load_mesh: Callable[[VehicleSection], SceneMesh],
     support: SupportSurfaces,
 ) -> Track:
-    """Return the local trajectory of the vehicle in the traffic that carries the sensors.
+    """Return the local trajectory of the vehicle in traffic that carries the sensors.
 
     The platform frame is the frame of the mesh of the vehicle.
 
@@ -555,7 +555,7 @@ def build_traffic_actors(
     support: SupportSurfaces,
     start_s: float,
 ) -> list[tuple[Actor, VehicleSection]]:
-    """Create actors from passages, in the local coordinates of a scene.
+    """Create actors from passages, in local coordinates.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""Show sweeps in third-party viewers while they are simulated: Foxglove and Rerun."""
+"""Show sweeps in Foxglove or Rerun while they are being simulated."""

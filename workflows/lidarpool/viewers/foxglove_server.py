@@ -50,7 +50,7 @@ _UNIT = messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
 
 
 class FoxgloveServer(Viewer):
-    """WebSocket server for Foxglove, which only listens on the loopback interface.
+    """WebSocket server for Foxglove, which listens only on the loopback interface.
 
     The server of the SDK has no token and does not check `Origin`. Every program that can connect
     can therefore read all messages, including scripts of any website in a browser on this machine.
@@ -111,12 +111,12 @@ class FoxgloveServer(Viewer):
 
     @property
     def link(self) -> str:
-        """Address that opens Foxglove in a browser, with this server as the data source."""
+        """Address that opens Foxglove in a browser and connects it to this server."""
         return f"https://app.foxglove.dev/?{self._source}"
 
     @property
     def desktop_link(self) -> str:
-        """Address that opens the Foxglove desktop application with this server."""
+        """Address that opens the Foxglove desktop application and connects it to this server."""
         return f"foxglove://open?{self._source}"
 
     @property
@@ -144,11 +144,14 @@ class FoxgloveServer(Viewer):
             self.show_path(surroundings.path)
 
     def show_path(self, path: Floats) -> None:
-        """Show a planned path in world coordinates, of shape (w, 3), in meters."""
+        """Show a planned path in world coordinates, in meters.
+
+        The path has shape (w, 3).
+        """
         self._send_entities(_PATH, [_entity("path", lines=[_line(path, _GREEN)])])
 
     def show_sweep(self, shown: ShownSweep) -> None:
-        """Show the points, frames and actor boxes of a sweep without waiting for clients."""
+        """Show a sweep's points, frames and actor boxes without waiting for clients."""
         self._start_ns = shown.start_ns
         if self._sends_time:
             self._server.broadcast_time(shown.start_ns)
@@ -182,19 +185,16 @@ class FoxgloveServer(Viewer):
         self._send(topic, channels.SceneUpdateChannel, update, self._start_ns)
 
     def _send(self, topic: str, kind: Callable[..., Any], message: Any, time_ns: int) -> None:
-        """Send a message to all subscribers of a topic."""
         channel = self._channel(topic, kind)
         self._latest[topic] = message, time_ns
         channel.log(message, log_time=time_ns)
 
     def _channel(self, topic: str, kind: Callable[..., Any]) -> Any:
-        """Return the channel of a topic, which is created and advertised if necessary."""
         if topic not in self._channels:
             self._channels[topic] = kind(topic, context=self._context)
         return self._channels[topic]
 
     def _send_again(self, topic: str) -> None:
-        """Send the latest message of a topic to all subscribers again."""
         if topic in self._latest:
             message, time_ns = self._latest[topic]
             self._channels[topic].log(message, log_time=time_ns)
@@ -207,12 +207,11 @@ class _SubscriptionListener(ServerListener):
         self._subscribed = subscribed
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        """Report the topic of a new subscription."""
         self._subscribed(channel.topic)
 
 
 def packed_points(shown: ShownSweep) -> Records:
-    """Pack the points of a sweep into records of x, y and z in float32, and all columns."""
+    """Pack a sweep's points into records, with x, y and z as float32 and all columns."""
     values: dict[str, AnyArray] = dict(zip("xyz", shown.positions.T, strict=True))
     values |= shown.columns
     kinds = [(name, column.dtype.newbyteorder("<")) for name, column in values.items()]
@@ -251,7 +250,7 @@ def _transform(transform: FramePose, stamp: Any) -> Any:
 
 
 def _actors(boxes: ActorBoxes, stamp: Any) -> Any:
-    """Return the boxes of present actors, and deletions for absent actors."""
+    """Return boxes for the actors that are present, and deletions for those that are not."""
     entities = []
     deletions = []
     for number, name in enumerate(boxes.names):
@@ -307,7 +306,10 @@ def _triangle_list(surface: Surface, face_indices: Any, pose: Any, color: Any) -
 
 
 def _line(positions: Floats, color: Any) -> Any:
-    """Return a line through positions of shape (k, 3), relative to the first position."""
+    """Return a line through the given positions, relative to the first position.
+
+    The positions have shape (k, 3).
+    """
     return messages.LinePrimitive(
         type=messages.LinePrimitiveLineType.LineStrip,
         pose=_pose(positions[0]),
@@ -319,7 +321,7 @@ def _line(positions: Floats, color: Any) -> Any:
 
 
 def _entity(name: str, **primitives: Any) -> Any:
-    """Return an entity in world coordinates, which replaces any entity with its name."""
+    """Return an entity in world coordinates, which replaces any entity of the same name."""
     return messages.SceneEntity(id=name, frame_id=WORLD, frame_locked=True, **primitives)
 
 

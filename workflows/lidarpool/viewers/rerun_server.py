@@ -1,4 +1,4 @@
-"""Send sweeps to a Rerun server, to which viewers in browsers and on desktops connect."""
+"""Send sweeps to a Rerun server, to which browser and desktop viewers connect."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _READY_S = 20.0
 
 
 class RerunServer(Viewer):
-    """Rerun server in a separate process, with a viewer page for browsers.
+    """Rerun server in a separate process, which also serves a viewer page for browsers.
 
     Parameters
     ----------
@@ -68,15 +68,18 @@ class RerunServer(Viewer):
         self._log.show_surroundings(surroundings)
 
     def show_path(self, path: Floats) -> None:
-        """Show a planned path in world coordinates, of shape (w, 3), in meters."""
+        """Show a planned path in world coordinates, in meters.
+
+        The path has shape (w, 3).
+        """
         self._log.show_path(path)
 
     def show_sweep(self, shown: ShownSweep) -> None:
-        """Show the points, frames and actor boxes of a sweep without waiting for viewers."""
+        """Show a sweep's points, frames and actor boxes without waiting for viewers."""
         self._log.show_sweep(shown)
 
     def close(self) -> None:
-        """Send pending messages, and stop the server."""
+        """Send the pending messages, and stop the server."""
         self._recording.disconnect()
         assert self._process.stdin is not None
         self._process.stdin.close()

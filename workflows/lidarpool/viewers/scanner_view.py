@@ -45,11 +45,11 @@ class ScannerView(ABC):
     @property
     @abstractmethod
     def description(self) -> str:
-        """Message for users that contains the addresses to open."""
+        """Message for users, which contains the addresses to open."""
 
     @abstractmethod
     def _send(self, scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> None:
-        """Send a sweep that started at `time_ns` on the clock of trajectories."""
+        """Send a sweep that started at `time_ns` on the trajectories' clock."""
 
     @abstractmethod
     def _end(self) -> None:
@@ -63,7 +63,7 @@ class ScannerView(ABC):
         start_s: float = 0.0,
         scanner: Scanner | None = None,
     ) -> None:
-        """Show a sweep with its frames and the boxes of the actors.
+        """Show a sweep with its frames and actor boxes.
 
         The method does not wait for clients. The time of the sweep is the time of the call.
 
@@ -101,7 +101,7 @@ class ScannerView(ABC):
 
 
 class _ExternalScannerView(ScannerView):
-    """View of a scanner in a third-party viewer."""
+    """Scanner view in a third-party viewer."""
 
     def __init__(self, viewer: Viewer, scanner: Scanner) -> None:
         super().__init__(scanner)
@@ -118,7 +118,6 @@ class _ExternalScannerView(ScannerView):
 
     @property
     def description(self) -> str:
-        """Message for users that contains the addresses to open."""
         return self._viewer.description
 
     def _send(self, scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> None:
@@ -129,7 +128,7 @@ class _ExternalScannerView(ScannerView):
 
 
 class Foxglove(_ExternalScannerView):
-    """Show the sweeps of a scanner in Foxglove, in real time.
+    """Show the sweeps of a scanner in Foxglove in real time.
 
     The object is a context manager. It prints the link that opens Foxglove.
 
@@ -154,7 +153,7 @@ class Foxglove(_ExternalScannerView):
 
 
 class Rerun(_ExternalScannerView):
-    """Show the sweeps of a scanner in Rerun, in real time.
+    """Show the sweeps of a scanner in Rerun in real time.
 
     The object is used like `Foxglove`. It prints the link of the viewer in the browser. By default,
     it listens on 127.0.0.1:9876, and the page is served on the next port. It requires rerun-sdk
@@ -167,7 +166,7 @@ class Rerun(_ExternalScannerView):
 
 
 def _sweep_for_viewers(scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> ShownSweep:
-    """Return a sweep of a scanner, with frames and boxes, for viewers."""
+    """Convert a scanner's sweep to a form that viewers can show, with frames and boxes."""
     scene = scanner.scene
     (mounted,) = scanner.survey.carried
     vehicle = pose_at(pose, time_ns)
@@ -198,7 +197,7 @@ def _sweep_for_viewers(scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float
 
 
 def _boxes(scanner: Scanner, cloud: Cloud, poses: list[Pose], time_ns: float) -> ActorBoxes:
-    """Return the boxes of the actors in a scanner's scene at their poses."""
+    """Return the boxes of the actors in a scanner's scene, given their poses."""
     scene = scanner.scene
     actors = scene.actors
     bounds = np.array([actor.bounds for actor in actors])
@@ -220,17 +219,16 @@ def _boxes(scanner: Scanner, cloud: Cloud, poses: list[Pose], time_ns: float) ->
 
 
 def is_present(actor: Actor, time_ns: float) -> bool:
-    """Return whether an actor is in the scene at a time in nanoseconds."""
+    """Return whether an actor is in the scene at a given time in nanoseconds."""
     appears_ns, leaves_ns = presence_ns(actor.trajectory)
     return appears_ns <= time_ns <= leaves_ns
 
 
 def pose_at(pose: Any, time_ns: float) -> Pose:
-    """Return the pose of a trajectory at a time, or a pose unchanged."""
+    """Return a trajectory's pose at a given time, or return a single pose unchanged."""
     is_trajectory = hasattr(pose, "poses")
     return pose.pose(0, time_ns) if is_trajectory else as_pose("pose", pose)
 
 
 def _position_and_quaternion(pose: Pose, origin: Floats) -> tuple[Floats, Floats]:
-    """Return the world position and the quaternion of a pose in local coordinates."""
     return np.array(pose.position) + origin, quaternions_of(pose.rotation_matrix[None])[0]

@@ -1,4 +1,4 @@
-"""Interface of viewers and the addresses on which they listen."""
+"""Interface of viewers, and the addresses on which they listen."""
 
 from __future__ import annotations
 
@@ -42,11 +42,14 @@ class Viewer(ABC):
 
     @abstractmethod
     def show_path(self, path: Floats) -> None:
-        """Show a planned path in world coordinates, of shape (w, 3), in meters."""
+        """Show a planned path in world coordinates, in meters.
+
+        The path has shape (w, 3).
+        """
 
     @abstractmethod
     def show_sweep(self, shown: ShownSweep) -> None:
-        """Show the points, frames and actor boxes of a sweep without waiting for clients."""
+        """Show a sweep's points, frames and actor boxes without waiting for clients."""
 
     @abstractmethod
     def close(self) -> None:
@@ -67,7 +70,7 @@ class Viewer(ABC):
 def open_viewer(
     name: str, to: str | None = None, title: str = "lidarpool", **options: Any
 ) -> Viewer:
-    """Start a viewer by name.
+    """Start the viewer with the given name.
 
     Parameters
     ----------
@@ -93,7 +96,7 @@ def open_viewer(
 
 
 def check_installed(name: str) -> None:
-    """Raise LidarError if the package of a viewer is not installed."""
+    """Raise LidarError if the package that a viewer requires is not installed."""
     row = VIEWERS[name]
     if find_spec(row.package) is None:
         command = install_command(f"lidarpool[{row.extra}]")
@@ -101,7 +104,7 @@ def check_installed(name: str) -> None:
 
 
 class Address(NamedTuple):
-    """Address and port on which a viewer listens."""
+    """Network address and port on which a viewer listens."""
 
     host: str
     port: int
@@ -156,12 +159,12 @@ class Address(NamedTuple):
 
     @property
     def is_loopback(self) -> bool:
-        """Whether only this machine can connect."""
+        """Whether only this machine can connect to the address."""
         entries = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM)
         return all(ip_address(entry[4][0]).is_loopback for entry in entries)
 
     def _check_free(self, count: int) -> None:
-        """Raise LidarError unless servers can listen on `count` ports from `port` on."""
+        """Raise LidarError unless servers can listen on `count` ports starting at `port`."""
         for port in range(self.port, self.port + count):
             try:
                 family, kind, protocol, _, socket_address = socket.getaddrinfo(

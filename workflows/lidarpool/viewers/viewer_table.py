@@ -1,4 +1,4 @@
-"""Table of viewers, which can be imported quickly for command-line help."""
+"""Table of viewers that can be imported quickly, for example for command-line help."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class ViewerRow(NamedTuple):
-    """Class and packages of a viewer."""
+    """Class of a viewer, and the packages that it requires."""
 
     target: str  # MODULE:CLASS, which is called with an address and a title
     package: str  # name of the import package

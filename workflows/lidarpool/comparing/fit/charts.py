@@ -1,4 +1,4 @@
-"""Charts of a fit, which show curves and values by ring with their confidence intervals."""
+"""Charts of a fit, with confidence intervals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .estimates import Estimate
 
 
 class _Chart(NamedTuple):
-    """Axis labels of a chart, and the factor that converts values to the unit of the y axis."""
+    """Axis labels of a chart, and a factor that converts values to the unit of the y axis."""
 
     x_label: str
     y_label: str
@@ -37,7 +37,7 @@ _CHARTS = {
 
 
 def draw_charts(figures: Mapping[str, Any]) -> Page:
-    """Draw all curves, and the values by ring, with their confidence intervals."""
+    """Draw all curves and the values of each ring, with confidence intervals."""
     channels = figures["channels"]
     curves = dict(figures["curves"])
     for name in ("noise_m", "bias_m", "uneven_deg"):
@@ -59,7 +59,7 @@ def draw_charts(figures: Mapping[str, Any]) -> Page:
 
 
 def _draw_curve(page: Page, axes: Axes, name: str, points: Sequence[Mapping[str, float]]) -> None:
-    """Draw the points of the curve `name` (a key of `_CHARTS`) and their confidence intervals."""
+    """Draw the points of a curve with confidence intervals."""
     chart = _CHARTS[name]
     x = np.array([point["x"] for point in points])
     value, lower, upper = (

@@ -1,4 +1,4 @@
-"""Estimated values with 95 % confidence intervals."""
+"""Estimates with 95 % confidence intervals."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _CONFIDENCE_SIGMAS = 1.959964  # half width of the interval of a normal distribu
 
 
 class Estimate(NamedTuple):
-    """An estimated value with its confidence interval."""
+    """Estimate of a value, with its confidence interval."""
 
     value: float
     low: float
@@ -22,13 +22,13 @@ class Estimate(NamedTuple):
 
     @classmethod
     def from_variance(cls, value: Any, variance: Any) -> Estimate:
-        """Create the estimate of a normally distributed value from its variance."""
+        """Create an estimate of a normally distributed value with the given variance."""
         half = _CONFIDENCE_SIGMAS
         return cls(*(float(value + sigmas * np.sqrt(variance)) for sigmas in (0, -half, half)))
 
     @classmethod
     def from_values(cls, values: Floats) -> Estimate:
-        """Estimate the mean of the values."""
+        """Estimate the mean of the given values."""
         return cls.from_variance(values.mean(), values.var() / len(values))
 
     @classmethod
@@ -57,11 +57,11 @@ class Estimate(NamedTuple):
         return cls(share, float(lower), float(upper))
 
     def is_within(self, share: float) -> bool:
-        """Return True if half of the interval is at most the fraction `share` of the value."""
+        """Return True if half of the confidence interval is at most `share` times the value."""
         return self.high - self.low <= 2 * share * abs(self.value)
 
     def power(self, exponent: float, scale: float = 1.0) -> Estimate:
-        """Return the estimate of `scale` times a power of the value.
+        """Return the estimate of the value raised to a power and multiplied by `scale`.
 
         Negative values are treated as 0.
         """

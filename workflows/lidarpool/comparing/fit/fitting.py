@@ -1,4 +1,4 @@
-"""Fit the performance parameters of a sensor to a recording, and save a sensor file and a report.
+"""Fit a sensor's performance parameters to a recording, and save a sensor file and a report.
 
 Confidence intervals have a level of 95 %. The axes of arrays are described in `stack`.
 """
@@ -42,7 +42,7 @@ _MAX_RING_OFFSET_DEG = 2.0  # a ring farther from all beams of a model is not on
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit:
-    """Result of `fit`, which is printed as a table."""
+    """Result of `fit`, whose text representation is a table."""
 
     figures: dict[str, Any]  # numbers and texts of the page; lengths in meters
     model: SensorModel  # the sensor with the fitted performance
@@ -51,7 +51,7 @@ class Fit:
         return render_template("fit.txt", report=self.figures).rstrip("\n")
 
     def save(self, file: str | Path) -> list[Path]:
-        """Write the sensor file, and an .html report next to it, and return both paths.
+        """Write the sensor file and an HTML report next to it, and return both paths.
 
         Raises
         ------
@@ -87,7 +87,7 @@ def fit(
     intensity: str | None = None,
     white: float | None = None,
 ) -> Fit:
-    """Fit the performance parameters of a sensor to recorded sweeps.
+    """Fit a sensor's performance parameters to recorded sweeps.
 
     The sensor must be stationary, unless a scene of the recorded place and the poses are available.
 
@@ -152,7 +152,6 @@ def fit(
 
 
 def _fit_of(recording: Recording, measured: SensorMeasurement, base: SensorModel) -> Fit:
-    """Create the fit of a sensor from the measured performance."""
     stack = measured.stack
     name = Path(recording.name).name
     source = f"fitted by lidarpool {__version__} to {name}, {plural(stack.sweep_count, 'sweep')}"
@@ -179,7 +178,6 @@ def _fit_of(recording: Recording, measured: SensorMeasurement, base: SensorModel
 
 
 def _has_rings(model: SensorModel, stack: SweepStack) -> bool:
-    """Return True if each ring has a beam nearby, or if a calibration file defines the beams."""
     offset_deg = np.abs(stack.elevation_deg[:, None] - (model.beams.elevation_deg or np.inf))
     is_near = not offset_deg.min(axis=1).max() > _MAX_RING_OFFSET_DEG
     return model.needs_calibration or is_near
@@ -188,7 +186,7 @@ def _has_rings(model: SensorModel, stack: SweepStack) -> bool:
 def _with_performance(
     base: SensorModel, estimates: Mapping[str, Estimate], source: str
 ) -> SensorModel:
-    """Return a sensor whose performance is updated with `SensorMeasurement.estimates`.
+    """Return a sensor model whose performance parameters are replaced with the estimates.
 
     Parameters without an estimate keep their values. The parameters of range noise belong together:
     an estimate of one of them replaces all of them, and also `precision`.
@@ -209,7 +207,7 @@ def _with_performance(
 
 
 def recorded_sensor(stack: SweepStack) -> SensorModel:
-    """Return a sensor model with the beams of a recording."""
+    """Return a sensor model whose beams are those of the recording."""
     return SensorModel(
         name="Recorded sensor",
         sources={"angles": "median angles of the recorded points"},

@@ -1,4 +1,4 @@
-"""Known poses of the sweeps in a recording, from the recording itself or from the user."""
+"""Poses of a recording's sweeps that are stored in the recording or given by the user."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _MIN_SPEED_DEG = 0.005  # smaller rotations between sweeps are not reported
 
 @dataclass(frozen=True, eq=False)
 class KnownPoses:
-    """Poses of sweeps in the frame of a scene, or in world coordinates without a scene."""
+    """Poses of sweeps in scene coordinates, or in world coordinates if there is no scene."""
 
     numbers: Ints  # (n,): numbers of the sweeps
     matrices: Floats  # (n, 4, 4): from the sensor frame at the start of each sweep
@@ -47,7 +47,7 @@ class KnownPoses:
     def from_recording(
         cls, recording: Recording, pose: Any, scene: Scene | None
     ) -> KnownPoses | None:
-        """Return the poses from the user or the recording, or None if they are unknown.
+        """Return the poses given by the user or stored in the recording, or None if there are none.
 
         Raises LidarError unless `pose` is a single pose or contains one pose for each sweep.
         """
@@ -68,11 +68,11 @@ class KnownPoses:
         return cls(numbers, recorded, False, origin)
 
     def are_of_firings(self, recording: Recording) -> bool:
-        """Return True if each firing has its own pose, as in a result."""
+        """Return True if each firing has its own pose, as in a result of lidarpool."""
         return not self.are_given and recording.fired is not None
 
     def speed(self, recording: Recording) -> Speed | None:
-        """Return the mean motion between consecutive sweeps, or None for a stationary sensor."""
+        """Return the mean motion between consecutive sweeps, or None if the sensor stands still."""
         positions = self.matrices[:, :3, 3]
         rotations = self.matrices[:, :3, :3]
         is_exact = self.are_given or self.are_of_firings(recording)
@@ -91,7 +91,7 @@ class KnownPoses:
         return Speed(shift_m, turn_deg if turn_deg > _MIN_SPEED_DEG else 0.0, period_ns)
 
     def fired(self, recording: Recording) -> Callable[[int], Sweep]:
-        """Return a function that reads a sweep as fired, with `firing_poses` in the scene frame.
+        """Return a function that reads a sweep's original firings and their poses in the scene.
 
         A result records the pose of each pulse. In other recordings, the pose of a sweep is used
         for all its pulses. Raises LidarError if only some sweeps of the recording have poses.
@@ -108,7 +108,7 @@ class KnownPoses:
         return read_in_scene
 
     def _of_whole_sweeps(self, recording: Recording) -> Callable[[int], Sweep]:
-        """Return a function that reads a sweep and assigns the same pose to all its pulses."""
+        """Return a function that reads a sweep and assigns the sweep's pose to all its pulses."""
         matrices = self.matrices
         if not self.are_given:
             recorded = recording.poses(range(recording.count))
@@ -127,7 +127,7 @@ class KnownPoses:
 
 
 def _given_matrices(pose: Any, recording: Recording) -> Floats:
-    """Convert a single pose, or one pose for each sweep, to an array of matrices."""
+    """Convert a single pose, or one pose per sweep, to an array of matrices."""
     if isinstance(pose, np.ndarray) and pose.shape[-2:] == (4, 4):
         matrices = pose.astype(np.float64).reshape(-1, 4, 4)
         check_rotations(matrices[:, :3, :3])
@@ -148,6 +148,5 @@ def _given_matrices(pose: Any, recording: Recording) -> Floats:
 
 
 def _angles_deg(first: Floats, second: Floats) -> Floats:
-    """Return the angles between pairs of rotations in degrees."""
     traces = np.einsum("nij,nij->n", *np.broadcast_arrays(first, second))
     return np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))

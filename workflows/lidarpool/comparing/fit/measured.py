@@ -1,4 +1,4 @@
-"""Measure the noise, losses and bias of a sensor from the rays of a recording."""
+"""Measure a sensor's noise, losses and range bias, using the rays of a recording."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Curve = list[dict[str, float]]  # points, each with x, value, low and high
 
 @dataclass(frozen=True, eq=False)
 class SensorMeasurement:
-    """Rays on smooth surfaces, and the sensor performance fitted to their returns."""
+    """Rays on smooth surfaces, and the sensor performance estimated from them."""
 
     stack: SweepStack
     rays: SmoothRays
@@ -54,7 +54,7 @@ class SensorMeasurement:
     moves: bool = False  # whether the sensor moves
 
     def curves(self) -> dict[str, Curve]:
-        """Compute the curves of noise, returns and intensity as {name in `charts`: points}."""
+        """Compute all curves for `charts`, keyed by chart name."""
         rays = self.rays
         light = rays.intensity if self.energy is None else self.energy
         variance = np.where(rays.freedom > 0, rays.variance, np.nan)
@@ -73,7 +73,7 @@ class SensorMeasurement:
         return curves
 
     def _range_variances(self) -> Floats:
-        """Return the range variance of each ray in m², without the contribution of angle noise.
+        """Return each ray's range variance in m², excluding the contribution of angle noise.
 
         The variance of a single return is NaN.
         """
@@ -84,7 +84,7 @@ class SensorMeasurement:
         return np.asarray(variance - (direction_noise_rad * rays.slope) ** 2)
 
     def channels(self) -> list[dict[str, Any]]:
-        """Return the noise, bias and azimuth spread of each ring, with one dictionary per ring."""
+        """Return a dictionary for each ring, which contains its noise, bias and azimuth spread."""
         stack = self.stack
         row_of_ray = self.rays.row
         range_variance = self._range_variances()
@@ -106,7 +106,7 @@ class SensorMeasurement:
 def measure_standing(
     recording: Recording, white: float | None, scene: Scene | None, poses: KnownPoses | None
 ) -> SensorMeasurement:
-    """Measure a stationary sensor from its returns on smooth surfaces.
+    """Measure a stationary sensor, using its returns from smooth surfaces.
 
     `white` is the intensity of a white surface. Raises LidarError if the sensor moves, if it is not
     at its pose in the scene, or if too few rays hit smooth surfaces.
@@ -138,7 +138,7 @@ def measure_standing(
 def measure_moving(
     recording: Recording, white: float | None, scene: Scene, poses: KnownPoses
 ) -> SensorMeasurement:
-    """Measure a moving sensor from its pulses on the surfaces of a scene.
+    """Measure a moving sensor, using its pulses that hit smooth surfaces of a scene.
 
     `white` is the intensity of a white surface. Raises LidarError if the sensor is not at its poses
     in the scene, or if too few pulses hit smooth surfaces.
@@ -163,7 +163,7 @@ def measure_moving(
 
 
 def _check_rays(count: int, name: str) -> None:
-    """Raise LidarError if there are too few rays on smooth surfaces."""
+    """Raise LidarError if too few rays hit smooth surfaces."""
     if count < MIN_RAYS:
         raise LidarError(
             f"{name} has only {count} rays on smooth surfaces, but at least {MIN_RAYS} are "
@@ -172,7 +172,7 @@ def _check_rays(count: int, name: str) -> None:
 
 
 def _scene_ranges(stack: SweepStack, scene: Scene, poses: KnownPoses | None) -> Floats:
-    """Return the range of the scene in each cell in meters, or NaN if the ray hits nothing."""
+    """Return the distance of the scene in each cell in meters, or NaN if the ray hits nothing."""
     rays = stack.directions.reshape(-1, 3)
     sensor = ListedSensor(head=Spin(len(rays), 360), rays=rays, shot_ns=np.zeros(len(rays)))
     pose = np.eye(4) if poses is None else poses.matrices[0]
@@ -181,7 +181,7 @@ def _scene_ranges(stack: SweepStack, scene: Scene, poses: KnownPoses | None) -> 
 
 
 def _check_pose(near_share: float, name: str) -> None:
-    """Raise LidarError unless at least half of the ranges agree with the scene."""
+    """Raise LidarError unless at least half of the ranges match the scene."""
     if not near_share > _MIN_SCENE_SHARE:
         message = (
             f"Less than half of the points in {name} are within {SCENE_TOLERANCE_M} m of the scene."
@@ -192,7 +192,7 @@ def _check_pose(near_share: float, name: str) -> None:
 
 
 def _lost_by_range(stack: SweepStack, expected: Floats) -> Curve:
-    """Compute the fraction of lost pulses as a function of the range of the scene."""
+    """Compute the fraction of lost pulses as a function of the expected range."""
     surfaces = find_surfaces(stack, expected, 0 * stack.rough_sigma)
     cells = surfaces.smooth & (stack.trials > 0)
     returned = np.isfinite(stack.ranges).sum(axis=0)
@@ -201,7 +201,7 @@ def _lost_by_range(stack: SweepStack, expected: Floats) -> Curve:
 
 
 def _pulse_energies(rays: SmoothRays, white: float | None, are_energies: bool) -> Floats | None:
-    """Return the mean energy of the returns of each ray, or None if it is unknown.
+    """Return the mean energy of each ray's returns, or None if it is unknown.
 
     A white surface at 10 m has an energy of 1. If `are_energies` is true, the recorded intensities
     are already energies. `white` is the intensity of a white surface, or None if it is unknown.
@@ -231,18 +231,17 @@ def _bias(
 
 
 def _pulse_bias(pulses: ScenePulses) -> dict[int, Estimate]:
-    """Estimate the range bias of each row in meters from returns that are not too oblique."""
+    """Estimate the range bias of each row in meters, excluding returns at grazing incidence."""
     returned = np.isfinite(pulses.residual) & (pulses.slope < FLAT_TANGENT * pulses.expected)
     return _mean_by_row(pulses.row[returned], pulses.residual[returned])
 
 
 def _mean_by_row(row: Ints, errors: Floats) -> dict[int, Estimate]:
-    """Estimate the mean error of each row that occurs in `row`."""
     return {number: Estimate.from_values(errors[row == number]) for number in set(row.tolist())}
 
 
 def _root_mean(variances: Floats) -> dict[str, float] | None:
-    """Estimate the root of the mean of finite variances, or return None if there are too few."""
+    """Estimate the root mean of the finite variances, or return None if there are too few."""
     finite = variances[np.isfinite(variances)]
     if len(finite) < MIN_RAYS:
         return None
@@ -250,7 +249,7 @@ def _root_mean(variances: Floats) -> dict[str, float] | None:
 
 
 def _curve(x: Floats, values: Floats, power: float = 1.0) -> Curve:
-    """Compute a curve of values over x, with one point for each interval of x.
+    """Compute a curve of values over x with one point per interval of x.
 
     The intervals contain equal numbers of finite values, at least `MIN_RAYS`. The x of a point is
     the median in its interval, and its value is the mean of the interval raised to `power`.

@@ -1,4 +1,4 @@
-"""Compare the pulses of a moving sensor, whose firing poses are known, with a scene.
+"""Compare pulses of a moving sensor with a scene, given the pose of the sensor at each firing.
 
 No two pulses share a ray, so a ray has no mean range, and the scene provides the expected range.
 Arrays for a sweep have r rows and c columns, as described in `stack`.
@@ -48,7 +48,10 @@ _LIGHT_COLUMNS = 3  # number of cells on either side whose intensities are avera
 
 @dataclass(frozen=True, eq=False)
 class ScenePulses:
-    """Pulses that hit smooth surfaces of a scene. All arrays have shape (n,)."""
+    """Pulses that hit smooth surfaces of a scene.
+
+    All arrays have shape (n,).
+    """
 
     row: Ints
     column: Ints
@@ -59,16 +62,16 @@ class ScenePulses:
     difference: Floats  # residual minus the next residual in the ring; NaN if unknown
 
     def rough_sigma(self) -> Floats:
-        """Estimate the standard deviation of each pulse's range in meters, to detect outliers."""
+        """Estimate each pulse's range noise in meters. It is used only to detect outliers."""
         scatter_m = float(np.nanmedian(np.abs(self.difference))) / (0.6745 * np.sqrt(2))
         return np.hypot(scatter_m, ASSUMED_DIRECTION_NOISE_RAD * self.slope)
 
     def select(self, chosen: Bools | Indices) -> ScenePulses:
-        """Select pulses by mask or index."""
+        """Select pulses with a mask or with indices."""
         return ScenePulses(*(values[chosen] for values in vars(self).values()))
 
     def near_scene(self, sigma: Floats) -> Bools:
-        """Mark pulses that are lost, or whose range agrees with the scene.
+        """Mark pulses that are lost or whose range matches the scene.
 
         `sigma` is the standard deviation of each range.
         """
@@ -76,7 +79,7 @@ class ScenePulses:
         return ~(np.abs(self.residual) > limit_m)  # NaN is marked, too
 
     def rays(self, sigma: Floats) -> SmoothRays:
-        """Convert the pulses to rays with one pulse each.
+        """Convert each pulse to a ray with a single pulse.
 
         `sigma` is the standard deviation of each range. The variances of the rays are derived from
         differences between neighboring pulses, in which errors of the poses and of the scene cancel
@@ -99,7 +102,7 @@ class ScenePulses:
 
 
 class SweepPulses(NamedTuple):
-    """Pulses on smooth surfaces of the scene, from one sweep or from all sweeps."""
+    """Pulses of one or more sweeps that hit smooth surfaces of the scene."""
 
     pulses: ScenePulses
     compared: int  # number of returns where the scene has a surface
@@ -107,7 +110,7 @@ class SweepPulses(NamedTuple):
 
     @classmethod
     def joined(cls, sweeps: Sequence[SweepPulses]) -> SweepPulses:
-        """Join the pulses of several sweeps.
+        """Concatenate the pulses of several sweeps.
 
         If there are too many pulses, they are sampled evenly.
         """
@@ -137,7 +140,7 @@ def measure_pulses(
 
 
 class _CellReturns(NamedTuple):
-    """The return of each cell in a sweep, or the closest return in azimuth on the same ring."""
+    """Each cell's return or, if the cell has none, the closest return of the same ring."""
 
     points: Floats  # (r, c, 3): meters, in the sensor frame at the firing of each point
     beside: Floats  # (2, r, c, 3): returns of the ring before and after the cell, like `points`
@@ -148,7 +151,7 @@ class _CellReturns(NamedTuple):
 
     @classmethod
     def from_sweep(cls, stack: SweepStack, sweep: int, fired: Sweep) -> _CellReturns:
-        """Find the returns for the cells of a sweep."""
+        """Find the returns of all cells in a sweep."""
         points = fired.points
         rings = fired.rings
         assert rings is not None
@@ -169,7 +172,7 @@ class _CellReturns(NamedTuple):
 
 
 class _NearestReturns(NamedTuple):
-    """The returns on the same ring that are closest in azimuth to each cell of a sweep.
+    """Returns that are closest in azimuth to each cell of a sweep, on the same ring.
 
     Distances are infinite in rings without a return.
     """
@@ -183,7 +186,7 @@ class _NearestReturns(NamedTuple):
     def from_sweep(
         cls, stack: SweepStack, sweep: int, points: Floats, rings: Ints
     ) -> _NearestReturns:
-        """Find the points that are closest in azimuth to the cells of a sweep.
+        """Find the points of a sweep that are closest in azimuth to each cell.
 
         `rings` contains the ring of each point.
         """
@@ -207,7 +210,7 @@ class _NearestReturns(NamedTuple):
 
     @classmethod
     def _for_ring(cls, cell_deg: Floats, ring_deg: Floats, points: Ints) -> _NearestReturns:
-        """Find the points of one ring that are closest to its cells.
+        """Find the points of a ring that are closest in azimuth to each cell of the ring.
 
         Points are sorted by azimuth.
         """
@@ -230,7 +233,7 @@ class _NearestReturns(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _RayPoses:
-    """A trajectory with one pose for each ray in a list.
+    """Trajectory that consists of one pose for each ray in a list.
 
     The time of ray i is i nanoseconds.
     """
@@ -242,26 +245,24 @@ class _RayPoses:
     duration_ns: ClassVar[float] = np.inf
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
-        """Return the pose of the ray with this time."""
         positions, rotations = self.poses(station, np.array([time_ns]))
         return Pose.from_rotation(positions[0], rotations[0])
 
     def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return the poses of the rays with these times."""
         ray = np.rint(times_ns).astype(np.int64).clip(0, len(self.positions) - 1)
         return self.positions[ray], self.rotations[ray]
 
 
 @dataclass(frozen=True, eq=False)
 class _CellCaster:
-    """Casts one ray into each cell of a sweep."""
+    """Ray caster with one ray for each cell of a sweep."""
 
     scanner: Scanner
     directions: Floats  # (r, c, 3): unit directions in the sensor frame
 
     @classmethod
     def from_stack(cls, stack: SweepStack, scene: Scene) -> _CellCaster:
-        """Create the caster for the cells of a stack."""
+        """Create a ray caster for the cells of a sweep stack."""
         rays = stack.directions.reshape(-1, 3)
         shot_ns = np.arange(len(rays), dtype=np.float64)
         sensor = ListedSensor(head=Spin(len(rays), 360), rays=rays, shot_ns=shot_ns)
@@ -269,7 +270,7 @@ class _CellCaster:
         return cls(scanner, stack.directions)
 
     def surfaces(self, positions: Floats, rotations: Floats) -> _SceneSurfaces:
-        """Cast the rays of all cells from the given positions and with the given rotations."""
+        """Cast the rays of all cells, each from the given position and with the given rotation."""
         cloud = self.scanner.sweep(_RayPoses(positions, rotations), number=0)
         shape = self.directions.shape
         cell = np.unravel_index(cloud["ray"].astype(np.int64), shape[:2])
@@ -293,7 +294,7 @@ class _CellCaster:
 
 
 class _SceneSurfaces(NamedTuple):
-    """Surfaces of a scene in the cells of a sweep."""
+    """Scene surfaces that the rays of a sweep's cells hit."""
 
     distance: Floats  # (r, c): meters; NaN without a hit
     slope: Floats  # (r, c): gradient of the range with respect to the direction, meters per radian
@@ -302,7 +303,7 @@ class _SceneSurfaces(NamedTuple):
     smooth: Bools  # (r, c): whether the neighbors lie in one plane with the cell
 
     def range_errors(self, points: Floats, rotations: Floats) -> Floats:
-        """Return the ranges of points minus the ranges of the planes in their cells, in meters.
+        """Return the difference between each point's range and the plane in its cell, in meters.
 
         `points` has shape (r, c, 3) and is in the sensor frame. The plane's range is computed in
         the direction of the point, because pulses are not at the centers of their cells.
@@ -318,7 +319,7 @@ class _SceneSurfaces(NamedTuple):
 def _pulses_of_sweep(
     stack: SweepStack, sweep: int, caster: _CellCaster, fired: Sweep
 ) -> SweepPulses:
-    """Compare the pulses of one sweep with the smooth surfaces of a scene."""
+    """Compare a sweep's pulses with the smooth surfaces of a scene."""
     returns = _CellReturns.from_sweep(stack, sweep, fired)
     surfaces = caster.surfaces(returns.positions, returns.rotations)
     residual = np.where(
@@ -353,7 +354,7 @@ def _pulses_of_sweep(
 
 
 def _firing_poses(fired: Sweep, index: Ints) -> tuple[Floats, Floats]:
-    """Return the positions and rotations of the sensor when points were fired."""
+    """Return the sensor position and rotation at the firing of each point."""
     poses = fired.firing_poses
     if poses.quaternions is None or poses.offsets is None:
         count = len(index)
@@ -364,13 +365,12 @@ def _firing_poses(fired: Sweep, index: Ints) -> tuple[Floats, Floats]:
 
 
 def _rotate_vectors(rotations: Floats, vectors: Floats) -> Floats:
-    """Rotate the vector of each cell by the rotation of the cell."""
     turned = np.einsum("kij,kj->ki", rotations, vectors.reshape(-1, 3))
     return np.asarray(turned.reshape(vectors.shape))
 
 
 def _means_beside(values: Floats) -> Floats:
-    """Return the mean of the cells around each cell, or NaN if all of them are NaN."""
+    """Return the mean of the neighbors of each cell in its row, or NaN if all of them are NaN."""
     shifts = [shift for shift in range(-_LIGHT_COLUMNS, _LIGHT_COLUMNS + 1) if shift]
     beside = np.stack([np.roll(values, shift, axis=1) for shift in shifts])
     known = np.isfinite(beside)

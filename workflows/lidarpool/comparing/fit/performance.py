@@ -1,4 +1,4 @@
-"""Fit noise, lost pulses and false alarms to the statistics of rays."""
+"""Estimate noise, lost pulses and false alarms from the statistics of rays."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _MIN_SKY_PULSES = 1000
 
 
 def has_frontal_rays(rays: SmoothRays) -> bool:
-    """Return True if there are enough frontal rays to separate range noise from direction noise."""
+    """Return True if enough rays hit surfaces frontally to separate range and direction noise."""
     frontal = (rays.slope < _FRONTAL_TANGENT * rays.distance).sum()
     return bool(frontal >= max(_MIN_FRONTAL_RAYS, _MIN_FRONTAL_SHARE * len(rays.row)))
 
@@ -52,7 +52,7 @@ def has_frontal_rays(rays: SmoothRays) -> bool:
 def fit_performance(
     rays: SmoothRays, energy: Floats | None, *, all_known: bool = False
 ) -> tuple[dict[str, Estimate], Floats]:
-    """Estimate the noise and the lost pulses of a sensor from its rays.
+    """Estimate a sensor's noise and pulse losses from its rays.
 
     `energy` is the energy of each ray's returns, or None if unknown. If `all_known` is true, rays
     without any return are also known, because a scene is available.
@@ -90,7 +90,7 @@ def fit_performance(
 def _fit_detection(
     rays: SmoothRays, energy: Floats | None, all_known: bool
 ) -> tuple[Estimate | None, Estimate | None]:
-    """Estimate the energy at which half of the pulses return, and the loss rate at any energy.
+    """Estimate the energy at which half of the pulses return, and the loss rate at high energies.
 
     Values that cannot be determined are None. `energy` is None if it is unknown.
     """
@@ -111,7 +111,7 @@ def _fit_detection(
 
 
 def lost_share(rays: SmoothRays, chosen: Bools, *, all_known: bool = False) -> Estimate | None:
-    """Estimate the fraction of pulses that the chosen rays lose, or None if there are too few rays.
+    """Estimate the fraction of pulses lost on the selected rays, or None if there are too few rays.
 
     Unless `all_known` is true, rays without any return are missing, so the remaining rays lose
     fewer pulses than average. To correct for this, the fraction is computed for each return from
@@ -132,7 +132,7 @@ def lost_share(rays: SmoothRays, chosen: Bools, *, all_known: bool = False) -> E
 
 
 class ScatterFit(NamedTuple):
-    """Noise of ranges and directions, fitted to the variances of rays."""
+    """Range noise and direction noise, fitted to the variances of rays."""
 
     # {`range_m`, `angle_deg` or the name of the increase, which are fields of `Noise`: estimate}
     estimates: dict[str, Estimate]
@@ -141,7 +141,10 @@ class ScatterFit(NamedTuple):
 
 
 class _VarianceSamples(NamedTuple):
-    """Range variances of rays that lose few pulses. All arrays have shape (k,)."""
+    """Range variances of rays that lose few pulses.
+
+    All arrays have shape (k,).
+    """
 
     variance: Floats  # square meters
     freedom: Ints  # degrees of freedom of the variance
@@ -153,7 +156,7 @@ class _VarianceSamples(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _VarianceModel:
-    """Model of the range variance due to range noise and direction noise.
+    """Model of the range variance that results from range noise and direction noise.
 
     The range noise grows with a quantity. The three parameters are relative to the typical variance
     v. The first is (σ / √v) to the power `power`, where σ is the range noise at a growth of 0. The
@@ -177,7 +180,6 @@ class _VarianceModel:
         return np.asarray(self.variance_scale * (range_term ** (2 / self.power) + direction_term))
 
     def expected(self, parameters: Floats, samples: _VarianceSamples) -> Floats:
-        """Return the variance that the model predicts for each sample, in square meters."""
         return self.variance(parameters, samples.growth, samples.slope)
 
 
@@ -219,7 +221,7 @@ def fit_scatter(rays: SmoothRays, increase_name: str, growth: Floats, power: int
 
 
 def _variance_samples(rays: SmoothRays, growth: Floats) -> _VarianceSamples:
-    """Select the rays whose variances are fitted.
+    """Select the rays that are used to fit the noise model.
 
     Rays that lose many pulses are excluded, because only their closer or brighter pulses return.
     `growth` is the quantity that range noise grows with.
@@ -238,7 +240,7 @@ def _variance_samples(rays: SmoothRays, growth: Floats) -> _VarianceSamples:
 
 
 def _fit_variances(model: _VarianceModel, samples: _VarianceSamples) -> tuple[Floats, Floats]:
-    """Fit the parameters of a model to samples, and estimate the variances of the parameters."""
+    """Fit the model parameters to samples, and estimate the variances of these parameters."""
     start = np.array([1.0, 0.1, 0.1])[model.fitted]
     theta, covariance = _fit_trimmed(model, start, samples, _TAIL_CHANCE)
     # Edges that are finer than the ray spacing increase the variances of some rays. The change in
@@ -257,7 +259,7 @@ def _fit_variances(model: _VarianceModel, samples: _VarianceSamples) -> tuple[Fl
 def _fit_trimmed(
     model: _VarianceModel, start: Floats, samples: _VarianceSamples, chance: float
 ) -> tuple[Floats, Floats]:
-    """Fit a model to variances, and estimate the covariance of its parameters.
+    """Fit a model to variances without outliers, and estimate the covariance of its parameters.
 
     Samples whose variance exceeds a quantile of the expected distribution are excluded. The
     probability to exceed the quantile is `chance`. The remaining samples have the mean of the
@@ -296,7 +298,7 @@ def _fit_trimmed(
 def fit_threshold(
     energy: Floats, rays: SmoothRays, dropout: float, *, all_known: bool = False
 ) -> Estimate | None:
-    """Estimate the energy at which half of the pulses return, with the model of `Noise.detected`.
+    """Estimate the energy at which half of the pulses return, using the model of `Noise.detected`.
 
     `dropout` is the loss rate at any energy. Unless `all_known` is true, a ray is known only if at
     least one pulse returns, so the likelihood of a truncated binomial distribution is used. Return
@@ -326,7 +328,7 @@ def fit_threshold(
 
 
 def alarm_share(stack: SweepStack) -> Estimate | None:
-    """Estimate the fraction of pulses into the sky that return.
+    """Estimate the fraction of pulses that return although they were emitted into the sky.
 
     A pulse counts as a sky pulse if no other pulse of its ray returns, and if no ray in its
     neighborhood returns twice. Rays with fewer than three pulses are ignored. Return None if there

@@ -1,4 +1,4 @@
-"""Estimate the motion of a sensor from changes in the ranges of smooth surfaces.
+"""Estimate a sensor's motion from range changes of smooth surfaces.
 
 If the sensor shifts by s, the range of the plane n · x = c in the direction d decreases by n · s /
 (n · d).
@@ -50,7 +50,7 @@ _OFFSET = 6  # column for the common offset of all ranges
 
 @dataclass(frozen=True, eq=False)
 class RangeChanges:
-    """Changes of the ranges of smooth surfaces between two sweeps."""
+    """Range changes of smooth surfaces between two sweeps."""
 
     surfaces: SmoothSurfaces  # surfaces of the first sweep
     # (r, c): rays that return in both sweeps, and hit smooth surfaces in the first sweep at angles
@@ -62,7 +62,7 @@ class RangeChanges:
 
     @classmethod
     def between(cls, stack: SweepStack, first: int, second: int) -> RangeChanges:
-        """Compare the ranges of two sweeps where the first sweep hits smooth surfaces."""
+        """Compare the ranges of two sweeps in cells where the first sweep hits smooth surfaces."""
         distance = stack.ranges[first].astype(np.float64)
         # If the sensor moves, range changes between sweeps are not noise, so noise is assumed.
         surfaces = find_surfaces(stack, distance, np.full_like(distance, _ASSUMED_NOISE_M))
@@ -76,37 +76,43 @@ class RangeChanges:
 
     @cached_property
     def design(self) -> Floats:
-        """Derivatives of the chosen rays' ranges with respect to the motion. Shape (k, 4).
+        """Derivatives of the selected rays' ranges with respect to the motion.
 
-        The columns are the shift along x, y and z, and the yaw at `ARM_M`. Yaw is expressed in
-        meters so that all unknowns have a similar magnitude.
+        The array has shape (k, 4). The columns are the shift along x, y and z, and the yaw at
+        `ARM_M`. Yaw is expressed in meters so that all unknowns have a similar magnitude.
         """
         yaw = self.surfaces.azimuth_slope[self.chosen] / ARM_M
         return np.column_stack([-self.surfaces.scaled_normal[self.chosen], yaw])
 
     @cached_property
     def distance(self) -> Floats:
-        """Ranges of the chosen rays in the first sweep in meters. Shape (k,)."""
+        """Ranges of the selected rays in the first sweep, in meters.
+
+        The array has shape (k,).
+        """
         return np.linalg.norm(self.points[self.chosen], axis=1)
 
     @cached_property
     def normal_error(self) -> Floats:
-        """Errors of the normals at the chosen rays in radians. Shape (k,).
+        """Errors of the surface normals at the selected rays, in radians.
 
-        Normals are computed from points two columns away on either side, because adjacent points
-        would yield inaccurate normals.
+        The array has shape (k,). Normals are computed from points two columns away on either side,
+        because adjacent points would yield inaccurate normals.
         """
         step_rad = 2 * np.pi / self.change.shape[1]
         return np.asarray(_ASSUMED_NOISE_M / (np.sqrt(10) * self.distance * step_rad))
 
     @cached_property
     def noise(self) -> Floats:
-        """Assumed noise in the changes of the chosen rays in meters. Shape (k,)."""
+        """Assumed noise of the selected rays' range changes, in meters.
+
+        The array has shape (k,).
+        """
         noise = _ASSUMED_NOISE_M + MAX_KINK_PER_M * self.distance
         return np.asarray(np.hypot(noise, _ASSUMED_SHIFT_M * self.normal_error))
 
     def motion(self) -> RigidMotion | None:
-        """Fit the motion of the sensor.
+        """Fit the sensor motion that explains the range changes, or return None if there is none.
 
         Return None if the motion does not explain most of the changes that it predicts.
         """
@@ -126,7 +132,7 @@ class RangeChanges:
         return None
 
     def _large(self, motion: Floats) -> Bools:
-        """Mark the chosen rays whose range a motion changes by more than the noise."""
+        """Mark the selected rays whose range a motion changes by more than the noise."""
         predicted = self.design @ motion
         residual = np.abs(self.change[self.chosen] - predicted)
         scale = 1.4826 * np.median(residual / self.noise)
@@ -135,7 +141,7 @@ class RangeChanges:
         return np.asarray(np.abs(predicted) > limit)
 
     def evidence(self, motion: RigidMotion) -> Evidence:
-        """Count the objects for and against a motion among the surfaces whose ranges it changes.
+        """Count the objects that support or contradict a motion.
 
         A surface wider than a vehicle counts as several objects.
         """
@@ -155,7 +161,7 @@ class RangeChanges:
         return evidence
 
     def axes(self) -> tuple[Floats, Floats]:
-        """Return the principal axes of the normals of unchanged surfaces, and their fractions.
+        """Return the principal axes of the normals of unchanged surfaces, with their fractions.
 
         The fraction of an axis is the mean square of the normals' components along it. Fractions
         are in ascending order. A shift along an axis with a small fraction changes few of these
@@ -174,7 +180,7 @@ class RangeChanges:
 
 
 def range_scatter(stack: SweepStack, lag: int) -> float:
-    """Return the typical change in the range of a smooth surface over `lag` sweeps, in meters.
+    """Return the typical range change of a smooth surface over `lag` sweeps, in meters.
 
     For each pair of sweeps, changes due to moving objects are excluded, and the mean of the
     remaining changes is used. A median would be 0 if ranges are rounded more coarsely than their
@@ -192,7 +198,7 @@ def range_scatter(stack: SweepStack, lag: int) -> float:
 
 
 def _rigid_motion(design: Floats, change: Floats, noise: Floats) -> Floats:
-    """Fit a motion to changes in ranges.
+    """Fit a rigid motion to range changes.
 
     The motion consists of the shift along x, y and z, and the yaw at `ARM_M`, in meters. A row of
     `design` contains the derivatives of a range with respect to the motion, and `noise` is the
@@ -217,7 +223,7 @@ def _rigid_motion(design: Floats, change: Floats, noise: Floats) -> Floats:
 
 
 class Creep(NamedTuple):
-    """Steady motion of a sensor during a recording, or 0 if noise may explain the changes."""
+    """Steady motion of a sensor during a recording, or 0 if noise can explain the range changes."""
 
     shift: Floats  # (3,): meters from sweep to sweep
     rotation: Floats  # (3,): rotation vector from sweep to sweep, radians
@@ -226,7 +232,7 @@ class Creep(NamedTuple):
 
 
 def fit_creep(stack: SweepStack) -> Creep:
-    """Fit the steady motion of a sensor to the ranges of all sweeps.
+    """Fit a steady motion of the sensor to the ranges of all sweeps.
 
     Each sweep has a small motion relative to the mean of all sweeps. It is fitted with Tukey's
     biweight, which ignores rays on moving objects. The steady motion is the slope of these motions.
@@ -254,7 +260,7 @@ def fit_creep(stack: SweepStack) -> Creep:
 
 
 class _SweepMotion(NamedTuple):
-    """Motion of a sensor relative to the mean of all sweeps, and its errors.
+    """Sensor motion relative to the mean of all sweeps, with an estimate of its errors.
 
     The seven values correspond to the columns of `_CreepRays.design`.
     """
@@ -266,7 +272,7 @@ class _SweepMotion(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _CreepRays:
-    """Rays on smooth surfaces in the mean of all sweeps."""
+    """Rays that hit smooth surfaces, selected from the mean of all sweeps."""
 
     numbers: Ints  # (t,): numbers of the sweeps
     # (k, 7): derivatives of ranges with respect to the shift, the rotation at `ARM_M`, and the
@@ -278,7 +284,7 @@ class _CreepRays:
 
     @classmethod
     def from_stack(cls, stack: SweepStack) -> _CreepRays:
-        """Select rays and sweeps at even intervals."""
+        """Select evenly spaced rays and sweeps."""
         numbers = even_indices(stack.sweep_count, _CREEP_SWEEPS)
         median = finite_median(stack.ranges, 0)
         count = np.isfinite(stack.ranges).sum(axis=0)
@@ -308,7 +314,7 @@ class _CreepRays:
         )
 
     def steady_motion(self, contrast: Floats) -> _SweepMotion:
-        """Return the sum of the sweeps' motions, weighted by `contrast`."""
+        """Return the weighted sum of the motions of all sweeps, with `contrast` as the weights."""
         motions = [self._sweep_motion(change) for change in self.change]
         return _SweepMotion(
             np.tensordot(contrast, [motion.values for motion in motions], 1),
@@ -317,7 +323,7 @@ class _CreepRays:
         )
 
     def _sweep_motion(self, change: Floats) -> _SweepMotion:
-        """Fit the motion of a sweep to the changes of its ranges."""
+        """Fit the sensor motion of a sweep to its range changes."""
         returned = np.isfinite(change)
         design = self.design[returned] / self.sigma[returned, None]
         values = change[returned] / self.sigma[returned]
@@ -336,7 +342,7 @@ class _CreepRays:
 
 
 def _tukey_weights(design: Floats, values: Floats, prior: Floats) -> tuple[Floats, float]:
-    """Return the weights of values in a robust linear fit, and the residuals' standard deviation.
+    """Return the weights of a robust linear fit and the standard deviation of its residuals.
 
     The limit beyond which values are ignored decreases during the fit, so that larger motions are
     also found.

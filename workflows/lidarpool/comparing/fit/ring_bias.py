@@ -1,4 +1,4 @@
-"""Estimate the range bias of rings from large planes that several rings cross."""
+"""Estimate the range bias of each ring, using large planes that several rings cross."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _STRICT_SIGMAS = 2.0  # stricter limit; the change in the solution is used as an
 
 
 class _PlaneRays(NamedTuple):
-    """Rays on large planes that several rings cross.
+    """Rays that hit large planes, each of which several rings cross.
 
     Both arrays have shape (n,).
     """
@@ -36,7 +36,7 @@ class _PlaneRays(NamedTuple):
 
 
 def ring_bias(rays: SmoothRays, directions: Floats, error_m: Floats) -> dict[int, Estimate]:
-    """Estimate by how much the ranges of each row differ from the mean of all rows, in meters.
+    """Estimate how much the range bias of each row differs from the mean of all rows, in meters.
 
     Planes u · x = 1 and offsets b of the rows are fitted simultaneously to the ranges r of rays
     with directions d. The equation is 1 / r = u · d − b / r², multiplied by r². `error_m` is the
@@ -64,7 +64,7 @@ def ring_bias(rays: SmoothRays, directions: Floats, error_m: Floats) -> dict[int
 
 
 def _plane_rays(rays: SmoothRays, directions: Floats) -> _PlaneRays:
-    """Select the rays on large planes, from rings that cross at least two of these planes.
+    """Select the rays of rings that cross at least two large planes.
 
     `directions` contains the unit directions of all `rays`. At most `_MAX_PLANE_POINTS` rays are
     considered, which are sampled evenly.
@@ -79,7 +79,7 @@ def _plane_rays(rays: SmoothRays, directions: Floats) -> _PlaneRays:
 
 
 def _solve_offsets(design: Floats, values: Floats, plane: Ints) -> tuple[Floats, Floats]:
-    """Return the offsets of the rows, whose mean is 0, and their variances.
+    """Solve for the range offset of each row and its variance, with a mean offset of 0.
 
     The unknowns of `design`, with shape (n, 3 p + r), are the vectors u of p planes, followed by
     the offsets of r rows (see `ring_bias`). `plane` contains the plane of each equation, and
@@ -108,7 +108,7 @@ def _solve_offsets(design: Floats, values: Floats, plane: Ints) -> tuple[Floats,
 def _solve_without_outliers(
     design: Floats, values: Floats, max_sigmas: float
 ) -> tuple[Floats, Bools]:
-    """Solve a least-squares problem without residuals beyond `max_sigmas` standard deviations.
+    """Solve a least-squares problem, ignoring residuals beyond `max_sigmas` standard deviations.
 
     Returns the solution, and a mask of the equations that were used.
     """
@@ -122,7 +122,7 @@ def _solve_without_outliers(
 
 
 def _segment_planes(points: Floats) -> Ints:
-    """Return the index of the large plane that contains each point, or -1."""
+    """Assign each point to a large plane, or -1 if it is on none."""
     o3d = load_open3d()
     o3d.utility.random.seed(0)
     plane = np.full(len(points), -1)

@@ -1,4 +1,4 @@
-"""Search for the motion of a sensor between two sweeps that explains most changed objects."""
+"""Search for the sensor motion between two sweeps that explains the most changed objects."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _THINGS = 3  # maximum number of moving objects to try, the largest first
 def motion_between(
     stack: SweepStack, first: int, second: int, period_ns: float | None
 ) -> RigidMotion | None:
-    """Find the motion of a sensor between two sweeps, or return None if it may be stationary.
+    """Find the sensor motion between two sweeps, or return None if it may be stationary.
 
     `period_ns` is the time between consecutive sweeps, or None if it is unknown.
     """
@@ -67,7 +67,6 @@ def motion_between(
 
 
 def _is_shown(motion: RigidMotion, pair: VisibilityPair, changes: RangeChanges) -> bool:
-    """Return True if more objects support a motion than contradict it."""
     if np.linalg.norm(motion.shift) < MIN_SHIFT_M and abs(motion.yaw_rad) < MIN_YAW_RAD:
         return False
     evidence = pair.evidence(motion), changes.evidence(motion)
@@ -80,7 +79,7 @@ def _is_shown(motion: RigidMotion, pair: VisibilityPair, changes: RangeChanges) 
 def _search_by_visibility(
     pair: VisibilityPair, changes: RangeChanges, max_shift_m: float
 ) -> RigidMotion | None:
-    """Search for a motion that is supported by objects, until few changed objects remain.
+    """Search for motions supported by objects, until few changed objects remain.
 
     The motion that explains most points may belong to a car beside the sensor, in which case the
     points that it explains are removed and the search is repeated.
@@ -97,7 +96,7 @@ def _search_by_visibility(
 
 
 def _best_motion(pair: VisibilityPair, changes: RangeChanges, max_shift_m: float) -> RigidMotion:
-    """Find the motion that aligns most points of two sweeps."""
+    """Find the motion that aligns the most points of two sweeps."""
     motions = _coarse_motions(_free_axes(changes), max_shift_m)
     sample = pair.sample(_COARSE_POINTS)
     scores = np.concatenate([pair.score(batch, *sample) for batch in _batches(motions)])
@@ -115,7 +114,7 @@ def _best_motion(pair: VisibilityPair, changes: RangeChanges, max_shift_m: float
 
 
 def _free_axes(changes: RangeChanges) -> Floats:
-    """Return the axes along which a shift of the sensor would change few ranges.
+    """Return the axes along which a sensor shift would change only a few ranges.
 
     If there are no such axes, the two axes with the smallest changes are returned.
     """
@@ -125,7 +124,7 @@ def _free_axes(changes: RangeChanges) -> Floats:
 
 
 def _coarse_motions(axes: Floats, max_shift_m: float) -> RigidMotion:
-    """Return candidate motions, which are rotations in place and shifts along one or two axes."""
+    """Return candidate motions, which are pure rotations and shifts along one or two axes."""
     yaw_rad = np.radians(np.arange(_YAW_STEP_DEG, _MAX_YAW_DEG, _YAW_STEP_DEG))
     directions = axes[:1]
     if len(axes) > 1:
@@ -144,23 +143,18 @@ def _batches(motions: RigidMotion) -> Iterator[RigidMotion]:
 
 
 def _select_motions(motions: RigidMotion, index: Any) -> RigidMotion:
-    """Select motions by index."""
     return RigidMotion(motions.shift[index], motions.yaw_rad[index])
 
 
 def _select_best(
     pair: VisibilityPair, motions: RigidMotion, sample: tuple[Floats, Floats]
 ) -> tuple[RigidMotion, int]:
-    """Return the motion with the highest score, and its score.
-
-    The first motion wins ties.
-    """
     scores = pair.score(motions, *sample)
     return _select_motions(motions, scores.argmax()), int(scores.max())
 
 
 def _add_offsets(motion: RigidMotion, offsets: Floats) -> RigidMotion:
-    """Add offsets to a motion.
+    """Add offsets to the shifts and the yaw of a motion.
 
     The offsets have shape (…, 4) and contain the shifts and the yaw at `ARM_M`, in meters.
     """
@@ -168,7 +162,7 @@ def _add_offsets(motion: RigidMotion, offsets: Floats) -> RigidMotion:
 
 
 def _center_motion(pair: VisibilityPair, motion: RigidMotion) -> RigidMotion:
-    """Return the center of the motions that explain two sweeps nearly as well as `motion`."""
+    """Return the center of all motions that align two sweeps nearly as well as `motion`."""
     sample = pair.sample(_FINE_POINTS)
     steps_m = np.arange(-_CENTER_STEPS, _CENTER_STEPS + 1) * _REFINEMENTS_M[-1]
     for axis in np.eye(4):

@@ -1,4 +1,4 @@
-"""Find smooth surfaces in range images, and the rays that hit them in all sweeps."""
+"""Find smooth surfaces in range images, and the rays that hit these surfaces in all sweeps."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MIN_RETURN_SHARE = 0.8  # minimum fraction of a ray's returns that belong to the
 
 
 class SmoothSurfaces(NamedTuple):
-    """Local surfaces in the cells of a range image.
+    """Smooth surface in each cell of a range image.
 
     Arrays have shape (r, c).
     """
@@ -38,7 +38,7 @@ class SmoothSurfaces(NamedTuple):
 
 
 class CellNeighbors(NamedTuple):
-    """Points in the cells beside each cell of a range image, in meters.
+    """Points in the cells next to each cell of a range image, in meters.
 
     Each array has shape (r, c, 3).
     """
@@ -52,7 +52,7 @@ class CellNeighbors(NamedTuple):
 
     @classmethod
     def from_points(cls, points: Floats) -> CellNeighbors:
-        """Find the neighbors of each point.
+        """Find the neighbors of each cell's point.
 
         Columns wrap around, because they cover a full revolution.
         """
@@ -62,13 +62,13 @@ class CellNeighbors(NamedTuple):
         return cls(*columns, *rings)
 
     def normals(self) -> Floats:
-        """Return the surface normals, which are not normalized."""
+        """Return surface normals of arbitrary length."""
         rise = self.above - self.below if len(self.above) > 2 else np.array([0, 0, 1.0])
         run = 2 * (self.next_2 - self.previous_2) + self.next_1 - self.previous_1
         return np.cross(run, rise)
 
     def are_coplanar(self, points: Floats, normal: Floats, tolerance_m: Floats) -> Bools:
-        """Mark points whose neighbors lie in the plane defined by the point and its normal.
+        """Mark points whose neighbors lie in the tangent plane of the point.
 
         The tolerance applies to neighbors in adjacent columns. It is doubled for other neighbors.
         """
@@ -83,7 +83,7 @@ class CellNeighbors(NamedTuple):
 
 
 def find_surfaces(stack: SweepStack, distance: Floats, error_m: Floats) -> SmoothSurfaces:
-    """Find slopes and edges in a range image.
+    """Compute the slopes of surfaces in a range image, and find their edges.
 
     `error_m` is the error of each range in meters.
     """
@@ -106,10 +106,11 @@ def find_surfaces(stack: SweepStack, distance: Floats, error_m: Floats) -> Smoot
 
 
 def _beam_origins(points: Floats) -> Floats:
-    """Return the origin of the beams in each row, in meters. Shape (r, 1, 3).
+    """Return the origin of the beams in each row, in meters.
 
-    The beams in a row intersect on the z axis, near the sensor's origin. Their height increases
-    linearly with the distance from the axis, and the height at distance 0 is the origin.
+    The array has shape (r, 1, 3). The beams in a row intersect on the z axis, near the sensor's
+    origin. Their height increases linearly with the distance from the axis, and the height at
+    distance 0 is the origin.
     """
     with warnings.catch_warnings(action="ignore"):
         distance = np.hypot(points[..., 0], points[..., 1])
@@ -123,7 +124,10 @@ def _beam_origins(points: Floats) -> Floats:
 
 
 class SmoothRays(NamedTuple):
-    """Rays that hit smooth surfaces. All arrays have shape (k,)."""
+    """Rays that hit smooth surfaces.
+
+    All arrays have shape (k,).
+    """
 
     row: Ints
     column: Ints
@@ -136,12 +140,15 @@ class SmoothRays(NamedTuple):
     freedom: Ints  # degrees of freedom of the variance, which is the number of returns minus 1
 
     def select(self, chosen: Bools | Indices) -> SmoothRays:
-        """Select rays by mask or index."""
+        """Select rays with a mask or with indices."""
         return SmoothRays._make(values[chosen] for values in self)
 
 
 class _RayStatistics(NamedTuple):
-    """Statistics of the returns of rays without outliers. All arrays have shape (k,)."""
+    """Statistics of each ray's returns without outliers.
+
+    All arrays have shape (k,).
+    """
 
     mean_range: Floats  # meters
     mean_intensity: Floats
@@ -152,7 +159,7 @@ class _RayStatistics(NamedTuple):
 def select_smooth_rays(
     stack: SweepStack, sigma: Floats, direction_noise_rad: float, expected: Floats | None = None
 ) -> SmoothRays:
-    """Select rays away from edges, and compute the statistics of their returns.
+    """Select rays that are not close to edges, and compute the statistics of their returns.
 
     A return is an outlier if its range differs from the median of the ray by more than `MAX_SIGMAS`
     standard deviations. The standard deviation combines the range noise `sigma` in meters and the
@@ -190,7 +197,7 @@ def select_smooth_rays(
 
 
 def among_smooth(smooth: Bools) -> Bools:
-    """Mark smooth cells that have smooth neighbors.
+    """Mark smooth cells whose neighbors are smooth.
 
     Cells that are smooth by chance, such as in foliage, usually have none.
     """
@@ -205,7 +212,7 @@ def _ray_statistics(
     median: Floats,
     limit_m: Floats,
 ) -> _RayStatistics:
-    """Compute the statistics of returns within `limit_m` of the median range of their ray.
+    """Compute the statistics of the returns within `limit_m` of their ray's median range.
 
     `cell` contains the row and column indices of the rays. Ranges are corrected for the azimuths of
     their pulses by `azimuth_slope` (see `SmoothSurfaces`). All distances are in meters.

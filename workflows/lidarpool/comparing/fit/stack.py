@@ -1,4 +1,4 @@
-"""Sweeps of a recording on common cells.
+"""Stack of a recording's sweeps that have been resampled to common cells.
 
 A cell is defined by a ring and a column, which is an azimuth step. All pulses in the same cell
 belong to the same ray. Arrays have s sweeps, r rings (rows), c columns and k rays. Positions and
@@ -36,7 +36,7 @@ MAX_KINK_M = 0.01  # maximum distance of a surface from its plane within four co
 
 @dataclass(frozen=True, eq=False)
 class SweepStack:
-    """Returns of all sweeps on common cells, by descending ring elevation.
+    """Returns of all sweeps in common cells, sorted by descending ring elevation.
 
     Values are NaN in cells without a return.
     """
@@ -54,17 +54,23 @@ class SweepStack:
 
     @property
     def sweep_count(self) -> int:
-        """Number of sweeps."""
+        """Number of sweeps in the stack."""
         return len(self.ranges)
 
     @cached_property
     def trials(self) -> Ints:
-        """Number of sweeps that cover each cell, with a return or a lost pulse. Shape (r, c)."""
+        """Number of sweeps in which each cell has a return or a lost pulse.
+
+        The array has shape (r, c).
+        """
         return np.asarray(self.covered.sum(axis=0))
 
     @cached_property
     def steady(self) -> Bools:
-        """Mask of the cells around which no object appears or disappears. Shape (r, c)."""
+        """Mask of the cells near which no object appears or disappears.
+
+        The array has shape (r, c).
+        """
         return steady_cells(np.isfinite(self.ranges), self.covered)
 
     @classmethod
@@ -113,7 +119,7 @@ class SweepStack:
 
 
 def check_sweeps(recording: Recording) -> None:
-    """Raise LidarError unless a recording has sweeps that contain all returns."""
+    """Raise LidarError unless the recording has sweeps that contain all returns."""
     if recording.thinned:
         raise LidarError(f"{recording.notes[0]}.")
     if recording.is_cloud or not recording.count:
@@ -124,7 +130,7 @@ def check_sweeps(recording: Recording) -> None:
 
 @dataclass(eq=False)
 class _CommonCells:
-    """Cells that are filled sweep by sweep.
+    """Cells that all sweeps share, filled with one sweep at a time.
 
     A ring is added with its first return.
     """
@@ -139,7 +145,7 @@ class _CommonCells:
 
     @classmethod
     def read(cls, recording: Recording, read: Callable[[int], Sweep]) -> _CommonCells:
-        """Create empty cells, defined by the largest of the first three sweeps."""
+        """Create empty cells, using the largest of the first three sweeps."""
         reference = max(map(read, range(min(3, recording.count))), key=len)
         if not len(reference):
             raise LidarError(f"{recording.name} contains no points, so there is nothing to fit.")
@@ -157,14 +163,9 @@ class _CommonCells:
 
     @property
     def step_deg(self) -> float:
-        """Width of a column in degrees."""
         return self.images.step_deg
 
     def add_sweep(self, index: int, points: Sweep) -> None:
-        """Add the points of the sweep `numbers[index]` to the cells.
-
-        Raises LidarError if the sweep comes from a different sensor.
-        """
         if not len(points):
             return
         number = int(self.numbers[index])
@@ -188,7 +189,7 @@ class _CommonCells:
         self.values[:, index, row_indices[:, None], columns] = sweep.images[0][:, sweep_rows]
 
     def _add_rings(self, sweep: RangeImages) -> None:
-        """Append rows for the rings of a sweep that no earlier sweep contained."""
+        """Append rows for rings that none of the earlier sweeps contain."""
         is_new = ~np.isin(sweep.rings, self.rings)
         if not is_new.any():
             return
@@ -200,19 +201,16 @@ class _CommonCells:
 
     @property
     def have_points(self) -> Bools:
-        """Mask of the sweeps that have points. Shape (s,)."""
         return np.asarray(np.isfinite(self.values[0]).any(axis=(1, 2)))
 
     def _order(self) -> Ints:
-        """Return row indices that sort the rows by descending elevation."""
         return np.argsort(-self.elevation_deg, kind="stable")
 
     def sorted_rings(self) -> Ints:
-        """Return the rings by descending elevation."""
         return np.asarray(self.rings[self._order()])
 
     def sorted_by_elevation(self) -> tuple[Floats, Floats32]:
-        """Return the elevations and values by descending elevation.
+        """Return the elevations and values, sorted by descending elevation.
 
         The arrays have shapes (r,) and (4, s, r, c). Sweeps without points are omitted.
         """
@@ -223,7 +221,7 @@ class _CommonCells:
 def _mean_directions(
     values: Floats32, elevation_deg: Floats, step_deg: float
 ) -> tuple[Floats, Floats32]:
-    """Return the mean direction of each cell, and the azimuth offsets from it in radians.
+    """Return each cell's mean direction, and the azimuth offsets from this direction in radians.
 
     The shapes are (r, c, 3) and (s, r, c). `values` comes from `_CommonCells`, and `elevation_deg`
     contains the elevation of each ring.
@@ -247,13 +245,13 @@ def _mean_directions(
 
 
 def finite_median(values: Floats32, axis: int | tuple[int, ...]) -> Any:
-    """Return the median of the finite values along axes in float64, or NaN if there are none."""
+    """Return the median of the finite values along axes as float64, or NaN if there are none."""
     with warnings.catch_warnings(action="ignore"):
         return np.nanmedian(values, axis=axis).astype(np.float64)
 
 
 def rough_scatter(ranges: Floats32) -> Floats:
-    """Estimate the standard deviation of ranges in each cell over all sweeps, in meters.
+    """Estimate the standard deviation of the ranges in each cell over all sweeps, in meters.
 
     The result is a median over neighboring rays, but not less than the median of the ring. Ranges
     of weak or steep surfaces scatter more than other ranges of the same ring.
@@ -270,7 +268,7 @@ def rough_scatter(ranges: Floats32) -> Floats:
 
 
 def covered_cells(returned: Bools) -> Bools:
-    """Return a mask of the cells into which a sweep sent a pulse.
+    """Return a mask of the cells into which a sweep emitted a pulse.
 
     The mask has shape (s, r, c). The other cells are gaps due to lost packets or incomplete sweeps.
     `returned` marks the cells with a return. A run of cells without a return, in one ring or in all
@@ -287,7 +285,7 @@ def covered_cells(returned: Bools) -> Bools:
 
 
 def _improbable_runs(empty: Bools, log_chance: Floats) -> Bools:
-    """Mark runs of empty cells that are too long to be a coincidence.
+    """Mark sequences of empty cells that are too long to be caused by chance.
 
     Runs extend along the last axis, which is a revolution. `log_chance` contains the logarithm of
     the probability that a cell is empty.
@@ -310,7 +308,7 @@ def _improbable_runs(empty: Bools, log_chance: Floats) -> Bools:
 
 
 def steady_cells(returned: Bools, covered: Bools) -> Bools:
-    """Mark the cells around which no object appears or disappears between sweeps.
+    """Mark the cells near which no object appears or disappears between sweeps.
 
     If a car drives past in front of the sky, the pulses of many cells return in some sweeps and in
     none of the others. Independent losses are very unlikely to produce this pattern: by the bound

@@ -1,4 +1,4 @@
-"""Determine whether a sensor is stationary during a recording.
+"""Determine whether the sensor is stationary during a recording.
 
 The module detects motion, creep and range drift.
 """
@@ -30,7 +30,7 @@ _MIN_CREEP_EFFECT = 0.15  # minimum ratio to the noise, at which the noise is ov
 
 
 class Speed(NamedTuple):
-    """Motion of a sensor between consecutive sweeps."""
+    """Sensor motion between consecutive sweeps."""
 
     shift_m: float
     turn_deg: float
@@ -68,14 +68,14 @@ def read_static(recording: Recording, *, stands: bool = False) -> SweepStack:
 
 
 def sweep_period_ns(recording: Recording, numbers: Ints) -> float | None:
-    """Return the median time between consecutive sweeps, or None if it is unknown."""
+    """Return the median sweep period in nanoseconds, or None if it is unknown."""
     if len(numbers) < 2 or recording.stamps_ns is None:
         return None
     return float(np.median(np.diff(recording.stamps_ns[numbers])))
 
 
 def moving_message(name: str, speed: Speed, advice: str) -> str:
-    """Return the error message for a moving sensor.
+    """Return the error message for a sensor that moves.
 
     `advice` is the first suggested remedy.
     """
@@ -95,7 +95,7 @@ def moving_message(name: str, speed: Speed, advice: str) -> str:
 
 
 def find_motion(stack: SweepStack, period_ns: float | None) -> Speed | None:
-    """Find the motion of a sensor, or return None if the sensor is stationary.
+    """Find the motion of the sensor between sweeps, or return None if it is stationary.
 
     Sweeps are compared with the next sweep, and with the sweep half a recording later. The first
     sweep is also compared with the last, because a slow motion is detectable only in sweeps that
@@ -125,7 +125,7 @@ def find_motion(stack: SweepStack, period_ns: float | None) -> Speed | None:
 
 
 def _speed(motions: list[RigidMotion], lag: int, period_ns: float | None) -> Speed:
-    """Return the median of motions between sweeps that are `lag` sweeps apart."""
+    """Return the median speed, given the motions between sweeps that are `lag` sweeps apart."""
     shift_m = float(np.median([np.linalg.norm(motion.shift) for motion in motions]))
     yaw_rad = float(np.median([abs(motion.yaw_rad) for motion in motions]))
     return Speed(
@@ -136,7 +136,7 @@ def _speed(motions: list[RigidMotion], lag: int, period_ns: float | None) -> Spe
 
 
 def _check_drift(stack: SweepStack, name: str) -> None:
-    """Raise LidarError if ranges change more over many sweeps than between consecutive sweeps."""
+    """Raise LidarError if ranges drift over many sweeps by more than they vary between sweeps."""
     lag = stack.sweep_count // 2
     step_m = range_scatter(stack, 1)
     drift_m = range_scatter(stack, lag)

@@ -1,4 +1,4 @@
-"""Evidence of a sensor's motion from the visibility of one sweep's points in another sweep.
+"""Evidence of sensor motion, based on whether the points of one sweep are visible in another.
 
 In a street, a sensor that moves parallel to the walls measures nearly the same ranges in each
 sweep. Only parked cars and posts appear to move. Cars that drive past a stationary sensor look
@@ -44,7 +44,7 @@ _KNOWN = (_EMPTY, _SURFACE)
 
 
 class RigidMotion(NamedTuple):
-    """Motion of a sensor between two sweeps, in the sensor frame of the first sweep.
+    """Sensor motion between two sweeps, in the sensor frame of the first sweep.
 
     Leading axes (…) index several motions.
     """
@@ -53,7 +53,7 @@ class RigidMotion(NamedTuple):
     yaw_rad: Floats  # (…)
 
     def to_first(self, points: Floats) -> Floats:
-        """Convert points of the second sweep to the frame of the first.
+        """Transform points of the second sweep to the sensor frame of the first.
 
         Points of shape (n, 3) are converted to shape (…, n, 3).
         """
@@ -62,7 +62,7 @@ class RigidMotion(NamedTuple):
         )
 
     def to_second(self, points: Floats) -> Floats:
-        """Convert points of the first sweep to the frame of the second.
+        """Transform points of the first sweep to the sensor frame of the second.
 
         Points of shape (n, 3) are converted to shape (…, n, 3).
         """
@@ -70,7 +70,6 @@ class RigidMotion(NamedTuple):
 
 
 def _rotate_about_z(points: Floats, yaw_rad: Floats) -> Floats:
-    """Rotate points about the z axis by angles."""
     x, y, z = np.moveaxis(points, -1, 0)
     c = np.cos(yaw_rad)
     s = np.sin(yaw_rad)
@@ -79,7 +78,7 @@ def _rotate_about_z(points: Floats, yaw_rad: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class VisibilityImage:
-    """Closest and farthest surfaces of a sweep around each direction."""
+    """Ranges of the closest and farthest surfaces around each direction of a sweep."""
 
     elevation_rad: Floats  # (r,): elevations of the rows, descending
     step_rad: float  # width of a column
@@ -94,7 +93,7 @@ class VisibilityImage:
 
     @classmethod
     def from_sweep(cls, stack: SweepStack, number: int) -> VisibilityImage:
-        """Determine what one sweep of a stack sees."""
+        """Create the image of one sweep in a stack."""
         ranges = stack.ranges[number].astype(np.float64)
         returned = np.isfinite(ranges)
         columns = ranges.shape[1]
@@ -150,14 +149,13 @@ class VisibilityImage:
 
 
 def _reduce_neighbors(values: Floats, reduce: np.ufunc) -> Floats:
-    """Reduce values over each column and its two neighbors."""
     return np.asarray(
         reduce(reduce(values, np.roll(values, 1, axis=1)), np.roll(values, -1, axis=1))
     )
 
 
 def _reduce_row_pairs(values: Floats, reduce: np.ufunc) -> Floats:
-    """Reduce values over adjacent rows.
+    """Reduce values over each pair of adjacent rows.
 
     The result has shape (r - 1, c). A single row is returned unchanged.
     """
@@ -165,7 +163,7 @@ def _reduce_row_pairs(values: Floats, reduce: np.ufunc) -> Floats:
 
 
 def _empty_around(returned: Bools) -> Bools:
-    """Mark pairs of rows around which no cell has a return."""
+    """Mark pairs of rows near which no cell has a return."""
     wide = returned.copy()
     for shift in range(1, _EMPTY_COLUMNS + 1):
         wide |= np.roll(returned, shift, axis=1) | np.roll(returned, -shift, axis=1)
@@ -177,7 +175,7 @@ def _empty_around(returned: Bools) -> Bools:
 
 
 def _is_wide(ranges: Floats, tolerance_m: float) -> Bools:
-    """Mark cells whose neighbor in the same row belongs to the same surface."""
+    """Mark cells with a neighbor in the same row that belongs to the same surface."""
     with np.errstate(invalid="ignore"):
         joined = np.abs(np.diff(ranges, axis=1, append=ranges[:, :1])) < (
             tolerance_m + _TOLERANCE_PER_M * ranges
@@ -186,7 +184,7 @@ def _is_wide(ranges: Floats, tolerance_m: float) -> Bools:
 
 
 class Evidence(NamedTuple):
-    """Numbers of objects that both sweeps see, by the motion that explains them."""
+    """Number of objects visible in both sweeps, grouped by the motion that explains them."""
 
     moved: int  # explained only by the motion
     stayed: int  # explained only by a stationary sensor
@@ -195,7 +193,7 @@ class Evidence(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class VisibilityPair:
-    """Two sweeps, and the classes of each sweep's points in the other sweep.
+    """Two sweeps, and the visibility of each sweep's points in the other sweep.
 
     The classes apply if the sensor is stationary.
     """
@@ -207,7 +205,7 @@ class VisibilityPair:
 
     @classmethod
     def from_images(cls, first: VisibilityImage, second: VisibilityImage) -> VisibilityPair:
-        """Classify the points of each sweep by the other sweep."""
+        """Classify the points of each sweep using the image of the other sweep."""
         return cls(
             first,
             second,
@@ -216,7 +214,7 @@ class VisibilityPair:
         )
 
     def sample(self, count: int) -> tuple[Floats, Floats]:
-        """Sample points of both sweeps, in their sensor frames and in meters.
+        """Sample points of both sweeps in their sensor frames, in meters.
 
         If the sensor were stationary, the other sweep would see some points in empty space and
         others on surfaces. About `count` points of each kind are sampled evenly from both sweeps
@@ -238,7 +236,7 @@ class VisibilityPair:
         return samples[0], samples[1]
 
     def score(self, motions: RigidMotion, first: Floats, second: Floats) -> Ints:
-        """Score motions by how well they align two sweeps.
+        """Score each motion by how well it aligns two sweeps.
 
         The score is the number of points on surfaces of the other sweep, minus the number in empty
         space.
@@ -249,13 +247,13 @@ class VisibilityPair:
         )
 
     def _seen_in_motion(self, motion: RigidMotion) -> tuple[Ints, Ints]:
-        """Classify each sweep's points by the other sweep for a moving sensor."""
+        """Classify the points of each sweep using the other sweep, given a sensor motion."""
         in_second = motion.to_second(self.first.points)
         in_first = motion.to_first(self.second.points)
         return self.second.classify_points(in_second), self.first.classify_points(in_first)
 
     def evidence(self, motion: RigidMotion | None) -> Evidence:
-        """Count the objects for and against a motion.
+        """Count the objects that support or contradict a motion.
 
         If `motion` is None, the objects that changed are counted.
         """
@@ -274,7 +272,7 @@ class VisibilityPair:
         return count_objects(points, kinds, _LONGEST_VEHICLE_M)
 
     def without_explained(self, motion: RigidMotion) -> VisibilityPair:
-        """Return the pair without the changed points that a motion explains."""
+        """Return the pair without changed points that are explained by a motion."""
         seen_first, seen_second = (
             np.where((at_rest == _EMPTY) & (in_motion == _SURFACE), _UNKNOWN, at_rest)
             for at_rest, in_motion in zip(
@@ -285,7 +283,7 @@ class VisibilityPair:
 
 
 def count_objects(points: Floats, kinds: Sequence[Bools], wide_m: float) -> Evidence:
-    """Count the objects in a point cloud by the kind of most of their points.
+    """Count the objects in a point cloud, classifying each by the majority of its points.
 
     `kinds` contains one mask for each field of `Evidence`. An object wider than `wide_m` in the top
     view counts as `WALL_OBJECTS` objects. An object close to the sensor may be the sensor's own

@@ -1,1 +1,1 @@
-"""The report of a run as a self-contained HTML file."""
+"""Report of a run as a self-contained HTML file."""

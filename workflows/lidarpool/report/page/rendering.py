@@ -1,4 +1,4 @@
-"""Render reports from Jinja templates, with filters that format numbers and escape names.
+"""Render reports from Jinja templates, using filters that format numbers and escape names.
 
 The HTML report of a survey includes a top view of the point cloud and a timeline of the tasks.
 """
@@ -104,7 +104,7 @@ def write_page(
 
 
 def insert_picture(page: Path, name: str, svg: str) -> None:
-    """Insert a picture into a page that was written by `write_page`.
+    """Insert an image into a page that `write_page` has written.
 
     The page does not change if it has no placeholder for the picture.
 
@@ -124,7 +124,7 @@ _Mark = tuple[float, float, int]
 
 
 def _station_marks(result: RunResult, cloud: CloudCounts) -> list[_Mark]:
-    """Return the stations of a stationary sensor that lie within the bounds of the points."""
+    """Return markers for the stations of a stationary sensor that are within the cloud's bounds."""
     survey = result.survey
     if survey.coordinates != "world" or survey.path.moves or not len(result.points):
         return []
@@ -140,7 +140,7 @@ def _station_marks(result: RunResult, cloud: CloudCounts) -> list[_Mark]:
 
 
 def draw_top_view(counts: Ints, pixel_m: float = 1.0, marks: Sequence[_Mark] = ()) -> str:
-    """Draw a top view of the point counts as an SVG image with a scale bar.
+    """Draw point counts as a top view in SVG, with a scale bar.
 
     In dark mode, the page inverts the lightness of the points.
 
@@ -165,7 +165,10 @@ def draw_top_view(counts: Ints, pixel_m: float = 1.0, marks: Sequence[_Mark] = (
 
 
 def _shade_counts(counts: Ints) -> str:
-    """Return a picture of point counts as a data URL. `counts` has shape (rows, columns)."""
+    """Return an image of point counts as a data URL.
+
+    `counts` has shape (rows, columns).
+    """
     shade = np.log1p(counts)
     weakest = np.where(counts > 0, _WEAKEST, 0)  # makes single points visible
     pixels = np.full((*counts.shape, 4), (53, 105, 176, 0), np.uint8)
@@ -188,7 +191,7 @@ def _draw_marks(marks: Sequence[_Mark], letter: float) -> str:
 
 
 def _scale_bar(width_m: float, pixel_m: float, bottom: float, letter: float) -> str:
-    """Draw a scale bar with its length, which is about an eighth of the width of the view."""
+    """Draw a labeled scale bar that spans about an eighth of the width of the view."""
     length_m = nice_step(width_m / 8)
     length = length_m / pixel_m
     words = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"
@@ -200,7 +203,7 @@ def _scale_bar(width_m: float, pixel_m: float, bottom: float, letter: float) -> 
 
 
 def _density_range(cloud: CloudCounts) -> tuple[float, float] | None:
-    """Return the minimum and maximum density in the top view in points per square meter.
+    """Return the minimum and maximum density in the top view, in points per square meter.
 
     Only pixels with points count. Return None if there are no points.
     """
@@ -277,7 +280,7 @@ def _template(name: str) -> Template:
 
 
 def _with_names(row: str, head: Sequence[str]) -> Markup:
-    """Add the column names to the cells (td) of a table row, so that the style sheet can show them.
+    """Add column names to the cells of a table row for use by the style sheet.
 
     The first column, which contains the name of the row (th), is skipped.
     """
@@ -286,7 +289,7 @@ def _with_names(row: str, head: Sequence[str]) -> Markup:
 
 
 def _scenario_yaml(scenario: Scenario) -> str:
-    """Return a scenario as YAML, truncated if it is too long."""
+    """Format a scenario as YAML, truncating it if it is too long."""
     data = scenario.model_dump(mode="json", exclude_defaults=True, by_alias=True)
     data |= {"classes": dict(scenario.classes)} if scenario.classes else {}  # JSON has no numbers
     text = yaml.safe_dump(
@@ -297,13 +300,12 @@ def _scenario_yaml(scenario: Scenario) -> str:
 
 
 def _changed_fields(values: Mapping[str, Any], kind: type) -> list[tuple[str, str]]:
-    """Return the names and values of the fields that differ from the defaults of a dataclass."""
     usual = declared_values(kind(), kind)
     return [(name, formatted(values[name])) for name in usual if values[name] != usual[name]]
 
 
 def make_timeline(stages: Sequence[StageTotals]) -> dict[str, Any] | None:
-    """Lay out a timeline of the recorded tasks of a run.
+    """Create the layout of a timeline of a run's recorded tasks.
 
     All rows share a time axis that starts with the first task. The first group has one row per
     stage. It is followed by one group per partition, with one row for each stage on each worker.
@@ -353,7 +355,6 @@ class _TimeAxis(NamedTuple):
         return "".join(f"M{x_start:.1f} {ROW / 2:g}H{x_stop:.1f}" for x_start, x_stop in joined)
 
     def row(self, label: str, stage: str, detail: str, times: Iterable[TimeSpan]) -> dict[str, str]:
-        """Return the template values of a row."""
         text = f"{label}: {detail}"
         return {"label": label, "detail": text, "stage": stage, "bars": self.bars(times)}
 
@@ -382,7 +383,7 @@ def _partition_groups(stages: Sequence[StageTotals], axis: _TimeAxis) -> list[di
 
 
 def _worker_rows(tasks: WorkerTasks, axis: _TimeAxis) -> list[dict[str, str]]:
-    """Return rows for the busiest combinations of a worker and a stage in a partition."""
+    """Return rows for the combinations of worker and stage that were the busiest in a partition."""
     busy_s = {key: sum(task.seconds for task in records) for key, records in tasks.items()}
     rows = []
     for worker, stage in sorted(
@@ -397,7 +398,7 @@ def _worker_rows(tasks: WorkerTasks, axis: _TimeAxis) -> list[dict[str, str]]:
 
 
 def sentence(note: str, names: Iterable[str] = ()) -> str:
-    """Capitalize the first letter of a note, unless the note begins with a name.
+    """Capitalize the first letter of a note unless the note begins with a name.
 
     A first word that is not entirely lowercase letters, such as ``wall.obj``, is considered a name.
     `names` lists names that look like ordinary words.
@@ -413,14 +414,14 @@ def sentence(note: str, names: Iterable[str] = ()) -> str:
 
 
 def printable(text: str) -> str:
-    """Replace unprintable characters, such as those that reverse the text direction."""
+    """Replace unprintable characters, including those that reverse the text direction."""
     return "".join(
         c if c.isprintable() or c in _SPACES else "\N{REPLACEMENT CHARACTER}" for c in text
     )
 
 
 def markdown(text: str) -> str:
-    """Escape text for Markdown, and join it to a single line."""
+    """Escape text for Markdown, and join its lines."""
     line = " ".join("".join(c if c.isprintable() else " " for c in text).split())
     return re.sub(r"([\\`*{}\[\]<>|#&~]|(?<!\w)_|_(?!\w))", r"\\\1", line)
 
@@ -436,7 +437,7 @@ def code(text: str) -> Markup:
 
 
 def duration(seconds: float) -> str:
-    """Format a duration with a suitable unit."""
+    """Format a duration with an appropriate unit."""
     if 0 < seconds < 0.001:
         return f"{1e6 * seconds:.0f} µs"
     if 0 < seconds < 0.9995:
@@ -450,12 +451,12 @@ def duration(seconds: float) -> str:
 
 
 def rate(number: float, seconds: float) -> str:
-    """Format a rate per second, or return a dash if the time is unknown."""
+    """Format a rate per second, or return a dash if the duration is unknown."""
     return f"{large(number / seconds)}/s" if seconds > 0 else "–"
 
 
 def large(number: float) -> str:
-    """Format a number with three significant digits, using k, M or G for large numbers."""
+    """Format a number with three significant digits, using the suffixes k, M and G."""
     for size, letter in ((1e9, "G"), (1e6, "M"), (1e4, "k")):
         if number >= size:
             scaled = number / (1e3 if letter == "k" else size)
@@ -464,12 +465,12 @@ def large(number: float) -> str:
 
 
 def share(part: float, total: float) -> str:
-    """Format a part of a total as a percentage."""
+    """Format the ratio of a part to a total as a percentage."""
     return f"{100 * part / total:.1f}%" if total else "–"
 
 
 def excess(fraction: float) -> str:
-    """Format an excess as a signed percentage, for example "+0.12%"."""
+    """Format a relative excess as a signed percentage, for example "+0.12%"."""
     if 0 < fraction < 1e-4:
         return "< 0.01%"
     return f"{fraction:+.2%}".replace("-", MINUS)
@@ -505,5 +506,5 @@ def millimeters(value: float | None) -> str:
 
 
 def ratio(value: float | None) -> str:
-    """Format a ratio from 0 to 1, or return "undefined" for None."""
+    """Format a ratio between 0 and 1, or return "undefined" for None."""
     return "undefined" if value is None else f"{value:.3f}"

@@ -1,1 +1,1 @@
-"""Clusters of runs, which are started or connected to, checked and monitored."""
+"""Clusters for runs, which are started or connected to, checked and monitored."""

@@ -1,4 +1,4 @@
-"""Checks of the cluster before a run starts, so that it does not fail later."""
+"""Check a cluster before a run starts, so that the run does not fail later."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ LOOK_EVERY_S = 0.2
 
 
 class TooFewWorkersError(LidarError):
-    """Error raised if a partition has too few workers or slots. Further workers may still join."""
+    """Raised if a partition has too few workers or slots, but further workers may still join."""
 
 
 class SurveyWorkers(NamedTuple):
-    """Workers of a run, and the backend and software with which they cast scans."""
+    """Workers of a run, with the ray-casting backend and software that they use."""
 
     pool: Pool  # all workers
     casting: list[WorkerInfo]  # workers in the GPU partition
@@ -60,7 +60,7 @@ def find_workers(
     *,
     writing: bool = False,
 ) -> SurveyWorkers:
-    """Wait for the workers of a run and check that they are sufficient.
+    """Wait until the workers that a run requires are available, and check them.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def check_memory(
 def check_workers(
     job: Job, tasks: TaskOptions, backend: str, casting: Iterable[WorkerInfo]
 ) -> None:
-    """Raise JobError if a casting worker has too little memory for a job."""
+    """Raise JobError if the memory of a casting worker is insufficient for a job."""
     bytes_per_slot = {w.address: w.memory / max(1, w.resources[GPU]) for w in casting if w.memory}
     # Only the worker with the least memory is checked. Checking hundreds of workers would take too
     # long for the small jobs of a campaign.
@@ -158,7 +158,7 @@ def check_workers(
 
 
 def _survey_pool(client: Client, required_slots: Mapping[str, int], writing: bool) -> Pool:
-    """Return all workers of the cluster after checking that they are sufficient."""
+    """Return all workers of the cluster, after checking that they are sufficient."""
     workers = worker_identities(client)
     if not workers:
         raise TooFewWorkersError(
@@ -188,7 +188,7 @@ def _survey_pool(client: Client, required_slots: Mapping[str, int], writing: boo
 
 
 def _check_versions(client: Client, workers: Sequence[str]) -> None:
-    """Check that workers have the same Python version and sources as the driver."""
+    """Check that all workers have the Python version and the sources of the driver."""
     driver_version = platform.python_version()
     for address, python in run_on_workers(client, platform.python_version, workers).items():
         # Code is sent to workers by value, which requires the same minor version.
@@ -213,7 +213,7 @@ def _check_versions(client: Client, workers: Sequence[str]) -> None:
 
 
 def check_formats(client: Client, pool: Pool, formats: Iterable[ExportSpec]) -> None:
-    """Check that the LIDAR workers can write the formats that plug-ins provide.
+    """Check that LIDAR workers can write the formats that plug-ins provide.
 
     Raise LidarError if a worker has a different version of a plug-in or cannot import it.
     """
@@ -245,7 +245,7 @@ def _check_installed(formats: Iterable[ExportSpec]) -> None:
 def common_software(
     client: Client, backend: str, workers: Sequence[WorkerInfo], earlier: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the software with which scans are cast.
+    """Return the software versions with which scans are cast.
 
     A resumed run uses the `earlier` software. Otherwise, the most common software of the workers is
     used. Workers with different software are refused when they are checked later. Raise LidarError
@@ -283,7 +283,7 @@ def _query_workers(
 
 
 def gpu_note(pool: Iterable[WorkerInfo], casting: Sequence[WorkerInfo], backend: str) -> str:
-    """Return a note if GPUs of the cluster are not used, or an empty string."""
+    """Return a note if the cluster has unused GPUs, or an empty string otherwise."""
     if backend == "cuda" or not any(worker.gpus for worker in pool):
         return ""
     if any(worker.gpus for worker in casting):

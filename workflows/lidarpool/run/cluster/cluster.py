@@ -1,4 +1,4 @@
-"""Cluster of a run, which is checked before jobs are cast and monitored for its loss."""
+"""Cluster of a run, which is checked before jobs are cast and monitored during the run."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class ClusterConnection:
         self.close()
 
     def open(self, first: Job, store: RunStore) -> Cluster:
-        """Connect to the cluster, and check that it has the slots that the job `first` requires.
+        """Connect to the cluster, and check that it has enough slots for the job `first`.
 
         Raise LidarError if workers, memory or software are missing.
         """
@@ -94,7 +94,7 @@ class ClusterConnection:
         return self.cluster
 
     def close(self) -> None:
-        """Stop the workers that were started for the run, or disconnect from a cluster."""
+        """Stop workers that were started for the run, or disconnect from an existing cluster."""
         self.cluster = None
         self._stack.close()
 
@@ -106,7 +106,7 @@ def open_client(
     screen: Screen,
     local: BackgroundClient | None = None,
 ) -> AbstractContextManager[Client]:
-    """Return a client of an existing cluster, or start a cluster with the required slots.
+    """Connect to an existing cluster, or start a cluster with the required slots.
 
     `local` is the new cluster if it is on this machine and is already starting.
     """
@@ -125,14 +125,13 @@ def open_client(
 
 
 def _start_local(options: RunOptions, slots: Mapping[str, int]) -> BackgroundClient:
-    """Start the workers of a run on this machine in the background."""
     check_starts_workers()
     workers = options.gpu_workers, options.other_workers
     return BackgroundClient(local_client(slots, *workers, tls=options.tls))
 
 
 class Cluster:
-    """Cluster of a run, which has been checked for its jobs.
+    """Cluster of a run, which has been checked for the run's jobs.
 
     Parameters
     ----------
@@ -214,7 +213,7 @@ class Cluster:
     def _request_slots(
         self, first: Job, store: RunStore, required_slots: Mapping[str, int]
     ) -> None:
-        """Request slots for the remaining scans, because partitions may be adaptive."""
+        """Request slots for the remaining scans, in case a partition is adaptive."""
         scan_count = first.survey.scan_count * (len(store.jobs.numbers) - store.db.ended_count)
         if store.only_job is not None:
             scan_count = len(store.only_job.scans) - store.only_job.resumed
@@ -222,7 +221,7 @@ class Cluster:
             self.partitions[name].request_slots(max(slots, scan_count) if name == GPU else slots)
 
     def _release_slots(self) -> None:
-        """Let adaptive partitions shrink that have grown for the run."""
+        """Let adaptive partitions release the workers that they started for the run."""
         if self.client.status == "running":
             with suppress(PoolError, OSError):
                 for partition in self.partitions.values():
@@ -239,15 +238,15 @@ class Cluster:
         return TaskGroup(self.partitions[name], self.software["lidarpool"])
 
     def watch(self, names: Sequence[str], lasting: Sequence[str] = ()) -> Watch:
-        """Start watching the workers of partitions (see `Watch`)."""
+        """Start watching the workers of the given partitions with a `Watch`."""
         return Watch(self.client, names, lasting, self.options.worker_timeout_s, self._screen.tell)
 
     def check(self, job: Job) -> None:
-        """Raise JobError if the workers have too little memory for a job."""
+        """Raise JobError if the memory of the workers is insufficient for a job."""
         check_workers(job, self.options, self.backend, self._workers.casting)
 
     def call(self, callback: Callable[..., None], *arguments: Any) -> None:
-        """Call a callback of the user.
+        """Call a callback that the user provided.
 
         Its errors are recorded, so that an OSError is not mistaken for an error of the cluster.
         """
@@ -259,7 +258,7 @@ class Cluster:
 
     @contextmanager
     def partitions_page(self) -> Iterator[None]:
-        """Show the partitions page while the body runs, and print its address.
+        """Serve the partitions page during the body, and print its address.
 
         Do nothing if the scheduler serves no pages, or if the cluster was started for this run.
         """

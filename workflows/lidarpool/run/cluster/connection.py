@@ -56,7 +56,7 @@ _QUIET = {
 
 
 def default_workers(cores: int, gpus: int) -> dict[str, int]:
-    """Return the default numbers of GPU and OTHER workers for a machine.
+    """Return the default numbers of GPU and OTHER workers on a machine.
 
     The GPU partition has one worker per GPU or, on a machine without GPUs, CPU workers for three
     quarters of the cores. OTHER has workers for the remaining cores. The LIDAR stages mostly wait,
@@ -78,7 +78,7 @@ def local_cluster(
     other_workers: int | None = None,
     **options: Any,
 ) -> SpecCluster:
-    """Start a Dask cluster on this machine with the partitions GPU, LIDAR and OTHER.
+    """Start a Dask cluster on this machine, with the partitions GPU, LIDAR and OTHER.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def local_cluster(
 
 
 def check_starts_workers() -> None:
-    """Raise LidarError if this is a Dask task or a daemonic process, which cannot start workers."""
+    """Raise LidarError in a Dask task or daemonic process, which cannot start workers."""
     try:
         get_worker()
         context = "a Dask task"
@@ -165,7 +165,7 @@ def local_client(
 
 
 class BackgroundClient(AbstractContextManager[Client]):
-    """Context of a client that is entered in a background thread as soon as it is created.
+    """Context manager of a client that is entered in a background thread upon creation.
 
     Entering this object waits for the thread. It may be exited without being entered, and more than
     once.
@@ -190,7 +190,7 @@ class BackgroundClient(AbstractContextManager[Client]):
 
 @contextmanager
 def start_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator[Client]:
-    """Start the cluster that a file describes, yield its client, and stop the cluster afterwards.
+    """Start the cluster that a file describes, yield its client, and stop the cluster at the end.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def start_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator[C
 
 @contextmanager
 def _client_of(cluster: AbstractContextManager[SpecCluster]) -> Iterator[Client]:
-    """Start a cluster, yield its client, and stop the cluster afterwards.
+    """Start a cluster, yield its client, and stop the cluster at the end.
 
     A cluster cannot be stopped cleanly while it is starting. An interrupt is therefore deferred
     until all workers have started or have been queued. An interrupt while workers are being stopped
@@ -311,7 +311,6 @@ async def _wait_for_scheduler(address: str, security: Security, waiting: WaitTim
 
 
 def _root_cause(error: BaseException) -> BaseException:
-    """Return the root cause of an error."""
     cause = error.__cause__ or error.__context__
     # A timeout is more informative than the canceled operation that it was raised from.
     if cause is None or isinstance(cause, asyncio.CancelledError):
@@ -320,7 +319,7 @@ def _root_cause(error: BaseException) -> BaseException:
 
 
 def _may_become_reachable(error: BaseException) -> bool:
-    """Return True if the address cannot be resolved or reached yet, so that a retry may help."""
+    """Return True if an address may become resolvable or reachable, so that a retry makes sense."""
     root = _root_cause(error)
     absent = (ConnectionRefusedError, TimeoutError, asyncio.CancelledError, socket.gaierror)
     return isinstance(root, absent) or getattr(root, "errno", None) in _UNREACHABLE

@@ -1,4 +1,4 @@
-"""Groups of tasks that the driver submits to a partition a few at a time."""
+"""Groups of tasks that the driver submits to a partition gradually."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 
 class TaskGroup(Generic[T]):
-    """Group of tasks on a partition, each of which is submitted for a purpose, such as a job.
+    """Group of tasks on a partition, each of which has a purpose, such as a job.
 
     Each task returns its result and its record. The records of finished tasks are added to `book`.
 
@@ -43,7 +43,7 @@ class TaskGroup(Generic[T]):
     def submit(
         self, purpose: T, function: Callable[..., Any], *arguments: Any, **options: Any
     ) -> None:
-        """Submit a task with options of `Partition.submit`."""
+        """Submit a task, passing any options to `Partition.submit`."""
         call = (call_with_plugins, self.plugins, function) if self.plugins else (function,)
         future = self.partition.submit(
             call_with_same_sources, self._sources, *call, *arguments, **options
@@ -51,7 +51,7 @@ class TaskGroup(Generic[T]):
         self.running[future] = purpose
 
     def pop_finished(self) -> list[tuple[T, Any]]:
-        """Remove the finished tasks and return their purposes and results."""
+        """Remove the finished tasks, and return their purposes and results."""
         finished = {future.key: future for future in self.running if future.status == "finished"}
         results: list[tuple[T, Any]] = []
         if not finished:
@@ -62,7 +62,7 @@ class TaskGroup(Generic[T]):
         return results
 
     def pop_failed(self) -> list[tuple[T, Future]]:
-        """Remove the failed and cancelled tasks and return them with their purposes."""
+        """Remove the failed and canceled tasks, and return their purposes and futures."""
         failed = [future for future in self.running if future.status in ("error", "cancelled")]
         return [(self.running.pop(future), future) for future in failed]
 
@@ -72,6 +72,6 @@ class TaskGroup(Generic[T]):
         return take_snapshot(self._client, self.partition.name, keys)
 
     def cancel(self) -> None:
-        """Cancel all tasks. Tasks that are already running are not interrupted."""
+        """Cancel all tasks without interrupting those that are already running."""
         self._client.cancel([*self.running])
         self.running.clear()

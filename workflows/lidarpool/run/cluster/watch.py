@@ -1,4 +1,4 @@
-"""Time limits and messages for a run that waits for its scheduler or its workers."""
+"""Time limits and messages for a run that waits for its scheduler or workers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TELL_EVERY_S = 5.0  # minimum interval between messages, which become less frequ
 
 
 class WaitTimer:
-    """Time limit for waiting, which starts when the object is used for the first time.
+    """Time limit for waiting that starts when the object is first used.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class WaitTimer:
         return time.monotonic()
 
     def restart(self) -> None:
-        """Restart the time limit."""
+        """Reset the time limit."""
         self._start_s = time.monotonic()
 
     def remaining_s(self, now_s: float | None = None) -> float:
@@ -53,7 +53,7 @@ class WaitTimer:
         return max(0.0, self._start_s + self.seconds - now_s)
 
     def tell(self, awaited: str, reason: str = "") -> None:
-        """Report that the run is waiting for `awaited`, unless the last message is recent."""
+        """Report that the run is waiting for `awaited`, unless it was reported recently."""
         now_s = time.monotonic()
         if now_s - max(self._told_at, self._start_s) >= max(
             TELL_EVERY_S, (now_s - self._start_s) / 10
@@ -64,12 +64,12 @@ class WaitTimer:
 
 
 def queued_clause(jobs: int) -> str:
-    """Return a clause about jobs that are queued or starting."""
+    """Return a clause about queued or starting jobs."""
     return f"{plural(jobs, 'job is', 'jobs are')} in the queue or starting"
 
 
 class Watch:
-    """Watchdog for partitions that have no workers, or whose workers accept no tasks.
+    """Watchdog for partitions that have no workers, or whose workers do not accept tasks.
 
     Dask itself would wait forever.
 
@@ -104,12 +104,12 @@ class Watch:
         self.notes: list[str] = []  # notes for the user about workers that Dask has paused
 
     def forget(self, names: Iterable[str]) -> None:
-        """Stop watching partitions that have no more tasks."""
+        """Stop watching partitions that have no tasks left."""
         for name in names:
             self._waits.pop(name, None)
 
     def check(self) -> None:
-        """Check the workers, unless the last check is recent.
+        """Check the workers, unless they were checked recently.
 
         Raise LidarError if workers have been missing for too long.
         """
@@ -155,7 +155,7 @@ class Watch:
 
 
 def _missing_workers_message(name: str, paused: bool, seconds: str) -> str:
-    """Return a message about a partition that has no workers, or only paused workers."""
+    """Return a message about a partition whose workers are missing or all paused."""
     start = f'start workers with `--resources "{name}=1"` and repeat the run.'
     if paused:
         return (

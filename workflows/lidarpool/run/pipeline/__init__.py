@@ -1,1 +1,1 @@
-"""Pipeline with four stages on the partitions of a cluster, and the driver that controls it."""
+"""Pipeline whose four stages run on the partitions of a cluster, and its driver."""

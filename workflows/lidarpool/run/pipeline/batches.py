@@ -20,7 +20,7 @@ class BatchState(Enum):
 
 
 class Outcome(Enum):
-    """Outcome of a casting task, which may be the reason why its batches are offered again."""
+    """Outcome of a casting task, whose value can be the reason for casting its batches again."""
 
     PENDING = "pending"
     DONE = "done"
@@ -34,7 +34,7 @@ class Outcome(Enum):
 
 @dataclass(eq=False)
 class Batch:
-    """Consecutive uncommitted scans of a job, which become a part."""
+    """Consecutive uncommitted scans of a job that will become a part."""
 
     job: PipelineJob
     first: int
@@ -61,6 +61,6 @@ class Batch:
         return range(self.first, self.stop)
 
     def move(self, state: BatchState) -> None:
-        """Change the state and record the current time."""
+        """Change the state, and record the time of the change."""
         self.state = state
         self.since = time.monotonic()

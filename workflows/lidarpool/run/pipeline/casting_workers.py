@@ -47,7 +47,7 @@ PREPARING = "Preparing the scene on the casting workers"
 
 
 class CastingWorkers:
-    """GPU workers of a run and their casting tasks, for all jobs.
+    """GPU workers of a run and their casting tasks, which may belong to several jobs.
 
     The software of a worker is checked before the worker unpickles anything. A worker is refused if
     it has different sources of lidarpool, or a version of NumPy or of the ray caster that may
@@ -97,7 +97,7 @@ class CastingWorkers:
 
     @property
     def slots(self) -> dict[str, int]:
-        """Number of concurrent tasks by address, for checked workers that accept tasks."""
+        """Number of concurrent tasks of each accepted worker that accepts tasks, by address."""
         free = self.locations.free
         return {
             a: worker.slots for a, worker in self._workers.items() if worker.slots and a in free
@@ -105,12 +105,12 @@ class CastingWorkers:
 
     @property
     def slot_count(self) -> int:
-        """Total number of concurrent casting tasks on all workers, at least 1."""
+        """Total number of concurrent casting tasks on all workers, or 1 if there are none."""
         return max(1, sum(self.slots.values()))
 
     @property
     def futures(self) -> list[Future]:
-        """Futures of all casting tasks, checks of workers and shared payloads."""
+        """Futures of all casting tasks, worker checks and shared payloads."""
         shared = [payload.future for payload in self._payloads if payload.future is not None]
         return [*(cast for cast, _ in self._casts.values()), *self._checks.values(), *shared]
 
@@ -124,7 +124,7 @@ class CastingWorkers:
 
     @property
     def _checks(self) -> dict[str, Future]:
-        """Unfinished software checks, by worker address."""
+        """Unfinished software checks of workers, keyed by worker address."""
         return {a: worker.check for a, worker in self._workers.items() if worker.check is not None}
 
     @property
@@ -133,14 +133,14 @@ class CastingWorkers:
 
     @property
     def pending(self) -> list[str]:
-        """Keys of the tasks that have not finished."""
+        """Keys of the unfinished tasks."""
         casts = [key for key, (future, _) in self._casts.items() if future.status == "pending"]
         return casts + [check.key for check in self._checks.values()]
 
     # -- jobs ------------------------------------------------------------------------------
 
     def add(self, job: int, scene: Scene, survey: Survey) -> tuple[bytes, str]:
-        """Register a job.
+        """Register a job to be cast.
 
         Returns
         -------
@@ -191,7 +191,7 @@ class CastingWorkers:
     # -- casting ---------------------------------------------------------------------------
 
     def submit(self, batches: Iterable[tuple[int, BatchRange]], worker: str) -> str:
-        """Submit batches to a worker as a single task, and return the key of the task.
+        """Submit a task that casts several batches on a worker, and return its key.
 
         Each batch is given as its job and its scans. The jobs must share a scene.
         """
@@ -250,7 +250,7 @@ class CastingWorkers:
         return Outcome.PENDING
 
     def _count_lost_device(self, error: DeviceLost, worker: str) -> None:
-        """Refuse a worker that has lost its GPU. Raise LidarError if this happens repeatedly."""
+        """Refuse a worker that has lost its GPU, and raise LidarError if this keeps happening."""
         if error.process in self._lost_devices:
             return
         self._lost_devices.add(error.process)
@@ -269,18 +269,18 @@ class CastingWorkers:
             )
 
     def forget(self, key: str) -> None:
-        """Cancel a casting task or drop its result."""
+        """Cancel a casting task, or release its result."""
         if (cast := self._casts.pop(key, None)) is not None:
             cast[0].release()
 
     def memory_clause(self, worker: str) -> str:
-        """Return a clause for messages if a worker was terminated because of its memory usage."""
+        """Return a clause for messages if a worker was terminated for using too much memory."""
         return memory_clause(self._client, [worker])
 
     # -- checking workers --------------------------------------------------------------------
 
     def refresh(self) -> PartitionSnapshot | None:
-        """Update the list of workers, unless the last update is recent.
+        """Update the list of workers, unless it was updated recently.
 
         Returns
         -------
@@ -312,7 +312,7 @@ class CastingWorkers:
         return self.locations
 
     def _check(self) -> None:
-        """Process the software checks that have finished."""
+        """Process the results of finished software checks."""
         addresses = {}
         for address, future in self._checks.items():
             if future.status == "finished" and address in self.locations.free:
@@ -331,7 +331,7 @@ class CastingWorkers:
                 self._accept(address, software, identities[address])
 
     def request_slots(self, slots: int) -> None:
-        """Request a number of slots from an adaptive partition, or 0 when all jobs have ended.
+        """Request a number of slots from an adaptive partition, or 0 after all jobs have ended.
 
         The request is necessary because each batch is restricted to an existing worker, so that no
         tasks wait for further workers.
@@ -346,7 +346,7 @@ class CastingWorkers:
             self._scenes.clear()
 
     def release(self) -> None:
-        """Let the workers drop their rigs if they can be reached."""
+        """Make all reachable workers drop their rigs."""
         addresses = [*self._casting & self.locations.members]
         for address in self._casting:
             del self._workers[address]
@@ -366,7 +366,7 @@ class CastingWorkers:
     def _accept(
         self, address: str, software: Mapping[str, str], identity: Mapping[str, Any]
     ) -> None:
-        """Accept a worker after its software check, or refuse it if its software differs."""
+        """Accept a worker if its software matches, or refuse it otherwise."""
         worker = self._workers[address]
         worker.check = None
         if differs := describe_difference(software, self._software):
@@ -425,7 +425,7 @@ class _Payload:
                 self._shared = SharedValue(pickled)
 
     def argument_for(self, worker: str) -> Pickled | SharedHandle | Future | None:
-        """Return the argument that carries the value to a worker, or None if it has a copy."""
+        """Return the task argument that carries the value to a worker, or None if it has a copy."""
         if worker in self._holders:
             return None
         self.recipients.add(worker)
@@ -444,11 +444,10 @@ class _Payload:
         return self.future
 
     def record_copy(self, worker: str) -> None:
-        """Record that a worker has a copy of the value."""
         self._holders.add(worker)
 
     def record_loss(self, worker: str, *, unseen: bool = False) -> None:
-        """Record that a worker has no copy of the value.
+        """Record that a worker does not have a copy of the value.
 
         `unseen` is True if the worker cannot access the shared memory.
         """
@@ -466,7 +465,7 @@ class _Payload:
 
 @dataclass(eq=False)
 class _Worker:
-    """Worker of the GPU partition, which is being checked, has been accepted or has been refused.
+    """Worker of the GPU partition that is being checked, or was accepted or refused.
 
     A worker is refused if it has different software or has lost its GPU. Refused workers are
     remembered even if they leave.
@@ -480,12 +479,11 @@ class _Worker:
 
 
 def _is_local(address: str) -> bool:
-    """Return True if a worker is probably on this machine."""
     return urlsplit(address).hostname in (None, "127.0.0.1", "::1", get_ip())
 
 
 def submit_value(partition: Partition, value: Any, **options: Any) -> Future:
-    """Submit a task that returns a value for other tasks, so that Dask can recompute it.
+    """Submit a task that returns a value, so that Dask can recompute the value for other tasks.
 
     In contrast to scattered data, the value is not lost if the worker that holds it dies.
     """

@@ -1,4 +1,4 @@
-"""Committed results of a job, which are its parts, its planning trials and its frames."""
+"""Committed results of a job, which are its parts, planning trials and frames."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FIRST = attrgetter("first")  # sort key of parts
 
 
 class CommittedParts:
-    """Receipts of the committed parts of a job, in scan order."""
+    """Receipts of a job's committed parts, in scan order."""
 
     def __init__(self) -> None:
         self.ordered: list[Receipt] = []  # without summaries
@@ -27,7 +27,10 @@ class CommittedParts:
 
     @property
     def cell_box(self) -> Ints | None:
-        """Lowest and highest cell of all points, with shape (2, 3), or None without points."""
+        """Lowest and highest cell of all points, or None if there are no points.
+
+        The array has shape (2, 3).
+        """
         boxes = [part.cell_box for part in self.ordered if part.cell_box]
         if not boxes:
             return None
@@ -35,11 +38,11 @@ class CommittedParts:
         return np.stack([table[:, 0].min(axis=0), table[:, 1].max(axis=0)])
 
     def reaching_past(self, scan: int) -> list[Receipt]:
-        """Return the parts that contain the given scan or later scans, in scan order."""
+        """Return the parts that contain the given scan or any later scan, in scan order."""
         return [part for part in self.ordered[self._index(scan) :] if part.stop > scan]
 
     def part_of(self, scan: int) -> Receipt:
-        """Return the part that contains a scan. Raise KeyError if the scan is not committed."""
+        """Return the part that contains a scan, or raise KeyError if the scan is not committed."""
         for part in self.ordered[self._index(scan) :][:1]:
             if scan in part.scans:
                 return part
@@ -58,7 +61,7 @@ class CommittedParts:
         return [*absent, (first, stop)] if first < stop else absent
 
     def add(self, part: Receipt) -> None:
-        """Add a part whose scans are not committed yet."""
+        """Add a part whose scans have not been committed before."""
         bare = replace(part, summaries=b"", record=None, held_at="")
         bisect.insort(self.ordered, bare, key=_FIRST)
         self._count(part, 1)
@@ -69,7 +72,6 @@ class CommittedParts:
         self._count(part, -1)
 
     def _index(self, scan: int) -> int:
-        """Return the index of the last part that starts at or before a scan, or 0 if none does."""
         return max(0, bisect.bisect_right(self.ordered, scan, key=_FIRST) - 1)
 
     def _count(self, part: Receipt, sign: int) -> None:
@@ -79,7 +81,7 @@ class CommittedParts:
 
 
 class CommittedResults:
-    """Committed parts and planning trials of a job, and its delivered frames.
+    """Committed parts and planning trials of a job, and the frames delivered so far.
 
     `RunDatabase` modifies the parts and trials, and `advance_frames` modifies the frames.
 
@@ -106,16 +108,16 @@ class CommittedResults:
         self.frames = self.scans.start  # one past the last scan that was delivered as a frame
 
     def advance_frames(self, stop: int) -> None:
-        """Record that the scans before `stop` were delivered as frames."""
+        """Record that all scans before `stop` were delivered as frames."""
         self.frames = stop
 
     @property
     def missing_count(self) -> int:
-        """Number of scans that are not committed."""
+        """Number of scans that have not been committed."""
         return len(self.scans) - self.parts.scans_done
 
     @property
     def scans_complete(self) -> bool:
-        """True if all scans are committed and, in a job with frames, delivered."""
+        """True if all scans have been committed and, in a job with frames, delivered."""
         framed = not self.has_frames or self.frames == self.scans.stop
         return framed and not self.missing_count

@@ -1,4 +1,4 @@
-"""Dispatch of batches to casting workers and collectors, including batches that have been lost.
+"""Dispatch batches to casting workers and collectors, and dispatch lost batches again.
 
 Stage 1 (GENERATE) sends ranges of scans, which the dispatcher divides into batches. Stage 2
 (INTERSECT) casts the batches on GPU workers, and stage 4 (COLLECT) writes them as parts.
@@ -31,7 +31,7 @@ PIECES = 16  # maximum number of pieces into which a batch that kills workers is
 
 
 class Dispatcher:
-    """Dispatcher of the batches of all jobs, which also isolates scans that kill their workers.
+    """Dispatcher of the batches of all jobs, which also isolates scans that kill workers.
 
     Parameters
     ----------
@@ -63,14 +63,14 @@ class Dispatcher:
         self._first_deaths: dict[PipelineJob, list[Batch]] = {}
 
     def in_states(self, *states: BatchState) -> list[Batch]:
-        """Return the batches in any of the given states."""
+        """Return all batches in any of the given states."""
         return [batch for batch in self.batches.values() if batch.state in states]
 
     def _batches_of(self, job: PipelineJob) -> list[Batch]:
         return [batch for batch in self.batches.values() if batch.job is job]
 
     def _batches_within(self, receipt: Receipt) -> list[Batch]:
-        """Return the uncommitted batches whose scans are contained in a part.
+        """Return the uncommitted batches whose scans lie within a part.
 
         There are several batches if a batch was divided after its part had been written.
         """
@@ -89,12 +89,12 @@ class Dispatcher:
 
     @property
     def max_weight(self) -> int:
-        """Maximum weight of the batches in flight (`policies.weight`)."""
+        """Maximum total weight of batches in flight, as defined by `policies.weight`."""
         slots = self._workers.slot_count
         return policies.max_weight_in_flight(slots, self._collector_count, self.per_task)
 
     def room(self, job: PipelineJob) -> float:
-        """Return the weight of the batches that may still be added for a job.
+        """Return the total weight of the batches that can still be added for a job.
 
         There is no room if the result is 0 or negative, or if too many batches have been created
         since the oldest batch of the job, because their scans have to be kept until it is done.
@@ -105,12 +105,12 @@ class Dispatcher:
         return self.max_weight - policies.weight(self.batches.values(), self.per_task)
 
     def slots_wanted(self, scan_count: int) -> int:
-        """Return the number of casting slots to request for a number of scans, at least 1."""
+        """Return the number of casting slots, at least 1, to request for a number of scans."""
         scan_s = self._cast_seconds / self._cast_scans if self._cast_scans else None
         return max(1, policies.slots_wanted(scan_count, scan_s))
 
     def _learn(self, records: list[tuple[PipelineJob, TaskRecord]]) -> None:
-        """Update the sizes of batches and tasks from the casting times of committed batches.
+        """Adapt the sizes of batches and tasks to the casting times of committed batches.
 
         The `items` of each record are the scans in its batch.
         """
@@ -131,7 +131,7 @@ class Dispatcher:
     # -- casting ---------------------------------------------------------------------------
 
     def add_scans(self, job: PipelineJob, first: int, stop: int) -> None:
-        """Create batches of the uncommitted scans in a range that stage 1 has sent."""
+        """Create batches for the uncommitted scans in a range that stage 1 has described."""
         first = max(first, job.generated)  # stage 1 repeats scans after a restart
         if first < stop:
             job.trace("take", GENERATE, range(first, stop))
@@ -145,7 +145,7 @@ class Dispatcher:
                 self._batch_count += 1
 
     def offer(self) -> None:
-        """Submit waiting batches to workers that have room for further tasks."""
+        """Submit waiting batches to workers with room for further tasks."""
         waiting = sorted(
             self.in_states(BatchState.WAITING), key=lambda batch: (batch.order, batch.first)
         )
@@ -170,7 +170,7 @@ class Dispatcher:
                 batch.job.trace("submit", INTERSECT, batch.scans)
 
     def check(self) -> None:
-        """Update the batches of casting tasks that have finished.
+        """Update the batches whose casting tasks have finished.
 
         If the worker died or no longer has the scene, the batches are offered again. If casting
         failed in a task with several jobs, the batches are also offered again, but in a separate
@@ -195,7 +195,7 @@ class Dispatcher:
                     batch.single_job |= outcome is Outcome.SEPARATE_JOBS
 
     def reclaim_lost(self, locations: PartitionSnapshot) -> None:
-        """Offer batches again whose workers have died, do not respond, are late or are paused."""
+        """Cast batches again whose workers are dead, unresponsive, late or paused."""
         prepared = len(self._workers.slots)
         late_s = policies.late_after_s(self._recent_casts)
         for batch in [*self.batches.values()]:
@@ -205,7 +205,7 @@ class Dispatcher:
     def _offer_again(
         self, batch: Batch, reason: str, state: BatchState = BatchState.WAITING
     ) -> None:
-        """Change the state of a batch so that it is cast again, or only collected again."""
+        """Change the state of a batch so that it is either cast or collected again."""
         if state is BatchState.WAITING:
             self._forget_task(batch)
         batch.move(state)
@@ -240,7 +240,7 @@ class Dispatcher:
     # -- batches that kill workers -----------------------------------------------------------
 
     def _blame(self, batch: Batch, stage: str, worker: str) -> None:
-        """Count the death of a worker against its batch, which may be divided or condemned."""
+        """Attribute the death of a worker to a batch, which may be divided or condemned."""
         batch.deaths[stage] += 1
         kills = policies.kills_alone(batch, stage)
         if stage == INTERSECT and not batch.job.cast and kills > 0:
@@ -263,12 +263,11 @@ class Dispatcher:
             self._fail_condemned(batch.job)
 
     def _fail_condemned(self, job: PipelineJob) -> None:
-        """Fail a job with condemned batches once all of its other batches are committed."""
         if job.condemned and not self._batches_of(job):
             self.failed.setdefault(job, JobError("\n".join(job.condemned)))
 
     def _blame_scene(self, batch: Batch, worker: str) -> None:
-        """Count the death of a worker with a single batch before any batch of the job was cast.
+        """Count the death of a worker before any batch of the job was cast.
 
         The cause may be the scene rather than the batch. A different batch is therefore tried next,
         and the job fails once several batches have killed a worker.
@@ -314,17 +313,16 @@ class Dispatcher:
         return orders
 
     def recast_part(self, receipt: Receipt) -> None:
-        """Offer the batches of a part again if the worker that held the part was lost."""
+        """Cast the batches of a part again because the worker that held the part was lost."""
         self._recast_uncollected(self._batches_within(receipt), "its part was lost")
 
     def recast_columns(self, message: ColumnsLost) -> None:
-        """Offer batches again if their columns could not be fetched."""
+        """Cast batches again because their columns could not be fetched."""
         # The message may come from a replaced collector, after the batches were offered again.
         task_batches = self._tasks.get(message.key, ())
         self._recast_uncollected([*task_batches], "its columns could not be fetched")
 
     def _recast_uncollected(self, batches: Iterable[Batch], reason: str) -> None:
-        """Offer batches again if they are in the state COLLECTING."""
         for batch in batches:
             if batch.state is BatchState.COLLECTING:
                 self._offer_again(batch, reason)
@@ -351,7 +349,7 @@ class Dispatcher:
         self._learn(records)
 
     def reclaim_uncollected(self, died: Mapping[str, str], started: Collection[str]) -> None:
-        """Reassign the batches of collectors that died or were restarted.
+        """Reassign the batches of collectors that have died or restarted.
 
         Parameters
         ----------

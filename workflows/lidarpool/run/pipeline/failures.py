@@ -1,4 +1,4 @@
-"""Errors of jobs and scans, and the classification of failed tasks."""
+"""Errors of jobs and scans, and classification of failed tasks."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ ASK_S = 10.0  # time limit for fetching an error from the scheduler
 
 
 class JobError(LidarError):
-    """Error that affects a single job. The run continues with the remaining jobs."""
+    """Error that affects a single job, so that the run can continue with the other jobs."""
 
 
 class ScanError(RuntimeError):
-    """Error raised while scans are described, cast or packed. The message names the scans."""
+    """Error while scans are described, cast or packed, with a message that names the scans."""
 
 
 class DeviceLost(RuntimeError):  # noqa: N818 - the name states what happened
-    """Error after which a GPU no longer responds to the process of the worker."""
+    """Error after which the GPU no longer responds to the worker process."""
 
     def __init__(self, reason: str, process: str, restarts: bool) -> None:
         super().__init__(reason, process, restarts)
@@ -39,7 +39,7 @@ class DeviceLost(RuntimeError):  # noqa: N818 - the name states what happened
 
 @contextmanager
 def naming_scans(first: int, stop: int) -> Iterator[None]:
-    """Convert errors in the body to a ScanError whose message names the scans.
+    """Convert errors in the body to a ScanError that names the scans.
 
     In contrast to arbitrary errors, a ScanError can always be pickled. A WorkerLeavingError is not
     converted, because it is not caused by the scans.
@@ -54,7 +54,7 @@ def naming_scans(first: int, stop: int) -> Iterator[None]:
 
 
 def storing(storage: Storage) -> AbstractContextManager[None]:
-    """Convert an OSError in the body to a LidarError with advice on the storage."""
+    """Convert OSErrors in the body to a LidarError that suggests how to make space available."""
     advice = "Free space there, or choose a different location with `--scratch-dir`"
     return explained(f"The points cannot be stored in {storage.url}", advice)
 
@@ -65,7 +65,7 @@ def error_of(future: Future) -> BaseException | None:
 
 
 def was_killed(future: Future) -> bool:
-    """Return True if a task failed because its worker left or because its workers kept dying."""
+    """Return True if a task failed because its worker left or its workers kept dying."""
     return isinstance(error_of(future), (KilledWorker, WorkerLeavingError))
 
 

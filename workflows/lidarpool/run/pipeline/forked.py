@@ -1,4 +1,4 @@
-"""Modules that the fork server imports, so that the workers of a local cluster inherit them.
+"""Modules that the fork server imports, so that workers of a local cluster inherit them.
 
 Otherwise, each worker would import these modules itself while the run waits for it.
 """

@@ -1,4 +1,4 @@
-"""Long-running tasks on LIDAR workers for stages 1, 3 and 4.
+"""Long-running tasks on LIDAR workers, which implement stages 1, 3 and 4.
 
 Each stage processes messages from the driver until a pipe is closed. A failed pipe also ends a
 stage silently, because the driver knows the reason. Each stage secedes from the thread pool of its
@@ -50,7 +50,7 @@ News = Scans | ColumnsLost | Failed  # message to the driver
 
 @translate_leaving_errors()
 def generate(start: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
-    """Describe the scans of surveys in order (stage 1).
+    """Describe the scans of all surveys in order (stage 1).
 
     The driver sends lists of `Description`, and receives `ScanRange` messages with the advised
     number of scans. The scans themselves are not sent, because workers can derive them from the
@@ -122,13 +122,13 @@ def sort_frames(start: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
 
 @dataclass(eq=False)
 class _ScanOrder:
-    """Summaries of a survey that wait for earlier scans."""
+    """Buffer for the summaries of a survey that wait for earlier scans."""
 
     next_scan: int = 0
     waiting: dict[int, Summaries] = field(default_factory=dict)  # {first scan: summaries}
 
     def add(self, item: Summaries) -> list[Summaries]:
-        """Add summaries, and return all summaries that are now next in scan order."""
+        """Add summaries, and return all summaries that are next in scan order."""
         self.next_scan = max(self.next_scan, item.framed)
         if item.stop > self.next_scan:
             self.waiting[max(item.first, self.next_scan)] = item
@@ -166,7 +166,7 @@ def collect(
 def _write_parts(
     start: StageStart, storage: Storage | None, order: CollectOrder, client: Client
 ) -> Iterator[News]:
-    """Write the parts of a casting task, and yield the messages to the driver."""
+    """Write the parts of a casting task, and yield messages for the driver."""
     results = fetch_available(client, [order.key], FETCH_PATIENCE_S, holder=order.worker)
     if order.key not in results:
         yield ColumnsLost(order.key)
@@ -194,7 +194,7 @@ def _write_parts(
 
 
 class _Sender:
-    """Sender of messages to the driver, which combines messages that follow each other quickly.
+    """Sender that combines messages to the driver if they follow each other quickly.
 
     At most `max_items` messages are sent at a time. Without a limit (0), the capacity of the pipe
     is ignored.
@@ -207,7 +207,7 @@ class _Sender:
         self.scan_count = 0  # number of scans that have been sent
 
     def send(self, news: Iterable[News]) -> None:
-        """Send messages as they are produced by an iterable."""
+        """Send messages as an iterable produces them."""
         waiting: list[News] = []
         sent_at = time.monotonic()
         for item in news:

@@ -1,4 +1,4 @@
-"""Long-running stages 1, 3 and 4, and the pipes that connect them to the driver.
+"""Long-running stages 1, 3 and 4, and the pipes between them and the driver.
 
 The functions that run on workers are in `long_stage_tasks.py`. A pipe consists of a Dask Queue and
 a Dask Variable, which other clients can access by name. In the following names, RUN is the ID of
@@ -60,7 +60,7 @@ class _StageTask:
 
 
 class LongStages:
-    """Long-running stages, each of which runs on a chosen worker and is restarted if it dies.
+    """Long-running stages, each of which is started on a chosen worker and restarted if it dies.
 
     Dask's own scheduling does not suit tasks that run as long as the run. It may assign two stages
     to the same slot, where the second would wait forever, and it fails a task when its fourth
@@ -132,14 +132,14 @@ class LongStages:
 
     @property
     def notes(self) -> list[str]:
-        """Notes for the user."""
+        """Notes for the user of the run."""
         noun = "worker" if len(self._hidden) == 1 else "workers"
         workers = f"{noun} {', '.join(sorted(self._hidden))} of partition {self.partition.name}"
         note = f"{workers} cannot access {self._storage.url}, so the driver wrote the parts"
         return [*self._notes, *([note] if self._hidden else [])]
 
     def open(self) -> None:
-        """Create the pipes and the probe file. Call `finish` to remove them."""
+        """Create the pipes and the probe file, which `finish` removes."""
         with storing(self._storage):
             self._storage.prepare()
             self._storage.write(*self.probe)
@@ -151,7 +151,7 @@ class LongStages:
     def wait(
         self, seconds: float, keys: Sequence[str], *, scans: bool, linger_s: float = 0.0
     ) -> list[Message]:
-        """Exchange messages with the stages, and return the received messages.
+        """Exchange messages with the stages, and return the received ones.
 
         A single request sends and receives all messages, because each request takes the driver and
         the scheduler about one millisecond.
@@ -174,7 +174,7 @@ class LongStages:
         return [*chain.from_iterable(news.values())]
 
     def send(self, name: str, messages: Sequence[Order]) -> None:
-        """Send messages to a stage with the next `wait`.
+        """Send messages to a stage during the next call of `wait`.
 
         Messages to a stage that is not running or is being replaced are lost. The driver sends all
         orders again when the stage has started.
@@ -184,11 +184,11 @@ class LongStages:
             self._outbox.setdefault(task.inlet.name, []).extend(messages)
 
     def advise(self, scans: int) -> None:
-        """Set the number of scans that stage 1 sends in each message."""
+        """Set the number of scans in each message from stage 1."""
         set_advice(self._scans, scans)
 
     def store_held(self, receipt: Receipt) -> bool:
-        """Store a part that is held in the memory of a worker. Return False if the part is lost."""
+        """Store a part that a worker holds in memory, and return False if the part is lost."""
         self._hidden.add(receipt.held_at)
         data = fetch_held_bytes(self.client, receipt.held_at, receipt.name)
         if data is None:
@@ -199,7 +199,7 @@ class LongStages:
 
     @property
     def collectors(self) -> dict[str, str]:
-        """Addresses of the workers on which collectors are running, by collector name."""
+        """Addresses of the workers on which collectors run, keyed by collector name."""
         return {
             name: task.worker
             for name, task in self._tasks.items()
@@ -208,13 +208,13 @@ class LongStages:
 
     @property
     def lacks_slot(self) -> bool:
-        """True if a stage whose worker has died is waiting for a free slot."""
+        """True if a stage whose worker has died still waits for a free slot."""
         return any(task.dead_since is not None for task in self._tasks.values())
 
     # -- starting --------------------------------------------------------------------------
 
     def _start(self) -> None:
-        """Start all stages if there are enough free slots. Otherwise, the next call tries again."""
+        """Start all stages if there are enough free slots, or else try again in the next call."""
         lock = Lock(self._lock_name, scheduler_rpc=self.client.scheduler, loop=self.client.loop)
         acquired = False
         with suppress(RuntimeError):  # another run has just removed the lock (`_forget_lock`)
@@ -268,7 +268,7 @@ class LongStages:
     # -- restarting --------------------------------------------------------------------------
 
     def refresh(self, progress: int) -> tuple[Mapping[str, str], Sequence[str]]:
-        """Start all stages, or restart stages that have died or are waiting for a slot.
+        """Start all stages, or restart those that have died or are waiting for a slot.
 
         Do nothing if the last call is recent.
 
@@ -304,7 +304,7 @@ class LongStages:
         return self._restart(now_s)
 
     def _restart(self, now_s: float) -> tuple[dict[str, str], list[str]]:
-        """Restart stages that have died or are waiting for a slot. Return the same as `refresh`."""
+        """Restart stages that have died or are waiting for a slot, with the result of `refresh`."""
         died: dict[str, str] = {}
         started: list[str] = []
         locations = self._locate()
@@ -363,7 +363,7 @@ class LongStages:
             )
 
     def _count_death(self, name: str, worker: str) -> None:
-        """Count the death of a worker. Raise LidarError if the stage keeps dying."""
+        """Count the death of a worker, and raise LidarError if the stage keeps dying."""
         died = self._deaths.setdefault(name, [])
         died.append(worker)
         if len(died) > MAX_DEATHS:
@@ -374,7 +374,7 @@ class LongStages:
             )
 
     def _submit(self, name: str, free: dict[str, int]) -> None:
-        """Start a stage with a new key on the worker with the most free slots.
+        """Start a stage, using a new key, on the worker with the most free slots.
 
         The stage gets a new pipe, and the pipe of its predecessor is deleted. If the predecessor
         was only suspended, it would otherwise take items from the pipe after resuming. Without its
@@ -410,7 +410,7 @@ class LongStages:
     # -- the end -----------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Shut down the stages after everything has been committed."""
+        """Shut down the stages after all results have been committed."""
         # The pipes of stage 1 are closed, too, because it may still describe a failed survey.
         for pipe in self._pipes:
             if pipe is not self._news:
@@ -419,7 +419,7 @@ class LongStages:
 
     @property
     def closed(self) -> bool:
-        """True if the stages are shutting down or have exited."""
+        """True if the stages have exited or are shutting down."""
         return self._closed_at is not None
 
     @property
@@ -428,7 +428,7 @@ class LongStages:
 
     @property
     def ended(self) -> bool:
-        """True once all stages have exited after `close`, or the shutdown timeout has elapsed."""
+        """True if all stages have exited after `close`, or if the shutdown has timed out."""
         if self._closed_at is None:
             return False
         late = time.monotonic() - self._closed_at > LAST_WORDS_S
@@ -441,7 +441,7 @@ class LongStages:
                 pipe.fail(reason)
 
     def finish(self, other_futures: Sequence[Future]) -> list[TaskRecord]:
-        """Wait a moment for the stages to exit, and remove their state from the scheduler.
+        """Wait briefly for the stages to exit, and remove their state from the scheduler.
 
         Parameters
         ----------

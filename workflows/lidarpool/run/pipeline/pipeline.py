@@ -1,4 +1,4 @@
-"""Driver side of the pipeline, which offers batches, commits their parts and sorts their frames.
+"""Driver side of the pipeline, which offers batches, commits parts and sorts frames.
 
 The driver exchanges messages (`stage_messages.py`) with four stages:
 
@@ -51,20 +51,20 @@ ANNOUNCED = 2  # minimum number of jobs that stage 1 has orders for
 
 
 class Commits(Protocol):
-    """Interface of the database that parts are committed to."""
+    """Protocol of the database to which parts are committed."""
 
     def commit(self, receipts: Iterable[tuple[CommittedResults, Receipt]]) -> list[Receipt]:
-        """Commit parts of jobs, and return the parts that had not been committed before."""
+        """Commit parts of jobs, and return those that had not been committed before."""
         ...
 
     def summaries(self, part: Receipt) -> bytes:
-        """Return the summaries of the scans in a part as the bytes of a `summary_type` array."""
+        """Return the scan summaries of a part as the bytes of a `summary_type` array."""
         ...
 
 
 @dataclass
 class PipelineNews:
-    """Results of a pipeline step, which its caller must process in this order."""
+    """Results of a pipeline step, which must be processed in the order of the fields."""
 
     parts: list[Receipt] = field(default_factory=list)  # newly committed parts
     # Next scans to deliver as frames. They may include scans that have already been delivered.
@@ -74,7 +74,7 @@ class PipelineNews:
 
 
 class Pipeline:
-    """Driver side of the four stages that jobs pass through.
+    """Driver side of the pipeline, whose four stages process the scans of jobs.
 
     Only `workers` and `stages` access Dask, so that tests can replace the cluster.
 
@@ -118,7 +118,7 @@ class Pipeline:
         scans_per_task: int,
         scans_of_run: int = 0,
     ) -> PipelineJob:
-        """Add a job to the pipeline, without the scans that are already committed.
+        """Add a job to the pipeline, excluding the scans that are already committed.
 
         Parameters
         ----------
@@ -153,7 +153,7 @@ class Pipeline:
 
     @property
     def has_room(self) -> bool:
-        """True if a further job should begin, so that stage 1 always has scans to describe."""
+        """True if another job should begin, so that stage 1 always has scans to describe."""
         max_weight = self.dispatcher.max_weight
         advice = self.dispatcher.advice
         if len(self.jobs) >= max_weight:
@@ -177,14 +177,13 @@ class Pipeline:
         self._news.ended.append((job, error))
 
     def _end_complete(self, jobs: Iterable[PipelineJob]) -> None:
-        """End the jobs that are complete."""
         for job in jobs:
             if job.complete and job.number in self.jobs:
                 self._end(job)
 
     @property
     def notes(self) -> list[str]:
-        """Notes for the user."""
+        """Notes for the user of the run."""
         return [*self.stages.notes, *self.workers.notes]
 
     # -- one step ----------------------------------------------------------------------------
@@ -227,7 +226,7 @@ class Pipeline:
         return news
 
     def wait(self, keys: Iterable[str] = ()) -> None:
-        """Wait a moment for messages, for casting tasks, or for the tasks in `keys`.
+        """Wait briefly for messages, for casting tasks, or for the tasks in `keys`.
 
         The next `step` processes the messages.
         """
@@ -246,7 +245,7 @@ class Pipeline:
         )
 
     def _handle(self, message: Message) -> None:
-        """Handle a message from a stage. Receipts are handled in `_commit`."""
+        """Handle a message from a stage, except for receipts, which `_commit` handles."""
         if isinstance(message, ColumnsLost):
             self.dispatcher.recast_columns(message)
             return
@@ -276,7 +275,7 @@ class Pipeline:
             self._end_complete([job])
 
     def _commit(self, receipts: Sequence[Receipt]) -> None:
-        """Commit the receipts of jobs in flight, and sort and report the newly committed parts."""
+        """Commit receipts of jobs in flight, and sort and report the newly committed parts."""
         stored = [
             (self.jobs[receipt.job].committed, receipt)
             for receipt in receipts
@@ -303,7 +302,7 @@ class Pipeline:
         self._end_complete(parts_of_jobs)
 
     def _is_stored(self, receipt: Receipt) -> bool:
-        """Return whether a part is in the storage, after storing it if a worker holds it."""
+        """Return whether a part is in the storage, and store it first if a worker holds it."""
         if not receipt.held_at or self.stages.store_held(receipt):
             return True
         self.dispatcher.recast_part(receipt)
@@ -312,7 +311,7 @@ class Pipeline:
     # -- workers and stages ------------------------------------------------------------------
 
     def _refresh(self, scans_to_come: int) -> None:
-        """Handle changes of workers and stages, unless the last check is recent.
+        """Handle changes of workers and stages, unless they were checked recently.
 
         Raise LidarError if a stage has failed, or if workers or slots have been missing for too
         long.
@@ -379,7 +378,7 @@ class Pipeline:
             self.stages.send(SORT, messages)
 
     def _sort_again(self, jobs: Iterable[PipelineJob]) -> None:
-        """Send the summaries of all committed scans that are not sorted yet to the sorter."""
+        """Send the summaries of all committed but unsorted scans to the sorter."""
         for job in jobs:
             job.sorted_at = time.monotonic()
             if job.committed.has_frames:
@@ -391,18 +390,18 @@ class Pipeline:
     # -- the end -----------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Shut down the stages after everything has been committed."""
+        """Shut down the stages after all results have been committed."""
         self.workers.request_slots(0)  # allows an adaptive partition to shrink
         self.stages.close()
 
     def stop(self, reason: str) -> None:
-        """Stop all stages immediately. Call `finish` afterwards."""
+        """Stop all stages immediately. The caller must then call `finish`."""
         for job in self.jobs.values():
             self.dispatcher.drop(job)
         self.stages.stop(reason)
 
     def finish(self) -> None:
-        """Wait a moment for the stages to exit, add their records to `book`, and clean up."""
+        """Wait briefly for the stages to exit, add their records to `book`, and clean up."""
         try:
             for record in self.stages.finish(self.workers.futures):
                 self.book.add(record)

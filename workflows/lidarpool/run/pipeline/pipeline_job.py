@@ -1,4 +1,4 @@
-"""Jobs in the pipeline and their progress."""
+"""Jobs in the pipeline, and their progress."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .committed_results import CommittedResults
 
 @dataclass(eq=False)
 class PipelineJob:
-    """Job in the pipeline.
+    """Job that is in the pipeline.
 
     Its progress is modified by the dispatcher and the pipeline, and its committed results are
     modified by the run's database.
@@ -45,11 +45,11 @@ class PipelineJob:
 
     @property
     def complete(self) -> bool:
-        """True if all scans are committed and, in a job with frames, sorted."""
+        """True if all scans have been committed and, in a job with frames, sorted."""
         is_sorted = not self.committed.has_frames or self.sorted == self.scans.stop
         return is_sorted and not self.committed.missing_count
 
     def trace(self, event: str, stage: str, scans: Iterable[int], **details: str) -> None:
-        """Trace a driver event that concerns scans of this job."""
+        """Trace an event of the driver that concerns scans of this job."""
         details |= {"run": self.run, "stage": stage}
         trace(f"driver.{event}", job=self.number, scans=list(scans), **details)

@@ -1,4 +1,4 @@
-"""Driver policies for batch sizes, the choice of workers, and retries.
+"""Policies of the driver for batch sizes, worker selection and retries.
 
 They are pure functions, which do not access the clock, the cluster or the driver.
 """
@@ -58,7 +58,7 @@ def max_scans_per_batch(scans_per_task: int, scan_count: int, slots: int) -> int
 def scans_per_batch(
     recent_casts: Sequence[tuple[float, int]], scans_per_task: int, scan_count: int, slots: int
 ) -> int:
-    """Choose the number of scans in a batch from the casting times of recent batches.
+    """Choose the number of scans in a batch, based on the casting times of recent batches.
 
     Several recent batches are considered, because casting times vary. When only the last batch was
     considered, the size varied by a factor of four during a campaign.
@@ -88,7 +88,7 @@ def scans_per_batch(
 
 
 def batches_per_task(recent_casts: Sequence[tuple[float, int]], slots: int) -> int:
-    """Choose the number of small batches in a casting task from recent casting times.
+    """Choose the number of small batches in a casting task, based on recent casting times.
 
     Each task takes the scheduler 0.5 to 1 ms. With one batch per task, a receipt took 2.5 ms of the
     scheduler's CPU time. With several batches, it takes 0.4 to 0.9 ms.
@@ -108,7 +108,7 @@ def batches_per_task(recent_casts: Sequence[tuple[float, int]], slots: int) -> i
 
 
 def weight(batches: Iterable[Batch], per_task: int) -> float:
-    """Return the weight of batches, in units of small batches.
+    """Return the total weight of batches, measured in small batches.
 
     A full task has the weight `per_task`. All batches of a task are in the memory of a worker at
     the same time, so a batch that fills half of the memory of a task (`batch.share` is 0.5) has the
@@ -118,7 +118,7 @@ def weight(batches: Iterable[Batch], per_task: int) -> float:
 
 
 def max_weight_in_flight(slots: int, collectors: int, per_task: int = 1) -> int:
-    """Return the maximum `weight` of the batches in flight.
+    """Return the maximum total `weight` of batches in flight.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def slots_wanted(scan_count: int, scan_s: float | None) -> int:
 
 
 def kills_alone(batch: Batch, stage: str) -> int:
-    """Return the number of workers of a stage that died while they processed only this batch.
+    """Return how many workers of a stage have died while they processed only this batch.
 
     The number is negative if the batch is not suspect yet.
 
@@ -162,7 +162,7 @@ def kills_alone(batch: Batch, stage: str) -> int:
 
 
 def is_suspect(batch: Batch, stage: str) -> bool:
-    """Return True if a batch may cause workers of a stage to die, and must be tried alone."""
+    """Return True if a batch may have killed workers of a stage, and must be tried alone."""
     return bool(batch.deaths) and kills_alone(batch, stage) >= 0
 
 
@@ -228,7 +228,7 @@ def choose_offers(
 
 @dataclass(eq=False)
 class _OfferState:
-    """Load of the casting workers while tasks are being offered."""
+    """Load of the casting workers, which is updated with each task that is offered."""
 
     slots: Mapping[str, int]  # {address: number of concurrent casting tasks}
     per_task: int  # number of small batches in a task
@@ -255,7 +255,7 @@ class _OfferState:
         )
 
     def idle_slots(self) -> int:
-        """Return the number of slots without a task on workers that are not reserved."""
+        """Return the number of idle slots on workers that are not reserved."""
         return sum(
             max(0, count - self.load[address])
             for address, count in self.slots.items()
@@ -276,14 +276,14 @@ class _OfferState:
         return address if address and fullness[address] < 1 else None
 
     def may_wait(self, first: Batch, group: Collection[Batch], worker: str) -> bool:
-        """Return True if a task would not be full, and would have to wait on its worker anyway."""
+        """Return True if a task would not be full, and would have to wait on its worker."""
         busy = self.has_backlog or self.load[worker] >= self.slots[worker]
         if not busy or first.deaths:
             return False
         return min(self.free_weight, weight(group, self.per_task)) < self.per_task
 
     def add(self, task: Collection[Batch], worker: str, *, alone: bool) -> None:
-        """Count a task that is offered to a worker, and reserve the worker if it runs alone."""
+        """Count a task that is offered to a worker, and reserve the worker if `alone` is set."""
         self.free_weight -= weight(task, self.per_task)
         self.load[worker] += 1
         if alone:
@@ -291,7 +291,7 @@ class _OfferState:
 
 
 def _group_key(batch: Batch) -> object:
-    """Return a key that is equal for batches that may share a task.
+    """Return a key that is equal for all batches that may share a task.
 
     Normally, batches of all jobs with the same scene may share a task. After a task with several
     jobs has failed, its batches only share tasks with batches of the same job. If a worker died
@@ -303,7 +303,7 @@ def _group_key(batch: Batch) -> object:
 
 
 def _take_task(group: deque[Batch], max_weight: float, per_task: int) -> list[Batch]:
-    """Remove the batches of the next task from a group and return them.
+    """Remove the batches of the next task from a group, and return them.
 
     The task contains at least one batch. Further batches are added as long as the `weight` of the
     task does not exceed `max_weight`.
@@ -367,7 +367,7 @@ def _host(address: str) -> str:
 
 
 def late_after_s(recent_casts: Sequence[tuple[float, int]]) -> float:
-    """Return the time in a state, in seconds, after which a batch is late.
+    """Return the time in seconds after which a batch in the same state is late.
 
     Without recent casting times, the result is infinity.
     """
@@ -379,7 +379,7 @@ def late_after_s(recent_casts: Sequence[tuple[float, int]]) -> float:
 def find_loss(
     batch: Batch, locations: PartitionSnapshot, prepared_workers: int, now_s: float, late_s: float
 ) -> Outcome | None:
-    """Return why a batch should be offered again although its task has not failed.
+    """Return why a batch must be offered again, although its task has not failed.
 
     Parameters
     ----------

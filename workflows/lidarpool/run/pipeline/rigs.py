@@ -1,4 +1,4 @@
-"""Casting of batches on GPU workers (stage 2), with rigs that each worker process builds once.
+"""Casting of batches on GPU workers (stage 2), with a rig that each process builds once.
 
 A casting task refers to the rig of its job by a handle. The first task of a job on a worker also
 contains the plan of the rig and the scene. The worker keeps the rig in `cached_rigs`, together with
@@ -51,7 +51,7 @@ UNUSED_S = 600.0  # rigs that have been unused for longer are dropped when a new
 
 @dataclass(frozen=True, slots=True)
 class CastWork:
-    """Batches of a job in a casting task."""
+    """Batches of one job in a casting task."""
 
     job: int
     handle: str  # handle of the rig
@@ -73,7 +73,7 @@ def intersect(
     scene: Packed | None = None,
     *plans: Packed | None,
 ) -> list[CastBatch]:
-    """Cast the rays of batches on a GPU worker and compute their columns.
+    """Cast the rays of batches on a GPU worker, and compute the columns of their points.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def intersect(
 
 
 def cast_batch(rig: Rig, work: CastWork, first: int, stop: int) -> CastBatch:
-    """Cast the scans from `first` to `stop` with a rig, and compute the columns of their points.
+    """Cast the scans from `first` to `stop` with a rig, and compute their columns.
 
     All points of a run come from this function, so that a benchmark can replace it to measure
     everything else. Raise ScanError, which names the scans, if casting or a column fails.
@@ -145,7 +145,9 @@ def exit_on_lost_device(rig: Rig) -> Iterator[None]:
 
 
 def _samples(returns: BatchPoints | DevicePoints) -> Floats32:
-    """Return sample points of each scan in meters, as an array of shape (scans, samples, 3).
+    """Return the sample points of each scan in meters.
+
+    The array has shape (scans, samples, 3).
 
     Missing samples are NaN.
     """
@@ -165,20 +167,20 @@ def _samples(returns: BatchPoints | DevicePoints) -> Floats32:
 
 
 class RigMissing(RuntimeError):  # noqa: N818 - the name states what happened
-    """Error raised if a worker no longer has a rig or scene, for example after a restart."""
+    """Raised if a worker no longer has a rig or scene, for example after a restart."""
 
 
 class MemoryUnseen(RigMissing):
-    """Error raised if a worker cannot access the shared memory of the driver."""
+    """Raised if a worker cannot access the shared memory of the driver."""
 
 
 class RigFailed(RuntimeError):  # noqa: N818
-    """Error raised if the rig of a survey cannot be built."""
+    """Raised if the rig of a survey cannot be built."""
 
 
 @dataclass(eq=False)
 class _CachedRig:
-    """Rig of a job, or any rig of a scene, with the time of its last use."""
+    """Rig that is cached for a job or a scene, with the time of its last use."""
 
     rig: Rig
     scene: str  # handle of the scene
@@ -192,7 +194,7 @@ _lock = threading.Lock()
 
 
 def rig_of(handle: str, plan: Packed | None = None, scene: Packed | None = None) -> Rig:
-    """Return a cached rig, or build it from a plan and a scene.
+    """Return a cached rig, or build the rig from a plan and a scene.
 
     Raises
     ------
@@ -258,7 +260,7 @@ def _build(handle: str, plan: Packed | None, scene: Packed | None) -> _CachedRig
 
 
 def drop(handles: Collection[str]) -> None:
-    """Drop cached rigs and scenes by their handles. Unknown handles are ignored."""
+    """Drop the cached rigs and scenes with the given handles, ignoring unknown handles."""
     for handle in handles:
         cached_rigs.pop(handle, None)
 
@@ -272,7 +274,7 @@ def drop_all(run: str) -> None:
 
 
 def _unpickle(data: Packed) -> Any:
-    """Unpickle a value from the driver. Raise MemoryUnseen if its memory is not accessible."""
+    """Unpickle a value from the driver, or raise MemoryUnseen if its memory is inaccessible."""
     if isinstance(data, SharedHandle):
         try:
             return data.load()

@@ -29,7 +29,7 @@ SAMPLES_PER_SURVEY = 400  # approximate number of sample rays in a survey
 
 
 def samples_of_scan(scan_count: int) -> int:
-    """Return the number of sample rays per scan, which is lower for surveys with many scans."""
+    """Return the number of sample rays per scan, which is smaller for larger surveys."""
     return max(1, min(MAX_SAMPLES_PER_SCAN, -(-SAMPLES_PER_SURVEY // scan_count)))
 
 
@@ -48,7 +48,7 @@ def summary_type(samples: int) -> np.dtype[np.void]:
 
 
 def format_scans(first: int, stop: int) -> str:
-    """Format a half-open range of scans for messages.
+    """Format a half-open range of scans for use in messages.
 
     Examples
     --------
@@ -61,7 +61,7 @@ def format_scans(first: int, stop: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class StageStart:
-    """Identification of a started stage in traces."""
+    """Data that identifies a started stage in traces."""
 
     run: str  # ID of the run
     stage: str
@@ -74,7 +74,7 @@ class StageStart:
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """Order to stage 1 to describe the scans of a survey from `first` to `stop`."""
+    """Order for stage 1 to describe the scans of a survey from `first` to `stop`."""
 
     job: int
     survey: bytes  # pickled separately, so that an error does not affect other surveys
@@ -84,7 +84,7 @@ class Description:
 
 @dataclass(frozen=True, slots=True)
 class Scans:
-    """Consecutive scans of a job."""
+    """Range of consecutive scans of a job."""
 
     job: int
     first: int
@@ -92,19 +92,19 @@ class Scans:
 
     @property
     def scans(self) -> range:
-        """Range of the scan numbers."""
+        """Numbers of the scans in the range."""
         return range(self.first, self.stop)
 
 
 class ScanRange(Scans):
-    """Message from stage 1 about scans that can be described and may be cast."""
+    """Message from stage 1 about scans that can be described, so that they may be cast."""
 
     __slots__ = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Summaries(Scans):
-    """Summaries of the scans in a committed part, which stage 3 returns in scan order."""
+    """Scan summaries of a committed part, which stage 3 returns in scan order."""
 
     data: bytes  # bytes of a `summary_type` array
     framed: int  # one past the last scan that stage 3 does not have to wait for
@@ -113,7 +113,7 @@ class Summaries(Scans):
 
 @dataclass(frozen=True, slots=True)
 class CollectOrder:
-    """Order to stage 4 to fetch the batches of a casting task and write each of them as a part."""
+    """Order for stage 4 to fetch the batches of a casting task and write each of them as a part."""
 
     key: str  # key of the casting task
     worker: str  # address of the worker that holds the result of the task
@@ -122,7 +122,7 @@ class CollectOrder:
 
 @dataclass(frozen=True, slots=True)
 class ColumnsLost:
-    """Message from stage 4 that the result of a casting task could not be fetched."""
+    """Message from stage 4 that it could not fetch the result of a casting task."""
 
     key: str  # key of the casting task
 
@@ -144,7 +144,7 @@ class Receipt(Scans):
     def from_part(
         cls, part: PartColumns, job: int, name: str, size: int, record: TaskRecord | None = None
     ) -> Receipt:
-        """Create the receipt of a part, with totals that are computed from its columns."""
+        """Create the receipt of a part, computing totals from its columns."""
         summaries = np.zeros(len(part.counts), summary_type(part.samples.shape[1]))
         summaries["hits"] = part.scan_hits
         summaries["points"] = part.counts
@@ -167,7 +167,7 @@ class Receipt(Scans):
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """Message from stages 1 and 4 that scans of a survey cannot be described or stored."""
+    """Message from stage 1 or 4 that scans of a survey cannot be described or stored."""
 
     job: int
     stage: str
@@ -180,7 +180,7 @@ Message = ScanRange | Summaries | ColumnsLost | Receipt | Failed
 
 @dataclass(frozen=True)
 class ScanFrame:
-    """Scan of a survey, delivered in scan order once its points have been stored.
+    """Scan of a survey, which is delivered in scan order after its points have been stored.
 
     Parameters
     ----------
@@ -208,12 +208,12 @@ class ScanFrame:
 
     @property
     def pose(self) -> Pose:
-        """Pose of the sensor at the start of the scan, in the local coordinates of the scene."""
+        """Sensor pose at the start of the scan, in the local coordinates of the scene."""
         return self._survey.pose(self.scan)
 
     @property
     def time_ns(self) -> float:
-        """Start time of the scan in nanoseconds since the start of the survey."""
+        """Start time of the scan, in nanoseconds since the start of the survey."""
         return self._survey.begins_ns(self.scan)
 
     def points(self) -> Cloud:
@@ -227,7 +227,7 @@ class ScanFrame:
         return self._read(self.scan)
 
     def hit_counts(self) -> Ints:
-        """Count the hits of this scan on each triangle of the scene.
+        """Count how often rays of this scan hit each triangle of the scene.
 
         Returns
         -------

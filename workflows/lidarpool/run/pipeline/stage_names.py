@@ -1,4 +1,4 @@
-"""Names of the stages and of the partitions that they run on."""
+"""Names of the stages, and of the partitions on which they run."""
 
 GPU = "GPU"
 LIDAR = "LIDAR"

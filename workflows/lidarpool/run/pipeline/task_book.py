@@ -1,4 +1,4 @@
-"""Totals and sampled records of the tasks in a run, which require a bounded amount of memory."""
+"""Totals and sampled records of a run's tasks, which occupy a limited amount of memory."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MAX_SPANS = 2048  # maximum number of busy spans per stage
 
 @dataclass(eq=False)
 class StageTotals:
-    """Totals of all tasks of a stage, and some of their records."""
+    """Totals over all tasks of a stage, and some of their records."""
 
     stage: str
     partition: str
@@ -38,7 +38,7 @@ class StageTotals:
     _gap: float = 1e-4  # maximum gap between spans that are merged, in seconds
 
     def add(self, record: TaskRecord) -> None:
-        """Count a task."""
+        """Add the record of a task to the totals."""
         if self.tasks % self._every == 0:
             self.records.append(record)
             if len(self.records) > MAX_RECORDS:
@@ -65,19 +65,19 @@ class StageTotals:
 
 
 class TaskBook:
-    """Totals of the tasks in a run, by stage."""
+    """Totals of the tasks in a run, grouped by stage."""
 
     def __init__(self) -> None:
         self.stages: dict[str, StageTotals] = {}
 
     def add(self, record: TaskRecord) -> None:
-        """Add a task."""
+        """Add the record of a task."""
         new = StageTotals(record.stage, record.partition)
         self.stages.setdefault(record.stage, new).add(record)
 
 
 def union(spans: Iterable[tuple[float, float]], gap: float = 0.0) -> list[tuple[float, float]]:
-    """Sort spans, and merge those that overlap or are at most `gap` apart."""
+    """Sort time spans, and merge those that overlap or are at most `gap` apart."""
     merged: list[tuple[float, float]] = []
     for start, stop in sorted(spans):
         if merged and start <= merged[-1][1] + gap:

@@ -1,4 +1,4 @@
-"""Records of where and when tasks ran, which are created by the tasks themselves."""
+"""Records of where and when a task ran, which the task itself creates."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ class TaskRecord:
 
     @property
     def misplaced(self) -> bool:
-        """True if the worker was not in the task's partition."""
+        """True if the task ran on a worker outside its partition."""
         return self.partition not in self.resources
 
 
 class Recorder:
-    """Recorder of the duration and the worker of the current task."""
+    """Recorder of the duration and worker of the current task."""
 
     def __init__(self, stage: str, partition: str) -> None:
         self.stage = stage
@@ -48,7 +48,7 @@ class Recorder:
         self._start_s = time.perf_counter()
 
     def finish(self, items: int = 1) -> TaskRecord:
-        """Return the record of the task up to now, with the number of processed items."""
+        """Return the record of the task until now, with the number of processed items."""
         worker = get_worker()
         return TaskRecord(
             stage=self.stage,
@@ -64,7 +64,7 @@ class Recorder:
 def call_recorded(
     stage: str, partition: str, function: Callable[..., T], /, *args: Any, **kwargs: Any
 ) -> tuple[T, TaskRecord]:
-    """Call a function in a task and return its result and the record of the task."""
+    """Call a function in a task, and return its result with the record of the task."""
     recorder = Recorder(stage, partition)
     result = function(*args, **kwargs)
     return result, recorder.finish()

@@ -1,4 +1,4 @@
-"""Database of a run, which records the parts and trials that belong to the result.
+"""Database of a run, which records the parts and trials that the result consists of.
 
 The database is a single SQLite file. A batch belongs to the result once its receipt has been
 committed to the database. Before that, work may be lost or repeated. Afterwards, a second receipt
@@ -64,11 +64,11 @@ PARTS_FOLDER = re.compile("run-[0-9a-f]{16}")  # pattern of the names that `part
 
 
 class DamagedError(LidarError):
-    """Error raised for a database that cannot be read."""
+    """Raised if a database cannot be read."""
 
 
 class RunDatabase:
-    """Database of the committed parts and trials of a run, and of the jobs that have ended.
+    """Database of a run's committed parts and trials, and of jobs that have ended.
 
     Jobs in flight also keep their committed results in memory. All methods that write raise
     LidarError if the disk is full or fails.
@@ -189,7 +189,7 @@ class RunDatabase:
 
     @property
     def used(self) -> bool:
-        """True if any results are or were committed."""
+        """True if results have been committed, even if they were removed later."""
         return "forgot" in self.meta or bool(self.ended_count or self.begun)
 
     def ended(self, number: int) -> bool:
@@ -197,17 +197,17 @@ class RunDatabase:
         return number < len(self._ended) and self._ended[number] != 0
 
     def failed(self) -> list[int]:
-        """Return the numbers of the failed jobs, in ascending order."""
+        """Return the numbers of all failed jobs in ascending order."""
         query = "SELECT number FROM jobs WHERE failed ORDER BY number"
         return [number for (number,) in self._rows(query)]
 
     def input_hash(self, number: int) -> str:
-        """Return the input hash of a job in flight, or an empty string if none is stored."""
+        """Return the input hash of a job in flight, or an empty string if none was stored."""
         rows = self._rows("SELECT hash FROM input_hashes WHERE job = ?", number)
         return "".join(text for (text,) in rows)
 
     def job_rows(self) -> Iterator[dict[str, Any]]:
-        """Yield the stored rows of the jobs that have ended, in order of their numbers."""
+        """Yield the stored rows of all ended jobs, sorted by job number."""
         with (
             _explained(self.path),
             closing(self._sql.execute("SELECT data FROM jobs ORDER BY number")) as rows,
@@ -216,7 +216,7 @@ class RunDatabase:
                 yield json.loads(data)
 
     def summaries(self, part: Receipt) -> bytes:
-        """Return the summaries of the scans in a committed part."""
+        """Return the scan summaries of a committed part."""
         query = "SELECT summaries FROM parts WHERE job = ? AND first = ?"
         with _explained(self.path):
             ((data,),) = self._rows(query, part.job, part.first)
@@ -225,13 +225,13 @@ class RunDatabase:
     # -- writing -------------------------------------------------------------------------
 
     def set(self, **values: str) -> None:
-        """Store values in the `meta` table."""
+        """Store values in the table `meta`."""
         with self._transaction():
             self._insert("meta", values.items(), "OR REPLACE")
         self.meta |= values
 
     def commit(self, receipts: Iterable[tuple[CommittedResults, Receipt]]) -> list[Receipt]:
-        """Commit parts in one transaction, and return the newly committed parts.
+        """Commit parts in a single transaction, and return those that are new.
 
         Parts that contain a scan that has already been committed are skipped. The number of
         delivered frames in these jobs is also committed.
@@ -274,7 +274,7 @@ class RunDatabase:
             self._insert("input_hashes", [(number, text)], "OR REPLACE")
 
     def drop(self, job: CommittedResults, receipts: Sequence[Receipt]) -> None:
-        """Remove parts that are missing from the storage, so that their scans are cast again."""
+        """Remove parts that the storage has lost, so that their scans are cast again."""
         with self._transaction():
             self._sql.executemany(
                 "DELETE FROM parts WHERE job = ? AND first = ?",
@@ -284,7 +284,7 @@ class RunDatabase:
             job.parts.remove(part)
 
     def add_trials(self, job: CommittedResults, trials: Sequence[Trial]) -> None:
-        """Commit planning trials of a job."""
+        """Commit the planning trials of a job."""
         with self._transaction():
             # JSON preserves floats exactly.
             rows = [
@@ -331,7 +331,7 @@ class RunDatabase:
         job.reset()
 
     def save_frames(self, jobs: Iterable[CommittedResults]) -> None:
-        """Commit the number of delivered frames in each job if it has changed."""
+        """Commit the number of delivered frames of each job for which it has changed."""
         unsaved = [job for job in jobs if self._has_unsaved_frames(job)]
         if unsaved:
             with self._transaction():
@@ -343,7 +343,7 @@ class RunDatabase:
             return self._sql.serialize()
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the database file."""
         self._sql.close()
 
     def _delete(self, numbers: Iterable[int]) -> None:
@@ -372,7 +372,7 @@ class RunDatabase:
         return job.frames != self._frames.get(job.number, job.scans.start)
 
     def _insert(self, table: str, rows: Iterable[Sequence[Any]], conflict: str = "") -> None:
-        """Insert rows with their CRC-32, with a conflict clause such as ``OR REPLACE``."""
+        """Insert rows and their CRC-32, using a conflict clause such as ``OR REPLACE``."""
         # The checksum is not computed in a function that SQLite calls, because an interrupt in that
         # function would look like damage.
         sealed_rows = [(*row, _crc32(*row)) for row in rows]
@@ -416,7 +416,7 @@ def _explained(path: Path) -> Iterator[None]:
 
 
 def _crc32(*values: Any) -> int:
-    """Return the CRC-32 of the values in a row, which must be as read from SQLite."""
+    """Return the CRC-32 of a row's values, which must have the types that SQLite returns."""
     crc = 0
     for value in values:
         crc = zlib.crc32(value if isinstance(value, bytes) else f"{value!r},".encode(), crc)
@@ -424,12 +424,12 @@ def _crc32(*values: Any) -> int:
 
 
 def parts_folder(mark: str) -> str:
-    """Return the name of a run's parts folder in a location that several runs share."""
+    """Return the name of a run's parts folder in a location shared by several runs."""
     return f"run-{mark}"
 
 
 def _validate_location(meta: Mapping[str, str]) -> tuple[str, str]:
-    """Return the mark and the parts location in a `meta` table.
+    """Return the mark and parts location from a table `meta`.
 
     Raise ValueError if they are invalid.
     """

@@ -1,4 +1,4 @@
-"""Checks of the parts from an earlier run before they are reused."""
+"""Check the parts of an earlier run before they are reused."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _IN_PART = attrgetter("first", "stop", "point_count")
 def check_parts(
     job: StoredJob, db: RunDatabase, sizes: Mapping[str, int], strays: Sequence[str]
 ) -> list[str]:
-    """Drop missing and damaged parts of a job, and commit parts that are not in the database.
+    """Drop missing and damaged parts of a job, and commit parts that the database lacks.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Runs in remote storage, such as an object store.
+"""Runs in a remote storage, such as an object store.
 
 SQLite requires a local disk. The database is therefore kept in a temporary folder of the driver and
 copied to the storage every few seconds. When a run is resumed, results that were committed after
@@ -23,7 +23,7 @@ COPY_REST = 20  # minimum pause after a copy as a multiple of the time that the 
 
 
 class RemoteRun:
-    """Copies of a run's database in remote storage, and the mark of the run that owns them.
+    """Copies of a run's database in a remote storage, with the mark of the run that owns them.
 
     A resumed run takes over the files of an earlier run. If the earlier run is still alive, it
     detects this before its next copy and then exits.
@@ -39,13 +39,13 @@ class RemoteRun:
         self._due = float("-inf")
 
     def claim(self, db: RunDatabase) -> None:
-        """Take over the run and write a first copy of the database."""
+        """Take over the run, and write the first copy of the database."""
         with self._explained():
             self.storage.write(OWNER, self._mark)
         self.save(db)
 
     def save(self, db: RunDatabase, *, force: bool = False) -> None:
-        """Copy the database to the storage if a copy is due, or if `force` is True.
+        """Copy the database to the storage if a copy is due or if `force` is True.
 
         Raise LidarError if another run has taken over.
         """
@@ -76,7 +76,7 @@ class RemoteRun:
 
 
 def fetch_database(storage: Storage, path: Path) -> None:
-    """Copy the database of a run from remote storage to a local path, if it exists."""
+    """Copy the database of a run from a remote storage to a local path, if it exists."""
     with explained(f"The run in {storage} cannot be read"):
         if FILE in storage.sizes():
             storage.get(FILE, path)

@@ -1,4 +1,4 @@
-"""Stores of runs, each with a database and parts, which allow runs to be resumed."""
+"""Stores of runs that consist of a database and parts, from which runs can be resumed."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class _EarlierDatabase(NamedTuple):
 
 
 class RunStore:
-    """Database of a run and folder with the parts of its jobs.
+    """Database of a run, and folder with the parts of the run's jobs.
 
     If the database is missing or damaged, it is rebuilt. The mark file in the parts folder contains
     the initial values of the database, and each part contains the data of its receipt.
@@ -173,7 +173,7 @@ class RunStore:
             raise
 
     def _open_earlier(self, path: Path, durable: bool) -> _EarlierDatabase:
-        """Open the database of an earlier run, if one exists."""
+        """Open the database of an earlier run, if there is one."""
         try:
             if self._remote:
                 fetch_database(self._remote.storage, path)
@@ -192,7 +192,7 @@ class RunStore:
     def _recover_meta(
         self, path: Path, earlier_mark: str, parts_location: str | Path | Storage | None
     ) -> dict[str, str] | None:
-        """Recover the initial values of a lost database from the mark file in the parts folder.
+        """Restore the initial values of a lost database from the mark file in the parts folder.
 
         Return None if there is no mark file. `earlier_mark` is the mark of an existing database
         without results, or an empty string. Raise LidarError if the database belongs to a different
@@ -209,7 +209,7 @@ class RunStore:
         return meta
 
     def _discard(self, earlier: _EarlierDatabase) -> None:
-        """Remove an earlier run without results. Raise LidarError if its database is damaged."""
+        """Remove an earlier run without results, or raise LidarError if its database is damaged."""
         if earlier.damage is not None:
             reason = str(earlier.damage).replace(self._folder.url, self.location.url)
             raise LidarError(reason) from earlier.damage
@@ -266,7 +266,7 @@ class RunStore:
         self.storage.write(mark_name(values["mark"]), json.dumps(values).encode())
 
     def _check_resumable(self, resume: bool) -> None:
-        """Raise LidarError if the options do not allow the existing run to be continued."""
+        """Raise LidarError if the options do not allow continuing the existing run."""
         if not resume:
             raise LidarError(
                 f"{self.location} contains an unfinished run with {self.committed_text}. "
@@ -280,7 +280,7 @@ class RunStore:
             )
 
     def _difference(self, meta: Mapping[str, str]) -> str:
-        """Describe how the run of a database differs from this run, as a sentence.
+        """Describe in a sentence how the run in a database differs from this run.
 
         Return an empty string if it does not differ.
         """
@@ -305,7 +305,7 @@ class RunStore:
         return ""
 
     def _check_same(self, meta: Mapping[str, str]) -> None:
-        """Raise LidarError if an earlier run in this location differs from this run."""
+        """Raise LidarError if the earlier run in this location differs from this run."""
         if difference := self._difference(meta):
             raise LidarError(
                 f"The run in {self.location} cannot be continued because {difference} Remove it "
@@ -316,16 +316,16 @@ class RunStore:
 
     @property
     def backend(self) -> str:
-        """Backend that the scans are cast with, or an empty string if it is not known yet."""
+        """Backend with which scans are cast, or an empty string if it is not known yet."""
         return self.db.meta.get("backend", "")
 
     @property
     def casting(self) -> dict[str, str]:
-        """Software of the workers that cast the scans, or an empty dictionary if not known yet."""
+        """Software of the workers that cast scans, or an empty dictionary if not known yet."""
         return dict(json.loads(self.db.meta.get("casting", "{}")))
 
     def cast_with(self, backend: str, casting: Mapping[str, str]) -> None:
-        """Store the backend and the software that all scans are cast with."""
+        """Store the backend and software with which all scans are cast."""
         if backend != self.backend or casting != self.casting:
             self.db.set(backend=backend, casting=json.dumps(casting))
             with storing(self.storage):
@@ -333,12 +333,12 @@ class RunStore:
 
     @property
     def fields(self) -> Mapping[str, str]:
-        """Descriptions of the fields that the results depend on, by field path."""
+        """Descriptions of the fields that determine the results, keyed by field path."""
         return dict(json.loads(self.db.meta.get("fields", "{}")))
 
     @property
     def made_with(self) -> dict[str, Any]:
-        """Identity, backend and software of the run, which are recorded in manifests."""
+        """Identity, backend and software of the run, as recorded in manifests."""
         identity = fingerprint(dict(self.identity))
         return {"identity": identity, "backend": self.backend, "casting": self.casting}
 
@@ -351,7 +351,7 @@ class RunStore:
 
     @property
     def advice(self) -> str:
-        """Advice at the end of a message that the backend is not available."""
+        """Last sentences of the error message for an unavailable backend."""
         if not self.committed_text:
             return AUTO_ADVICE
         return (
@@ -360,17 +360,17 @@ class RunStore:
         )
 
     def rows(self) -> Iterator[JobRow]:
-        """Yield the table rows of the jobs that have ended, in order of their numbers."""
+        """Yield the table rows of all ended jobs, sorted by job number."""
         for row in self.db.job_rows():
             yield JobRow.from_json(row)
 
     @property
     def sensors(self) -> dict[str, str]:
-        """Models and rates of the sensors in finished jobs, by sensor name."""
+        """Models and rates of the sensors in finished jobs, keyed by sensor name."""
         return dict(json.loads(self.db.meta.get("sensors", "{}")))
 
     def note_nothing_to_resume(self, target: object) -> None:
-        """Add a note if a survey should be resumed, but had no unfinished run.
+        """Add a note if the user asked to resume a survey that has no unfinished run.
 
         The note names `target`, the location of the result.
         """
@@ -382,7 +382,7 @@ class RunStore:
     # -- jobs --------------------------------------------------------------------------------
 
     def open_job(self, job: Job) -> StoredJob:
-        """Return the stored job for a job in flight, after checking parts from an earlier run."""
+        """Check any parts from an earlier run of a job, and return the stored job."""
         number = job.number
         if number in self.in_flight:
             return self.in_flight[number]
@@ -410,7 +410,6 @@ class RunStore:
         return self._add(StoredJob(job, committed, self.storage, self.db, resumed, keeper=self))
 
     def _check(self, stored: StoredJob, strays: Sequence[str]) -> StoredJob:
-        """Check parts from an earlier run, and update the number of resumed scans."""
         self.notes += check_parts(stored, self.db, self._sizes, strays)
         return self._add(replace(stored, resumed=stored.parts.scans_done))
 
@@ -419,13 +418,13 @@ class RunStore:
         return stored
 
     def reassign_points(self, job: Job) -> None:
-        """Assign the committed points to `job`, as if this run had cast all of them."""
+        """Assign all committed points to `job`, as if they had been cast in this run."""
         assert self.only_job is not None, "the run is a survey"
         self.only_job.committed.advance_frames(self.only_job.scans.stop)
         self.only_job = self._add(replace(self.only_job, job=job, resumed=0))
 
     def end(self, rows: Sequence[JobRow]) -> list[tuple[JobRow, StoredJob]]:
-        """Commit the rows of ended jobs, and return the jobs that were in flight with their rows.
+        """Commit the rows of ended jobs, and return those that were in flight, with their jobs.
 
         The models and rates of their sensors are also stored, for the data set card.
         """
@@ -461,7 +460,7 @@ class RunStore:
     # -- the end -----------------------------------------------------------------------------
 
     def save(self, *, force: bool = False) -> None:
-        """Store the number of delivered frames, and the input hashes of partly cast jobs.
+        """Store the number of delivered frames, and the input hashes of partially cast jobs.
 
         If the run is in remote storage, the database is also copied there if a copy is due or if
         `force` is True. Raise LidarError if this fails, or if another run has taken over.
@@ -486,7 +485,7 @@ class RunStore:
         self.db.close()
 
     def tidy(self) -> None:
-        """Remove parts from dead or replaced collectors, which belong to no job in flight."""
+        """Remove parts of dead or replaced collectors that do not belong to a job in flight."""
         mark = self.db.meta["mark"]
         part_names = [part.name for job in self.in_flight.values() for part in job.parts.ordered]
         needed_names = {mark_name(mark), *part_names}
@@ -496,7 +495,7 @@ class RunStore:
             )
 
     def remove(self) -> None:
-        """Remove the store, but no files of other runs, after the result has been published."""
+        """Remove the store after the result has been published, but no files of other runs."""
         if self._remote:
             self._remote.check()
         self._removed = True
@@ -505,7 +504,7 @@ class RunStore:
 
     @contextmanager
     def kept_on_error(self) -> Iterator[None]:
-        """If the body raises an error, add a note on how to resume, or remove an empty store."""
+        """If the body fails, add a note that explains how to resume, or remove the empty store."""
         try:
             yield
         except BaseException as error:
@@ -619,7 +618,7 @@ def remove_run(folder: str | Path | Storage) -> None:
 
 
 def _remove(location: Storage, part_storage: Storage, mark: str | None) -> None:
-    """Remove the database of a run and the parts with its mark.
+    """Remove the database of a run, and the parts with the run's mark.
 
     If `mark` is None because the database cannot be read, the parts of all mark files in the parts
     folder are removed.

@@ -1,4 +1,4 @@
-"""Committed results of a job, read from the run store."""
+"""Committed results of a job that are read from the run store."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class StoredJob:
         return self.committed.trials
 
     def receipt(self, name: str) -> Receipt | None:
-        """Create the receipt of a part in the storage, or return None if the part is damaged."""
+        """Create the receipt of a stored part, or return None if the part is damaged."""
         try:
             data = self.storage.read(name)
             return Receipt.from_part(unpack(data), self.job.number, name, len(data))
@@ -90,7 +90,7 @@ class StoredJob:
 
     @property
     def committed_text(self) -> str:
-        """Number of committed scans or trials as text, or an empty string for none."""
+        """Number of committed scans or trials as text, or an empty string if there are none."""
         if self.parts.scans_done:
             return f"{self.parts.scans_done:,} of {len(self.scans):,} scans"
         if self.trials:
@@ -99,11 +99,11 @@ class StoredJob:
 
     @property
     def complete(self) -> bool:
-        """True if all scans and planning trials are committed and all frames were delivered."""
+        """True if all scans and trials have been committed and all frames delivered."""
         return self.committed.scans_complete and len(self.trials) == self.job.trials
 
     def progress(self) -> Progress:
-        """Return the progress of the job according to its committed results."""
+        """Return the progress of the job, computed from its committed results."""
         start = self.scans.start
         stop = self.scans.stop
         frames = self.committed.frames
@@ -122,7 +122,7 @@ class StoredJob:
         )
 
     def points(self) -> StoredCloud:
-        """Return the points that have been committed so far."""
+        """Return all points that have been committed so far."""
         parts = self.parts.ordered
         job = self.job
         world = job.survey.coordinates == "world"
@@ -172,7 +172,7 @@ class StoredJob:
             )
 
     def hit_counts(self) -> Ints:
-        """Return the number of committed hits for each hit counter of the scene.
+        """Return the number of committed hits of each hit counter in the scene.
 
         Returns
         -------
@@ -186,7 +186,7 @@ class StoredJob:
         return counts
 
     def sample_rays(self) -> Floats32:
-        """Return the start and end points of sample rays, in meters in local coordinates.
+        """Return the start and end points of sample rays in local coordinates, in meters.
 
         Returns
         -------
