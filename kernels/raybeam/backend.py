@@ -72,11 +72,11 @@ class Backend(ABC):
     @classmethod
     @abstractmethod
     def unavailable_reason(cls) -> str:
-        """Return the reason why this backend is unavailable, with a remedy, or ""."""
+        """Return why this backend is unavailable and how to fix this, or "" if it is available."""
 
     @classmethod
     def versions(cls) -> str:
-        """Return the versions, except NumPy's, that affect the bits of the results, or ""."""
+        """Return the versions that affect the bits of the results, or "" if only NumPy's does."""
         return ""
 
     @classmethod  # noqa: B027 - most backends have nothing to limit
@@ -90,12 +90,12 @@ class Backend(ABC):
         self._scene = scene
 
     def update_scene(self, scene: LocalScene) -> None:
-        """Replace the scene with a scene that has the same instances but new transforms."""
+        """Replace the scene by one with the same instances but new transforms."""
         self._scene = scene
 
     @property
     def device_lost(self) -> bool:
-        """Whether the device no longer responds to calls from this process after an error."""
+        """Whether the device has stopped responding to this process after an error."""
         return False
 
     @abstractmethod
@@ -116,7 +116,7 @@ class Backend(ABC):
         return join_hits(parts)
 
     def cast_pairs(self, pairs: RayBodyPairs, nearest: NearestHits) -> None:
-        """Cast rays at bodies with the shape of this scene, and record closer hits in `nearest`."""
+        """Cast rays at bodies with this shape, and record closer hits in `nearest`."""
         cast_pairs(self.hit_columns, pairs, nearest)
 
     def upload_rays(
@@ -153,7 +153,7 @@ class Backend(ABC):
         return hits
 
     def scan(self, scan: Scan) -> ScanReturns:
-        """Return the stored hits of a scan and the counts of all hits."""
+        """Return the hits to store for a scan, and the counts of all hits."""
         collector = HitCollector(scan, self._scene.face_count if scan.tally else 0)
         for start, stop, (ray, distance, triangle, instance) in self.scan_parts(scan):
             if scan.tally:
@@ -165,7 +165,7 @@ class Backend(ABC):
         return collector.result()
 
     def scan_parts(self, scan: Scan) -> Iterator[tuple[int, int, HitColumns]]:
-        """Yield consecutive parts of a scan, each as first ray, end, and hits.
+        """Yield consecutive parts of a scan as tuples of the first ray, the end, and the hits.
 
         The ray indices of the hits start at 0 in each part.
         """

@@ -28,7 +28,7 @@ _LEAF_SIZE = 4
 
 @dataclass(frozen=True, eq=False)
 class DeformingMesh:
-    """A mesh whose vertices move linearly between frames, for use as a shape in `MovingBodies`.
+    """A mesh whose vertices move linearly between frames, used as a shape in `MovingBodies`.
 
     Frame numbers start at 0, and frame 1.5 is halfway between the second and the third frame. The
     mesh keeps its shape before the first and after the last frame.
@@ -47,11 +47,11 @@ class DeformingMesh:
 
     @property
     def box(self) -> Floats:
-        """Lower and upper corner of the bounding box of all frames, in meters. Shape (2, 3)."""
+        """Lower and upper corner of a bounding box around all frames, in meters. Shape (2, 3)."""
         return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
     def cast_pairs(self, pairs: RayBodyPairs, nearest: NearestHits) -> None:
-        """Cast rays at bodies with this shape, and record closer hits in `nearest`.
+        """Cast rays at bodies that have this shape, and record closer hits in `nearest`.
 
         Ties are resolved in favor of the lowest triangle index.
         """
@@ -61,7 +61,7 @@ class DeformingMesh:
 
     @cached_property
     def _tree(self) -> DeformingTree:
-        """The mesh and its tree in the form that the compiled loop reads."""
+        """The mesh and its tree, as required by the compiled loop."""
         from . import deforming_loops as loops
 
         vertices = np.ascontiguousarray(self.vertices)

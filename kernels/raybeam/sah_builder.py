@@ -1,4 +1,4 @@
-"""Top-down builder of binary hierarchies by the surface area heuristic (SAH).
+"""Build binary hierarchies from top to bottom with the surface area heuristic (SAH).
 
 Starting at the root, each node is divided where the heuristic has its minimum, over all positions
 between its boxes sorted along each of the three axes. This full sweep generally gives the best
@@ -23,7 +23,7 @@ _LEVELS = 32
 
 @dataclass(frozen=True)
 class _Level:
-    """The nodes with at least two boxes on one level of the tree.
+    """The nodes on one level of the tree that contain at least two boxes.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ def build_by_sah(lower: Floats32, upper: Floats32, weight: Floats) -> list[Indic
 def _cheapest_splits(
     lower: Floats32, upper: Floats32, weight: Floats, level: _Level, node: Indices
 ) -> tuple[Indices, Indices]:
-    """Return the axis and position of the cheapest split of each node.
+    """Find the axis and position of the cheapest split of each node.
 
     The position is the last one of the first part.
     """
@@ -97,7 +97,7 @@ def _cheapest_splits(
 def _split_costs(
     lower: Floats32, upper: Floats32, weight: Floats, level: _Level, node: Indices
 ) -> Floats:
-    """Return the cost of a split after each position.
+    """Compute the cost of splitting a node after each position.
 
     The boxes and weights are sorted along an axis.
     """
@@ -113,7 +113,7 @@ def _split_costs(
 
 
 def _prefix_half_areas(lower: Floats32, upper: Floats32, node: Indices) -> Floats:
-    """Return half the surface area of each box combined with the earlier boxes of its node."""
+    """Compute half the surface area of the box around each node's first boxes, for all counts."""
     # Each node is shifted by a different offset, so that one pass over all nodes restarts at each
     # node.
     shift = _NODE_SPACING * node
@@ -127,7 +127,7 @@ def _prefix_half_areas(lower: Floats32, upper: Floats32, node: Indices) -> Float
 def _split_nodes(
     level: _Level, node: Indices, axis: Indices, split: Indices
 ) -> tuple[Indices, _Level]:
-    """Return the two children of each node, and the next level."""
+    """Split each node into two children, and return the children and the next level."""
     right = np.zeros(int(max(order.max() for order in level.orders)) + 1, np.bool_)
     for k, order in enumerate(level.orders):
         split_on_axis = (axis == k)[node]
