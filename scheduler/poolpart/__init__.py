@@ -1,4 +1,4 @@
-"""Pool partitions and pipes for Dask clusters."""
+"""Partitions of the workers of a Dask cluster, and pipes between tasks."""
 
 from . import extras as extras  # registers the features
 from ._version import __version__
