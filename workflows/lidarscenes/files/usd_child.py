@@ -504,7 +504,7 @@ class MaterialReader:
         return source | self._coordinates(shader.GetInput("st"))
 
     def _coordinates(self, coordinate_input: Any) -> dict[str, Any]:
-        """Return the name of texture coordinates, and the 3 x 2 matrix that maps (u, v, 1)."""
+        """Return the name of texture coordinates, and their 3 x 2 matrix for (u, v, 1)."""
         matrix = np.eye(3)
         for _ in range(_MAX_LINKS):
             attributes = (

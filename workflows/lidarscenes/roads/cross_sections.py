@@ -329,7 +329,7 @@ class _Columns(NamedTuple):
 
     @classmethod
     def from_surfaces(cls, surfaces: Sequence[SampledSurface]) -> _Columns:
-        """Number the columns and cells of all surfaces consecutively."""
+        """Assign consecutive numbers to the columns and cells of all surfaces."""
         intervals = []
         right = []
         left = []
