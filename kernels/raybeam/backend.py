@@ -105,7 +105,7 @@ class Backend(ABC):
     def hit_columns(self, rays: Rays) -> HitColumns:
         """Return the closest hits of any number of rays, in ray order.
 
-        Rays that miss and barycentric weights are not included.
+        The result omits rays that miss, and barycentric weights.
         """
         parts: list[HitColumns] = []
         for start in range(0, len(rays), self.chunk):
@@ -128,7 +128,7 @@ class Backend(ABC):
     def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearestHits) -> None:
         """Cast rays at bodies on the device, and record closer hits in `nearest`.
 
-        The bodies have the shape of this scene.
+        This scene is the shape of the bodies.
         """
         raise BackendUnavailable(f"Backend {self.name!r} does not support devices. Use cast_pairs.")
 

@@ -172,7 +172,7 @@ def cast_pairs(
 ) -> None:
     """Cast rays at bodies and record closer hits in `nearest`.
 
-    `cast` returns the closest hits of rays in the frame of the bodies.
+    The function `cast` returns the closest hits of rays that are in body coordinates.
     """
     rays = _to_body_frames(pairs)
     ray, distance, triangle, instance = cast(rays)

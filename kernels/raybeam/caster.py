@@ -82,8 +82,8 @@ class RayCaster:
         """Create a ray caster for mesh instances, numbered from 0 in the given order.
 
         Each mesh has a single acceleration structure, so memory use and build time depend on the
-        meshes, and hardly on the number of instances. A caster for a single instance without a
-        transform is equivalent to a caster for its mesh.
+        meshes and hardly at all on the number of instances. A caster for a single instance without
+        a transform is equivalent to a caster for its mesh.
 
         Parameters
         ----------
@@ -167,9 +167,9 @@ class RayCaster:
     ) -> DeviceNearestHits:
         """Copy rays `start` to `stop` of a scan to the device, initially without hits on bodies.
 
-        `time_index` (n,) contains the index of the time of each ray. Only hits at a distance of
-        less than `end` meters are recorded. Raises BackendUnavailable if this backend does not use
-        a device.
+        `time_index` (n,) contains the index of each ray's time. Only hits at a distance of less
+        than `end` meters are recorded. Raises BackendUnavailable if this backend does not use a
+        device.
         """
         return self.engine.upload_rays(scan, start, stop, time_index, end)
 

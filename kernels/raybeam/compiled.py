@@ -271,8 +271,8 @@ def inlined(function: Any) -> Any:
 def noinline(function: Any) -> Any:
     """Compile a function that is not inlined into the compiled functions that call it.
 
-    LLVM vectorizes the loops of such a function, which often fails in the middle of a longer
-    function.
+    LLVM vectorizes the loops of such a function. In the middle of a longer function, this often
+    fails.
     """
     return _compile_inner(function)
 

@@ -56,10 +56,10 @@ class CudaBackend(Backend):
     Only the stored hits are copied to the host.
 
     Kernels and copies use the current stream of the calling thread. Each call ends with a copy to
-    the host that CuPy waits for, so the device no longer uses the memory of a call when the call
-    returns. Tables and patterns are kept between calls. The call that creates them waits until they
-    are complete, so that threads with other streams can use them. Each call switches to the
-    caster's device and back.
+    the host, for which CuPy waits. When the call returns, the device therefore no longer uses the
+    call's memory. Tables and patterns are kept between calls. The call that creates them waits
+    until they are complete, so that threads with other streams can use them. Each call switches to
+    the caster's device and back.
 
     NumPy builds the trees (cuda_tables.py). A builder on the device would need as much code as the
     traversal and would save each worker only two seconds per million triangles at startup.
@@ -380,8 +380,8 @@ class CudaBackend(Backend):
     def _pattern_flags(self, scan: Scan, start: int) -> list[np.int32]:
         """Return the remaining arguments of the kernel `make_rays`.
 
-        They are the number of rays of the first pose and of each later pose, whether there are
-        rotations, and whether the pattern has origins.
+        These are the number of rays that use the first pose, the number for each later pose,
+        whether there are rotations, and whether the pattern has origins.
         """
         poses = scan.poses
         first_count = poses.rays_per_pose - start % poses.rays_per_pose

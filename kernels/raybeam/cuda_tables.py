@@ -93,7 +93,7 @@ def build_mesh_tables(meshes: tuple[LocalMesh, ...]) -> MeshTables:
 def build_instance_tables(scene: LocalScene, roots: Ints) -> InstanceTables:
     """Build the tree over the instances. For a plain scene, return placeholders.
 
-    `roots` contains the root of the tree of each mesh.
+    `roots` contains the root of each mesh's tree.
     """
     if scene.matrices is None:
         return InstanceTables(

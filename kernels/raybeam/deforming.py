@@ -1,10 +1,10 @@
 """Meshes whose vertices move between frames.
 
-A ray hits such a mesh in its shape at the firing time of the ray. One tree over the triangles,
-which is built once, serves all times: each vertex moves along a straight line between two frames,
-so a box that encloses a triangle at both frames also encloses it in between. All backends cast rays
-at these meshes with a compiled loop on the CPU (deforming_loops.py), which uses the intersection
-test in triangle.py.
+A ray hits such a mesh in the shape that the mesh has when the ray is fired. One tree over the
+triangles, which is built once, serves all times: each vertex moves along a straight line between
+two frames, so a box that encloses a triangle at both frames also encloses it in between. All
+backends cast rays at these meshes with a compiled loop on the CPU (deforming_loops.py), which uses
+the intersection test in triangle.py.
 """
 
 from __future__ import annotations

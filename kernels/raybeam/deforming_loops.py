@@ -138,8 +138,9 @@ def _corner(vertices, frame, share, vertex, axis):  # type: ignore[no-untyped-de
 def cast_pairs(pairs, tree, nearest):  # type: ignore[no-untyped-def]  # noqa: C901, PLR0914, PLR0915 - a compiled loop
     """Cast rays at deforming bodies, and record closer hits in `nearest`.
 
-    Each ray hits the mesh in its shape at the frame number `RayBodyPairs.frame`. Nodes are visited
-    from near to far. `stack_distances` contains the entry distances of the nodes on the stack.
+    Each ray hits the mesh in the shape that the mesh has at the frame number `RayBodyPairs.frame`.
+    Nodes are visited from near to far. `stack_distances` contains the entry distances of the nodes
+    on the stack.
     """
     rays = pairs.rays
     poses = pairs.poses

@@ -251,8 +251,8 @@ def build_scene(instances: Sequence[Instance]) -> tuple[LocalScene, Floats]:
 def check_transforms(numbers: Integers, transforms: ArrayLike) -> Floats:
     """Validate the transforms of the instances `numbers`, and return them as a float64 array.
 
-    The result has shape (k, 3, 4). Raises ValueError with the index of the instance if a transform
-    is invalid.
+    The result has shape (k, 3, 4). If a transform is invalid, raises ValueError with the index of
+    its instance.
     """
     values = np.asarray(transforms)
     if values.ndim != 3 or len(values) != len(numbers):

@@ -55,7 +55,8 @@ def triangle_corners(table, triangle, axis):  # type: ignore[no-untyped-def]
 def is_opaque(mesh, triangle, hit):  # type: ignore[no-untyped-def]
     """Return whether a mesh is opaque at a hit, like `MaskTables.is_opaque`.
 
-    `mesh` points to a `MESH` record, and `triangle` is the row in its corners.
+    `mesh` points to a `MESH` record, and `triangle` is the row of the triangle in the mesh's
+    corners.
     """
     uv = float32s(mesh[1])
     mask = uint8s(mesh[2])
@@ -79,8 +80,8 @@ def barycentric_weights(  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a co
     """Compute the barycentric weights `u` and `v` of the second and third vertex at each hit.
 
     The rays (m, 3) are in local scene coordinates. `origins` is (1, 3) if all rays share an origin.
-    `triangle_row` is the row of each hit in the corners of all meshes, as `cast_rays` writes it if
-    the field `index` of the cast is 0.
+    `triangle_row` contains the row of each hit triangle in the corners of all meshes. `cast_rays`
+    writes these rows if the cast's field `index` is 0.
     """
     mesh = casts[0].mesh
     instances = casts[0].instances

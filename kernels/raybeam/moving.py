@@ -3,10 +3,10 @@
 No tree is rebuilt. On the CPU, consecutive rays, which are fired at almost the same time, form
 cells of `CELL_RAYS` rays. First, the cone and the plane around the directions of each cell are
 compared with the bounding sphere of each body along its path. Then the rays of the remaining cells
-are compared with the bounding box of the body at its pose when the cell is fired. Finally, the
-remaining rays are transformed to the frame of the body at their own firing times and cast at its
-shape, starting with the closest bodies. The comparisons are compiled loops (moving_loops.py). They
-are conservative, so they do not affect the hits.
+are compared with the body's bounding box, at the pose that the body has when the cell is fired.
+Finally, the remaining rays are transformed to the frame of the body at their own firing times and
+cast at its shape, starting with the closest bodies. The comparisons are compiled loops
+(moving_loops.py). They are conservative, so they do not affect the hits.
 
 On a CUDA device, each ray is compared with boxes around the paths of the bodies, and the device
 holds the poses of all bodies at all ray times.

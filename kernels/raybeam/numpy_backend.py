@@ -160,8 +160,8 @@ class _Nodes:
     def walk(self, rays: _Packet, root: Indices, test: Callable[[_Pairs], None]) -> None:
         """Traverse the tree from each ray's root, and call `test` for the rays that reach leaves.
 
-        `test` receives pairs in which the node contains the first triangle and the number of
-        triangles of the leaf. It reduces `rays.limit` if it finds closer hits.
+        `test` receives pairs whose node encodes a leaf's first triangle and number of triangles. It
+        reduces `rays.limit` if it finds closer hits.
         """
         blocks = [_Pairs(np.arange(len(root)), root, np.zeros(len(root), np.float32))]
         while blocks:

@@ -137,8 +137,8 @@ class MaskTables:
 def join_masks(opacities: list[LocalOpacity | None], orders: list[Ints32]) -> MaskTables | None:
     """Join the opacities of several meshes, or return None if all meshes are opaque.
 
-    `orders` contains the order of the triangles of each mesh. A mask that several meshes share as
-    the same memory is stored once.
+    `orders` contains the order of the triangles of each mesh. A mask whose memory several meshes
+    share is stored only once.
     """
     uv = [np.zeros((0, 6), np.float32)]
     mask = [np.zeros(0, np.uint8)]

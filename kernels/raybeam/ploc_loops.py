@@ -23,8 +23,8 @@ def _common_area(lower, upper, i, j):  # type: ignore[no-untyped-def]
 def best_partners(lower, upper, radius, best):  # type: ignore[no-untyped-def]
     """Find the best partner of each cluster, and write its position to `best`, int64 (m,).
 
-    The best partner is the cluster whose common box has the smallest area, among `radius` neighbors
-    on each side. Ties are resolved as in `ploc._find_best_partners`.
+    The best partner is one of the `radius` neighbors on each side, namely the one with which the
+    common box has the smallest area. Ties are resolved as in `ploc._find_best_partners`.
     """
     n = lower.shape[1]
     for i in range(n):

@@ -2,7 +2,7 @@
 
 A ray is a beam of the pattern, or a sub-ray of a beam, that is cast from a pose. The rays of one
 tile are computed at a time. `cast` is a `CAST` record (cast_record.py), and `tile` is the address
-of the memory of a tile with `rays` rays (tile_memory.py), which `floats` and `numbers` access as
+of tile memory for `rays` rays (tile_memory.py). `floats` and `numbers` access this memory as
 float64 and int64. Arrays of a `CAST` are passed by address and have one column per beam or pose. A
 vector contains four rays.
 """
@@ -90,7 +90,7 @@ def oriented_axes(x, y, z, axis):  # type: ignore[no-untyped-def]
 def _find_rows(tile, rays, first_row, row_count):  # type: ignore[no-untyped-def]
     """Write the pattern row of each ray in a tile, counting every sub-ray as a row.
 
-    `first_row` is the row of the first ray of the call. The pattern has `row_count` rows and
+    `first_row` is the pattern row of the call's first ray. The pattern has `row_count` rows and
     repeats.
     """
     numbers = int64s(tile)
@@ -105,8 +105,7 @@ def _find_rows(tile, rays, first_row, row_count):  # type: ignore[no-untyped-def
 def _find_poses(tile, rays, first, rays_per_pose, poses):  # type: ignore[no-untyped-def]
     """Write the pose of each ray in a tile, and the index of the ray within its pose.
 
-    `first` is the `FirstRay` of the call. Rays before or after the rays of the call use the closest
-    pose.
+    `first` is the `FirstRay` of the call. Rays that do not belong to the call use the closest pose.
     """
     numbers = int64s(tile)
     number_at = row_index(NUMBER, rays)
@@ -287,7 +286,7 @@ def _rotate(tile, rays, first_row, rotations, poses):  # type: ignore[no-untyped
     """Rotate vectors in a tile to the axes of the scene.
 
     The vectors are in three rows of the tile, starting at row `first_row`. `rotations` is the
-    address of the matrices of the poses, float64 (9, poses).
+    address of the poses' matrices, float64 (9, poses).
     """
     numbers = int64s(tile)
     floats = float64s(tile)
@@ -339,7 +338,7 @@ def _apply_rates(tile, rays, first_row, cast):  # type: ignore[no-untyped-def]  
 def _add_to_origins(tile, rays, table, count, field):  # type: ignore[no-untyped-def]
     """Add vectors from a table to the ray origins in a tile.
 
-    Row `field` of the tile contains the column of the table for each ray.
+    Row `field` of the tile contains each ray's column in the table.
     """
     numbers = int64s(tile)
     floats = float64s(tile)

@@ -223,7 +223,7 @@ def _test_leaf(tile, rays, ray, mesh, instance, code, start):  # type: ignore[no
 def walk_ray(tile, rays, ray, first_row, mesh, instance, pending):  # type: ignore[no-untyped-def]
     """Cast a ray at a mesh.
 
-    `pending` is the number of entries of the instance tree that are on the stack.
+    `pending` is the number of instance tree entries on the stack.
     """
     floats = float64s(tile)
     address = int64s(tile)[_STACK]

@@ -1,9 +1,10 @@
 """Build binary hierarchies from top to bottom with the surface area heuristic (SAH).
 
-Starting at the root, each node is divided where the heuristic has its minimum, over all positions
-between its boxes sorted along each of the three axes. This full sweep generally gives the best
-trees among the builders that only use boxes. Trees from binned builders are a few percent worse.
-All nodes of a level are divided together, in tens of operations on whole arrays.
+Starting at the root, each node's boxes are sorted along each of the three axes. The node is then
+divided at the position between two boxes where the heuristic has its minimum. This full sweep
+generally gives the best trees among the builders that only use boxes. Trees from binned builders
+are a few percent worse. All nodes of a level are divided together, in tens of operations on whole
+arrays.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ def _cheapest_splits(
 ) -> tuple[Indices, Indices]:
     """Find the axis and position of the cheapest split of each node.
 
-    The position is the last one of the first part.
+    The position is that of the last box in the first part.
     """
     best = np.full(len(level.start), np.inf)
     axis, split = np.zeros((2, len(level.start)), np.intp)

@@ -38,8 +38,8 @@ class SubRays:
     ) -> tuple[Floats, Floats, Floats]:
         """Return the forward, lateral, and vertical components of the sub-ray directions.
 
-        The components of the unit vectors have shape (m,) each. `offsets` (2, m) contains the
-        angles across and up, in radians, that are added to the angles of each sub-ray.
+        Each component of the unit vectors has shape (m,). `offsets` (2, m) contains the angles
+        across and up, in radians, that are added to the angles of each sub-ray.
         """
         across, up = self.angles[subray].T
         if offsets is not None:
@@ -123,7 +123,7 @@ def oriented_axes(directions: Floats, axis: Floats) -> tuple[Floats, Floats]:
     """Return two axes that are perpendicular to the given directions and aligned with an axis.
 
     The first one points counterclockwise about the axis and the second one upward along it. For
-    directions parallel to the axis, they are the axes of `perpendicular_axes`.
+    directions parallel to the axis, the result is the same as that of `perpendicular_axes`.
     """
     x, y, z = directions
     a, b, c = axis

@@ -220,8 +220,8 @@ class TileBackend(Backend):
 
         Ray indices are relative to `start`.
 
-        Distances are in meters. `triangle` is the index in the caller's faces, or the row of the
-        corners if the field `index` of the record is 0.
+        Distances are in meters. `triangle` contains indices in the caller's faces, or rows of the
+        corners if the record's field `index` is 0.
         """
         n = stop - start
         ray = np.empty(n, np.uint32)

@@ -176,8 +176,8 @@ class AdaptivePartitions(SchedulerPlugin):
     def group_jobs(self, name: str, report: GroupReport) -> dict[str, list[str]]:
         """Return the jobs of a worker group, and the workers of each job, for `decide`.
 
-        Each member is a job, and so is each worker that has not joined yet, under a placeholder
-        name.
+        Each member counts as a job. Each worker that has not joined yet also counts as a job, under
+        a placeholder name.
         """
         leaving = self.records[name].leaving
         leaving.difference_update(report.removed)

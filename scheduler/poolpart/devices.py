@@ -1,9 +1,9 @@
 """Assign a CUDA device to each worker, and record this on the scheduler.
 
-The assignment is part of the scheduler's state of the worker and is removed with the worker.
-Therefore, all tasks of a worker get the same device, and nothing has to be cleaned up. A restarted
-worker is a new worker for Dask and may have a new name, but it finds the device of its predecessor
-free.
+The assignment is part of the worker's state on the scheduler, and is removed together with the
+worker. Therefore, all tasks of a worker get the same device, and nothing has to be cleaned up. A
+restarted worker is a new worker for Dask and may have a new name, but it finds the device of its
+predecessor free.
 """
 
 from __future__ import annotations

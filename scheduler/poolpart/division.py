@@ -1,7 +1,7 @@
 """Handle client requests to create partitions, move workers, and dissolve partitions.
 
-Each of them is a single request to the scheduler, which completes or rejects it even if the client
-dies in the meantime. Concurrent requests are processed one after the other.
+Each operation is a single request, which the scheduler completes or rejects even if the client dies
+in the meantime. Concurrent requests are processed one after the other.
 """
 
 from __future__ import annotations
@@ -63,7 +63,8 @@ async def _run_operation(
 ) -> tuple[Any, str]:
     """Call a function on the scheduler, with the steward as its first argument.
 
-    The result is the return value and "", or None and the message of a PoolError.
+    The result consists of the return value and "" or, after a PoolError, of None and the error
+    message.
     """
     # If the error were raised here, Dask would log it with a traceback.
     with steward_of(dask_scheduler) as steward:

@@ -137,9 +137,10 @@ class Partition:
     def stats(self) -> PartitionStats:
         """Return the partition's current load and its counts of finished tasks, for all clients.
 
-        In a divided pool, counting begins with the division. In a partition that the workers were
-        started with, it begins when a client submits its first task through `Partition`, or when
-        this method is first called. `PartitionStats.since` contains the time when counting began.
+        In a divided pool, counting begins with the division. In a partition whose workers were
+        started with its resource, counting begins when a client submits its first task through
+        `Partition`, or when this method is first called. `PartitionStats.since` contains the time
+        when counting began.
 
         Raises
         ------
@@ -732,11 +733,11 @@ class Partition:
     def shrink(self, workers: int = 1, *, timeout_s: float = 60.0) -> list[str]:
         """Move workers out of this partition while tasks are running, and return their names.
 
-        Workers that this partition has borrowed leave first, and return to the partition that they
-        were started in or that a rule has selected them for. Further workers, those with the lowest
-        load first, are moved to the partition with the rule `rest`. If no other partition has this
-        rule, they no longer belong to any partition. All workers first finish their tasks, as
-        described for `grow`.
+        Workers that this partition has borrowed leave first, and return to the partition in which
+        they were started or for which a rule has selected them. Further workers, those with the
+        lowest load first, are moved to the partition with the rule `rest`. If no other partition
+        has this rule, they no longer belong to any partition. All workers first finish their tasks,
+        as described for `grow`.
 
         Raises
         ------
@@ -815,8 +816,8 @@ class Partition:
     def dissolve(self, timeout_s: float = 30.0) -> None:
         """Dissolve this partition, as `Pool.dissolve` does for all partitions.
 
-        Workers that this partition has borrowed return to the partition that they were started in
-        or that a rule has selected them for. Other workers declare their original resources again.
+        Workers that this partition has borrowed return to the partition in which they were started
+        or for which a rule has selected them. Other workers declare their original resources again.
         """
         request_dissolution(self.client, [self.name], timeout_s)
 

@@ -246,7 +246,7 @@ class Pipe:
     def _change(self, **changes: Any) -> Reply:
         """Change the pipe's state on the scheduler, and return the reply with the new state.
 
-        The possible changes are `producer`, the ID of a producer that closes the pipe, `failure`
+        The possible changes are `producer` (the ID of a producer that closes the pipe), `failure`
         and `advice`. Without changes, the reply contains the current state.
         """
         return self._reply(_ask(self.client, CHANGE, names=[self.name], **changes))
@@ -729,9 +729,9 @@ def _install_handlers(client: Client) -> None:
 def _ask(client: Client, handler: str, **arguments: Any) -> Replies:
     """Send a single request to the scheduler, and return the reply for each pipe.
 
-    `handler` is CHANGE, PUT or TAKE, the name of a handler that `pipe_states.PipeRegistry` adds to
-    the scheduler and that receives `arguments`. Pipes that do not exist are omitted from the
-    replies.
+    `handler` is CHANGE, PUT or TAKE. These are the names of the handlers that
+    `pipe_states.PipeRegistry` adds to the scheduler. The handler receives `arguments`. Pipes that
+    do not exist are omitted from the replies.
     """
     _install_handlers(client)
     replies: Replies = client.sync(

@@ -217,7 +217,7 @@ class Pool:
         """Return all partitions in the cluster by name, including those without workers.
 
         These are the partitions that a division has created, adaptive partitions, and the
-        partitions that workers were started with. A partition of the last kind is not listed while
+        partitions in which workers were started. A partition of the last kind is not listed while
         none of its workers is running, unless workers were moved into or out of it. It has a `note`
         if a worker's number of slots differs from its number of threads.
 
@@ -461,8 +461,8 @@ class Pool:
 
         Workers declare their original resources again. Rules, statistics and the page are removed,
         and exclusive workers accept other tasks again. Results that a client holds are kept. If
-        such a result is lost, any worker may recompute it. Partitions that workers were started
-        with remain.
+        such a result is lost, any worker may recompute it. Partitions in which workers were started
+        remain.
 
         Parameters
         ----------

@@ -24,8 +24,8 @@ class Rule:
         Number of tasks that each worker runs at the same time. By default, its number of threads.
     minimum
         Minimum number of workers. A partition cannot be created with fewer workers, and moving
-        workers to other partitions never leaves it with fewer. Partitions that workers were started
-        with have no rule, and a minimum of 0.
+        workers to other partitions never leaves it with fewer. Partitions in which workers were
+        started have no rule, and a minimum of 0.
     exclusive
         Whether to keep other tasks off the workers, which are tasks without a partition,
         collections, and tasks of other users. Other tasks that are already assigned to a worker

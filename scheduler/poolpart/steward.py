@@ -149,8 +149,8 @@ class Steward(SchedulerPlugin):
         """Record the partition of a worker. The name None stands for no partition.
 
         The worker is behind the fence of the partition immediately. `reconcile` makes all other
-        changes. If `slots` is not given, the number of slots is that of the rule, that of the
-        resource which the worker was started with, or the number of threads.
+        changes. If `slots` is not given, the number of slots comes from the rule, from the resource
+        with which the worker was started, or from the number of threads, in this order.
         """
         record.partition = name
         record.slots = 0
@@ -406,7 +406,7 @@ class Steward(SchedulerPlugin):
     def _set_visible_resources(
         self, record: WorkerRecord, worker: Any, resources: Resources
     ) -> None:
-        """Set the resources of a worker that the scheduler considers when it places tasks.
+        """Set the resources that the scheduler considers when it places tasks on a worker.
 
         This also invalidates the worker groups of `choosing.py` and updates the fence of the
         worker.

@@ -222,9 +222,9 @@ def run_on_workers(
 def silent_workers(last_seen: Mapping[str, float]) -> set[str]:
     """Return the addresses of workers that have not sent a heartbeat recently.
 
-    `last_seen` contains the time of the last heartbeat of each worker in seconds, by address. The
-    times are compared with the latest heartbeat of all workers, because if all workers are silent,
-    the scheduler itself was stopped or busy.
+    `last_seen` maps each worker's address to the time of its last heartbeat, in seconds. The times
+    are compared with the latest heartbeat of all workers, because if all workers are silent, the
+    scheduler itself was stopped or busy.
     """
     latest = max(last_seen.values(), default=0.0)
     # Dask's heartbeat interval increases with the size of the cluster.

@@ -1,7 +1,7 @@
 """Partitions whose workers are started as jobs in a queue or as processes over SSH.
 
-The number of jobs is fixed, or follows the work. In the latter case, `adapting.py` decides on the
-scheduler which jobs to start and end.
+The number of jobs is either fixed or depends on the amount of work. In the latter case,
+`adapting.py` decides on the scheduler which jobs to start and end.
 """
 
 from __future__ import annotations

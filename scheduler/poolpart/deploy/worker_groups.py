@@ -1,7 +1,7 @@
 """Partitions whose workers are scaled as groups by another system, such as Kubernetes.
 
-As for jobs of a queue, `adapting.py` decides on the scheduler. Once per second, a thread of this
-process requests the target size of each group and passes changes on.
+As with queued jobs, `adapting.py` makes the decisions on the scheduler. Once per second, a thread
+of this process requests the target size of each group and passes changes on.
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ class Inheritance(SchedulerPlugin):
     def _enable_part(self, feature: str, without: str, begin: Callable[[], None]) -> bool:
         """Enable one part of the feature, and return whether this version of Dask supports it.
 
-        If not, a note for users that begins with `without` names the missing private API.
+        If it does not, a note for users begins with `without` and names the missing private API.
         """
         try:
             require_feature(feature)

@@ -92,9 +92,10 @@ async def wait_until(
 class BoundedQueue:
     """Queue in which waits end with an error once the pipe has ended.
 
-    It takes the place of an `asyncio.Queue` in Dask's queue extension, which calls its methods
-    `put`, `get` and `qsize` for the methods of a `distributed.Queue`. Therefore, the capacity
-    applies to the items of all clients, and all waiting requests are notified of them.
+    It takes the place of an `asyncio.Queue` in Dask's queue extension. The extension calls its
+    methods `put`, `get` and `qsize` when a client calls the methods of a `distributed.Queue`.
+    Therefore, the capacity applies to the items of all clients, and all waiting requests are
+    notified of them.
 
     Parameters
     ----------
@@ -239,7 +240,7 @@ def _record_of(item: bytes) -> Record:
 def _packed(name: str, record: Record) -> Packed:
     """Convert an item to the form in which it is sent to a client.
 
-    An item of a pipe becomes the pickled item, and an item of `Queue.put` becomes its record.
+    An item from a pipe becomes pickled bytes, and an item from `Queue.put` becomes its record.
     """
     if record["type"] == _PICKLED:
         item: bytes = record["value"].frames[0]

@@ -30,7 +30,7 @@ class SubmittingTask(NamedTuple):
 
 
 def set_visible_resources(scheduler: Any, worker: Any, resources: Resources) -> None:
-    """Set the resources of a worker that the scheduler considers when it places tasks."""
+    """Set the resources that the scheduler considers when it places tasks on a worker."""
     for name in worker.resources.keys() | resources.keys():
         declaring = scheduler.resources.setdefault(name, {})
         declaring.pop(worker.address, None)
@@ -172,7 +172,7 @@ def hand_off_tasks(
 
 
 def is_idle(scheduler: Any, worker: Any) -> bool:
-    """Return whether a running worker has neither tasks nor the only copy of a result."""
+    """Return whether a worker is running and has neither tasks nor the only copy of a result."""
     return worker.status is Status.running and holds_nothing(scheduler, worker)
 
 

@@ -92,7 +92,7 @@ _Json = dict[str, Any]
 class _Polygons(NamedTuple):
     """The polygons of all objects in a document.
 
-    An owner is (index of the object, material).
+    An owner is a tuple of an object index and a material index.
     """
 
     corners: list[Ints]  # vertices of the polygons without holes, one array per object
@@ -233,8 +233,8 @@ class _CityFile:
     ) -> list[list[SceneMesh]]:
         """Return the mesh of each object as a list, which is empty if it has no triangles.
 
-        `objects` are names and geometries. All polygons in a document are triangulated at once,
-        which is ten times as fast.
+        `objects` are names and geometries. It is ten times as fast to triangulate all polygons in a
+        document at once.
         """
         faces, owners = self._triangles(points, self._polygons(points, objects))
         if not len(faces):

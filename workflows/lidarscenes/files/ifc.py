@@ -345,10 +345,10 @@ class _MapConversion:
     def from_file(cls, stated: dict[str, Any]) -> _MapConversion:
         """Validate the conversion that a file states.
 
-        The map unit is that of the coordinate system. If it is not stated, it is the unit, meters
-        or the project unit, for which the scale is close to 1. Without a scale, it is the project
-        unit. A missing scale means that only units are converted. Raises ValueError if the
-        conversion is inconsistent.
+        The map unit is that of the coordinate system. If none is stated, it is either meters or the
+        project unit, whichever makes the scale close to 1. Without a scale, it is the project unit.
+        A missing scale means that only units are converted. Raises ValueError if the conversion is
+        inconsistent.
         """
         if stated["count"] > 1:
             raise ValueError(

@@ -1,6 +1,6 @@
 """Script that `ifc.py` runs in a separate process to read an IFC building with ifcopenshell.
 
-Invalid files can crash ifcopenshell, and here this affects only this process. The script imports
+Invalid files can crash ifcopenshell, but this only affects the separate process. The script imports
 nothing from lidarpool. It writes frames to standard output (see `child_process.py`): first the
 building, then each shape that elements share, and finally the elements.
 """

@@ -114,10 +114,10 @@ class RasterOptions:
 def read_raster(_data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read the first band as a mesh with a vertex at each pixel center and two triangles per cell.
 
-    A cell with a pixel that has no height is a hole. The coordinate system is `epsg` in
-    `options.own`. By default, it is that of the raster if its coordinates are in meters that are
-    true to scale at its center, otherwise the UTM zone of its center. A window includes the pixels
-    whose centers are inside.
+    Cells are omitted if one of their pixels has no height. The coordinate system is `epsg` in
+    `options.own`. By default, it is the raster's own system if this uses meters that are true to
+    scale at the raster's center. Otherwise, it is the UTM zone of the center. A window includes the
+    pixels whose centers are inside.
     """
     if find_spec("rasterio") is None:
         raise MeshFileError(

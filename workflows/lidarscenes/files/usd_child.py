@@ -1,10 +1,10 @@
 """Script that `usd.py` runs in a separate process to read an OpenUSD scene with usd-core.
 
-Some invalid files crash usd-core, and others need unlimited memory. Here, this affects only this
-process. The script imports nothing from lidarpool, so that it starts quickly. It writes frames to
-standard output: first the stage, then each mesh, preceded by the images and materials that it is
-the first to use, and finally the nodes. Content that several prims share is written once. For an
-animation, meshes and nodes are written again for each pose.
+Some invalid files crash usd-core, and others need unlimited memory, but this only affects the
+separate process. The script imports nothing from lidarpool, so that it starts quickly. It writes
+frames to standard output: first the stage, then each mesh, preceded by the images and materials
+that it is the first to use, and finally the nodes. Content that several prims share is written
+once. For an animation, meshes and nodes are written again for each pose.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class _Inherited(NamedTuple):
 class StageNodes:
     """The nodes of a stage, numbered in the order in which they are found.
 
-    A node that several instances share is the node in their prototype.
+    If several instances share a node, it is the node in their prototype.
     """
 
     def __init__(

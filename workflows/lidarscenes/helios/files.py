@@ -160,8 +160,8 @@ def read_vector(values: Element | dict[str, str] | None) -> Floats:
 def read_rotation(element: Element | None) -> Floats:
     """Return the product of all <rot> rotations in an element, in the given order.
 
-    The axes are fixed unless the element states ``rotations="local"``, in which case each rotation
-    is about the axes that the previous rotations have rotated.
+    The axes are fixed unless the element states ``rotations="local"``. In this case, each rotation
+    also rotates the axes of the following ones.
     """
     total = np.eye(3)
     for step in () if element is None else element.findall("rot"):

@@ -85,7 +85,7 @@ def read_legs(
 ) -> list[Leg]:
     """Read the legs of a survey.
 
-    `height` returns the height of the ground at x, y in meters.
+    `height` returns the height of the ground at x and y, in meters.
     """
     legs = []
     for index, element in enumerate(survey.findall("leg")):
@@ -139,7 +139,8 @@ def moving_trajectory(legs: Sequence[Leg]) -> HeliosTrajectory:
 def stationary_trajectory(legs: Sequence[Leg], heads: dict[int, float]) -> HeliosTrajectory:
     """Return a trajectory that stops at each leg until the scanner head has finished rotating.
 
-    `heads` are the rotation times in seconds by leg number, 0 for a head that does not rotate.
+    `heads` maps leg numbers to the time in seconds for which the head rotates, which is 0 if it
+    does not rotate.
     """
     rows = []
     segments = []

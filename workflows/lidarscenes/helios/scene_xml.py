@@ -77,7 +77,7 @@ class HeliosPart:
     def material_fields(self, spectra: Callable[[str], float | None]) -> dict[str, dict[str, Any]]:
         """Return the `materials` fields for each material, which are reflectance and class.
 
-        `spectra` returns a reflectance by the name of a spectrum.
+        `spectra` returns the reflectance for the name of a spectrum.
         """
         kinds: dict[str, dict[str, Any]] = {}
         for name, values in self.materials.items():

@@ -362,8 +362,8 @@ def returns_section(
 def waveform(settings: dict[str, str], pulse_ns: float) -> dict[str, Any]:
     """Return the waveform fields for `returns`. There are none without waveform settings.
 
-    Times in HELIOS++ are range divided by the speed of light, which is half of the time that light
-    takes to a surface and back.
+    In HELIOS++, a time is the range divided by the speed of light. This is half of the time that
+    light takes to a surface and back.
     """
     if "binSize_ns" not in settings and "winSize_ns" not in settings:
         return {}

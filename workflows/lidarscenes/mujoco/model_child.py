@@ -1,8 +1,8 @@
 """Script that `model_file.py` runs in a separate process to read a MuJoCo model.
 
-Invalid files can crash the process, and some models need unlimited memory. Here, this affects only
-this process. The script imports nothing from lidarpool. It writes one frame to standard output: a
-line of JSON, followed by the bytes of the arrays that the line lists.
+Invalid files can crash MuJoCo, and some models need unlimited memory, but this only affects the
+separate process. The script imports nothing from lidarpool. It writes one frame to standard output:
+a line of JSON, followed by the bytes of the arrays that the line lists.
 """
 
 from __future__ import annotations

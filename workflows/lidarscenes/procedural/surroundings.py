@@ -268,7 +268,7 @@ def _openness(scene: Scene) -> float:
 
     This is the length of the sum of all area vectors, divided by the sum of their lengths.
 
-    Area vectors point along the normals. For a closed surface, they add up to zero.
+    Area vectors point along the normals. The area vectors of a closed surface add up to zero.
     """
     total = np.zeros(3)
     area = 0.0

@@ -180,7 +180,7 @@ class Intervals:
     def place(self, counts: Ints, steps: Bools) -> PlacedStations:
         """Divide each interval into the given number of parts, and return the stations.
 
-        `steps` (n,) marks intervals with a step of the surface at their stop.
+        `steps` (n,) marks intervals at whose stop the surface has a step.
         """
         has_stop = steps.copy()
         has_stop[-1] = True

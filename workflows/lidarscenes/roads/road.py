@@ -148,8 +148,8 @@ class Road:
     def heights(self, stations: RoadStations, t: Floats, pieces: Floats | None = None) -> Floats:
         """Return the heights that crossfall and shapes add at the given t coordinates.
 
-        The heights are relative to the banked plane. `t` and `pieces` have shape (..., k), and
-        `pieces` are the t coordinates that select the pieces of the shapes, by default `t`.
+        The heights are relative to the banked plane. `t` and `pieces` have shape (..., k). `pieces`
+        contains the t coordinates that select the pieces of the shapes, which are `t` by default.
         """
         heights = np.zeros_like(t)
         for side, crossfall in self.crossfalls.items():

@@ -144,7 +144,7 @@ class Robot:
     ) -> Trajectory:
         """Return the trajectory of a link, given that of the root link.
 
-        `joints`, `ignore` and `time_unit` are as for `actors`.
+        `joints`, `ignore` and `time_unit` are the same as in `actors`.
 
         Raises
         ------
@@ -452,8 +452,8 @@ class LinkPath:
         """Return the linear and angular velocities at the given times of a station.
 
         Times are in nanoseconds. The velocities are in the scene frame, in m/s and rad/s, and
-        include the motion of all joints exactly. At a time of the joint values, they are those of
-        the following interval.
+        include the motion of all joints exactly. At the times of the joint values, where velocities
+        change, those of the following interval are returned.
 
         Raises
         ------

@@ -1,6 +1,6 @@
 """Script that `omnilidar.py` runs in a separate process to read an OmniLidar prim with usd-core.
 
-Invalid files can crash usd-core, and here this affects only this process. The script imports
+Invalid files can crash usd-core, but this only affects the separate process. The script imports
 nothing from lidarpool. It writes one frame to standard output, which is a line of JSON with the
 attributes of the prim, followed by the bytes of the arrays that the line lists.
 """

@@ -199,8 +199,8 @@ class _Writer:
     def _material(self, image: AnyArray | None, name: str) -> int:
         """Return the index of a material. The material is added on first use.
 
-        `image` is a mask, bool (h, w), an image, a single color, or None for a material with only a
-        name.
+        `image` is a mask (bool (h, w)), an image, or a single color. It is None for a material that
+        only has a name.
         """
         key = id(image), name
         if key not in self._materials:
