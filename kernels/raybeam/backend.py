@@ -24,7 +24,7 @@ class BackendUnavailable(RuntimeError):  # noqa: N818 - describes a state, not a
 
 @dataclass(frozen=True)
 class ClosestHits:
-    """Closest hits of a chunk of rays, in ray order.
+    """Closest hits of the rays in a chunk, in ray order.
 
     Rays that miss have no row.
 

@@ -146,7 +146,7 @@ class NearestHits(NamedTuple):
         return cls(limits, np.full(n, -1), np.zeros(n, np.int32), np.zeros(n, np.int32))
 
     def view(self, start: int, stop: int) -> NearestHits:
-        """Return views of the rows of rays `start` to `stop`."""
+        """Return the rows for rays `start` to `stop` as views."""
         span = slice(start, stop)
         distance, body, instance, triangle = self
         return NearestHits(distance[span], body[span], instance[span], triangle[span])

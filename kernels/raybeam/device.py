@@ -207,7 +207,7 @@ class CopyQueue:
         self._pending: deque[tuple[Any, Sequence[Any]]] = deque()
 
     def send(self, pairs: Sequence[tuple[Any, AnyArray]]) -> None:
-        """Start to copy arrays that the current stream computes.
+        """Start copying arrays that the current stream computes.
 
         `pairs` contains the source and target of each copy. The targets must come from
         `pinned_array`.

@@ -184,7 +184,7 @@ class LocalScene:
     def to_mesh_coordinates(
         self, instance: Indices, origins: Floats, directions: Floats
     ) -> tuple[Floats, Floats, Floats]:
-        """Transform each ray to the coordinates of the mesh of its instance.
+        """Transform each ray to the mesh coordinates of its instance.
 
         The scene must be nested.
 

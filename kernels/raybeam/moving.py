@@ -253,7 +253,7 @@ def _bounding_boxes(moving: MovingBodies, shape: Indices, poses: Floats) -> Floa
 def pair_cells_with_boxes(
     rays: Floats, times: Floats, boxes: Floats, presence: Floats, reach: float
 ) -> tuple[Indices, Indices, int]:
-    """Find pairs of a group of rays ("cell") and a static box that these rays may intersect.
+    """Find pairs of a cell (a group of rays) and a static box that the cell's rays may intersect.
 
     Parameters
     ----------
@@ -413,7 +413,7 @@ class _Chunk:
         return boxes
 
     def _cast_pairs(self, cell: Indices, spans: Floats, body: Ints) -> None:
-        """Cast each cell at its body, and record closer hits.
+        """Cast the rays of each cell at the cell's body, and record closer hits.
 
         `spans` (2, m) contains the first and last time of each cell in seconds.
         """

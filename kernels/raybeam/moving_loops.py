@@ -64,7 +64,7 @@ class BodySamples(NamedTuple):
 
 
 class CellBodyPairs(NamedTuple):
-    """Pairs of a cell of rays and a body.
+    """Pairs of a cell and a body.
 
     Attributes
     ----------

@@ -147,7 +147,7 @@ class _Pairs:
 
 
 class _Nodes:
-    """Bounding boxes of the nodes of one or more trees."""
+    """Bounding boxes of all nodes in one or more trees."""
 
     def __init__(self, tree: WideTree) -> None:
         self._count = len(tree.child)

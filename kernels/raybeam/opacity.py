@@ -83,7 +83,7 @@ def check_opacity(opacity: Opacity, face_count: int, index: Ints32) -> LocalOpac
 
 @dataclass(frozen=True, eq=False)
 class MaskTables:
-    """Tables of the opacities of several meshes.
+    """Tables that contain the opacities of several meshes.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Compute the origins and directions of the rays of a pattern."""
+"""Compute the origins and directions of the rays in a pattern."""
 
 from __future__ import annotations
 

@@ -560,7 +560,7 @@ class Results(Iterator[Any]):
         return busy_s
 
     def _deliver(self) -> None:
-        """Move results to the queue of ready results as soon as it is their turn."""
+        """Move results to the queue of ready results when it is their turn."""
         while self._undelivered and self._failed is None:
             first = self._next_item if self._stages[-1].ordered else next(iter(self._undelivered))
             if first not in self._undelivered:

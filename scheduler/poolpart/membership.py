@@ -315,7 +315,7 @@ def release_partitions(
 
 
 def release_statistics(scheduler: Any) -> None:
-    """Delete the statistics, or keep them only as long as clients are registered."""
+    """Delete the statistics. If clients are registered, wait until the last one has left."""
     if NAME in scheduler.plugins:
         statistics_of(scheduler).is_kept = False
     else:

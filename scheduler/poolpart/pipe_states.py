@@ -236,7 +236,7 @@ def delete_existing_pipes(names: Collection[str], dask_scheduler: Any = None) ->
 
 
 class PipeRegistry(SchedulerPlugin):
-    """Scheduler plugin with the states of all pipes, which exists as long as there are pipes."""
+    """Scheduler plugin with the states of all pipes. It is removed after the last pipe."""
 
     name = NAME
 

@@ -108,7 +108,7 @@ class Pool:
         idle_s: float = math.inf,
         **options: Any,
     ) -> Pool:
-        """Start a cluster on this machine that has partitions, and return its pool.
+        """Start a cluster with partitions on this machine, and return its pool.
 
         At the end of a ``with`` block, the cluster is closed, even if tasks are running. Each
         worker is a separate process. Scripts do not need an ``if __name__ == "__main__":`` guard.

@@ -1,4 +1,4 @@
-"""Partitions whose workers are started as jobs in a queue or as processes over SSH.
+"""Start partitions whose workers are queued jobs, or processes on other hosts (SSH).
 
 The number of jobs is either fixed or depends on the amount of work. In the latter case,
 `adapting.py` decides on the scheduler which jobs to start and end.
@@ -285,7 +285,7 @@ class _JobStarter:
         return any(advice_of_part.jobs_to_start for advice_of_part in advice.values())
 
     async def _remove_job(self, part: _PartitionJobs, job: str) -> None:
-        """Remove a job whose workers have been closed, or will be closed as soon as they join."""
+        """Remove a job. Its workers have been closed, or will be closed when they join."""
         self._cluster.worker_spec.pop(job, None)
         part.host_indices.pop(job, None)
         worker = self._cluster.workers.get(job)

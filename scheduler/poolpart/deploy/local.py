@@ -1,4 +1,4 @@
-"""Start clusters on this machine that are divided into partitions."""
+"""Start clusters with partitions on this machine."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def local_cluster(
     dashboard_port: int | None = 0,
     security: Security | bool = False,
 ) -> SpecCluster:
-    """Start a Dask cluster on this machine that is divided into partitions.
+    """Start a Dask cluster with partitions on this machine.
 
     The scheduler, the workers and the dashboard only listen on the loopback interface. The workers
     are processes with nannies, which restart them if they die. They do not import the script that

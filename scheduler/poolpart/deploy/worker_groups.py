@@ -150,7 +150,7 @@ class GroupScaler:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop scaling as soon as a call to `scale` that is in progress has returned."""
+        """Stop scaling. If a call to `scale` is in progress, wait for it to return."""
         self._closed.set()
         self._thread.join()
 

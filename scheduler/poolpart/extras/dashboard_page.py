@@ -174,7 +174,7 @@ class _Handler(web.RequestHandler):
 
 
 class PageOwners(SchedulerPlugin):
-    """Scheduler plugin that serves the page as long as a client that opened it is connected."""
+    """Scheduler plugin that serves the page until all clients that opened it have left."""
 
     name = NAME
 

@@ -1,4 +1,4 @@
-"""Make tasks that a task submits run in the same partition as that task.
+"""Make nested tasks run in the partition of the task that submits them.
 
 In plain Dask, resources are not inherited, so the tasks that a GPU task submits run on any worker.
 With this feature, the scheduler assigns such tasks, at any depth, to the partition of the

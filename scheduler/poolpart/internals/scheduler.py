@@ -312,7 +312,7 @@ async def call_worker(
 
 
 def _unpacked(result: Any) -> Any:
-    """Return the object in a reply, which is serialized, or only wrapped within a process."""
+    """Unpack a reply, whose object is either serialized or, within a process, only wrapped."""
     from distributed.protocol.serialize import Serialize, Serialized, deserialize
 
     if isinstance(result, Serialized):

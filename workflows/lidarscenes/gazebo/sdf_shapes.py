@@ -228,7 +228,7 @@ def height_map_mesh(shape: Element, image: Path, allowance: Allowance) -> SceneM
 
 
 def road_mesh(road: Element) -> SceneMesh | None:
-    """Return a strip along the points of a road, as wide as the road.
+    """Return a strip that follows the points of a road and has the road's width.
 
     Returns None if the road has fewer than two distinct points.
     """

@@ -46,7 +46,7 @@ class PlanPoints(NamedTuple):
 
 
 class _Clothoid(NamedTuple):
-    """A piece of a clothoid, which includes lines, arcs, and spirals."""
+    """A piece of a clothoid. Lines and arcs are special cases of clothoids."""
 
     start: float  # distance in the table, in meters
     x: float
