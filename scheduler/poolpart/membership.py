@@ -315,7 +315,7 @@ def release_partitions(
 
 
 def release_statistics(scheduler: Any) -> None:
-    """Delete the statistics. If clients are registered, wait until the last one has left."""
+    """Delete the statistics or, if clients are registered, let them end with the last one."""
     if NAME in scheduler.plugins:
         statistics_of(scheduler).is_kept = False
     else:

@@ -82,7 +82,7 @@ class per_gpu(Rule):  # noqa: N801 - reads as a function, like the rules below
     max_workers: int
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Select workers so that each GPU is shared by about as many of them."""
+        """Select workers so that they are distributed evenly over the GPUs."""
         if not any(worker.gpus for worker in free):
             return per_host(self.max_workers).choose(free)
         workers_of_gpu: Counter[str] = Counter()

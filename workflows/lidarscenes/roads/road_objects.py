@@ -151,7 +151,7 @@ class ObjectBuilder:
         placement: _Placement,
         outlines: Sequence[_Outline],
     ) -> Iterator[Piece]:
-        """Yield the edges of an object that are painted."""
+        """Yield the paint of markings along an object's sides or between its corners."""
         corners = {key: point for outline in outlines for key, point in outline.ids.items()}
         rectangle = transform_points(_rectangle(placement.size), frame.origin, frame.turn)
         sides = {
