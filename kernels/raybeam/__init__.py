@@ -1,4 +1,4 @@
-"""Closest intersections of rays with triangle meshes, on GPUs and CPUs."""
+"""Find the closest intersections of rays with triangle meshes, on GPUs and CPUs."""
 
 from ._version import __version__
 from .backend import BackendUnavailable

@@ -1,4 +1,4 @@
-"""Type aliases for NumPy arrays, named after their elements."""
+"""Type aliases for NumPy arrays, named after their element types."""
 
 from __future__ import annotations
 

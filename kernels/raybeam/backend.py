@@ -24,7 +24,7 @@ class BackendUnavailable(RuntimeError):  # noqa: N818 - describes a state, not a
 
 @dataclass(frozen=True)
 class ClosestHits:
-    """Closest hits of a chunk of rays, in ray order.
+    """Closest hits of the rays in a chunk, in ray order.
 
     Rays that miss have no row.
 
@@ -72,11 +72,11 @@ class Backend(ABC):
     @classmethod
     @abstractmethod
     def unavailable_reason(cls) -> str:
-        """Return the reason why this backend is unavailable, with a remedy, or ""."""
+        """Return why this backend is unavailable and how to fix this, or "" if it is available."""
 
     @classmethod
     def versions(cls) -> str:
-        """Return the versions, except NumPy's, that affect the bits of the results, or ""."""
+        """Return the versions that affect the bits of the results, or "" if only NumPy's does."""
         return ""
 
     @classmethod  # noqa: B027 - most backends have nothing to limit
@@ -90,12 +90,12 @@ class Backend(ABC):
         self._scene = scene
 
     def update_scene(self, scene: LocalScene) -> None:
-        """Replace the scene with a scene that has the same instances but new transforms."""
+        """Replace the scene by one with the same instances but new transforms."""
         self._scene = scene
 
     @property
     def device_lost(self) -> bool:
-        """Whether the device no longer responds to calls from this process after an error."""
+        """Whether the device has stopped responding to this process after an error."""
         return False
 
     @abstractmethod
@@ -105,7 +105,7 @@ class Backend(ABC):
     def hit_columns(self, rays: Rays) -> HitColumns:
         """Return the closest hits of any number of rays, in ray order.
 
-        Rays that miss and barycentric weights are not included.
+        The result omits rays that miss, and barycentric weights.
         """
         parts: list[HitColumns] = []
         for start in range(0, len(rays), self.chunk):
@@ -116,7 +116,7 @@ class Backend(ABC):
         return join_hits(parts)
 
     def cast_pairs(self, pairs: RayBodyPairs, nearest: NearestHits) -> None:
-        """Cast rays at bodies with the shape of this scene, and record closer hits in `nearest`."""
+        """Cast rays at bodies with this shape, and record closer hits in `nearest`."""
         cast_pairs(self.hit_columns, pairs, nearest)
 
     def upload_rays(
@@ -128,7 +128,7 @@ class Backend(ABC):
     def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearestHits) -> None:
         """Cast rays at bodies on the device, and record closer hits in `nearest`.
 
-        The bodies have the shape of this scene.
+        This scene is the shape of the bodies.
         """
         raise BackendUnavailable(f"Backend {self.name!r} does not support devices. Use cast_pairs.")
 
@@ -153,7 +153,7 @@ class Backend(ABC):
         return hits
 
     def scan(self, scan: Scan) -> ScanReturns:
-        """Return the stored hits of a scan and the counts of all hits."""
+        """Return the hits to store for a scan, and the counts of all hits."""
         collector = HitCollector(scan, self._scene.face_count if scan.tally else 0)
         for start, stop, (ray, distance, triangle, instance) in self.scan_parts(scan):
             if scan.tally:
@@ -165,7 +165,7 @@ class Backend(ABC):
         return collector.result()
 
     def scan_parts(self, scan: Scan) -> Iterator[tuple[int, int, HitColumns]]:
-        """Yield consecutive parts of a scan, each as first ray, end, and hits.
+        """Yield consecutive parts of a scan as tuples of the first ray, the end, and the hits.
 
         The ray indices of the hits start at 0 in each part.
         """

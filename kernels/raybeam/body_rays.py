@@ -1,4 +1,4 @@
-"""Pairs of rays and moving bodies, and the closest hits on bodies.
+"""Pairs of rays and moving bodies, and the closest hits of rays on moving bodies.
 
 Moving bodies are not part of a caster's scene. Instead, the rays that may hit a body are
 transformed to the frame of the body at the firing time of each ray, and cast at the body's shape
@@ -64,7 +64,7 @@ class RayBodyPairs(NamedTuple):
 
 
 class TimedBodies(NamedTuple):
-    """Bodies with the same shape, and their poses at consecutive ray times.
+    """Bodies that share a shape, with their poses at consecutive ray times.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ TIMES_PER_BOX = 32
 
 
 class BodyHits(NamedTuple):
-    """Closest hits on moving bodies, without rays that hit no body.
+    """Closest hits on moving bodies, only for the rays that hit a body.
 
     Attributes
     ----------
@@ -138,7 +138,7 @@ class NearestHits(NamedTuple):
 
     @classmethod
     def empty(cls, limits: Floats) -> NearestHits:
-        """Create a table without hits, which records hits at a distance of less than `limits`.
+        """Create a table that has no hits yet and only records hits closer than `limits`.
 
         `limits` contains one distance per ray in meters and becomes the column `distance`.
         """
@@ -146,13 +146,13 @@ class NearestHits(NamedTuple):
         return cls(limits, np.full(n, -1), np.zeros(n, np.int32), np.zeros(n, np.int32))
 
     def view(self, start: int, stop: int) -> NearestHits:
-        """Return the rows of rays `start` to `stop` as views of the same memory."""
+        """Return the rows for rays `start` to `stop` as views."""
         span = slice(start, stop)
         distance, body, instance, triangle = self
         return NearestHits(distance[span], body[span], instance[span], triangle[span])
 
     def update(self, hits: BodyHits) -> None:
-        """Record the hits that are closer than the hits recorded so far."""
+        """Record the hits that are closer than those recorded so far."""
         nearer = np.flatnonzero(hits.distance < self.distance[hits.ray])
         ray = hits.ray[nearer]
         self.distance[ray] = hits.distance[nearer]
@@ -161,7 +161,7 @@ class NearestHits(NamedTuple):
         self.triangle[ray] = hits.triangle[nearer]
 
     def compact(self) -> BodyHits:
-        """Return the recorded hits, without rays that hit no body."""
+        """Return the recorded hits, only for the rays that hit a body."""
         ray = np.flatnonzero(self.body >= 0)
         distance, body, instance, triangle = self
         return BodyHits(ray, distance[ray], body[ray], instance[ray], triangle[ray])
@@ -172,7 +172,7 @@ def cast_pairs(
 ) -> None:
     """Cast rays at bodies and record closer hits in `nearest`.
 
-    `cast` returns the closest hits of rays in the frame of the bodies.
+    The function `cast` returns the closest hits of rays that are in body coordinates.
     """
     rays = _to_body_frames(pairs)
     ray, distance, triangle, instance = cast(rays)
@@ -191,7 +191,7 @@ def cast_pairs(
 
 
 def _to_body_frames(pairs: RayBodyPairs) -> Rays:
-    """Return the ray of each pair in the frame of its body."""
+    """Transform the ray of each pair to the frame of the pair's body."""
     poses = pairs.poses[:, pairs.pose]
     origins = pairs.rays[:3, pairs.row] - poses[:3]
     directions = pairs.rays[3:, pairs.row]
@@ -204,7 +204,7 @@ def _to_body_frames(pairs: RayBodyPairs) -> Rays:
 
 
 def _nearer_hits(nearest: NearestHits, row: Ints, distance: Floats, body: Ints) -> Indices:
-    """Return the indices of the hits that are closer than the recorded hits.
+    """Return the indices of the hits that are closer than those recorded so far.
 
     The hits are sorted so that the closest hit of each ray comes last. If they are assigned in this
     order, the closest hit remains.

@@ -1,4 +1,4 @@
-"""Records from which compiled loops read a cast, its meshes and their instances.
+"""Records that tell the compiled loops about a cast, its meshes, and their instances.
 
 The records contain the addresses of arrays, so that a loop takes one argument instead of forty.
 `CastRecord` fills a record and keeps its arrays alive.
@@ -99,7 +99,7 @@ KEYS_PER_INSTANCE = np.int64(1) << 32
 
 
 def pointer(kind: Any) -> Any:
-    """Create an intrinsic that converts an int64 address to a pointer to numbers of a type."""
+    """Create an intrinsic that converts an int64 address to a pointer to a given number type."""
 
     @intrinsic
     def read(context: Any, address: Any) -> Any:
@@ -123,7 +123,7 @@ casts_at = pointer(CASTS.dtype)
 
 
 class CastRecord:
-    """A `CAST` record together with the arrays that it refers to.
+    """A `CAST` record, together with the arrays to which it refers.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ class CastRecord:
         self._arrays: list[AnyArray] = []
 
     def address_of(self, array: AnyArray | None) -> int:
-        """Return the address of a contiguous float64 copy of an array, or 0 for None."""
+        """Copy an array to contiguous float64 memory and return its address, or 0 for None."""
         if array is None:
             return 0
         self._arrays.append(np.ascontiguousarray(array, np.float64))
@@ -145,7 +145,7 @@ class CastRecord:
     def set_beams(
         self, directions: Floats, origins: Floats | None, poses: Poses, first: int
     ) -> None:
-        """Set the beams, the poses and the pattern row of ray 0.
+        """Set the beams, the poses, and the pattern row of ray 0.
 
         `directions` and `origins` have shape (n, 3) and are in the sensor frame, in meters. In a
         pattern with sub-rays, each sub-ray is a row.
@@ -171,7 +171,7 @@ class CastRecord:
         record["shares_origin"] = len(poses) == 1 and origins is None and motion is None
 
     def set_pattern(self, pattern: Pattern, poses: Poses, first: int) -> None:
-        """Set the beams and sub-rays of a pattern, the poses and the pattern row of ray 0."""
+        """Set the beams, the sub-rays, and the poses of a pattern, and the pattern row of ray 0."""
         self.set_beams(pattern.directions, pattern.origins, poses, first)
         sub_rays = pattern.sub_rays
         record = self.record

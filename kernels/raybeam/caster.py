@@ -23,7 +23,7 @@ from .scan import Scan, check_scan
 
 
 class RayCaster:
-    """Ray caster for a triangle mesh, or for instances of meshes (`from_instances`).
+    """Ray caster for a triangle mesh, or for instances of meshes (see `from_instances`).
 
     Both sides of a triangle can be hit. A ray in the plane of a triangle does not hit it. A ray
     through an edge or a vertex hits every adjacent triangle, so closed meshes do not leak. The
@@ -79,11 +79,11 @@ class RayCaster:
         threads: int | None = None,
         device: int | None = None,
     ) -> RayCaster:
-        """Create a ray caster for instances of meshes, numbered from 0 in the given order.
+        """Create a ray caster for mesh instances, numbered from 0 in the given order.
 
         Each mesh has a single acceleration structure, so memory use and build time depend on the
-        meshes, and hardly on the number of instances. A caster for a single instance without a
-        transform is equivalent to a caster for its mesh.
+        meshes and hardly at all on the number of instances. A caster for a single instance without
+        a transform is equivalent to a caster for its mesh.
 
         Parameters
         ----------
@@ -145,7 +145,7 @@ class RayCaster:
 
     @property
     def device_lost(self) -> bool:
-        """Whether the CUDA device no longer responds to calls from this process after an error."""
+        """Whether the CUDA device has stopped responding to this process after an error."""
         return self._engine.device_lost
 
     @property
@@ -159,7 +159,7 @@ class RayCaster:
         return len(self._scene.mesh)
 
     def cast_pairs(self, pairs: RayBodyPairs, nearest: NearestHits) -> None:
-        """Cast rays at bodies with this shape, and record closer hits in `nearest`."""
+        """Cast rays at bodies that have this shape, and record closer hits in `nearest`."""
         self.engine.cast_pairs(pairs, nearest)
 
     def upload_rays(
@@ -167,21 +167,21 @@ class RayCaster:
     ) -> DeviceNearestHits:
         """Copy rays `start` to `stop` of a scan to the device, initially without hits on bodies.
 
-        `time_index` (n,) contains the index of the time of each ray. Only hits at a distance of
-        less than `end` meters are recorded. Raises BackendUnavailable if this backend does not use
-        a device.
+        `time_index` (n,) contains the index of each ray's time. Only hits at a distance of less
+        than `end` meters are recorded. Raises BackendUnavailable if this backend does not use a
+        device.
         """
         return self.engine.upload_rays(scan, start, stop, time_index, end)
 
     def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearestHits) -> None:
-        """Cast rays at bodies with this shape on the device, and record closer hits in `nearest`.
+        """Cast rays on the device at bodies with this shape, and record closer hits in `nearest`.
 
         Raises BackendUnavailable if this backend does not use a device.
         """
         self.engine.cast_bodies(bodies, nearest)
 
     def set_transforms(self, instance: int | ArrayLike, transform: ArrayLike) -> None:
-        """Set new transforms of instances for all subsequent casts.
+        """Set new instance transforms for all subsequent casts.
 
         Only the acceleration structure over the instances is rebuilt, which happens once before the
         next cast. The results are the same as those of a new caster. Do not call this method while
@@ -229,7 +229,7 @@ class RayCaster:
 
     @property
     def engine(self) -> Backend:
-        """Ray-casting engine, updated with the current transforms if instances have moved."""
+        """Backend for the scene, which is updated first if instances have moved."""
         with self._lock:
             if self._moved:
                 self._scene = self._scene.with_transforms(self._transforms)

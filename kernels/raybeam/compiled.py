@@ -78,7 +78,7 @@ def _imported_files(path: Path) -> tuple[Path, ...]:
 
 @cache
 def _source_stamp(path: Path) -> tuple[int, ...]:
-    """Return a value that changes with each source file that affects the compiled code of a loop.
+    """Return the modification times and sizes of all source files that affect a compiled loop.
 
     numba only checks the file that contains the loop. The constants and callees of a loop may also
     come from modules that this file imports, directly or indirectly, and from raybeam. Other
@@ -107,7 +107,7 @@ _wait_left_s = [_WAIT_S]  # remaining time to wait for other processes
 
 @contextmanager
 def _compile_lock(folder: str) -> Iterator[None]:
-    """Let only one process at a time compile loops in a folder.
+    """Allow only one process at a time to compile the loops in a folder.
 
     The other processes wait and then load the compiled code. If a hundred workers start with an
     empty cache folder, each loop is compiled once, even if the workers run on different machines.
@@ -147,7 +147,7 @@ def _compile_lock(folder: str) -> Iterator[None]:
 
 
 def _log_if_slow(seconds: float) -> None:
-    """Add the time that a loop took, and log once that loops are being compiled.
+    """Add the time spent on compiling a loop, and log once that loops are being compiled.
 
     Loops are compiled one after the other when modules are imported. If they take more than a
     second in total, many of them are being compiled, so a message is helpful.
@@ -162,7 +162,7 @@ def _log_if_slow(seconds: float) -> None:
 
 
 def _cached(dispatcher: Any, function: Any) -> Any:
-    """Make a dispatcher cache its compiled code on disk until its sources change."""
+    """Make a dispatcher cache its compiled code on disk until the sources change."""
     if not HAS_CACHE:
         dispatcher.compile = _timed(dispatcher.compile)
         return dispatcher
@@ -184,7 +184,7 @@ def _cached(dispatcher: Any, function: Any) -> Any:
 
 
 def _timed(compile_now: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a compile function so that the time it takes is recorded."""
+    """Wrap a compile function so that the time spent in it is recorded."""
 
     def compile_and_count(*signature: Any) -> Any:
         if _lock_depth[0]:  # The loop is called by a loop whose time is already measured.
@@ -199,7 +199,7 @@ def _timed(compile_now: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _load_compiled(cache: Any, signature: Any, target_context: Any) -> Any:
-    """Return compiled code from the cache on disk, or None if there is none.
+    """Load compiled code from the cache on disk, or return None if it is not there.
 
     `FunctionCache.load_overload` would first import everything that numba needs for compiling,
     including `scipy.linalg`, which accounts for more than half of the time needed to load all
@@ -213,7 +213,7 @@ def _load_compiled(cache: Any, signature: Any, target_context: Any) -> Any:
 
 
 def _save_compiled(cache: Any, signature: Any, code: Any) -> None:
-    """Store compiled code on disk, or log a warning if that fails."""
+    """Store compiled code on disk, or log a warning if this fails."""
     remove_unfinished(cache._cache_path, is_locked=_locked_folder[0] == cache._cache_path)
     try:
         cache._save_overload(signature, code)
@@ -222,7 +222,7 @@ def _save_compiled(cache: Any, signature: Any, code: Any) -> None:
 
 
 def compiled(*signature: Any) -> Callable[[Any], Any]:
-    """Compile a function for numba signatures, or on the first call if there are none."""
+    """Compile a function for the given numba signatures, or on its first call if there are none."""
     if njit is None:
         return lambda function: function
 
@@ -238,7 +238,7 @@ def compiled(*signature: Any) -> Callable[[Any], Any]:
 
 
 def called_by_address(signature: Any) -> Callable[[Any], Any]:
-    """Compile a function that compiled callers call by its address.
+    """Compile a function that other compiled functions call by its address.
 
     With `noinline`, the function would be compiled again with each of its callers, and with their
     callers. Callers must pass all arguments by position, because a call by address does not support
@@ -264,21 +264,21 @@ _called_by_address: list[Any] = []  # keeps code alive whose address is compiled
 
 
 def inlined(function: Any) -> Any:
-    """Compile a function that is inlined into its compiled callers."""
+    """Compile a function that is inlined into the compiled functions that call it."""
     return _compile_inner(function, forceinline=True)
 
 
 def noinline(function: Any) -> Any:
-    """Compile a function that compiled callers call, but do not inline.
+    """Compile a function that is not inlined into the compiled functions that call it.
 
-    LLVM vectorizes the loops of such a function, which often fails in the middle of a longer
-    function.
+    LLVM vectorizes the loops of such a function. In the middle of a longer function, this often
+    fails.
     """
     return _compile_inner(function)
 
 
 def _compile_inner(function: Any, **options: Any) -> Any:
-    """Compile a function that only compiled functions call.
+    """Compile a function that is only called by compiled functions.
 
     No wrapper for calls from Python is generated, which saves compile time. Python can call the
     original function as `py_func`. Literal integers are treated as plain integers, so that there is

@@ -51,15 +51,15 @@ class _CastChunk(NamedTuple):
 
 
 class CudaBackend(Backend):
-    """Backend that traverses the trees in intersect.cu, with one thread per ray.
+    """Backend that traverses the trees with the kernels in intersect.cu, one thread per ray.
 
     Only the stored hits are copied to the host.
 
     Kernels and copies use the current stream of the calling thread. Each call ends with a copy to
-    the host that CuPy waits for, so the device no longer uses the memory of a call when the call
-    returns. Tables and patterns are kept between calls. The call that creates them waits until they
-    are complete, so that threads with other streams can use them. Each call switches to the
-    caster's device and back.
+    the host, for which CuPy waits. When the call returns, the device therefore no longer uses the
+    call's memory. Tables and patterns are kept between calls. The call that creates them waits
+    until they are complete, so that threads with other streams can use them. Each call switches to
+    the caster's device and back.
 
     NumPy builds the trees (cuda_tables.py). A builder on the device would need as much code as the
     traversal and would save each worker only two seconds per million triangles at startup.
@@ -74,7 +74,7 @@ class CudaBackend(Backend):
 
     @classmethod
     def unavailable_reason(cls) -> str:
-        """Return the reason why CuPy or CUDA is unavailable, with a remedy, or ""."""
+        """Return why CuPy or CUDA is unavailable and how to fix this, or "" if it is available."""
         if importlib.util.find_spec("cupy") is None:
             command = install_command("cupy-cuda12x")
             return f"CuPy is not installed; run {command} (or cupy-cuda13x)"
@@ -141,7 +141,7 @@ class CudaBackend(Backend):
         self.update_scene(scene)
 
     def update_scene(self, scene: LocalScene) -> None:
-        """Replace the scene with a scene that has the same instances but new transforms."""
+        """Replace the scene by one with the same instances but new transforms."""
         super().update_scene(scene)
         layout = build_instance_tables(scene, self._roots)
         with self._device:
@@ -203,7 +203,7 @@ class CudaBackend(Backend):
     def _weights(
         self, hits: tuple[Any, Any, Any], table: tuple[Any, Any], ray: Any
     ) -> tuple[Any, Any]:
-        """Return the barycentric weights of the second and third vertex at the hits of rays.
+        """Return the barycentric weights of the second and third vertex at each hit.
 
         `ray` (k,) contains the indices of rays that hit.
         """
@@ -218,7 +218,7 @@ class CudaBackend(Backend):
         return u, v
 
     def scan(self, scan: Scan) -> ScanReturns:
-        """Return the stored hits of a scan and the counts of all hits."""
+        """Return the hits to store for a scan, and the counts of all hits."""
         if scan.pattern.sub_rays is not None:  # The kernel does not support sub-rays.
             return super().scan(scan)
         if scan.out is not None:
@@ -315,14 +315,14 @@ class CudaBackend(Backend):
             )
 
     def _nonzero_counters(self, tally: Any) -> TallyCounts:
-        """Copy the nonzero counters of a tally, which are usually few, to the host."""
+        """Copy the nonzero counters to the host, because most counters are zero."""
         rows = self._cupy.flatnonzero(tally)
         return rows.get(), tally[rows].get()
 
     def _apply_external_hits(
         self, hits: tuple[Any, Any, Any], start: int, n: int, external_hits: ExternalHits | None
     ) -> tuple[Any, ...]:
-        """Replace the hits of a chunk of n rays where an external hit is closer.
+        """Replace hits in a chunk of n rays where an external hit is closer.
 
         Return the arguments of the kernel `pack` that describe the external hits.
         """
@@ -341,7 +341,7 @@ class CudaBackend(Backend):
         return meters, triangle, np.int32(len(self._scene.mesh))
 
     def _make_rays(self, scan: Scan, start: int, stop: int) -> Any:
-        """Compute the origins in meters and the directions of rays `start` to `stop` of a scan.
+        """Compute the origins (in meters) and the directions of rays `start` to `stop` of a scan.
 
         Return a float64 array (6, n) on the device, which is bit-identical to the result of
         `pattern_rays`. Casting rays that are read from memory takes fewer registers and fewer
@@ -368,7 +368,7 @@ class CudaBackend(Backend):
         return rays
 
     def _pose_tables(self, poses: Poses, start: int, stop: int) -> list[Any]:
-        """Return the positions and rotations of the poses of rays, as arguments of `make_rays`."""
+        """Return the poses' positions and rotations, as arguments of the kernel `make_rays`."""
         span = _pose_span(poses, start, stop)
         matrices = np.zeros(1) if poses.rotations is None else poses.rotations[span]
         # Poses are stored component by component, and `asarray` would keep this memory order.
@@ -378,10 +378,10 @@ class CudaBackend(Backend):
         ]
 
     def _pattern_flags(self, scan: Scan, start: int) -> list[np.int32]:
-        """Return further arguments of the kernel `make_rays`.
+        """Return the remaining arguments of the kernel `make_rays`.
 
-        They are the number of rays of the first pose and of each later pose, whether there are
-        rotations, and whether the pattern has origins.
+        These are the number of rays that use the first pose, the number for each later pose,
+        whether there are rotations, and whether the pattern has origins.
         """
         poses = scan.poses
         first_count = poses.rays_per_pose - start % poses.rays_per_pose
@@ -391,7 +391,7 @@ class CudaBackend(Backend):
         return [np.int32(number) for number in (*counts, has_rotations, has_origins)]
 
     def _motion_tables(self, poses: Poses, start: int, stop: int) -> tuple[Any, ...]:
-        """Return the delays, the velocities, and whether the lidar moves, for `make_rays`."""
+        """Return delays, velocities, and whether the lidar moves, as arguments of `make_rays`."""
         cp = self._cupy
         motion = poses.motion
         if motion is None:
@@ -401,7 +401,7 @@ class CudaBackend(Backend):
         return cp.asarray(motion.delays), cp.asarray(np.ascontiguousarray(rates)), np.int32(1)
 
     def _pattern_on_device(self, pattern: Pattern) -> tuple[Any, ...]:
-        """Return the directions and origins of a pattern on the device.
+        """Copy a pattern's directions and origins to the device.
 
         The arrays have shape (3, n) and are copied on first use. If the pattern has no origins, the
         directions are returned in their place, and the kernel does not read them.
@@ -418,7 +418,7 @@ class CudaBackend(Backend):
     def _cast(
         self, table: tuple[Any, Any], n: int, limits: tuple[float, float]
     ) -> tuple[Any, Any, Any]:
-        """Return the local distance, table row and instance of the closest hits, on the device.
+        """Find the closest hits on the device.
 
         `table` contains the origins and directions of n rays. `limits` are the minimum and maximum
         distance in meters.
@@ -440,7 +440,7 @@ class CudaBackend(Backend):
         groups: HitGroups,
         external_hits: ExternalHits | None,
     ) -> _CastChunk:
-        """Cast rays `start` to `stop` of a scan and count the hits, without blocking."""
+        """Cast rays `start` to `stop` of a scan, and count the hits without blocking."""
         rays = _split_rays(self._make_rays(scan, start, stop))
         hits = self._cast(rays, stop - start, (scan.t_min, scan.t_max))
         replacing = self._apply_external_hits(hits, start, stop - start, external_hits)
@@ -454,7 +454,7 @@ class CudaBackend(Backend):
         groups: HitGroups,
         external_hits: tuple[Any, ...],
     ) -> _CastChunk:
-        """Compute the cumulative number of hits, and start to copy the counts to the host.
+        """Compute the cumulative number of hits, and start copying the counts to the host.
 
         The hits are compacted by these sums instead of atomic operations, so that they are in ray
         order and each run returns the same bytes.
@@ -482,7 +482,7 @@ class CudaBackend(Backend):
         scale: float,
         counting: tuple[Any, np.int32, Any],
     ) -> tuple[Any, Any, Any, Any]:
-        """Count the hits of a chunk in `groups`, and compact the hits to store, on the device.
+        """Count a chunk's hits in `groups` on the device, and compact the hits to store.
 
         Distances are divided by `scale`. `counting` contains the tally arguments of the kernel
         `pack`. Return the ray indices, distances, triangles and instances.
@@ -525,7 +525,7 @@ class CudaBackend(Backend):
 
 
 def _one_behind(items: Iterable[T]) -> Iterator[T]:
-    """Yield each item after the next item has been computed.
+    """Yield each item only after the next item has been computed.
 
     This way, the device casts the next chunk while the host waits for the hits of the current
     chunk.
@@ -539,18 +539,17 @@ def _one_behind(items: Iterable[T]) -> Iterator[T]:
 
 
 def _split_rays(rays: Any) -> tuple[Any, Any]:
-    """Split a table of rays into origins and directions."""
     return rays[:3], rays[3:]
 
 
 def _table_arguments(table: tuple[Any, Any]) -> tuple[Any, np.int64, Any, np.int64]:
-    """Return the origins and directions as kernel arguments, each followed by its column count."""
+    """Return kernel arguments for origins and directions, each followed by its column count."""
     origins, directions = table
     return origins, np.int64(origins.shape[1]), directions, np.int64(directions.shape[1])
 
 
 def _select_rays(start: int, table: tuple[Any, Any], ray: Any) -> tuple[Any, Any]:
-    """Return the origins and directions of selected rays in a table.
+    """Return the origins and directions of selected rays.
 
     The first column of the table belongs to ray `start`. The results have shape (3, k).
     """
@@ -559,12 +558,12 @@ def _select_rays(start: int, table: tuple[Any, Any], ray: Any) -> tuple[Any, Any
 
 
 def _pose_span(poses: Poses, start: int, stop: int) -> slice:
-    """Return the range of poses that rays `start` to `stop` belong to."""
+    """Return the slice of poses to which rays `start` to `stop` belong."""
     return slice(start // poses.rays_per_pose, -(-stop // poses.rays_per_pose))
 
 
 def kernel_source() -> str:
-    """Return the text of intersect.cu, with its file name for compiler messages."""
+    """Return the source code of intersect.cu, preceded by its file name for compiler messages."""
     text = importlib.resources.files(__package__).joinpath("intersect.cu").read_text("utf-8")
     return f'#line 1 "intersect.cu"\n{text}'
 
@@ -581,7 +580,7 @@ def compiler_options(stack: int, nested: bool, masked: bool) -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)
 def _compiled(cupy: Any, device: int, options: tuple[str, ...]) -> Any:
-    """Compile the kernels for the current device, whose index is `device`. The result is cached."""
+    """Compile the kernels for the current device, and cache the result by device index."""
     module = cupy.RawModule(code=kernel_source(), options=options)
     module.compile()
     return module
@@ -600,7 +599,7 @@ def _has_cuda_headers() -> bool:
 
 
 def _device(cupy: Any, number: int | None) -> Any:
-    """Return the device with an index, or the current device for None.
+    """Return the device with the given index, or the current device if it is None.
 
     Raises ValueError if the device does not exist.
     """

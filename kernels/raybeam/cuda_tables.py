@@ -1,4 +1,4 @@
-"""Tables of meshes, instances and their trees for intersect.cu."""
+"""Tables of meshes, instances, and trees for the kernels in intersect.cu."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _FLOOR = 1e-35  # more than the error of products of tiny edges that underflow i
 
 @dataclass(frozen=True)
 class MeshTables:
-    """Tables of the meshes.
+    """Tables of all meshes of a scene.
 
     The comment at the top of intersect.cu describes the columns.
 
@@ -53,7 +53,7 @@ class MeshTables:
 
 @dataclass(frozen=True)
 class InstanceTables:
-    """Tables of the instances.
+    """Tables of all instances of a scene.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class InstanceTables:
 
 
 def build_mesh_tables(meshes: tuple[LocalMesh, ...]) -> MeshTables:
-    """Build the trees of meshes and return the tables of all meshes."""
+    """Build a tree for each mesh, and return the tables of all meshes."""
     trees = [build_tree(mesh.corners, _WIDTH, _LEAF_SIZE) for mesh in meshes]
     tree, roots = join_trees(trees)
     corners = [mesh.corners[t.order] for mesh, t in zip(meshes, trees, strict=True)]
@@ -91,9 +91,9 @@ def build_mesh_tables(meshes: tuple[LocalMesh, ...]) -> MeshTables:
 
 
 def build_instance_tables(scene: LocalScene, roots: Ints) -> InstanceTables:
-    """Build the tree over the instances and return its tables, or placeholders for a plain scene.
+    """Build the tree over the instances. For a plain scene, return placeholders.
 
-    `roots` contains the root of the tree of each mesh.
+    `roots` contains the root of each mesh's tree.
     """
     if scene.matrices is None:
         return InstanceTables(
@@ -112,12 +112,11 @@ def build_instance_tables(scene: LocalScene, roots: Ints) -> InstanceTables:
 
 
 def _concatenate(tables: list[AnyArray]) -> AnyArray:
-    """Concatenate tables. A single table is returned without a copy."""
     return tables[0] if len(tables) == 1 else np.concatenate(tables)
 
 
 def _node_rows(tree: WideTree) -> Floats32:
-    """Return the nodes of a tree as rows of 32 numbers, with boxes, children and padding."""
+    """Return each tree node as a row of 32 numbers: boxes, children, and padding."""
     table = np.zeros((len(tree.child), 8, _WIDTH), np.float32)
     table[:, 0:3] = tree.lower
     table[:, 3:6] = tree.upper
@@ -126,7 +125,7 @@ def _node_rows(tree: WideTree) -> Floats32:
 
 
 def _triangle_rows(corners: Floats) -> Floats32:
-    """Return the first vertex, two edges and the rounding error bounds of each triangle.
+    """Return each triangle's first vertex, two edges, and bounds of the rounding errors.
 
     The bounds are those of the float32 test in intersect.cu. In the following, u = 2**-24,
     coordinates are within [-1, 1], d is a unit direction, e and g are the edges, t = origin -
@@ -158,7 +157,7 @@ def _triangle_rows(corners: Floats) -> Floats32:
 
 
 def max_stack_depth(tree: WideTree) -> int:
-    """Return the maximum number of pending nodes in a traversal.
+    """Return the maximum number of pending nodes during a traversal.
 
     On each level of the tree, the siblings of the current node are pending.
     """

@@ -1,10 +1,10 @@
 """Meshes whose vertices move between frames.
 
-A ray hits such a mesh in its shape at the firing time of the ray. One tree over the triangles,
-which is built once, serves all times: each vertex moves along a straight line between two frames,
-so a box that encloses a triangle at both frames also encloses it in between. All backends cast rays
-at these meshes with a compiled loop on the CPU (deforming_loops.py), which uses the intersection
-test in triangle.py.
+A ray hits such a mesh in the shape that the mesh has when the ray is fired. One tree over the
+triangles, which is built once, serves all times: each vertex moves along a straight line between
+two frames, so a box that encloses a triangle at both frames also encloses it in between. All
+backends cast rays at these meshes with a compiled loop on the CPU (deforming_loops.py), which uses
+the intersection test in triangle.py.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _LEAF_SIZE = 4
 
 @dataclass(frozen=True, eq=False)
 class DeformingMesh:
-    """A mesh whose vertices move linearly between frames, for use as a shape in `MovingBodies`.
+    """A mesh whose vertices move linearly between frames, used as a shape in `MovingBodies`.
 
     Frame numbers start at 0, and frame 1.5 is halfway between the second and the third frame. The
     mesh keeps its shape before the first and after the last frame.
@@ -47,11 +47,11 @@ class DeformingMesh:
 
     @property
     def box(self) -> Floats:
-        """Lower and upper corner of the bounding box of all frames, in meters. Shape (2, 3)."""
+        """Lower and upper corner of a bounding box around all frames, in meters. Shape (2, 3)."""
         return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
     def cast_pairs(self, pairs: RayBodyPairs, nearest: NearestHits) -> None:
-        """Cast rays at bodies with this shape, and record closer hits in `nearest`.
+        """Cast rays at bodies that have this shape, and record closer hits in `nearest`.
 
         Ties are resolved in favor of the lowest triangle index.
         """
@@ -61,7 +61,7 @@ class DeformingMesh:
 
     @cached_property
     def _tree(self) -> DeformingTree:
-        """The mesh and its tree in the form that the compiled loop reads."""
+        """The mesh and its tree, as required by the compiled loop."""
         from . import deforming_loops as loops
 
         vertices = np.ascontiguousarray(self.vertices)

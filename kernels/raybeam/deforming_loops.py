@@ -21,7 +21,7 @@ _TINY = 1e-300
 
 
 class DeformingTree(NamedTuple):
-    """A deforming mesh, and a tree over its triangles with boxes for each interval between frames.
+    """A deforming mesh, and a tree over its triangles with boxes for each pair of frames.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ _TREE = named_tuple_type(
 
 @compiled("void(f8[:, :, ::1], i8[:, ::1], i4[::1], i4[:, ::1], f8, f4[:, :, :, ::1])")
 def fit_boxes(vertices, faces, order, child, pad, boxes):  # type: ignore[no-untyped-def]
-    """Compute the boxes of all nodes of a `DeformingTree` between consecutive frames.
+    """Compute the boxes of all nodes of a `DeformingTree` between each frame and the next.
 
     The boxes are written to `boxes`. They extend beyond the triangles by `pad` meters.
     """
@@ -90,7 +90,7 @@ def fit_boxes(vertices, faces, order, child, pad, boxes):  # type: ignore[no-unt
 
 @noinline
 def _entry_distances(box, origin, inverse, reach, entry_distances):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write the distances at which a ray enters the boxes of a node's children, or inf for a miss.
+    """Compute the distances at which a ray enters a node's child boxes, or inf if it misses them.
 
     `box` is the address of the boxes, float32 (6, `WIDTH`), and `entry_distances` is the address of
     the output, float64 (`WIDTH`,). `inverse` contains the reciprocals of the direction's
@@ -120,7 +120,7 @@ def _inverse(d):  # type: ignore[no-untyped-def]
 
 @inlined
 def _corner(vertices, frame, share, vertex, axis):  # type: ignore[no-untyped-def]
-    """Return a vertex between two frames, as three coordinates in meters with `axis` last.
+    """Interpolate a vertex between two frames, with the coordinate of `axis` last, in meters.
 
     `share` is the fraction of the time from `frame` to the next frame, between 0 and 1.
     """
@@ -136,10 +136,11 @@ def _corner(vertices, frame, share, vertex, axis):  # type: ignore[no-untyped-de
 
 @compiled(types.void(PAIRS, _TREE, NEAREST_HITS))
 def cast_pairs(pairs, tree, nearest):  # type: ignore[no-untyped-def]  # noqa: C901, PLR0914, PLR0915 - a compiled loop
-    """Cast pairs of rays and bodies at a deforming mesh, and record closer hits in `nearest`.
+    """Cast rays at deforming bodies, and record closer hits in `nearest`.
 
-    Each ray hits the mesh in its shape at the frame number `RayBodyPairs.frame`. Nodes are visited
-    from near to far. `stack_distances` contains the entry distances of the nodes on the stack.
+    Each ray hits the mesh in the shape that the mesh has at the frame number `RayBodyPairs.frame`.
+    Nodes are visited from near to far. `stack_distances` contains the entry distances of the nodes
+    on the stack.
     """
     rays = pairs.rays
     poses = pairs.poses

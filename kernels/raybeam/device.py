@@ -1,4 +1,4 @@
-"""Hits on a CUDA device, and transfers from the device to the host."""
+"""Hits on a CUDA device, and how they are copied to the host."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MAX_PENDING = 2  # pending copies, so that one runs while the next arrays are c
 
 @dataclass(frozen=True, eq=False)
 class DeviceHits:
-    """Stored hits of a part of a scan, as CuPy arrays on the current device and stream.
+    """Stored hits in one part of a scan, as CuPy arrays on the current device and stream.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class DeviceHits:
 
 @dataclass(frozen=True, eq=False)
 class ExternalHits:
-    """Hits of a scan's rays on surfaces that are not part of the caster, for example moving bodies.
+    """Hits of a scan's rays on surfaces that the caster does not contain, such as moving bodies.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class ExternalHits:
 
 @dataclass(frozen=True, eq=False)
 class DeviceNearestHits:
-    """Rays on a CUDA device with their closest hits on moving bodies, as CuPy arrays.
+    """Rays on a CUDA device and their closest hits on moving bodies, as CuPy arrays.
 
     Attributes
     ----------
@@ -125,7 +125,7 @@ def to_device(cupy: Any, array: AnyArray) -> Any:
 
 
 class _Pinned:
-    """Thread-safe count of the page-locked bytes that this process uses."""
+    """Thread-safe counter of the page-locked memory used by this process, in bytes."""
 
     def __init__(self) -> None:
         # Reentrant, because a finalizer may run while its thread holds the lock.
@@ -133,14 +133,13 @@ class _Pinned:
         self._bytes = 0
 
     def reserve(self, size: int) -> bool:
-        """Reserve bytes, and return False if the limit would be exceeded."""
+        """Reserve bytes, or return False if they would exceed the limit."""
         with self._lock:
             fits = self._bytes + size <= PINNED_BYTES
             self._bytes += size * fits
             return fits
 
     def release(self, size: int) -> None:
-        """Release reserved bytes."""
         with self._lock:
             self._bytes -= size
 
@@ -149,7 +148,7 @@ _pinned = _Pinned()
 
 
 def pinned_array(cupy: Any, count: int, dtype: DTypeLike) -> AnyArray:
-    """Return an array in page-locked memory, to which the device can write directly.
+    """Allocate an array in page-locked memory, to which the device can write directly.
 
     The memory returns to CuPy's pool when the last view of the array is released. If `PINNED_BYTES`
     are in use, the array is in ordinary memory instead. Copies to ordinary memory are slower, but
@@ -169,7 +168,7 @@ def pinned_array(cupy: Any, count: int, dtype: DTypeLike) -> AnyArray:
 
 
 class PendingCopy:
-    """A small copy to the host that runs in the current stream without blocking.
+    """A small copy to the host that the current stream performs without blocking.
 
     Parameters
     ----------
@@ -193,7 +192,7 @@ class PendingCopy:
 
 
 class CopyQueue:
-    """Queue of copies to the host in a separate stream, while the device computes further arrays.
+    """Queue of copies to the host in a separate stream, so that the device can keep computing.
 
     Parameters
     ----------
@@ -208,7 +207,7 @@ class CopyQueue:
         self._pending: deque[tuple[Any, Sequence[Any]]] = deque()
 
     def send(self, pairs: Sequence[tuple[Any, AnyArray]]) -> None:
-        """Start to copy arrays that the current stream computes.
+        """Start copying arrays that the current stream computes.
 
         `pairs` contains the source and target of each copy. The targets must come from
         `pinned_array`.
@@ -231,7 +230,7 @@ class CopyQueue:
 
 
 class HitTransfer:
-    """Transfer of a scan's hits to the host, part by part, while the device casts further rays.
+    """Copies a scan's hits to the host in parts while the device casts further rays.
 
     Parameters
     ----------
@@ -251,7 +250,7 @@ class HitTransfer:
         self._count = 0
 
     def send(self, hits: DeviceHits) -> None:
-        """Start to copy the next hits in ray order."""
+        """Start copying the next hits in ray order."""
         rows = slice(self._count, self._count + len(hits))
         columns = (hits.ray, hits.distance, hits.triangle, hits.instance)
         pairs = zip(columns, self._arrays, strict=False)
@@ -259,7 +258,7 @@ class HitTransfer:
         self._count += len(hits)
 
     def finish(self) -> HitColumns:
-        """Wait until all copies are complete and return the hits."""
+        """Wait until all copies are complete, and return the hits."""
         self._outbox.wait()
         ray, distance, triangle, *instances = (
             trim_to_count(array, self._count, self._max_hits) for array in self._arrays
@@ -269,7 +268,7 @@ class HitTransfer:
 
 
 def trim_to_count(array: AnyArray, count: int, capacity: int) -> AnyArray:
-    """Return the first `count` values of an array from `pinned_array`.
+    """Return the first `count` values of an array that `pinned_array` has allocated.
 
     If the values occupy less than half of the array's `capacity`, they are copied to ordinary
     memory, so that the page-locked memory can be released.

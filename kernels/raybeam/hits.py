@@ -1,4 +1,4 @@
-"""Results of ray casting."""
+"""Data structures for the results of ray casting."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Hits:
 
 @dataclass(frozen=True)
 class ScanReturns:
-    """Result of a scan, with the stored hits in ray order and the counts of all hits.
+    """Result of a scan: the stored hits in ray order, and the counts of all hits.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Installation commands for error messages."""
+"""Installation commands that are shown in error messages."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def install_command(*requirements: str) -> str:
-    """Return the command that installs requirements in the environment of this process.
+    """Return the command that installs the given requirements in this process's environment.
 
     A requirement may have a version, for example ``pye57>=0.4``. Environments created by uv do not
     contain pip, and conda environments may lack it.
@@ -26,7 +26,7 @@ def install_command(*requirements: str) -> str:
 
 
 def _created_by_uv(prefix: Path) -> bool:
-    """Return whether uv created a virtual environment."""
+    """Return whether uv created a given virtual environment."""
     try:
         settings = (prefix / "pyvenv.cfg").read_text("utf-8")
     except OSError:

@@ -1,4 +1,4 @@
-"""Meshes, instances, and the scene that a backend casts rays at.
+"""Meshes, instances, and the scenes that backends use.
 
 Rays are cast on two levels. The scene and each mesh have their own local coordinates
 (`LocalFrame`). At an instance, a matrix transforms a ray from scene to mesh coordinates, and its
@@ -34,7 +34,7 @@ _FLAT = 1e-9
 
 
 class Mesh:
-    """A triangle mesh that instances share.
+    """A triangle mesh that can be shared by instances.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ class Instance:
 
 @dataclass(frozen=True, eq=False)
 class MeshFrames:
-    """Local coordinates and bounding boxes of the meshes of n instances.
+    """Local coordinates and bounding box of each instance's mesh, for n instances.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ class MeshFrames:
 
     @classmethod
     def from_instances(cls, meshes: tuple[LocalMesh, ...], mesh: Indices) -> MeshFrames:
-        """Return the frames of the meshes of instances. The arguments are as in `LocalScene`."""
+        """Look up the local coordinates of each instance's mesh. See `LocalScene` for arguments."""
         frames = [local.frame for local in meshes]
         scale = np.array([frame.scale for frame in frames])[mesh]
         lower = np.array([frame.lower for frame in frames])[mesh] / scale[:, None]
@@ -119,7 +119,7 @@ class MeshFrames:
 
 @dataclass(frozen=True, eq=False)
 class LocalScene:
-    """Instances and meshes in the representation used by backends.
+    """Instances and meshes in the form that backends use.
 
     Attributes
     ----------
@@ -149,22 +149,22 @@ class LocalScene:
 
     @property
     def nested(self) -> bool:
-        """Whether rays must be transformed to the coordinates of the meshes."""
+        """Whether rays must be transformed to the coordinates of each mesh."""
         return self.matrices is not None
 
     @cached_property
     def first_face(self) -> Ints:
-        """First tally row of each mesh, followed by the number of all rows. Shape (meshes + 1,)."""
+        """First tally row of each mesh, followed by the number of rows. Shape (meshes + 1,)."""
         return np.cumsum([0, *(mesh.face_count for mesh in self.meshes)])
 
     @property
     def face_count(self) -> int:
-        """Number of rows of a tally."""
+        """Number of tally rows."""
         return int(self.first_face[-1])
 
     @property
     def counters(self) -> Ints:
-        """First tally row of each instance, and the step between its rows. Shape (n, 2)."""
+        """First tally row of each instance, and the step from one row to the next. Shape (n, 2)."""
         first = self.first_face[:-1][self.mesh]
         return np.stack([first, np.ones_like(first)], axis=1)
 
@@ -178,7 +178,7 @@ class LocalScene:
         return _nested_scene(self.meshes, self.mesh, self.mesh_frames, transforms)
 
     def tally_rows(self, instance: Ints32, triangle: Ints32) -> Integers:
-        """Return the tally row of each hit, given its instance and triangle."""
+        """Return the tally row of each hit, given the hit instance and triangle."""
         return self.first_face[self.mesh[instance]] + triangle if self.nested else triangle
 
     def to_mesh_coordinates(
@@ -213,14 +213,14 @@ class LocalScene:
 
 
 def single_mesh_scene(mesh: LocalMesh) -> LocalScene:
-    """Return the plain scene of a single mesh without a transform."""
+    """Return the plain scene of a single, untransformed mesh."""
     frame = mesh.frame
     boxes = np.stack([frame.lower, frame.upper])[None]
     return LocalScene((mesh,), np.zeros(1, np.intp), frame, None, boxes)
 
 
 def build_scene(instances: Sequence[Instance]) -> tuple[LocalScene, Floats]:
-    """Validate instances, and return their scene and their transforms.
+    """Validate instances, and return them as a scene together with their transforms.
 
     Raises
     ------
@@ -249,10 +249,10 @@ def build_scene(instances: Sequence[Instance]) -> tuple[LocalScene, Floats]:
 
 
 def check_transforms(numbers: Integers, transforms: ArrayLike) -> Floats:
-    """Return the transforms of the instances `numbers` as a float64 array.
+    """Validate the transforms of the instances `numbers`, and return them as a float64 array.
 
-    The result has shape (k, 3, 4). Raises ValueError with the index of the instance if a transform
-    is invalid.
+    The result has shape (k, 3, 4). If a transform is invalid, raises ValueError with the index of
+    its instance.
     """
     values = np.asarray(transforms)
     if values.ndim != 3 or len(values) != len(numbers):
@@ -276,7 +276,7 @@ def _matrix(number: int, transform: ArrayLike | None) -> Floats:
 
 
 def _matrices(numbers: Integers, values: AnyArray) -> Floats:
-    """Return transforms of the instances `numbers` as a float64 array of shape (k, 3, 4).
+    """Convert the transforms of the instances `numbers` to (3, 4) float64 matrices.
 
     Raises ValueError if the shape, the type or the last row is invalid.
     """
@@ -297,7 +297,7 @@ def _matrices(numbers: Integers, values: AnyArray) -> Floats:
 
 
 def _check_regular(numbers: Integers, transforms: Floats) -> None:
-    """Raise ValueError if a transform is not finite or is singular."""
+    """Raise ValueError if a transform is singular or not finite."""
     finite = np.isfinite(transforms).all(axis=(1, 2))
     if not finite.all():
         row = int(finite.argmin())
@@ -321,7 +321,7 @@ def _check_regular(numbers: Integers, transforms: Floats) -> None:
 def _nested_scene(
     meshes: tuple[LocalMesh, ...], mesh: Indices, mesh_frames: MeshFrames, transforms: Floats
 ) -> LocalScene:
-    """Return the scene of instances with transforms.
+    """Create a scene from instances and their transforms.
 
     Parameters
     ----------
@@ -356,7 +356,7 @@ def _nested_scene(
 
 
 def _scene_frame(center: Floats, shift: Floats, half: Floats) -> tuple[LocalFrame, Floats]:
-    """Return the local coordinates of a scene, and the local boxes of its instances.
+    """Compute the local coordinates of a scene, and the boxes of its instances in them.
 
     The boxes have the centers ``center + shift`` and the half side lengths `half`, with shape (n,
     3). The returned boxes have shape (n, 2, 3).
@@ -372,12 +372,12 @@ def _scene_frame(center: Floats, shift: Floats, half: Floats) -> tuple[LocalFram
 
 
 def _multiply(matrices: Floats, vectors: Floats) -> Floats:
-    """Multiply matrices and vectors, with the same bits on every machine."""
+    """Multiply matrices by vectors, with the same bits on every machine."""
     return (matrices * vectors[:, None, :]).sum(axis=2)
 
 
 def _invert(matrices: Floats) -> Floats:
-    """Return the inverses of 3 x 3 matrices, with the same bits on every machine."""
+    """Invert 3 x 3 matrices, with the same bits on every machine."""
     (a, d, g), (b, e, h), (c, f, i) = matrices.transpose(1, 2, 0)  # columns (a, b, c), …
     # The rows are cross products of columns. `numpy.cross` takes four times as long for few
     # matrices.

@@ -1,4 +1,4 @@
-"""Cache files of compiled loops, with checksums."""
+"""Cache files of compiled loops, protected by checksums."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ABANDONED_S = 3600.0  # older temporary files are considered abandoned
 
 
 class LoopFiles(IndexDataCacheFile):
-    """Cache files of a loop, which are an index (.nbi) and a code file (.nbc) per signature.
+    """Cache files of a loop: an index (.nbi), and a code file (.nbc) for each signature.
 
     numba's own cache files have no checksums. Unpickling a damaged file can raise any exception,
     and if a process is killed after it has written the index but before it has written the code,
@@ -44,7 +44,7 @@ class LoopFiles(IndexDataCacheFile):
         super().__init__(folder, f"{name}.checked", stamp)
 
     def load(self, key: Any) -> Any:
-        """Return the compiled code for a signature, or None if it is missing or damaged."""
+        """Load the compiled code for a signature, or return None if it is missing or damaged."""
         name, checksum = self._load_index().get(key, ("", b""))
         if not name:
             return None
@@ -55,7 +55,7 @@ class LoopFiles(IndexDataCacheFile):
         return pickle.loads(code)  # noqa: S301 - the checksum matches
 
     def save(self, key: Any, data: Any) -> None:
-        """Write the compiled code for a signature, and then the index.
+        """Write the compiled code for a signature first, and then the index.
 
         Raises OSError if a file cannot be written.
         """
@@ -72,7 +72,7 @@ class LoopFiles(IndexDataCacheFile):
         self._save_index(entries)
 
     def _load_index(self) -> dict[Any, tuple[str, bytes]]:
-        """Return the entries of the index, or {} if it is missing, damaged or outdated."""
+        """Load the entries of the index, or return {} if it is missing, damaged, or outdated."""
         content = self._content(self._index_name)
         if content is None:
             return {}
@@ -95,14 +95,13 @@ class LoopFiles(IndexDataCacheFile):
         self._write(self._index_path, _checksum(pickled) + pickled)
 
     def _content(self, name: str) -> bytes | None:
-        """Return the content of a file in the folder, or None if it cannot be read."""
         try:
             return Path(self._data_path(name)).read_bytes()
         except OSError:
             return None
 
     def _write(self, path: str, content: bytes) -> None:
-        """Write a file under a temporary name and rename it."""
+        """Write a file under a temporary name first, and then rename it."""
         with self._open_for_write(path) as file:
             file.write(content)
 
@@ -116,7 +115,7 @@ class LoopFiles(IndexDataCacheFile):
 
 
 def warn_not_cached(folder: str, error: OSError) -> None:
-    """Warn that compiled code cannot be stored, so that each process compiles the loops."""
+    """Warn that compiled code cannot be stored, so that every process has to compile the loops."""
     _warn_once(
         "Compiled loops cannot be stored in %s, so each process compiles them: %s.",
         folder,
@@ -145,7 +144,7 @@ _warned = set[tuple[str, str]]()  # messages that this process has logged, with 
 
 
 def _warn_once(message: str, folder: str, example: str) -> None:
-    """Log a warning about a folder, once for all loops in the folder."""
+    """Log a warning about a folder only once, even if it concerns several loops."""
     if (message, folder) not in _warned:
         _warned.add((message, folder))
         _log.warning(message, folder, example)

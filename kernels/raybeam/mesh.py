@@ -27,7 +27,7 @@ _BLOCK = 1 << 16  # triangles that are processed at a time
 
 @dataclass(frozen=True)
 class LocalFrame:
-    """Local coordinates, in which a bounding box is centered and scaled into [-1, 1].
+    """Local coordinates, in which a bounding box is centered at the origin and scaled into [-1, 1].
 
     The translation makes float32 accurate enough even for coordinates of hundreds of kilometers.
     The scale is a power of two, so that it does not cause rounding errors. Because of the scaling,
@@ -55,14 +55,14 @@ class LocalFrame:
 
     @property
     def table(self) -> Floats:
-        """Center, scale, lower and upper corner as read by compiled code. Shape (10,)."""
+        """Center, scale, lower corner, and upper corner, for compiled loops. Shape (10,)."""
         return np.concatenate([self.center, [self.scale], self.lower, self.upper])
 
 
 def clip_to_box(
     lower: Floats, upper: Floats, origins: Floats, directions: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the distances at which rays enter and leave a box.
+    """Compute the distances at which rays enter and leave a box.
 
     The distances have shape (n,) and are in local units. A ray intersects the box if ``entry <=
     leave``. The entry distance is 0 if the ray starts inside the box.
@@ -152,7 +152,7 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
 
 
 def center_and_scale(lower: Floats, upper: Floats) -> tuple[Floats, float]:
-    """Return the center and the scale of the frame for a bounding box in meters."""
+    """Compute the center and scale of the local coordinates for a bounding box in meters."""
     center = lower / 2 + upper / 2
     half = float(np.maximum(upper - center, center - lower).max())
     return center, math.ldexp(1.0, -math.frexp(half)[1]) if half > 0 else 1.0

@@ -1,4 +1,4 @@
-"""Compiled functions for rays, meshes, instances and masks.
+"""Compiled functions that concern rays, meshes, instances, and masks.
 
 `mesh` and `instances` are addresses of `MESH` and `INSTANCE` records (cast_record.py).
 """
@@ -20,7 +20,7 @@ i32_1 = types.int32[::1]
 
 @noinline
 def to_mesh_coordinates(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Transform a ray from scene to mesh coordinates, as `LocalScene.to_mesh_coordinates` does.
+    """Transform a ray from scene to mesh coordinates, like `LocalScene.to_mesh_coordinates`.
 
     `m` points to the (3, 4) matrix of the instance. Return the origin, the unit direction, and the
     length that the direction had before it was normalized.
@@ -37,7 +37,7 @@ def to_mesh_coordinates(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-d
 
 @inlined
 def triangle_corners(table, triangle, axis):  # type: ignore[no-untyped-def]
-    """Return the three vertices of a triangle, each as three coordinates with `axis` last.
+    """Return a triangle's three vertices, each as three coordinates with `axis` last.
 
     `triangle` is the row of the triangle in `table`.
     """
@@ -53,9 +53,10 @@ def triangle_corners(table, triangle, axis):  # type: ignore[no-untyped-def]
 
 @noinline
 def is_opaque(mesh, triangle, hit):  # type: ignore[no-untyped-def]
-    """Return whether a mesh is opaque at a hit, as `MaskTables.is_opaque` does.
+    """Return whether a mesh is opaque at a hit, like `MaskTables.is_opaque`.
 
-    `mesh` points to a `MESH` record, and `triangle` is the row in its corners.
+    `mesh` points to a `MESH` record, and `triangle` is the row of the triangle in the mesh's
+    corners.
     """
     uv = float32s(mesh[1])
     mask = uint8s(mesh[2])
@@ -76,11 +77,11 @@ def is_opaque(mesh, triangle, hit):  # type: ignore[no-untyped-def]
 def barycentric_weights(  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
     casts, origins, directions, triangle_row, instance, u, v
 ):
-    """Write the barycentric weights `u` and `v` of the second and third vertex of hits.
+    """Compute the barycentric weights `u` and `v` of the second and third vertex at each hit.
 
     The rays (m, 3) are in local scene coordinates. `origins` is (1, 3) if all rays share an origin.
-    `triangle_row` is the row of each hit in the corners of all meshes, as `cast_rays` writes it if
-    the field `index` of the cast is 0.
+    `triangle_row` contains the row of each hit triangle in the corners of all meshes. `cast_rays`
+    writes these rows if the cast's field `index` is 0.
     """
     mesh = casts[0].mesh
     instances = casts[0].instances

@@ -1,12 +1,12 @@
-"""Casting rays at bodies that move while the rays are fired.
+"""Cast rays at bodies that move while the rays are fired.
 
 No tree is rebuilt. On the CPU, consecutive rays, which are fired at almost the same time, form
 cells of `CELL_RAYS` rays. First, the cone and the plane around the directions of each cell are
 compared with the bounding sphere of each body along its path. Then the rays of the remaining cells
-are compared with the bounding box of the body at its pose when the cell is fired. Finally, the
-remaining rays are transformed to the frame of the body at their own firing times and cast at its
-shape, starting with the closest bodies. The comparisons are compiled loops (moving_loops.py). They
-are conservative, so they do not affect the hits.
+are compared with the body's bounding box, at the pose that the body has when the cell is fired.
+Finally, the remaining rays are transformed to the frame of the body at their own firing times and
+cast at its shape, starting with the closest bodies. The comparisons are compiled loops
+(moving_loops.py). They are conservative, so they do not affect the hits.
 
 On a CUDA device, each ray is compared with boxes around the paths of the bodies, and the device
 holds the poses of all bodies at all ray times.
@@ -46,7 +46,7 @@ _NO_FRAMES = np.zeros(0)
 
 @dataclass(frozen=True, eq=False)
 class MovingBodies:
-    """Moving bodies, each with a shape and with a pose at any time.
+    """Moving bodies, each of which has a shape and a pose that depends on time.
 
     Attributes
     ----------
@@ -77,26 +77,26 @@ class MovingBodies:
 
     @property
     def on_device(self) -> Bools:
-        """Mask of the bodies whose shapes are on a CUDA device. Shape (b,)."""
+        """Mask of the bodies whose shape is on a CUDA device. Shape (b,)."""
         return np.array([shape.on_device for shape in self.shapes], np.bool_)[self.shape]
 
     @cached_property
     def box_centers(self) -> Floats:
-        """Centers of the bounding boxes in the frames of the shapes, in meters. Shape (s, 3)."""
+        """Center of each shape's bounding box in the shape's frame, in meters. Shape (s, 3)."""
         return np.asarray(self.boxes.mean(axis=1))
 
     @cached_property
     def box_half_sizes(self) -> Floats:
-        """Half side lengths of the bounding boxes of the shapes, in meters. Shape (s, 3)."""
+        """Half side lengths of each shape's bounding box, in meters. Shape (s, 3)."""
         return (self.boxes[:, 1] - self.boxes[:, 0]) / 2
 
     @cached_property
     def radii(self) -> Floats:
-        """Radii of the bounding spheres of the boxes, in meters. Shape (s,)."""
+        """Radius of a sphere around each shape's bounding box, in meters. Shape (s,)."""
         return np.asarray(np.sqrt((self.box_half_sizes**2).sum(axis=1)))
 
     def is_present(self, body: Ints, times: Floats) -> Bools:
-        """Return whether each body is present at its time."""
+        """Return whether each body is present at the given time."""
         first, last = self.presence[body].T
         return np.asarray((first <= times) & (times <= last))
 
@@ -104,7 +104,7 @@ class MovingBodies:
 def nearest_body_hits(
     moving: MovingBodies, scan: Scan, times: Callable[[Ints], Floats], limits: Floats | None = None
 ) -> NearestHits:
-    """Return the closest hit of each ray of a scan on a moving body.
+    """Return the closest hit of each ray in a scan on a moving body.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def nearest_body_hits(
 
 
 def body_hits(moving: MovingBodies, scan: Scan, times: Callable[[Ints], Floats]) -> BodyHits:
-    """Return the result of `nearest_body_hits` without rays that hit no body.
+    """Return the result of `nearest_body_hits` only for the rays that hit a body.
 
     If all shapes are on a device, no host memory per ray is needed.
     """
@@ -160,7 +160,7 @@ def body_hits(moving: MovingBodies, scan: Scan, times: Callable[[Ints], Floats])
 
 
 def _exclusive_limit(scan: Scan) -> float:
-    """Return the shortest distance that exceeds the maximum range of a scan, in meters.
+    """Return the shortest distance that exceeds a scan's maximum range, in meters.
 
     The maximum range is inclusive, but the limits of `NearestHits` are not.
     """
@@ -170,7 +170,7 @@ def _exclusive_limit(scan: Scan) -> float:
 def _hits_on_device(
     moving: MovingBodies, scan: Scan, times: Callable[[Ints], Floats], bodies: Ints
 ) -> Iterator[BodyHits]:
-    """Yield the closest hits of consecutive rays on bodies whose shapes are on a device."""
+    """Yield the closest hits of consecutive rays on bodies whose shape is on a device."""
     if not len(bodies):
         return
     limits = (scan.t_min, scan.t_max)
@@ -200,7 +200,7 @@ def _hits_on_device(
 
 
 def _distinct(times: Floats) -> tuple[Floats, Ints32]:
-    """Return the distinct times in ascending order, and the index of each time among them."""
+    """Return the distinct times in ascending order, and the index of each given time among them."""
     later = times[1:] > times[:-1]
     if np.array_equal(later, times[1:] != times[:-1]):  # ascending, so sorting is not necessary
         index = np.zeros(len(times), np.int32)
@@ -211,7 +211,7 @@ def _distinct(times: Floats) -> tuple[Floats, Ints32]:
 
 
 def _poses_and_boxes(moving: MovingBodies, bodies: Ints, times: Floats) -> tuple[Floats, Floats]:
-    """Return the poses of bodies at times, and boxes around their paths, as in `TimedBodies`."""
+    """Return poses at the given times, and boxes around the paths, as in `TimedBodies`."""
     body = np.tile(bodies, len(times))
     time = np.repeat(times, len(bodies))
     present = moving.is_present(body, time)
@@ -230,7 +230,7 @@ def _poses_and_boxes(moving: MovingBodies, bodies: Ints, times: Floats) -> tuple
 
 
 def _bounding_boxes(moving: MovingBodies, shape: Indices, poses: Floats) -> Floats:
-    """Return the bounding boxes of shapes at poses.
+    """Compute the bounding boxes of shapes that are placed at poses.
 
     The poses have shape (12, m), and the boxes have shape (2, 3, m) and contain the lower and upper
     corners in meters. The boxes are aligned with the axes of the scene and include a margin for
@@ -253,7 +253,7 @@ def _bounding_boxes(moving: MovingBodies, shape: Indices, poses: Floats) -> Floa
 def pair_cells_with_boxes(
     rays: Floats, times: Floats, boxes: Floats, presence: Floats, reach: float
 ) -> tuple[Indices, Indices, int]:
-    """Return pairs of a cell of rays and a static box that the rays may intersect.
+    """Find pairs of a cell (a group of rays) and a static box that the cell's rays may intersect.
 
     Parameters
     ----------
@@ -294,7 +294,7 @@ def pair_cells_with_boxes(
 
 
 class _CellPoses(NamedTuple):
-    """Pairs of a cell and a body, and the pose of the body when the cell is fired.
+    """Pairs of a cell and a body, with the pose of the body when the cell is fired.
 
     Attributes
     ----------
@@ -322,7 +322,7 @@ class _CellPoses(NamedTuple):
 
 
 class _RayPairs(NamedTuple):
-    """Pairs of a ray and a body whose bounding box the ray intersects, as in `RayBodyPairs`."""
+    """Pairs of a ray and a body whose bounding box it intersects, as in `RayBodyPairs`."""
 
     row: Ints  # (m,): index of the ray in the chunk
     body: Ints  # (m,): index of the body
@@ -331,7 +331,7 @@ class _RayPairs(NamedTuple):
 
 
 class _Chunk:
-    """Consecutive rays of a scan, with their firing times and their closest hits."""
+    """Consecutive rays in a scan, with their firing times and closest hits."""
 
     def __init__(
         self,
@@ -350,14 +350,14 @@ class _Chunk:
         self._nearest = nearest
 
     def cast(self, bodies: Ints) -> None:
-        """Cast the rays at the bodies that are present, and record closer hits."""
+        """Cast the rays at all bodies that are present, and record closer hits."""
         first, last = self._moving.presence[bodies].T
         present = bodies[(first <= self._times.max()) & (last >= self._times.min())]
         if len(present):
             self._cast_near_cells(present)
 
     def _cast_near_cells(self, bodies: Ints) -> None:
-        """Cast cells at the bodies that they may hit, starting with the closest bodies.
+        """Cast each cell at the bodies that it may hit, starting with the closest bodies.
 
         The hits on close bodies shorten the rays for the following bodies.
         """
@@ -379,7 +379,7 @@ class _Chunk:
             self._cast_pairs(cell[pairs], spans[cell[pairs]].T, body[pairs])
 
     def _sample_bodies(self, bodies: Ints, cells: Floats) -> BodySamples:
-        """Sample the boxes of bodies at regular time steps while cells are fired."""
+        """Sample the boxes of bodies at regular time steps while the given cells are fired."""
         loops = self._loops
         moving = self._moving
         spans = cells[:, loops.FIRST_TIME : loops.LAST_TIME + 1]
@@ -399,7 +399,7 @@ class _Chunk:
         return samples
 
     def _sampled_boxes(self, bodies: Ints, times: Floats) -> Floats:
-        """Return the boxes of bodies at times of shape (b, s), as in `BodySamples`."""
+        """Compute the boxes of bodies at the given times, as in `BodySamples`. Shape (b, s, 12)."""
         moving = self._moving
         body = np.repeat(bodies, times.shape[1])
         table = moving.poses(body, times.ravel())
@@ -413,7 +413,7 @@ class _Chunk:
         return boxes
 
     def _cast_pairs(self, cell: Indices, spans: Floats, body: Ints) -> None:
-        """Cast each cell at its body, and record closer hits.
+        """Cast the rays of each cell at the cell's body, and record closer hits.
 
         `spans` (2, m) contains the first and last time of each cell in seconds.
         """
@@ -446,7 +446,7 @@ class _Chunk:
             caster.cast_pairs(ray_body_pairs, self._nearest)
 
     def _cell_poses(self, cell: Indices, spans: Floats, body: Ints) -> _CellPoses:
-        """Return the pose of each body when its cell is fired, and a margin for its motion."""
+        """Return each body's pose when its cell is fired, and a margin for its later motion."""
         moving = self._moving
         starts, stops = np.clip(spans, *moving.presence[body].T)
         new = (np.diff(body, prepend=-1) != 0) | (np.diff(starts, prepend=np.nan) != 0)
@@ -463,7 +463,7 @@ class _Chunk:
         return _CellPoses(cell, body, pose, poses, pads, has_several_times)
 
     def _passing_rays(self, pairs: _CellPoses) -> _RayPairs:
-        """Return the rays that intersect the boxes of bodies, with the poses of the bodies.
+        """Find the rays that intersect the bounding box of a body, and the pose of the body.
 
         If the rays of a cell are fired at different times, each ray gets the pose at its own time.
         """
@@ -497,10 +497,9 @@ class _Chunk:
 
 
 def _rotations(poses: Floats) -> Floats:
-    """Return the rotation matrices of poses."""
     return poses[3:].reshape(3, 3, -1).transpose(2, 0, 1)
 
 
 def _rotate(rotations: Floats, vectors: Floats) -> Floats:
-    """Rotate vectors by matrices, with a fixed order of operations."""
+    """Multiply matrices by vectors in a fixed order of operations."""
     return (rotations * vectors[:, None, :]).sum(axis=2)

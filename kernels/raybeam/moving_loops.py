@@ -1,4 +1,4 @@
-"""Compiled loops that find the rays that may hit moving bodies (moving.py).
+"""Compiled loops that find rays that may hit moving bodies (moving.py).
 
 Rays are float64 (6, n): origins in meters and directions of approximately unit length. Times are in
 seconds. A pose is a column of a table (12, p): position in meters, and rotation matrix from the
@@ -43,7 +43,7 @@ _i32_1 = types.int32[::1]
 
 
 class BodySamples(NamedTuple):
-    """Bounding boxes of bodies, sampled at regular time steps.
+    """Bounding boxes of moving bodies, sampled at regular time steps.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class BodySamples(NamedTuple):
 
 
 class CellBodyPairs(NamedTuple):
-    """Pairs of a cell of rays and a body.
+    """Pairs of a cell and a body.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class CellBodyPairs(NamedTuple):
 
 
 def named_tuple_type(kind: type, *fields: types.Type) -> types.Type:
-    """Return the numba type of a NamedTuple class whose fields have the given types."""
+    """Return the numba type for a NamedTuple class and the numba types of its fields."""
     return types.BaseTuple.from_types(fields, kind)
 
 
@@ -100,7 +100,7 @@ NEAREST_HITS = named_tuple_type(NearestHits, _f64_1, _i64_1, _i32_1, _i32_1)
 
 @compiled("f8[:, ::1](f8[:, ::1], f8[::1], i8)")
 def make_cells(rays, times, size):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Return the table of cells with `size` consecutive rays each.
+    """Divide rays into cells of `size` consecutive rays, and return a table of the cells.
 
     The table has shape (c, 15). The constants `AXIS` to `MAX_SINE` are its column indices.
     """
@@ -174,7 +174,7 @@ def make_cells(rays, times, size):  # type: ignore[no-untyped-def]  # noqa: PLR0
 
 @inlined
 def _may_hit(cell, box, sphere, reach):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Return whether the rays of a cell may hit a body.
+    """Return whether any ray of a cell may hit a body.
 
     `cell` points to a row of the table of cells, and `box` and `sphere` point to rows of
     `BodySamples`. `reach` is the maximum distance at which a ray ends, in meters.
@@ -220,7 +220,7 @@ def _may_hit(cell, box, sphere, reach):  # type: ignore[no-untyped-def]  # noqa:
 # The loops write to preallocated arrays, because numba takes 8 s to compile slices and copies.
 @compiled(types.int64(_f64_2, _f64_2, _SAMPLES, types.float64, _i64_2))
 def _pair_cells(wide_cells, cells, samples, reach, pairs):  # type: ignore[no-untyped-def]
-    """Write the pairs of a cell and a body that it may hit, and return the number of pairs."""
+    """Write the pairs of a cell and a body that its rays may hit, and return their number."""
     sample_of_cell, boxes, spheres = samples
     count = 0
     # Pointers are used because reference counting of array views takes longer than the comparisons.
@@ -253,7 +253,7 @@ def _pair_cells(wide_cells, cells, samples, reach, pairs):  # type: ignore[no-un
 def pair_cells_with_bodies(
     wide_cells: Floats, cells: Floats, samples: BodySamples, reach: float
 ) -> tuple[Indices, Indices]:
-    """Return pairs of a cell and a body that its rays may hit, sorted by body and then by cell.
+    """Find pairs of a cell and a body that the cell's rays may hit, sorted by body, then by cell.
 
     Parameters
     ----------
@@ -287,20 +287,20 @@ def pose_rotation(poses, p):  # type: ignore[no-untyped-def]
 
 @inlined
 def to_body_axes(rotation, x, y, z):  # type: ignore[no-untyped-def]
-    """Rotate a vector from scene axes to body axes, by the transpose of `rotation`."""
+    """Rotate a vector from scene to body axes by the transpose of `rotation`."""
     (a, b, c), (d, e, f), (g, h, i) = rotation
     return (x * a + y * d) + z * g, (x * b + y * e) + z * h, (x * c + y * f) + z * i
 
 
 @inlined
 def box_corners(box):  # type: ignore[no-untyped-def]
-    """Return the lower and upper corner of a box, given a pointer to six numbers."""
+    """Return a box's lower and upper corner, given a pointer to six numbers."""
     return (box[0], box[1], box[2]), (box[3], box[4], box[5])
 
 
 @inlined
 def _clip_axis(slab, o, d, interval):  # type: ignore[no-untyped-def]
-    """Clip an interval of distances along a ray to the part between two planes across an axis."""
+    """Clip a range of distances along a ray to the part between two planes across an axis."""
     enters, leaves = interval
     inverse = 1 / (d if abs(d) >= _TINY else _TINY)
     lower = (slab[0] - o) * inverse
@@ -310,7 +310,7 @@ def _clip_axis(slab, o, d, interval):  # type: ignore[no-untyped-def]
 
 @inlined
 def intersects_box(corners, pad, reach, origin, direction):  # type: ignore[no-untyped-def]
-    """Return whether a ray intersects a box, enlarged by `pad`, before the distance `reach`.
+    """Return whether a ray reaches a box, enlarged by `pad`, before the distance `reach`.
 
     The ray and the corners of the box are in the frame of the body, in meters.
     """
@@ -325,7 +325,7 @@ def intersects_box(corners, pad, reach, origin, direction):  # type: ignore[no-u
 
 @inlined
 def _bounding_sphere(corners, pose, pad):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Return the center, in the scene, and the radius of a sphere around a box at a pose.
+    """Return a bounding sphere for a box at a pose: its center in the scene, and its radius.
 
     The sphere encloses the box with the margins of `intersects_box` for a ray that starts at the
     center of the sphere. `_find_rays_near_sphere` adds the part of the margin that grows with the
@@ -350,7 +350,7 @@ def _bounding_sphere(corners, pose, pad):  # type: ignore[no-untyped-def]  # noq
 
 @noinline
 def _find_rays_near_sphere(rays, n, x, y, z, radius, near):  # type: ignore[no-untyped-def]
-    """Write which rays of a cell intersect a sphere, and return their number.
+    """Write the indices of a cell's rays that intersect a sphere, and return their number.
 
     `rays` is the address of the first ray of the cell in a table (6, n). The output `near` is the
     address of int64 (`CELL_RAYS`,) and receives 0 or 1 for each ray. The center and the radius are
@@ -378,7 +378,7 @@ def _find_rays_near_sphere(rays, n, x, y, z, radius, near):  # type: ignore[no-u
 
 @inlined
 def _ray_intersects_box(rays, n, k, reach, pose, corners, pad):  # type: ignore[no-untyped-def]
-    """Return whether ray `k` of a table, given by its address, intersects a box at a pose."""
+    """Return whether ray `k` in the table at an address intersects a box at a pose."""
     ray = float64s(rays)
     (px, py, pz), rotation = pose
     origin = to_body_axes(rotation, ray[k] - px, ray[n + k] - py, ray[2 * n + k] - pz)
@@ -388,7 +388,7 @@ def _ray_intersects_box(rays, n, k, reach, pose, corners, pad):  # type: ignore[
 
 @compiled(types.int64(_f64_2, _f64_1, _PAIRS, _f64_2, _f64_2, _i64_1, _i64_2))
 def _pair_rays(rays, reaches, pairs, poses, boxes, near, ray_pairs):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write the rays that intersect boxes to `ray_pairs`, and return the number of columns written.
+    """Write the rays that intersect boxes to `ray_pairs`, and return how many columns were written.
 
     Each column contains the index of a ray and the index of a pair of a cell and a body. `near` is
     scratch memory for one cell. The other arguments are as in `rays_through_boxes`.
@@ -422,7 +422,7 @@ def _pair_rays(rays, reaches, pairs, poses, boxes, near, ray_pairs):  # type: ig
 def rays_through_boxes(
     rays: Floats, reaches: Floats, pairs: CellBodyPairs, poses: Floats, boxes: Floats
 ) -> tuple[Indices, Indices]:
-    """Return the rays of cells that intersect the boxes of bodies, with the pair of each ray.
+    """Find the rays that intersect the bounding box of a body, and the cell-body pair of each.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Ray casting in NumPy, which needs no other package and serves as the reference.
+"""Ray casting with NumPy alone, as the reference for the other backends.
 
 Many rays traverse a wide tree together. The unit of work is a pair of a ray and a node. The boxes
 of the node's children are tested in float32 for a block of pairs at a time. Pairs of a ray and an
@@ -57,7 +57,7 @@ class _Best:
 
 @dataclass(frozen=True)
 class _Query:
-    """Rays that intersect the bounding box of the scene, and their closest hits.
+    """Rays that intersect the scene's bounding box, and their closest hits.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class _Query:
 
 @dataclass(frozen=True)
 class _Visit:
-    """The instances that rays are cast at.
+    """The instances at which rays are cast.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class _Visit:
 
 @dataclass(frozen=True)
 class _Packet:
-    """Rays prepared for traversal, in the local coordinates of the scene or of a mesh.
+    """Rays that are prepared for traversal, in local coordinates of the scene or a mesh.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class _Packet:
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Pairs of a ray and a node, with the distances at which the rays enter the nodes."""
+    """Pairs of a ray and a node, with the distance at which the ray enters the node."""
 
     ray: Indices
     node: Indices
@@ -147,7 +147,7 @@ class _Pairs:
 
 
 class _Nodes:
-    """Boxes of one or more trees."""
+    """Bounding boxes of all nodes in one or more trees."""
 
     def __init__(self, tree: WideTree) -> None:
         self._count = len(tree.child)
@@ -158,10 +158,10 @@ class _Nodes:
         self._child = tree.child.astype(np.intp)
 
     def walk(self, rays: _Packet, root: Indices, test: Callable[[_Pairs], None]) -> None:
-        """Traverse the tree from the root of each ray, and call `test` for rays at leaves.
+        """Traverse the tree from each ray's root, and call `test` for the rays that reach leaves.
 
-        `test` receives pairs in which the node contains the first triangle and the number of
-        triangles of the leaf. It reduces `rays.limit` if it finds closer hits.
+        `test` receives pairs whose node encodes a leaf's first triangle and number of triangles. It
+        reduces `rays.limit` if it finds closer hits.
         """
         blocks = [_Pairs(np.arange(len(root)), root, np.zeros(len(root), np.float32))]
         while blocks:
@@ -186,7 +186,7 @@ class _Nodes:
     def _intersect_children(
         self, rays: _Packet, ray: Indices, node: Indices
     ) -> tuple[Floats32, Bools]:
-        """Return the entry distances of the children's boxes, and a mask of the intersected boxes.
+        """Compute entry distances for the boxes of all children, and mask the boxes that are hit.
 
         Both arrays have shape (m * width,).
         """
@@ -209,7 +209,7 @@ class _Nodes:
 
 
 class NumpyBackend(Backend):
-    """Backend that traverses a bounding volume hierarchy with blocks of rays on a single thread."""
+    """Backend that traverses bounding volume hierarchies with blocks of rays in a single thread."""
 
     name: ClassVar[str] = "numpy"
     chunk: ClassVar[int] = 1 << 16
@@ -236,7 +236,7 @@ class NumpyBackend(Backend):
         self.update_scene(scene)
 
     def update_scene(self, scene: LocalScene) -> None:
-        """Replace the scene with a scene that has the same instances but new transforms."""
+        """Replace the scene by one with the same instances but new transforms."""
         super().update_scene(scene)
         if scene.nested:
             self._top = _Nodes(build_instance_tree(scene.boxes, _WIDTH))
@@ -276,7 +276,6 @@ class NumpyBackend(Backend):
         )
 
     def _walk(self, query: _Query, rays: _Packet, root: Indices) -> None:
-        """Traverse the trees of meshes from the given roots, and record closer hits."""
         self._nodes.walk(rays, root, lambda leaves: self._test(query, rays, leaves))
 
     def _visit(self, query: _Query, rays: _Packet, leaves: _Pairs) -> None:
@@ -293,7 +292,7 @@ class NumpyBackend(Backend):
             rays.limit[visit.ray] = _limit(query.best.t[visit.ray], rays.entry[visit.ray])
 
     def _inner_rays(self, query: _Query, ray: Indices, instance: Indices) -> _Packet:
-        """Return rays in the mesh coordinates of instances, without rays that miss the mesh."""
+        """Transform rays to the mesh coordinates of instances, and omit rays that miss the mesh."""
         origins, directions, length = self._scene.to_mesh_coordinates(
             instance, query.origins[ray], query.directions[ray]
         )
@@ -308,7 +307,7 @@ class NumpyBackend(Backend):
         return _packet(origins[rows], directions[rows], entry[rows], t_max[rows], visit)
 
     def _test(self, query: _Query, rays: _Packet, leaves: _Pairs) -> None:
-        """Test rays against the triangles of leaves, and record closer hits."""
+        """Test rays against the triangles in leaves, and record closer hits."""
         row, position = _leaf_pairs(leaves)
         hits = exact.intersect(rays.sheared, row, self._corners, position)
         t = hits.t
@@ -335,7 +334,7 @@ class NumpyBackend(Backend):
 
 
 def _leaf_pairs(leaves: _Pairs) -> tuple[Indices, Indices]:
-    """Return the ray and the triangle position of each pair of a ray and a triangle in its leaf."""
+    """Expand pairs of a ray and a leaf to pairs of a ray and a triangle position."""
     count = (leaves.node & ((1 << LEAF_BITS) - 1)) + 1
     first = leaves.node >> LEAF_BITS
     row = np.repeat(leaves.ray, count)
@@ -344,7 +343,7 @@ def _leaf_pairs(leaves: _Pairs) -> tuple[Indices, Indices]:
 
 
 def _rounds(leaves: _Pairs) -> list[Indices]:
-    """Return the rows of pairs by round.
+    """Divide the rows into rounds, each of which contains at most one leaf per ray.
 
     The first round contains the closest leaf of each ray, the second round the second closest leaf,
     and so on.
@@ -359,7 +358,7 @@ def _rounds(leaves: _Pairs) -> list[Indices]:
 
 
 def _write_closer(best: _Best, rays: _Packet, row: Indices, hits: _Best) -> None:
-    """Record the hits that are closer than those recorded so far, and reduce the limits."""
+    """Record hits that are closer than those recorded so far, and shorten the rays."""
     ray = row if rays.visit is None else rays.visit.ray[row]
     order = np.lexsort((hits.key, hits.t, ray))
     order = order[np.diff(ray[order], prepend=-1) != 0]  # only the closest hit of each ray
@@ -386,7 +385,7 @@ def _packet(
     t_max: Floats | float,
     visit: _Visit | None = None,
 ) -> _Packet:
-    """Prepare rays in local coordinates of the scene or a mesh for traversal."""
+    """Prepare rays for traversal, in local coordinates of the scene or a mesh."""
     # The start is clipped, because float64 cannot represent it accurately if the ray is too far
     # away.
     start = np.clip(origins + entry[:, None] * directions, -2, 2).T.astype(np.float32)
@@ -407,6 +406,6 @@ def _packet(
 
 
 def _limit(t: Floats, entry: Floats) -> Floats32:
-    """Return distances from `entry` as float32, never less than the exact distances."""
+    """Convert distances to float32 relative to `entry`, never rounding down."""
     remaining = (t - entry) * (1 + _SLACK) + _SLACK
     return np.clip(remaining, -MAX_DIAGONAL, MAX_DIAGONAL).astype(np.float32)

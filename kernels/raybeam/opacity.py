@@ -1,4 +1,4 @@
-"""Masks that make parts of triangles transparent, for example leaves, fences and nets.
+"""Masks that make parts of triangles transparent, for example for leaves, fences, and nets.
 
 A ray hits a triangle only where the mask is true. All backends compute the position in the mask in
 float64, with the operations of `MaskTables.is_opaque` in the same order.
@@ -19,7 +19,7 @@ _MAX_COORDINATE = 2.0**31
 
 @dataclass(frozen=True, eq=False)
 class Opacity:
-    """Mask of the opaque parts of the triangles of a mesh.
+    """Mask that defines which parts of a mesh's triangles are opaque.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class LocalOpacity:
 
 
 def check_opacity(opacity: Opacity, face_count: int, index: Ints32) -> LocalOpacity:
-    """Validate an opacity and select the triangles `index`.
+    """Validate an opacity, and select the triangles `index`.
 
     Raises ValueError if the opacity is invalid.
     """
@@ -83,7 +83,7 @@ def check_opacity(opacity: Opacity, face_count: int, index: Ints32) -> LocalOpac
 
 @dataclass(frozen=True, eq=False)
 class MaskTables:
-    """Opacities of several meshes as tables.
+    """Tables that contain the opacities of several meshes.
 
     Attributes
     ----------
@@ -135,10 +135,10 @@ class MaskTables:
 
 
 def join_masks(opacities: list[LocalOpacity | None], orders: list[Ints32]) -> MaskTables | None:
-    """Join the opacities of meshes, or return None if all meshes are opaque.
+    """Join the opacities of several meshes, or return None if all meshes are opaque.
 
-    `orders` contains the order of the triangles of each mesh. A mask that several meshes share as
-    the same memory is stored once.
+    `orders` contains the order of the triangles of each mesh. A mask whose memory several meshes
+    share is stored only once.
     """
     uv = [np.zeros((0, 6), np.float32)]
     mask = [np.zeros(0, np.uint8)]

@@ -1,4 +1,4 @@
-"""Ray patterns, which are cast from many poses."""
+"""Ray patterns that are cast from many poses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ROUGH = 0.1
 
 
 class Pattern:
-    """Set of rays that is cast repeatedly, for example one revolution of a lidar.
+    """Set of rays that is cast repeatedly, such as one revolution of a lidar.
 
     Rays are validated and normalized once, and a backend can keep a copy on its device.
 
@@ -119,17 +119,20 @@ class Pattern:
 
     @property
     def subrays_per_beam(self) -> int:
-        """Number of rays per direction."""
+        """Number of rays per beam."""
         return 1 if self.sub_rays is None else len(self.sub_rays)
 
     @property
     def directions(self) -> Floats:
-        """Unit vectors of the beams, read-only, contiguous when transposed. Shape (n, 3)."""
+        """Unit vectors of the beams. Shape (n, 3).
+
+        The array is read-only, and its transpose is contiguous.
+        """
         return self._directions.T
 
     @property
     def origins(self) -> Floats | None:
-        """Origins of the beams in meters, or None.
+        """Origins of the beams in meters, or None if all beams start at the sensor position.
 
         The array is read-only, and its transpose is contiguous.
         """
@@ -137,7 +140,7 @@ class Pattern:
 
     @cached_property
     def step(self) -> int:
-        """Number of rows between consecutive firings of a channel, as passed or estimated."""
+        """Number of rows from one firing of a channel to the next, as passed or estimated."""
         if self._step is not None:
             return self._step
         return _repetition_step(self._directions) or _closest_step(self._directions)
@@ -151,7 +154,7 @@ class Pattern:
 
 
 def _repetition_step(directions: Floats) -> int:
-    """Return the step at which the distances between neighboring rows repeat, or 0.
+    """Return the step at which the distances between neighboring rows repeat, or 0 if none do.
 
     `directions` (3, n) contains unit vectors. If each firing contains all rings, the distances
     repeat after one firing, because the head has rotated as a whole in between. If the rows are
@@ -172,7 +175,7 @@ def _repetition_step(directions: Floats) -> int:
     deviations = np.abs(sliding_window_view(squared[1:], samples) - first)  # (steps, samples)
 
     def equal_shares(difference: float) -> Floats:
-        """Return, for each step, the fraction of distances that are equal within a tolerance."""
+        """Return the fraction of distances that are equal within a tolerance, for each step."""
         return np.asarray((deviations <= difference * first).mean(axis=1))
 
     # The strict tolerance distinguishes rings of nearly the same radius if the directions are
@@ -187,7 +190,7 @@ def _repetition_step(directions: Floats) -> int:
 
 
 def _closest_step(directions: Floats) -> int:
-    """Return the step with the smallest angles between a row and later rows.
+    """Return the step that leads to the smallest angles between rows.
 
     `directions` (3, n) contains unit vectors, of which 32 rows are sampled.
     """
@@ -204,7 +207,7 @@ def _closest_step(directions: Floats) -> int:
 
 
 def sample_rows(count: int, stop: int) -> Ints:
-    """Return `count` integers from 0 to `stop` in ascending order, evenly but irregularly spaced.
+    """Choose `count` integers from 0 to `stop`, evenly but irregularly spaced in ascending order.
 
     Rows at regular intervals may all belong to the same ring.
 

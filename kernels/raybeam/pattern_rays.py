@@ -1,4 +1,4 @@
-"""Origins and directions of the rays of a pattern."""
+"""Compute the origins and directions of the rays in a pattern."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def pattern_rays(
     rays_per_pose: int | None = None,
     motion: PoseMotion | None = None,
 ) -> tuple[Floats, Floats]:
-    """Return the origins and directions of the rays of a scan in mesh coordinates.
+    """Return the origins and directions of a scan's rays in mesh coordinates.
 
     The rays are bit-identical to the rays that `RayCaster.scan` casts, in any batch.
 
@@ -77,7 +77,7 @@ def pattern_rays(
 
 
 def compute_rays(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple[Floats, Floats]:
-    """Return the origins and directions of rays, with compiled loops if numba is installed.
+    """Compute the origins and directions of rays, with compiled loops if numba is installed.
 
     `first` is the pattern row of ray 0, and `ray` (m,) contains ray indices. The arguments are not
     validated. The result is as in `pattern_rays`.
@@ -93,7 +93,7 @@ def compute_rays(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple
 def compute_rays_numpy(
     pattern: Pattern, first: int, ray: Ints, poses: Poses
 ) -> tuple[Floats, Floats]:
-    """Return the origins and directions of rays like `compute_rays`, with NumPy.
+    """Compute the origins and directions of rays with NumPy, as `compute_rays` does.
 
     Vectors are rotated to the mesh frame and then translated: ``((x a + y b) + z c) + p``. If the
     lidar moves while the rays of a pose are fired, rotations are followed by ``v + t (w x v)`` and
@@ -118,7 +118,7 @@ def compute_rays_numpy(
 
 
 def _sensor_rays(pattern: Pattern, row: Ints) -> tuple[Floats, Floats | None]:
-    """Return the directions and the origins of rays in the sensor frame.
+    """Compute the directions and origins of rays in the sensor frame.
 
     `row` (m,) contains pattern rows, which may be beyond the end of the pattern. The results have
     shape (3, m). The origins are relative to the sensor position, in meters, or None if all are

@@ -34,7 +34,7 @@ _GRID_BITS = 21  # bits per coordinate; three coordinates take 63 bits
 
 @dataclass(frozen=True)
 class BinaryTree:
-    """Binary tree over n boxes.
+    """Binary tree over n bounding boxes.
 
     Nodes 0 to n-1 are the boxes, nodes n to 2n-2 are inner nodes, and the last node is the root.
 
@@ -57,13 +57,13 @@ class BinaryTree:
 
     @property
     def area(self) -> Floats32:
-        """Half the surface area of each node's box. Shape (2n-1,)."""
+        """Half the surface area of each node's bounding box. Shape (2n-1,)."""
         return _half_area(self.upper - self.lower)
 
 
 @dataclass
 class _Clusters:
-    """Clusters that have no parent yet, in the order of the space-filling curve.
+    """Clusters without a parent so far, in the order of the space-filling curve.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class _Clusters:
     node: Ints32
 
     def merge(self, first: Indices, second: Indices) -> None:
-        """Extend the boxes of clusters `first` by the boxes of their partners `second`."""
+        """Enlarge the boxes of clusters `first` to contain the boxes of their partners `second`."""
         self.lower[:, first] = np.minimum(self.lower[:, first], self.lower[:, second])
         self.upper[:, first] = np.maximum(self.upper[:, first], self.upper[:, second])
 
@@ -97,7 +97,7 @@ class _Clusters:
 
 
 class _Nodes:
-    """Arrays of all nodes of a `BinaryTree`, and the number of boxes below each node."""
+    """Arrays that describe all nodes of a `BinaryTree`, and the number of boxes below each node."""
 
     def __init__(self, lower: Floats32, upper: Floats32) -> None:
         n = lower.shape[1]
@@ -108,7 +108,7 @@ class _Nodes:
         self.count = np.ones(2 * n - 1, np.int32)
 
     def merge(self, clusters: _Clusters, next_node: int, first: Indices, second: Indices) -> None:
-        """Create nodes for pairs of clusters, starting at `next_node`, and replace the clusters."""
+        """Create parents for pairs of clusters, from `next_node` on, and replace the clusters."""
         if loops := _compiled_loops():
             left = loops.merge_pairs(
                 (clusters.lower, clusters.upper, clusters.node),
@@ -132,14 +132,14 @@ class _Nodes:
         clusters.remove(second)
 
     def fit_boxes(self, start: int, stop: int) -> None:
-        """Compute the boxes of nodes `start` to `stop` from the boxes of their children."""
+        """Compute the boxes of nodes `start` to `stop` from those of their children."""
         children = self.first_child[start:stop], self.second_child[start:stop]
         self.lower[:, start:stop] = np.minimum(*(self.lower[:, child] for child in children))
         self.upper[:, start:stop] = np.maximum(*(self.upper[:, child] for child in children))
 
 
 def build_binary_tree(lower: Floats32, upper: Floats32) -> BinaryTree:
-    """Build a binary tree over boxes.
+    """Build a binary tree over bounding boxes.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def build_binary_tree(lower: Floats32, upper: Floats32) -> BinaryTree:
 def _build_upper_levels(
     clusters: _Clusters, count: Ints32, next_node: int
 ) -> tuple[Ints32, list[tuple[int, int]]]:
-    """Build the tree above the last m clusters.
+    """Build the rest of the tree once only m clusters are left.
 
     Return the children (m - 1, 2) of the new nodes, with the root last, and the ranges of nodes on
     each level. `count` (m,) is the number of boxes in each cluster, and `next_node` is the index of
@@ -189,7 +189,7 @@ def _build_upper_levels(
 
 
 def _mutual_partners(lower: Floats32, upper: Floats32) -> tuple[Indices, Indices]:
-    """Return the positions of pairs of mutual best partners, with the lower position first."""
+    """Return the pairs of clusters that are each other's best partner, the lower position first."""
     n = lower.shape[1]
     position = np.arange(n)
     best = np.empty(n, np.int64)
@@ -219,7 +219,7 @@ def _compiled_loops() -> Any:
 
 
 def _find_best_partners(lower: Floats32, upper: Floats32, best: Indices) -> None:
-    """Write the position of the best partner of each cluster to `best`."""
+    """Find the best partner of each cluster, and write its position to `best`."""
     n = lower.shape[1]
     position = np.arange(n)
     # Partners must also match if all candidates are equally good, for example, copies of one
@@ -247,13 +247,12 @@ def _find_best_partners(lower: Floats32, upper: Floats32, best: Indices) -> None
 
 
 def _half_area(size: Floats32) -> Floats32:
-    """Return half the surface area of boxes, given their side lengths."""
     x, y, z = size
     return x * y + y * z + z * x
 
 
 def _morton_codes(lower: Floats32, upper: Floats32) -> NDArray[np.uint64]:
-    """Return the position of the center of each box along a Z-order curve."""
+    """Compute each box center's position on a Z-order curve."""
     center = lower.astype(np.float64) + upper
     start = center.min(axis=1, keepdims=True)
     extent = float((center - start).max()) or 1.0
@@ -266,7 +265,7 @@ def _morton_codes(lower: Floats32, upper: Floats32) -> NDArray[np.uint64]:
 
 
 def _spread_bits(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Insert two zero bits after each of the 21 lowest bits of numbers."""
+    """Insert two zero bits after each of the 21 lowest bits of each number."""
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),

@@ -12,7 +12,7 @@ from .compiled import compiled, inlined
 
 @inlined
 def _common_area(lower, upper, i, j):  # type: ignore[no-untyped-def]
-    """Return half the surface area of the box around boxes `i` and `j`."""
+    """Return half the surface area of the bounding box around boxes `i` and `j`."""
     x = max(upper[0, i], upper[0, j]) - min(lower[0, i], lower[0, j])
     y = max(upper[1, i], upper[1, j]) - min(lower[1, i], lower[1, j])
     z = max(upper[2, i], upper[2, j]) - min(lower[2, i], lower[2, j])
@@ -21,10 +21,10 @@ def _common_area(lower, upper, i, j):  # type: ignore[no-untyped-def]
 
 @compiled()
 def best_partners(lower, upper, radius, best):  # type: ignore[no-untyped-def]
-    """Write the position of the best partner of each cluster to `best`, int64 (m,).
+    """Find the best partner of each cluster, and write its position to `best`, int64 (m,).
 
-    The best partner is the cluster whose common box has the smallest area, among `radius` neighbors
-    on each side. Ties are resolved as in `ploc._find_best_partners`.
+    The best partner is one of the `radius` neighbors on each side, namely the one with which the
+    common box has the smallest area. Ties are resolved as in `ploc._find_best_partners`.
     """
     n = lower.shape[1]
     for i in range(n):
@@ -46,7 +46,7 @@ def best_partners(lower, upper, radius, best):  # type: ignore[no-untyped-def]
 def merge_pairs(  # type: ignore[no-untyped-def]
     clusters, first, second, next_node, boxes, children, count
 ):
-    """Create nodes for pairs of clusters, replace the clusters, and return their new number.
+    """Create parents for pairs of clusters, replace the clusters, and return how many are left.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Poses of a sensor, each of which applies to a number of consecutive rays."""
+"""Sensor poses, each of which applies to a number of consecutive rays."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SLACK = 2e-9  # tolerance for the dot products of the rows of a rotation matrix
 
 @dataclass(frozen=True, eq=False)
 class PoseMotion:
-    """Motion of a lidar while the rays that share a pose are fired one after the other.
+    """Motion of a lidar while it fires the rays that share a pose.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class PoseMotion:
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Validated poses.
+    """Validated poses of a sensor.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class Poses:
         return len(self.positions)
 
     def per_ray(self, ray: Ints, out: Floats) -> RayPoses:
-        """Return the pose of each ray, using `out` as memory.
+        """Return the pose index of each ray, using `out` as memory.
 
         `out` is float64 (18, m).
         """
@@ -95,7 +95,7 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class RayPoses:
-    """Poses of m rays.
+    """Poses of m individual rays.
 
     The arrays have shape (components, m), or (components, 1) if all rays share a pose.
 
@@ -142,7 +142,7 @@ class RayPoses:
         return crosses
 
     def translate(self, positions: Floats) -> Floats:
-        """Move positions by the velocity during the delay of each ray."""
+        """Move positions by the product of velocity and delay of each ray."""
         if self.velocities is None:
             return positions
         pairs = zip(positions, self.velocities, strict=True)
@@ -156,7 +156,7 @@ def check_poses(
     ray_count: int,
     motion: PoseMotion | None = None,
 ) -> Poses:
-    """Validate the poses of a number of rays.
+    """Validate the poses of the given number of rays.
 
     `RayCaster.scan` describes the arguments. If `positions` is a `Poses` object, which has already
     been validated, it is returned unchanged.
@@ -193,7 +193,7 @@ def check_poses(
 
 
 def _broadcast_rows(table: Floats, count: int) -> Floats:
-    """Repeat a table with a single row along the first axis unless it has `count` rows."""
+    """Repeat a single row until the table has `count` rows."""
     return table if len(table) == count else np.broadcast_to(table, (count, *table.shape[1:]))
 
 
@@ -215,7 +215,7 @@ def _check_motion(motion: PoseMotion, pose_count: int, ray_count: int) -> PoseMo
 
 
 def _check_rotations(rotations: ArrayLike) -> Floats:
-    """Return rotations as float64 matrices.
+    """Validate rotations, and convert them to float64 matrices.
 
     Raises ValueError if a matrix is not orthonormal or contains a reflection.
     """
@@ -247,13 +247,13 @@ def _check_rotations(rotations: ArrayLike) -> Floats:
 
 
 def determinants(matrix_rows: Floats) -> Floats:
-    """Return the determinants of k matrices with shape (3, 3, k)."""
+    """Compute the determinants of k matrices with shape (3, 3, k)."""
     (a, b, c), (d, e, f), (g, h, i) = matrix_rows
     return np.asarray((a * (e * i - f * h) - b * (d * i - f * g)) + c * (d * h - e * g))
 
 
 def component_major(table: AnyArray) -> Floats:
-    """Return a table as float64 with each component contiguous over the rows."""
+    """Copy a table to float64 memory in which each component is contiguous."""
     # `numpy.moveaxis` would take as long as casting 100 rays.
     components_first = table.transpose(*range(1, table.ndim), 0)
     contiguous = np.ascontiguousarray(components_first, dtype=np.float64)

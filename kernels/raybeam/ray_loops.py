@@ -1,8 +1,8 @@
-"""Compiled loops that compute the rays of a pattern, with the operations of `compute_rays_numpy`.
+"""Compiled loops that compute a pattern's rays with the same operations as `compute_rays_numpy`.
 
 A ray is a beam of the pattern, or a sub-ray of a beam, that is cast from a pose. The rays of one
 tile are computed at a time. `cast` is a `CAST` record (cast_record.py), and `tile` is the address
-of the memory of a tile with `rays` rays (tile_memory.py), which `floats` and `numbers` access as
+of tile memory for `rays` rays (tile_memory.py). `floats` and `numbers` access this memory as
 float64 and int64. Arrays of a `CAST` are passed by address and have one column per beam or pose. A
 vector contains four rays.
 """
@@ -30,7 +30,7 @@ _BEAMS = 64  # beams per tile if rays are computed but not cast
 
 
 class FirstRay(NamedTuple):
-    """The first ray of a call.
+    """Pattern row, pose, and index of the first ray in a call.
 
     Attributes
     ----------
@@ -50,13 +50,13 @@ class FirstRay(NamedTuple):
 
 @inlined
 def _floor_divide(number, divisor):  # type: ignore[no-untyped-def]
-    """Return ``number // divisor`` for integers below 2**52, faster than `//`."""
+    """Divide integers below 2**52 and round down, faster than `//`."""
     return np.int64(np.floor(np.float64(number) / np.float64(divisor)))
 
 
 @inlined
 def perpendicular_axes(x, y, z):  # type: ignore[no-untyped-def]
-    """Return the six components of the two axes of `sub_rays.perpendicular_axes`."""
+    """Compute the two axes of `sub_rays.perpendicular_axes` as six components."""
     sign = -1.0 if z < 0 else 1.0
     a = -1.0 / (sign + z)
     b = x * y * a
@@ -65,7 +65,7 @@ def perpendicular_axes(x, y, z):  # type: ignore[no-untyped-def]
 
 @inlined
 def oriented_axes(x, y, z, axis):  # type: ignore[no-untyped-def]
-    """Return the six components of the two axes of `sub_rays.oriented_axes`.
+    """Compute the two axes of `sub_rays.oriented_axes` as six components.
 
     `axis` contains the three components of `SubRays.axis`.
     """
@@ -88,9 +88,9 @@ def oriented_axes(x, y, z, axis):  # type: ignore[no-untyped-def]
 
 @noinline
 def _find_rows(tile, rays, first_row, row_count):  # type: ignore[no-untyped-def]
-    """Write the pattern rows of a tile's rays, counting each sub-ray as a row.
+    """Write the pattern row of each ray in a tile, counting every sub-ray as a row.
 
-    `first_row` is the row of the first ray of the call. The pattern has `row_count` rows and
+    `first_row` is the pattern row of the call's first ray. The pattern has `row_count` rows and
     repeats.
     """
     numbers = int64s(tile)
@@ -103,10 +103,9 @@ def _find_rows(tile, rays, first_row, row_count):  # type: ignore[no-untyped-def
 
 @noinline
 def _find_poses(tile, rays, first, rays_per_pose, poses):  # type: ignore[no-untyped-def]
-    """Write the poses of a tile's rays, and the indices of the rays within their poses.
+    """Write the pose of each ray in a tile, and the index of the ray within its pose.
 
-    `first` is the `FirstRay` of the call. Rays before or after the rays of the call use the closest
-    pose.
+    `first` is the `FirstRay` of the call. Rays that do not belong to the call use the closest pose.
     """
     numbers = int64s(tile)
     number_at = row_index(NUMBER, rays)
@@ -121,7 +120,7 @@ def _find_poses(tile, rays, first, rays_per_pose, poses):  # type: ignore[no-unt
 
 @noinline
 def _look_up_beams(tile, rays, directions, beam_count):  # type: ignore[no-untyped-def]
-    """Write the directions of a tile's rays, given their pattern rows."""
+    """Write the direction of each ray in a tile, given its pattern row."""
     numbers = int64s(tile)
     floats = float64s(tile)
     table = float64s(directions)
@@ -136,13 +135,12 @@ def _look_up_beams(tile, rays, directions, beam_count):  # type: ignore[no-untyp
 
 @inlined
 def _combine(a, x, b, y):  # type: ignore[no-untyped-def]
-    """Return ``a x + b y`` for vectors."""
     return a * x + b * y
 
 
 @noinline
 def _make_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write the directions of a tile's sub-rays, and their starts relative to the beam origins.
+    """Write the direction of each sub-ray in a tile, and its start relative to the beam origin.
 
     The pattern rows of the sub-rays are replaced by the rows of their beams. Each beam occupies
     `lanes_per_beam` consecutive lanes. If beams have `offsets`, rows 1 and 2 of the sub-ray table
@@ -198,7 +196,7 @@ def _make_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: P
 
 @noinline
 def _make_single_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write the directions and starts like `_make_sub_rays`, if each beam has a single sub-ray."""
+    """Do the same as `_make_sub_rays`, but for beams with a single sub-ray."""
     numbers = int64s(tile)
     floats = float64s(tile)
     table = float64s(cast.sub_ray_table)
@@ -240,7 +238,7 @@ def _make_single_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # 
 
 @inlined
 def _rotate_four(floats, target, rays, matrix):  # type: ignore[no-untyped-def]
-    """Rotate four vectors by a matrix of nine vectors.
+    """Rotate four vectors by a matrix whose nine elements are vectors, too.
 
     The components of the vectors are in three rows of the tile, starting at index `target`.
     """
@@ -255,7 +253,7 @@ def _rotate_four(floats, target, rays, matrix):  # type: ignore[no-untyped-def]
 
 @inlined
 def _matrix(matrices, pose, poses):  # type: ignore[no-untyped-def]
-    """Return the nine elements of a pose's matrix, each as a vector of equal numbers."""
+    """Return a pose's matrix as nine vectors, each of which repeats one element."""
     k = pose
     n = poses
     return (
@@ -285,10 +283,10 @@ def _rotate_one(floats, i, rays, matrices, k, n):  # type: ignore[no-untyped-def
 
 @noinline
 def _rotate(tile, rays, first_row, rotations, poses):  # type: ignore[no-untyped-def]
-    """Rotate vectors of a tile to the axes of the scene.
+    """Rotate vectors in a tile to the axes of the scene.
 
     The vectors are in three rows of the tile, starting at row `first_row`. `rotations` is the
-    address of the matrices of the poses, float64 (9, poses).
+    address of the poses' matrices, float64 (9, poses).
     """
     numbers = int64s(tile)
     floats = float64s(tile)
@@ -312,7 +310,7 @@ def _rotate(tile, rays, first_row, rotations, poses):  # type: ignore[no-untyped
 
 @noinline
 def _apply_rates(tile, rays, first_row, cast):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Rotate vectors of a tile by the angular velocities of their poses. See `PoseMotion`."""
+    """Rotate vectors in a tile by the angular velocities of the poses. See `PoseMotion`."""
     numbers = int64s(tile)
     floats = float64s(tile)
     delays = float64s(cast.delays)
@@ -338,9 +336,9 @@ def _apply_rates(tile, rays, first_row, cast):  # type: ignore[no-untyped-def]  
 
 @noinline
 def _add_to_origins(tile, rays, table, count, field):  # type: ignore[no-untyped-def]
-    """Add vectors of a table to the origins of a tile's rays.
+    """Add vectors from a table to the ray origins in a tile.
 
-    Row `field` of the tile contains the column of the table for each ray.
+    Row `field` of the tile contains each ray's column in the table.
     """
     numbers = int64s(tile)
     floats = float64s(tile)
@@ -356,7 +354,7 @@ def _add_to_origins(tile, rays, table, count, field):  # type: ignore[no-untyped
 
 @noinline
 def _add_position(tile, rays, position):  # type: ignore[no-untyped-def]
-    """Add the position of the only pose, given its address, to the origins of a tile's rays."""
+    """Add the only pose's position, given by its address, to the ray origins in a tile."""
     floats = float64s(tile)
     vector = float64s(position)
     target = row_index(OX, rays)
@@ -368,7 +366,7 @@ def _add_position(tile, rays, position):  # type: ignore[no-untyped-def]
 
 @noinline
 def _apply_velocities(tile, rays, cast):  # type: ignore[no-untyped-def]
-    """Move the origins of a tile's rays by the velocities of their poses."""
+    """Move the ray origins in a tile by the velocities of the poses."""
     numbers = int64s(tile)
     floats = float64s(tile)
     delays = float64s(cast.delays)
@@ -387,7 +385,6 @@ def _apply_velocities(tile, rays, cast):  # type: ignore[no-untyped-def]
 
 @noinline
 def _clear_origins(tile, rays):  # type: ignore[no-untyped-def]
-    """Set the origins of a tile's rays to zero."""
     floats = float64s(tile)
     zero = splat(0.0)
     for k in range(row_index(OX, rays), row_index(OX + 3, rays), 4):
@@ -396,7 +393,7 @@ def _clear_origins(tile, rays):  # type: ignore[no-untyped-def]
 
 @noinline
 def _write_origins(tile, rays, cast):  # type: ignore[no-untyped-def]
-    """Write the origins of a tile's rays in the scene, in meters.
+    """Write the origin of each ray in a tile, in scene coordinates in meters.
 
     If sub-rays have starts, these must already be in the rows of the origins.
     """
@@ -420,7 +417,7 @@ def _write_origins(tile, rays, cast):  # type: ignore[no-untyped-def]
 
 @noinline
 def _to_local(tile, rays, x, y, z, scale):  # type: ignore[no-untyped-def]
-    """Convert the origins of a tile's rays from meters to local coordinates."""
+    """Convert the ray origins in a tile from meters to local coordinates."""
     floats = float64s(tile)
     target = row_index(OX, rays)
     factor = splat(scale)
@@ -433,7 +430,7 @@ def _to_local(tile, rays, x, y, z, scale):  # type: ignore[no-untyped-def]
 
 @noinline
 def _write_output(tile, rays, first_row, address, total, count):  # type: ignore[no-untyped-def]
-    """Write vectors of a tile to an output array for all rays of a cast.
+    """Copy vectors from a tile to an output array for all rays in a cast.
 
     `address` is the output for the first ray of the call, and `count` is the number of rays in the
     call.
@@ -453,7 +450,7 @@ def _write_output(tile, rays, first_row, address, total, count):  # type: ignore
 
 @inlined
 def first_ray(cast, ray):  # type: ignore[no-untyped-def]
-    """Return the `FirstRay` of a call, given its index in the scan."""
+    """Return the `FirstRay` of a call that starts at the given ray of the scan."""
     total = cast.beam_count * cast.subrays
     rays_per_pose = cast.rays_per_pose
     pose = ray // rays_per_pose
@@ -463,7 +460,7 @@ def first_ray(cast, ray):  # type: ignore[no-untyped-def]
 
 @called_by_address(types.void(*4 * INT64))
 def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
-    """Compute the rays of a tile in local coordinates, given their indices in the call.
+    """Compute the rays in a tile in local coordinates, given their indices in the call.
 
     `address` is the address of the `CAST`, `start` is the index of the call's first ray in the
     scan, and `count` is the number of rays in the call. If there is a single pose, the tile may
@@ -501,7 +498,7 @@ def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
 
 @noinline
 def write_shared_origin(cast, tile, rays):  # type: ignore[no-untyped-def]
-    """Write the origin that all rays of a cast share to the rays of a tile, in local coordinates.
+    """Write the common origin of all rays in a cast to a tile, in local coordinates.
 
     All tiles of a cast use the same memory, and `make_rays` does not change this origin, so it is
     written only once before the first tile.
@@ -512,7 +509,7 @@ def write_shared_origin(cast, tile, rays):  # type: ignore[no-untyped-def]
 
 @inlined
 def _clip_axis(lower, upper, o, d, entry):  # type: ignore[no-untyped-def]
-    """Return the larger of `entry` and the distance at which a ray enters the slab of one axis."""
+    """Return the distance at which a ray enters the range of one axis, but at least `entry`."""
     component = d
     if abs(d) < _TINY:
         component = -_TINY if d < 0 else _TINY
@@ -521,7 +518,7 @@ def _clip_axis(lower, upper, o, d, entry):  # type: ignore[no-untyped-def]
 
 @inlined
 def entry_distance(half, o, d):  # type: ignore[no-untyped-def]
-    """Return the distance at which a ray enters the cube from -half to half, 0 if it starts inside.
+    """Return the distance at which a ray enters the cube from -half to half, or 0 from inside.
 
     All lengths are in local units. `o` and `d` are the origin and the direction of the ray. The
     result is meaningless if the ray misses the cube.
@@ -536,7 +533,7 @@ def entry_distance(half, o, d):  # type: ignore[no-untyped-def]
 
 @compiled(types.void(memory.CASTS, types.int64[::1], types.float64[:, ::1], types.float64[:, ::1]))
 def _compute_rays(casts, rays, origins, directions):  # type: ignore[no-untyped-def]
-    """Write the directions of rays, and their origins unless `origins` has shape (3, 0)."""
+    """Write ray directions, and also ray origins unless `origins` has shape (3, 0)."""
     cast = casts[0]
     address = casts.ctypes.data
     tile = cast.tile
@@ -570,7 +567,7 @@ def _compute_rays(casts, rays, origins, directions):  # type: ignore[no-untyped-
 def compute_rays_compiled(
     pattern: Pattern, first: int, ray: Ints, poses: Poses
 ) -> tuple[Floats | None, Floats]:
-    """Return the origins and directions of rays.
+    """Compute the origins and directions of rays with compiled loops.
 
     The arguments are as in `pattern_rays.compute_rays`. The results are float64 (3, m). The origins
     are None if all rays share an origin.

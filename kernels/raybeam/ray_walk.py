@@ -1,4 +1,4 @@
-"""Traversal of the trees of tiles by a single ray."""
+"""Traversal of the tile backend's trees by a single ray."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _MAX_ENTRY = 1e9  # local distance that the padding in tree.py allows for
 
 
 class _Start(NamedTuple):
-    """A ray in float32, starting where it enters the box of a scene or mesh.
+    """A ray in float32 that starts where it enters the box of a scene or mesh.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class _Start(NamedTuple):
 
 @inlined
 def _make_start(floats, k, rays):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Return the `_Start` of a ray, whose six numbers start at index `k` with a stride of `rays`.
+    """Return the `_Start` of a ray. Its six numbers start at index `k` and are `rays` apart.
 
     The box of a scene or mesh is within [-1, 1], plus padding.
     """
@@ -124,13 +124,13 @@ def _not_zero(component):  # type: ignore[no-untyped-def]
 
 @inlined
 def _limit_of(t, entry):  # type: ignore[no-untyped-def]
-    """Return a distance from the entry as float32, never less than the exact distance."""
+    """Convert a distance to float32 relative to `entry`, never rounding down."""
     return np.float32(min(max((t - entry) * (1 + SLACK) + SLACK, -MAX_DIAGONAL), MAX_DIAGONAL))
 
 
 @inlined
 def _slab(boxes, base, near_at, axis, inverse, start):  # type: ignore[no-untyped-def]
-    """Return the distances at which a ray intersects the two sides of eight boxes across an axis.
+    """Compute the distances at which a ray crosses both sides of eight boxes along an axis.
 
     The first vector contains the closer sides.
     """
@@ -145,7 +145,7 @@ def _slab(boxes, base, near_at, axis, inverse, start):  # type: ignore[no-untype
 
 @inlined
 def _push_children(tile, address, nodes, node, start, limit, count):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Push the children of a node that a ray intersects, and return the new size of the stack.
+    """Push the child nodes that a ray intersects, and return the new stack size.
 
     The closest child is pushed last. `address` is the stack, which has `count` entries, `nodes` is
     the address of the nodes, and `limit` is the distance at which the ray ends.
@@ -189,7 +189,7 @@ def _push_children(tile, address, nodes, node, start, limit, count):  # type: ig
 
 @inlined
 def _test_leaf(tile, rays, ray, mesh, instance, code, start):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Test a ray against the triangles of a leaf, and return whether a closer hit was found."""
+    """Test a ray against the triangles in a leaf, and return whether a closer hit was found."""
     record = int64s(mesh)
     blocks = float32s(record[BLOCKS])
     block = (code >> LEAF_BITS) * BLOCK
@@ -223,7 +223,7 @@ def _test_leaf(tile, rays, ray, mesh, instance, code, start):  # type: ignore[no
 def walk_ray(tile, rays, ray, first_row, mesh, instance, pending):  # type: ignore[no-untyped-def]
     """Cast a ray at a mesh.
 
-    `pending` is the number of entries of the instance tree that are on the stack.
+    `pending` is the number of instance tree entries on the stack.
     """
     floats = float64s(tile)
     address = int64s(tile)[_STACK]
@@ -252,7 +252,7 @@ def walk_ray(tile, rays, ray, first_row, mesh, instance, pending):  # type: igno
 
 @noinline
 def _transform_ray(tile, rays, ray, instance):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write a ray in the mesh coordinates of an instance, whose record is given by its address."""
+    """Transform a ray to the mesh coordinates of an instance, given its record's address."""
     floats = float64s(tile)
     numbers = int64s(tile)
     k = row_index(OX, rays) + ray
@@ -286,7 +286,7 @@ def _transform_ray(tile, rays, ray, instance):  # type: ignore[no-untyped-def]  
 
 @called_by_address(types.void(*5 * INT64))
 def walk_ray_over_instances(tile, rays, ray, nodes, instances):  # type: ignore[no-untyped-def]
-    """Cast a ray at all instances. `nodes` is the address of the nodes of the instance tree."""
+    """Cast a ray at all instances, given the address `nodes` of the instance tree's nodes."""
     floats = float64s(tile)
     numbers = int64s(tile)
     address = numbers[_STACK]

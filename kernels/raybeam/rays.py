@@ -41,7 +41,7 @@ class Rays:
         return len(self.directions)
 
     def normalized(self, start: int, stop: int) -> Rays:
-        """Return rays `start` to `stop` in float64 with unit directions.
+        """Return rays `start` to `stop` in float64, with unit directions.
 
         Backends normalize rays part by part, so that the temporary memory does not grow with the
         rays.
@@ -70,7 +70,7 @@ def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: f
 
 
 def check_origins(origins: ArrayLike, ray_count: int) -> AnyArray:
-    """Return validated origins.
+    """Validate origins and return them.
 
     The result has shape (n, 3), or (1, 3) if all rays share an origin. Raises ValueError if the
     shape is wrong or a value is not finite.
@@ -86,7 +86,7 @@ def check_origins(origins: ArrayLike, ray_count: int) -> AnyArray:
 
 
 def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
-    """Return the minimum and maximum distance as floats.
+    """Validate the minimum and maximum distance, and return them as floats.
 
     Raises ValueError unless ``0 <= t_min <= t_max`` and `t_min` is finite.
     """
@@ -101,7 +101,7 @@ def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
 
 
 def unit_directions(directions: ArrayLike) -> Floats:
-    """Return directions as a new array of float64 unit vectors.
+    """Normalize directions, and return them as a new float64 array.
 
     The array has shape (n, 3), and its transpose is contiguous. Each row of the result depends only
     on the same row of the input, so that batches can be split anywhere.
@@ -121,7 +121,7 @@ def unit_directions(directions: ArrayLike) -> Floats:
 
 
 def _normalized(table: Floats) -> Floats:
-    """Return directions as unit vectors.
+    """Normalize directions that are not unit vectors.
 
     If all directions already are unit vectors, the same array is returned.
     """
@@ -143,7 +143,7 @@ def _normalized(table: Floats) -> Floats:
 
 
 def as_real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) -> AnyArray:
-    """Return real numbers as an array with rows of a given shape, copied only if necessary.
+    """Convert real numbers to an array with rows of a given shape, copying only if necessary.
 
     The result has shape (n, *shape). An array with the shape `shape` counts as a single row.
     """
@@ -160,7 +160,7 @@ def as_real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) ->
 
 
 def are_finite(block: Floats) -> Bools:
-    """Return a mask of the rows that contain only finite numbers."""
+    """Return a mask of the rows that only contain finite numbers."""
     x, y, z = np.isfinite(block).T
     return x & y & z
 
@@ -171,7 +171,7 @@ def check_rows(
     is_valid: Callable[[Floats], Bools],
     expected: str,
 ) -> None:
-    """Raise ValueError if a row is invalid.
+    """Raise ValueError if any row is invalid.
 
     The message contains the first invalid row and the number of invalid rows.
     """
@@ -188,7 +188,7 @@ def check_rows(
 
 
 def _are_units(columns: Floats) -> bool:
-    """Return whether all vectors are finite unit vectors."""
+    """Return whether all directions are finite unit vectors."""
     x, y, z = columns
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         squared = x * x

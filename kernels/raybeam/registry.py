@@ -1,4 +1,4 @@
-"""The available backends, and how one of them is selected."""
+"""List the available backends, and select one of them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ BACKENDS: tuple[type[Backend], ...] = (CudaBackend, TileBackend, NumpyBackend)
 
 
 def available_backends() -> dict[str, str]:
-    """Return the availability of all backends by name, fastest first.
+    """Return the availability of each backend by name, starting with the fastest backend.
 
     The value is "" if a backend can be used. Otherwise, it states the reason and a remedy.
 
@@ -25,7 +25,7 @@ def available_backends() -> dict[str, str]:
 
 
 def backend_versions(name: str) -> str:
-    """Return the versions that affect the bits of a backend's results, except NumPy's.
+    """Return the versions, except NumPy's, that affect the bits of a backend's results.
 
     Two processes with the same versions, and with the same version of NumPy, return bit-identical
     hits.
@@ -41,7 +41,7 @@ def backend_versions(name: str) -> str:
 
 
 def choose_backend(name: str) -> type[Backend]:
-    """Return the backend with a name, or the first available one if the name is "auto".
+    """Return the named backend, or the first available one if the name is "auto".
 
     Raises
     ------

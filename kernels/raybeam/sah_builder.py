@@ -1,9 +1,10 @@
-"""Top-down builder of binary hierarchies by the surface area heuristic (SAH).
+"""Build binary hierarchies from top to bottom with the surface area heuristic (SAH).
 
-Starting at the root, each node is divided where the heuristic has its minimum, over all positions
-between its boxes sorted along each of the three axes. This full sweep generally gives the best
-trees among the builders that only use boxes. Trees from binned builders are a few percent worse.
-All nodes of a level are divided together, in tens of operations on whole arrays.
+Starting at the root, each node's boxes are sorted along each of the three axes. The node is then
+divided at the position between two boxes where the heuristic has its minimum. This full sweep
+generally gives the best trees among the builders that only use boxes. Trees from binned builders
+are a few percent worse. All nodes of a level are divided together, in tens of operations on whole
+arrays.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _LEVELS = 32
 
 @dataclass(frozen=True)
 class _Level:
-    """The nodes with at least two boxes on one level of the tree.
+    """The nodes on one level of the tree that contain at least two boxes.
 
     Attributes
     ----------
@@ -73,9 +74,9 @@ def build_by_sah(lower: Floats32, upper: Floats32, weight: Floats) -> list[Indic
 def _cheapest_splits(
     lower: Floats32, upper: Floats32, weight: Floats, level: _Level, node: Indices
 ) -> tuple[Indices, Indices]:
-    """Return the axis and position of the cheapest split of each node.
+    """Find the axis and position of the cheapest split of each node.
 
-    The position is the last one of the first part.
+    The position is that of the last box in the first part.
     """
     best = np.full(len(level.start), np.inf)
     axis, split = np.zeros((2, len(level.start)), np.intp)
@@ -97,7 +98,7 @@ def _cheapest_splits(
 def _split_costs(
     lower: Floats32, upper: Floats32, weight: Floats, level: _Level, node: Indices
 ) -> Floats:
-    """Return the cost of a split after each position.
+    """Compute the cost of splitting a node after each position.
 
     The boxes and weights are sorted along an axis.
     """
@@ -113,7 +114,7 @@ def _split_costs(
 
 
 def _prefix_half_areas(lower: Floats32, upper: Floats32, node: Indices) -> Floats:
-    """Return half the surface area of each box combined with the earlier boxes of its node."""
+    """Compute half the surface area of the box around each node's first boxes, for all counts."""
     # Each node is shifted by a different offset, so that one pass over all nodes restarts at each
     # node.
     shift = _NODE_SPACING * node
@@ -127,7 +128,7 @@ def _prefix_half_areas(lower: Floats32, upper: Floats32, node: Indices) -> Float
 def _split_nodes(
     level: _Level, node: Indices, axis: Indices, split: Indices
 ) -> tuple[Indices, _Level]:
-    """Return the two children of each node, and the next level."""
+    """Split each node into two children, and return the children and the next level."""
     right = np.zeros(int(max(order.max() for order in level.orders)) + 1, np.bool_)
     for k, order in enumerate(level.orders):
         split_on_axis = (axis == k)[node]

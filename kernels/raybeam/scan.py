@@ -1,4 +1,4 @@
-"""Scans, which combine a pattern with poses, and the selection of the hits to store."""
+"""Scans, which combine a pattern with poses, and the choice of hits to store."""
 
 from __future__ import annotations
 
@@ -61,12 +61,12 @@ class Scan:
         return self.count
 
     def chunks(self, size: int) -> Iterator[tuple[int, int]]:
-        """Yield the start and stop of ranges of at most `size` rays, in ray order."""
+        """Yield consecutive ranges of at most `size` rays, each as start and stop."""
         for start in range(0, self.count, size):
             yield start, min(start + size, self.count)
 
     def rays(self, start: int, stop: int) -> Rays:
-        """Compute rays `start` to `stop`, bit-identical to `pattern_rays`.
+        """Compute rays `start` to `stop`, with the same bits as `pattern_rays`.
 
         If the scan has an output array, the rays are written to it.
         """
@@ -129,7 +129,7 @@ def check_scan(
 
 
 def host_rays(scan: Scan, start: int, stop: int) -> Floats:
-    """Return the origins in meters and directions of rays `start` to `stop` of a scan.
+    """Compute the origins (in meters) and the directions of rays `start` to `stop` in a scan.
 
     The result has shape (6, n).
     """
@@ -143,7 +143,7 @@ def host_rays(scan: Scan, start: int, stop: int) -> Floats:
 
 
 class HitGroups:
-    """Counts the hits in each group of rays, and selects every n-th hit of a group.
+    """Counts the hits in each group of rays, and selects every n-th hit within a group.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ class HitGroups:
         self.hit_counts = np.zeros(len(starts), np.int64)  # number of hits in each group so far
 
     def find_groups(self, start: int, stop: int) -> tuple[slice, Ints]:
-        """Find the groups that rays `start` to `stop` belong to.
+        """Find the groups to which rays `start` to `stop` belong.
 
         Returns
         -------
@@ -173,7 +173,7 @@ class HitGroups:
         return slice(first, last), self._starts[first + 1 : last] - start
 
     def count_hits(self, groups: slice, counts: Ints) -> tuple[Ints, Ints]:
-        """Count the hits of groups in a chunk, and determine the hits to store.
+        """Count a chunk's hits by group, and determine which hits to store.
 
         Parameters
         ----------
@@ -246,7 +246,7 @@ class HitCollector(HitGroups):
         return row_indices
 
     def count_triangles(self, tally_indices: Integers) -> None:
-        """Add the hits of a chunk to the tally, given their tally rows.
+        """Add a chunk's hits to the tally, given their tally rows.
 
         Without a tally, the call has no effect.
         """
@@ -261,12 +261,12 @@ class HitCollector(HitGroups):
         triangle: Ints32,
         instance: Ints32,
     ) -> None:
-        """Add the stored hits of a chunk, whose indices `ray` are relative to `start`."""
+        """Add a chunk's stored hits, whose ray indices are relative to `start`."""
         ray_number = ray.astype(np.uint32, copy=False)
         ray_number = ray_number + np.uint32(start) if start else ray_number
         self._parts.append((ray_number, distance, triangle, instance))
 
     def result(self) -> ScanReturns:
-        """Return the result of all chunks."""
+        """Combine the results of all chunks."""
         ray, distance, triangle, instance = join_hits(self._parts)
         return ScanReturns(ray, distance, triangle, self.hit_counts, self._tally, instance)

@@ -1,4 +1,4 @@
-"""Sub-rays of a beam, which are computed from the direction of the beam during a cast."""
+"""Sub-rays, which are computed from the direction of their beam during a cast."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .tile_sizes import VECTOR_RAYS
 
 @dataclass(frozen=True, eq=False)
 class SubRays:
-    """Sub-rays of each beam in a pattern.
+    """Sub-rays into which each beam of a pattern is divided.
 
     Attributes
     ----------
@@ -36,10 +36,10 @@ class SubRays:
     def components(
         self, subray: Indices | slice = slice(None), offsets: Floats | None = None
     ) -> tuple[Floats, Floats, Floats]:
-        """Return the forward, lateral and vertical components of the sub-ray directions.
+        """Return the forward, lateral, and vertical components of the sub-ray directions.
 
-        The components of the unit vectors have shape (m,) each. `offsets` (2, m) contains the
-        angles across and up, in radians, that are added to the angles of each sub-ray.
+        Each component of the unit vectors has shape (m,). `offsets` (2, m) contains the angles
+        across and up, in radians, that are added to the angles of each sub-ray.
         """
         across, up = self.angles[subray].T
         if offsets is not None:
@@ -49,7 +49,7 @@ class SubRays:
         return forward, across * forward, up * forward
 
     def loop_table(self, offsets: Floats | None) -> Floats:
-        """Return the table of sub-rays for compiled loops.
+        """Return the sub-rays as a table for compiled loops.
 
         The table has 5 rows. Each row is padded to whole vectors of 8 sub-rays by repeating the
         last sub-ray.
@@ -71,7 +71,7 @@ class SubRays:
 def sub_ray_directions(
     sub_rays: SubRays, beam_directions: Floats, subray: Indices, offsets: Floats | None
 ) -> tuple[Floats, Floats | None]:
-    """Return the directions of sub-rays, and their origins relative to the beam origins.
+    """Return sub-ray directions, and sub-ray origins relative to the beam origins.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def sub_ray_directions(
 
 
 def perpendicular_axes(directions: Floats) -> tuple[Floats, Floats]:
-    """Return two axes that are perpendicular to each other and to unit directions.
+    """Return two axes that are perpendicular to each other and to the given directions.
 
     The method of Duff et al. (2017) works for all directions.
     """
@@ -120,10 +120,10 @@ def perpendicular_axes(directions: Floats) -> tuple[Floats, Floats]:
 
 
 def oriented_axes(directions: Floats, axis: Floats) -> tuple[Floats, Floats]:
-    """Return two axes that are perpendicular to unit directions and oriented by an axis.
+    """Return two axes that are perpendicular to the given directions and aligned with an axis.
 
     The first one points counterclockwise about the axis and the second one upward along it. For
-    directions parallel to the axis, they are the axes of `perpendicular_axes`.
+    directions parallel to the axis, the result is the same as that of `perpendicular_axes`.
     """
     x, y, z = directions
     a, b, c = axis

@@ -1,4 +1,4 @@
-"""Ray casting with tiles of neighboring rays, in loops that numba compiles for any CPU."""
+"""Ray casting with tiles of neighboring rays in loops compiled by numba, for any CPU."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _MAX_PLANS = 16  # cached tile plans
 
 
 class TileBackend(Backend):
-    """Backend that traverses trees with tiles of rays in float32 and decides hits in float64.
+    """Backend that traverses trees with tiles of rays in float32, but decides hits in float64.
 
     The margins of the float32 tests exceed all rounding errors, so the hits have the same bits as
     those of the numpy backend.
@@ -42,7 +42,7 @@ class TileBackend(Backend):
 
     @classmethod
     def unavailable_reason(cls) -> str:
-        """Return the reason why numba is unavailable, with a remedy, or ""."""
+        """Return why numba is unavailable and how to fix this, or "" if it is available."""
         if importlib.util.find_spec("numba") is None:
             return f"numba is not installed; run {install_command('numba')}"
         return ""
@@ -80,7 +80,7 @@ class TileBackend(Backend):
         self.update_scene(scene)
 
     def _mesh_records(self, scene: LocalScene) -> AnyArray:
-        """Return a `MESH` record for each mesh of a scene."""
+        """Create a `MESH` record for each mesh in a scene."""
         records = np.zeros(len(scene.meshes), self._memory.MESH)
         for record, mesh, tree, corners in zip(
             records, scene.meshes, self._trees, self._corners, strict=True
@@ -97,7 +97,7 @@ class TileBackend(Backend):
         return records
 
     def _instance_records(self, scene: LocalScene) -> AnyArray:
-        """Return an `INSTANCE` record for each instance of a scene, without its matrix."""
+        """Create an `INSTANCE` record for each instance in a scene, without its matrix."""
         records = np.zeros(len(scene.mesh), self._memory.INSTANCE)
         first_rows = np.cumsum([0, *(len(corners) for corners in self._corners[:-1])])
         records["mesh"] = self._meshes.ctypes.data + self._meshes.itemsize * scene.mesh
@@ -105,7 +105,7 @@ class TileBackend(Backend):
         return records
 
     def update_scene(self, scene: LocalScene) -> None:
-        """Replace the scene with a scene that has the same instances but new transforms."""
+        """Replace the scene by one with the same instances but new transforms."""
         super().update_scene(scene)
         frame = scene.frame
         base = self._base
@@ -132,7 +132,7 @@ class TileBackend(Backend):
         return ClosestHits(ray, t, self._index[row], u, v, instance)
 
     def cast_pairs(self, pairs: RayBodyPairs, nearest: NearestHits) -> None:
-        """Cast rays at bodies with the shape of this scene, and record closer hits in `nearest`."""
+        """Cast rays at bodies with this shape, and record closer hits in `nearest`."""
         record = self._base.copy()
         scale = self._scene.frame.scale
         record["t_min"], record["t_max"] = self._local_limits(pairs.limits, scale)
@@ -140,7 +140,7 @@ class TileBackend(Backend):
         self._loops.cast_pairs(record, pairs.contiguous(), nearest)
 
     def scan_parts(self, scan: Scan) -> Iterator[tuple[int, int, HitColumns]]:
-        """Yield consecutive parts of a scan, each as first ray, end, and hits.
+        """Yield consecutive parts of a scan as tuples of the first ray, the end, and the hits.
 
         The ray indices of the hits start at 0 in each part.
         """
@@ -150,7 +150,7 @@ class TileBackend(Backend):
             yield start, stop, self._cast(cast, start, stop, plan)
 
     def _plan(self, scan: Scan) -> TilePlan:
-        """Return the tile plan of a scan, which is cached for scans with the same beams."""
+        """Return the tile plan for a scan, cached for scans with the same beams."""
         beams = np.asarray(scan.pattern.directions.base)  # Copies of a pattern share this array.
         key = id(beams), scan.pattern.subrays_per_beam, len(scan)
         known = self._plans.get(key)
@@ -163,14 +163,14 @@ class TileBackend(Backend):
         return plan
 
     def _tile_address(self, rays: int) -> int:
-        """Return the address of this thread's tile memory for a number of rays."""
+        """Return the address of this thread's tile memory for the given number of rays."""
         nested = self._scene.nested
         pending = self._pending_nodes + (self._top_stack if nested else 0)
         return self._tiles.address(rays, pending, len(self._scene.mesh) if nested else 0)
 
     @staticmethod
     def _local_limits(limits: tuple[float, float], scale: float) -> tuple[float, float]:
-        """Convert distance limits from meters to local coordinates.
+        """Convert the distance limits from meters to local coordinates.
 
         The maximum distance is made finite, because infinity stands for no hit.
         """
@@ -178,7 +178,7 @@ class TileBackend(Backend):
         return t_min * scale, min(t_max * scale, np.finfo(np.float64).max)
 
     def _ray_cast(self, rays: Rays) -> CastRecord:
-        """Return the `CastRecord` of rays that do not belong to a pattern.
+        """Create a `CastRecord` for rays that do not belong to a pattern.
 
         Each ray becomes a beam, and all beams are cast from a single pose.
         """
@@ -194,7 +194,7 @@ class TileBackend(Backend):
         return cast
 
     def _scan_cast(self, scan: Scan) -> CastRecord:
-        """Return the `CastRecord` of a scan.
+        """Create a `CastRecord` for a scan.
 
         If the scan has an output array, the compiled loops also write the rays to it.
         """
@@ -211,15 +211,17 @@ class TileBackend(Backend):
         return cast
 
     def _set_limits(self, cast: CastRecord, limits: tuple[float, float]) -> None:
-        """Set the minimum and maximum distance of a cast, given in meters."""
+        """Set a cast's minimum and maximum distance, given in meters."""
         record = cast.record
         record["t_min"], record["t_max"] = self._local_limits(limits, self._scene.frame.scale)
 
     def _cast(self, cast: CastRecord, start: int, stop: int, plan: TilePlan) -> HitColumns:
-        """Return the hits of rays `start` to `stop` in ray order, with ray indices that start at 0.
+        """Cast rays `start` to `stop`, and return their hits in ray order.
 
-        Distances are in meters. `triangle` is the index in the caller's faces, or the row of the
-        corners if the field `index` of the record is 0.
+        Ray indices are relative to `start`.
+
+        Distances are in meters. `triangle` contains indices in the caller's faces, or rows of the
+        corners if the record's field `index` is 0.
         """
         n = stop - start
         ray = np.empty(n, np.uint32)
@@ -228,7 +230,7 @@ class TileBackend(Backend):
         instance = (np.empty if self._scene.nested else np.zeros)(n, np.int32)
 
         def cast_share(begin: int) -> HitColumns:
-            """Return the hits of `share` rays, starting at `begin`, as views of the outputs."""
+            """Cast up to `share` rays from `begin` on, and return their hits as output views."""
             record = cast.record.copy()
             row = begin - start
             hits = np.empty(2 * (min(share, stop - begin) + 1))

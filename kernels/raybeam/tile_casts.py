@@ -1,4 +1,4 @@
-"""Compiled loops that cast scans, and rays at moving bodies, tile by tile.
+"""Compiled loops that cast scans tile by tile, and rays at moving bodies.
 
 tile_plan.py determines which rays form a tile. The hits of a call are first stored by ray index and
 then written to the output in ray order.
@@ -40,7 +40,7 @@ _TILE_RAYS = 8 * SUBTILES  # rays per tile if rays are cast at bodies
 
 @noinline
 def _number_rays(tile, rays, lanes, first, count):  # type: ignore[no-untyped-def]
-    """Write the ray indices of a tile, and return whether any of them belongs to the call.
+    """Write the ray indices of a tile, and return whether any of its rays belongs to the call.
 
     The indices are `first` plus the numbers at the address `lanes`. An index below 0, or not below
     `count`, belongs to a ray that is cast with the tile but ignored.
@@ -58,7 +58,7 @@ def _number_rays(tile, rays, lanes, first, count):  # type: ignore[no-untyped-de
 
 @noinline
 def _clear_hits(tile, rays, t_max, count):  # type: ignore[no-untyped-def]
-    """Clear the hits of a tile, and set the maximum distance of each ray.
+    """Clear a tile's hits, and set the maximum distance of each ray.
 
     The maximum distance is -1 for rays that do not belong to the call.
     """
@@ -77,7 +77,7 @@ def _clear_hits(tile, rays, t_max, count):  # type: ignore[no-untyped-def]
 
 @noinline
 def _store_hits(tile, rays, hits, count):  # type: ignore[no-untyped-def]
-    """Store the hits of a tile in the scratch memory of a call with `count` rays.
+    """Copy a tile's hits to the scratch memory of a call with `count` rays.
 
     Hits of rays that do not belong to the call go to an additional last row.
     """
@@ -97,7 +97,7 @@ def _store_hits(tile, rays, hits, count):  # type: ignore[no-untyped-def]
 
 @compiled(types.int64(memory.CASTS, types.int64, types.int64))
 def cast_rays(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Cast rays `start` to `stop` of a `CAST`, and return the number of hits.
+    """Cast rays `start` to `stop` of a `CAST`, and return how many of them hit.
 
     The hits are written to the outputs of the `CAST` in ray order.
     """
@@ -154,7 +154,7 @@ def cast_rays(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0
 
 @inlined
 def _write_ray(cast, floats, lane, origin, direction):  # type: ignore[no-untyped-def]
-    """Write a ray to a lane of a tile in local coordinates, and return the length of its direction.
+    """Write a ray to a tile lane in local coordinates, and return the length of its direction.
 
     `origin`, in meters, and `direction` are in the frame of the body. The length differs from 1
     only if the sensor rotates while the rays of a pose are fired.
@@ -185,7 +185,7 @@ def _write_ray(cast, floats, lane, origin, direction):  # type: ignore[no-untype
 
 @inlined
 def _fill_lanes(tile, filled):  # type: ignore[no-untyped-def]
-    """Fill the lanes of a tile after the first `filled` rays with copies of the first ray.
+    """Fill the unused lanes of a tile, after the first `filled` ones, with copies of its first ray.
 
     The maximum distance of the copies is -1, so that they are not cast. The hits of all rays are
     cleared.
@@ -205,7 +205,7 @@ def _fill_lanes(tile, filled):  # type: ignore[no-untyped-def]
 
 @inlined
 def _write_hits(cast, pairs, nearest, filled):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Record the hits of a tile's first `filled` rays in a `NearestHits`, where they are closer."""
+    """Record the hits of a tile's first `filled` rays in a `NearestHits` if they are closer."""
     numbers = int64s(cast.tile)
     floats = float64s(cast.tile)
     index = int32s(cast.index)
@@ -237,7 +237,7 @@ def _write_hits(cast, pairs, nearest, filled):  # type: ignore[no-untyped-def]  
 
 @compiled(types.void(memory.CASTS, PAIRS, NEAREST_HITS))
 def cast_pairs(casts, pairs, nearest):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Cast pairs of rays and bodies with a `CAST`, and record closer hits in a `NearestHits`.
+    """Cast rays at bodies with a `CAST` record, and record closer hits in a `NearestHits`.
 
     If a ray misses the bounding box of the body, or ends in front of it, the pair does not occupy a
     lane of a tile.

@@ -1,4 +1,4 @@
-"""The intersection test of triangle.py in float64, for one or four rays of a tile."""
+"""The float64 intersection test of triangle.py, for one or four rays in a tile."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _NESTED = field_index("nested")
 
 @called_by_address(types.void(*3 * INT64))
 def shear_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write the shear of all rays of a tile.
+    """Compute the shear of every ray in a tile.
 
     Also write the longest axis that each group of eight rays has in common, or -1 if their longest
     axes differ. `first_row` is the first of six rows with origins and directions.
@@ -95,7 +95,7 @@ def shear_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: 
 
 @inlined
 def _ray_shear(floats, rays, ray):  # type: ignore[no-untyped-def]
-    """Return the sheared coordinates of a ray as six numbers, without the axis."""
+    """Return a ray's origin with the longest axis last, followed by its shear, as six numbers."""
     k = row_index(U, rays) + ray
     return (
         floats[k],
@@ -109,7 +109,7 @@ def _ray_shear(floats, rays, ray):  # type: ignore[no-untyped-def]
 
 @noinline
 def intersect_ray(tile, rays, ray, mesh, instance, position):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Test a ray against a triangle in float64, and return whether it is a closer hit.
+    """Test a ray against a triangle in float64, and return whether there is a closer hit.
 
     A closer hit is recorded in the tile. `instance` is the index of the instance times
     `KEYS_PER_INSTANCE`, and `position` is the position of the triangle in leaf order.
@@ -157,7 +157,7 @@ def intersect_ray(tile, rays, ray, mesh, instance, position):  # type: ignore[no
 
 @inlined
 def intersect_four_rays(tile, rays, ray, axis, corners, position, key):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Test four consecutive rays against a triangle, and return the mask of rays with closer hits.
+    """Test four consecutive rays against a triangle, and return a mask of the closer hits.
 
     The rays must have the same longest axis `axis`, and the mesh must not have a mask. `corners`
     points to the corners of the mesh in leaf order, and `key` is the key of the triangle. Hits are

@@ -1,4 +1,4 @@
-"""The coordinate system of a tile, and its rays, sides and depths in this system.
+"""The coordinate system of a tile, and the tile's rays, sides, and depths in this system.
 
 A ray becomes a point (su, sv) on a plane perpendicular to the tile's mean direction m. In the axes
 (u, v, m), the direction of the ray is (su, sv, 1), scaled so that its component along m is 1.
@@ -52,13 +52,13 @@ _MAX_START = 64.0  # Rays that start farther away, in local units, are cast one 
 
 @inlined
 def dot(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
-    """Return the dot products of vectors, given by their components."""
+    """Return the dot products of two lists of vectors, given as components."""
     return multiply_add(ax, bx, multiply_add(ay, by, az * bz))
 
 
 @inlined
 def cross(a, b):  # type: ignore[no-untyped-def]
-    """Return the cross products of vectors, given by their components."""
+    """Return the cross products of two lists of vectors, given as components."""
     ax, ay, az = a
     bx, by, bz = b
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
@@ -66,7 +66,7 @@ def cross(a, b):  # type: ignore[no-untyped-def]
 
 @inlined
 def tile_axes(singles):  # type: ignore[no-untyped-def]
-    """Return the axes u, v, m of the tile, each as three vectors of equal numbers."""
+    """Return the tile axes u, v, and m, each as three vectors of equal numbers."""
     k = _AXES
     u = splat(singles[k]), splat(singles[k + 1]), splat(singles[k + 2])
     v = splat(singles[k + 3]), splat(singles[k + 4]), splat(singles[k + 5])
@@ -76,7 +76,7 @@ def tile_axes(singles):  # type: ignore[no-untyped-def]
 
 @inlined
 def to_tile_axes(axes, x, y, z):  # type: ignore[no-untyped-def]
-    """Return the components of vectors along the axes of the tile."""
+    """Return the components of vectors along the tile axes."""
     u, v, m = axes
     return (
         dot(x, y, z, u[0], u[1], u[2]),
@@ -87,13 +87,12 @@ def to_tile_axes(axes, x, y, z):  # type: ignore[no-untyped-def]
 
 @inlined
 def _load_eight(floats, k):  # type: ignore[no-untyped-def]
-    """Return eight float64 numbers, starting at index `k`, as float32."""
     return to_float32(load(floats, k), load(floats, k + 4))
 
 
 @noinline
 def _write_axes(tile, rays, first_row):  # type: ignore[no-untyped-def]
-    """Write the axes of a tile and its point, and return the largest coordinate of the point.
+    """Write a tile's axes and reference point, and return the point's largest coordinate.
 
     `first_row` is the first of six rows with origins and directions.
     """
@@ -123,7 +122,7 @@ def _write_axes(tile, rays, first_row):  # type: ignore[no-untyped-def]
 
 @inlined
 def _set_frame(singles, x, y, z):  # type: ignore[no-untyped-def]
-    """Write three orthonormal axes, of which the last one has a given direction."""
+    """Write three orthonormal axes, the last of which has the given direction."""
     norm = 1 / np.sqrt((x * x + y * y) + z * z)
     x *= norm
     y *= norm
@@ -148,7 +147,7 @@ def _set_frame(singles, x, y, z):  # type: ignore[no-untyped-def]
 
 @noinline
 def _project_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write su, sv and the depths of a tile's rays, with their bounds.
+    """Write su, sv, and the depth of each ray in a tile, and the bounds of these values.
 
     Return the smallest cosine of the angle between a ray and the axis m. The field `offset` is also
     written. To compute it, each ray is compared with the ray that has the same (su, sv) but starts
@@ -219,7 +218,7 @@ def _project_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noq
 
 @noinline
 def _set_planes(tile):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write the sides of the tile and of its subtiles, with margins, and the margin of depths."""
+    """Write the side planes of a tile and its subtiles, with margins, and the margin for depths."""
     singles = float32s(tile)
     numbers = int64s(tile)
     u, v, m = tile_axes(singles)
@@ -311,7 +310,7 @@ def update_depths(tile, rays, subtiles):  # type: ignore[no-untyped-def]  # noqa
 
 @called_by_address(types.int64(*4 * INT64))
 def prepare_tile(tile, rays, first_row, mask):  # type: ignore[no-untyped-def]
-    """Compute the coordinate system of a tile and its rays in it, and return whether it is usable.
+    """Set up the coordinate system of a tile and its rays, and return whether it is usable.
 
     A tile is not usable if its rays diverge too much or start too far away. `first_row` is the
     first of six rows with origins and directions, and `mask` contains the subtiles to cast.

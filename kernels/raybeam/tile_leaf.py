@@ -1,4 +1,4 @@
-"""Intersection of a tile's rays with the triangles of a leaf.
+"""Intersect a tile's rays with the triangles in a leaf.
 
 In the coordinates of a tile, a triangle consists of three linear functions of (su, sv), which are
 computed for the eight triangles of a leaf at a time. If the maximum of one of these functions over
@@ -64,7 +64,7 @@ LEAF_MASK = (1 << LEAF_BITS) - 1
 
 @inlined
 def _leaf_edges(singles, blocks, block):  # type: ignore[no-untyped-def]
-    """Return the first vertices of a leaf's triangles, relative to the tile's point, and two edges.
+    """Return the first vertex of each triangle relative to the tile's point, and two edges.
 
     All vectors are in the axes of the tile.
     """
@@ -84,13 +84,13 @@ def _leaf_edges(singles, blocks, block):  # type: ignore[no-untyped-def]
 
 @inlined
 def l1_norm(a):  # type: ignore[no-untyped-def]
-    """Return the sum of the absolute values of the components of vectors."""
+    """Return the L1 norm of each vector, given as components."""
     return (absolute(a[0]) + absolute(a[1])) + absolute(a[2])
 
 
 @inlined
 def _max_over_bounds(normal, bounds):  # type: ignore[no-untyped-def]
-    """Return the maximum of a linear function over ranges of (su, sv)."""
+    """Return the maximum of a linear function for su and sv within their bounds."""
     nu, nv, nm = normal
     low_u, high_u, low_v, high_v = bounds
     return (nm + maximum(nu * low_u, nu * high_u)) + maximum(nv * low_v, nv * high_v)
@@ -103,7 +103,7 @@ def _splat_three(singles, k):  # type: ignore[no-untyped-def]
 
 @called_by_address(types.int64(*6 * INT64, types.float32))
 def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Test the rays of a mask of subtiles against the triangles of a leaf.
+    """Test the rays in selected subtiles against the triangles in a leaf.
 
     Return the mask of subtiles with closer hits. `code` is the code of the leaf, `deepest` is the
     maximum depth that a ray reaches, and `instance` is the index of the instance times

@@ -1,4 +1,4 @@
-"""Casting of a tile of rays.
+"""Cast the rays in a tile.
 
 A tile contains up to some hundred neighboring rays. They become points (su, sv) on a plane
 perpendicular to the tile's mean direction m: in the axes (u, v, m), the direction of a ray is (su,
@@ -74,7 +74,7 @@ _FEW = 6  # up to this number of rays, tiles are cast ray by ray
 
 @noinline
 def _cast_in_mesh(tile, rays, first_row, mesh, instance, mask):  # type: ignore[no-untyped-def]
-    """Cast the rays of a mask of subtiles at a mesh, as a tile or ray by ray.
+    """Cast the rays in selected subtiles at a mesh, as a tile or one by one.
 
     If a tile is too wide or visits too many leaves, the following tiles are cast ray by ray,
     because they are likely to be similar. After that, tiles are tried again. The rays must already
@@ -103,7 +103,7 @@ def _cast_in_mesh(tile, rays, first_row, mesh, instance, mask):  # type: ignore[
 
 @called_by_address(types.void(*3 * INT64))
 def _transform_rays(tile, rays, instance):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write all rays in the mesh coordinates of an instance, as `to_mesh_coordinates` does."""
+    """Transform all rays to the mesh coordinates of an instance, like `to_mesh_coordinates`."""
     floats = float64s(tile)
     m = float64s(instance)
     k = row_index(OX, rays)
@@ -134,7 +134,7 @@ def _transform_rays(tile, rays, instance):  # type: ignore[no-untyped-def]  # no
 
 @noinline
 def _reaching_subtiles(tile, rays, near, mask):  # type: ignore[no-untyped-def]
-    """Return the subtiles of a mask that contain a ray which reaches a depth along the axis m.
+    """Return which of the given subtiles contain a ray that reaches a depth along the axis m.
 
     The depth is in scene coordinates, in which a distance along a ray is at least as long as its
     depth.
@@ -153,7 +153,7 @@ def _reaching_subtiles(tile, rays, near, mask):  # type: ignore[no-untyped-def]
 
 @called_by_address(types.void(*6 * INT64))
 def cast_tile(tile, rays, mesh, instances, top, last):  # type: ignore[no-untyped-def]
-    """Write the closest hits of a tile to its rows `T` and `KEY`.
+    """Find the closest hits of a tile's rays, and write them to its rows `T` and `KEY`.
 
     Before the call, these rows contain the maximum distances and -1. `instances` and `top` are the
     addresses of the `INSTANCE` records and of their tree, or 0 for a single mesh without a

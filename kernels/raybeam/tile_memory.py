@@ -1,4 +1,4 @@
-"""Scratch memory of a tile of rays, with fixed fields followed by tables of one number per ray.
+"""Scratch memory of a tile, with fixed fields followed by rows of one number per ray.
 
 A tile has `SUBTILES` subtiles, each of which has one or more vectors of eight rays. A row of a
 table contains a number for each ray of the tile, in the order of the subtiles.
@@ -67,7 +67,7 @@ FIRST_ROW = -(-TILE.itemsize // 64) * 8  # index of the first row, in units of 8
 
 
 def field_index(name: str) -> int:
-    """Return the index of a field if the tile memory is read as an array of the field's type."""
+    """Return a field's index if the tile memory is read as an array of the field's type."""
     field = TILE[name]
     kind = field.subdtype[0] if field.subdtype else field
     return int(TILE.fields[name][1]) // kind.itemsize  # type: ignore[index]
@@ -75,18 +75,18 @@ def field_index(name: str) -> int:
 
 @inlined
 def row_index(row, rays):  # type: ignore[no-untyped-def]
-    """Return the index of a row of a tile with a number of rays, in units of 8 bytes."""
+    """Return the start of a row in the memory of a tile, in units of 8 bytes."""
     return FIRST_ROW + row * rays
 
 
 class _ThreadTiles(threading.local):
-    """Tile memory of each thread, because several threads may cast at the same time."""
+    """Separate tile memory for each thread, because several threads may cast at the same time."""
 
     def __init__(self) -> None:
         self._size = (0, 0, 0)
 
     def address(self, rays: int, pending: int, instances: int) -> int:
-        """Return the address, a multiple of 64, of memory for a tile with a number of rays.
+        """Return the address of tile memory for a number of rays, which is a multiple of 64.
 
         `pending` is the maximum number of pending nodes, and `instances` is the number of
         instances. The memory is allocated again if it is too small.

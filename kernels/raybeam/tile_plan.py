@@ -1,4 +1,4 @@
-"""Division of a scan's rays into tiles of neighboring rays.
+"""Divide a scan's rays into tiles of neighboring rays.
 
 The rays of a pattern are stored firing by firing. The rings of a firing are not necessarily sorted
 by elevation, and their beams may point at different azimuths, several degrees apart. Therefore,
@@ -25,7 +25,7 @@ _FEW_FIRINGS = 4
 
 
 class TilePlan(NamedTuple):
-    """Division of a scan's rays into tiles.
+    """Tiles into which the rays of a scan are divided.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class TilePlan(NamedTuple):
 
 
 def plan_consecutive(subrays: int) -> TilePlan:
-    """Return a plan whose tiles consist of consecutive beams with a number of sub-rays each."""
+    """Create a plan in which each tile consists of consecutive beams with all of their sub-rays."""
     beams = np.arange(SUBTILES * VECTOR_RAYS)
     return TilePlan(
         subrays, len(beams), _sub_ray_lanes(beams, subrays)[None], np.zeros(1, np.int64)
@@ -61,7 +61,7 @@ def plan_consecutive(subrays: int) -> TilePlan:
 
 
 def _sub_ray_lanes(beams: Ints, subrays: int) -> Ints:
-    """Return the indices of the sub-rays of beams.
+    """Return the ray index of every sub-ray in the given beams.
 
     The sub-rays of each beam are padded to whole vectors.
     """
@@ -73,7 +73,7 @@ def _sub_ray_lanes(beams: Ints, subrays: int) -> Ints:
 
 
 def plan_tiles(scan: Scan) -> TilePlan:
-    """Return the tile plan of a scan, which is derived from the directions of two firings."""
+    """Create the tile plan for a scan from the directions of two firings."""
     subrays = scan.pattern.subrays_per_beam
     step = scan.pattern.step
     firing = step * subrays
@@ -91,7 +91,7 @@ def plan_tiles(scan: Scan) -> TilePlan:
 
 
 def _sort_rings(first: Floats, second: Floats) -> tuple[Ints, Ints, tuple[float, float]]:
-    """Determine which rings are neighbors from the directions of two firings.
+    """Find out which rings are neighbors from the directions of two firings.
 
     The directions have shape (n, 3), and the firings must be consecutive.
 
@@ -121,7 +121,7 @@ def _sort_rings(first: Floats, second: Floats) -> tuple[Ints, Ints, tuple[float,
 def _plan_from_rings(
     rings: Ints, shifts: Ints, spacings: tuple[float, float], subrays: int
 ) -> TilePlan:
-    """Return a plan whose tiles cover nearly square ranges of angles."""
+    """Create a plan whose tiles cover nearly square ranges of angles."""
     step = len(rings)
     firing = step * subrays
     each = 1 if subrays > 1 else 2  # vectors per subtile, without sub-rays
@@ -160,7 +160,7 @@ def _plan_from_rings(
 def _squarest_grid(
     beams: int, spacings: tuple[float, float], most_rings: int, most_firings: int
 ) -> tuple[int, int]:
-    """Return the numbers of rings and firings that cover the most square angle.
+    """Choose the numbers of rings and firings that form the most nearly square tile.
 
     Their product is `beams`.
     """

@@ -1,4 +1,4 @@
-"""Sizes of a tile of rays, on which the tile planner and the compiled loops must agree.
+"""Tile sizes, on which the tile planner and the compiled loops must agree.
 
 The module imports nothing, so that tiles can be planned without loading numba.
 """
@@ -10,7 +10,7 @@ VECTOR_RAYS = 8  # rays per vector, and the smallest number of rays per subtile
 
 
 def lanes_per_beam(subrays: int) -> int:
-    """Return the number of lanes that the sub-rays of a beam occupy in a tile.
+    """Return the number of lanes that a beam's sub-rays occupy in a tile.
 
     A beam without sub-rays occupies a single lane. Otherwise, the sub-rays are padded to whole
     vectors, so that each vector contains rays of a single beam.

@@ -1,4 +1,4 @@
-"""The tree that tiles of rays traverse.
+"""Trees that are traversed by tiles of rays.
 
 Nodes have eight children, and leaves contain up to eight triangles.
 """
@@ -32,7 +32,7 @@ _EMPTY = np.float32(1e37)
 
 @dataclass(frozen=True)
 class TileTree:
-    """The tree of a mesh.
+    """The tree of a single mesh.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class TileTree:
 
 
 def build_tile_tree(corners: Floats) -> TileTree:
-    """Build the tree of triangles in local coordinates."""
+    """Build a tree over triangles, given in local coordinates."""
     tree = build_tree(corners, WIDTH, _LEAF_SIZE, _TRIANGLE_COST)
     is_leaf = tree.child < 0
     codes = ~tree.child[is_leaf]
@@ -76,7 +76,7 @@ def build_tile_tree(corners: Floats) -> TileTree:
 
 
 def build_instance_nodes(boxes: Floats) -> tuple[Floats32, int]:
-    """Build the nodes of a tree over boxes, with the index of a single box in each leaf.
+    """Build the nodes of a tree over boxes, each leaf of which contains the index of one box.
 
     The boxes have shape (n, 2, 3). Also return the maximum number of pending nodes.
     """
@@ -85,7 +85,7 @@ def build_instance_nodes(boxes: Floats) -> tuple[Floats32, int]:
 
 
 def _stack(tree: WideTree) -> int:
-    """Return the maximum number of pending nodes, including the children of the current node."""
+    """Return the maximum number of pending nodes, including the current node's children."""
     return max_stack_depth(tree) + 2 * WIDTH
 
 
@@ -100,7 +100,7 @@ def _nodes(tree: WideTree, child: Ints32) -> Floats32:
 
 
 def _aligned(row_count: int, columns: int) -> Floats32:
-    """Return a float32 array of zeros that starts at a cache line of 64 bytes."""
+    """Allocate a float32 array of zeros that starts at a multiple of 64 bytes (a cache line)."""
     memory = np.zeros(row_count * columns + 16, np.float32)
     start = -memory.ctypes.data % 64 // 4
     return memory[start : start + row_count * columns].reshape(row_count, columns)
@@ -108,7 +108,7 @@ def _aligned(row_count: int, columns: int) -> Floats32:
 
 @compiled()
 def _fill_blocks(corners, first, count, blocks):  # type: ignore[no-untyped-def]
-    """Write the triangles of leaves.
+    """Write the triangles in all leaves.
 
     Edges are computed in float64 and then rounded, so that short edges are accurate.
     """

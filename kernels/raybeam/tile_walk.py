@@ -1,4 +1,4 @@
-"""Traversal of a tree by a tile of rays.
+"""Traversal of a tree by the rays in a tile.
 
 For each node, the boxes of its eight children are tested against the tile, and those that remain
 are tested against the eight subtiles at once. A box is outside the tile or a subtile if it is
@@ -42,7 +42,7 @@ _MET = field_index("met")
 
 @inlined
 def write_entry(stack, codes, k, near, code, mask):  # type: ignore[no-untyped-def]
-    """Write entry `k` of a list, with its depth, code, and mask of subtiles."""
+    """Write entry `k` of a list: its depth, its code, and its mask of subtiles."""
     stack[ENTRY * k] = near
     codes[ENTRY * k + 1] = np.int32(code)
     codes[ENTRY * k + 2] = np.int32(mask)
@@ -50,7 +50,7 @@ def write_entry(stack, codes, k, near, code, mask):  # type: ignore[no-untyped-d
 
 @inlined
 def sort_farthest_first(address, start, stop):  # type: ignore[no-untyped-def]
-    """Sort entries `start` to `stop` of a list so that the closest entry is last.
+    """Sort entries `start` to `stop` of a list so that the closest one is last.
 
     `address` is the address of the list.
     """
@@ -71,7 +71,7 @@ def sort_farthest_first(address, start, stop):  # type: ignore[no-untyped-def]
 
 @inlined
 def _push_children(tile, nodes, blocks, node, mask, deepest, count):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Push the children of a node that the tile may intersect, the closest last.
+    """Push the child nodes that the tile may intersect, the closest one last.
 
     The stack has `count` entries. Return its new size. `nodes` and `blocks` are addresses.
     """
@@ -139,7 +139,7 @@ def _push_children(tile, nodes, blocks, node, mask, deepest, count):  # type: ig
 
 @noinline
 def _unfinished_subtiles(tile, count):  # type: ignore[no-untyped-def]
-    """Return the mask of the subtiles that reach one of the first `count` pending nodes."""
+    """Return a mask of the subtiles that reach any of the first `count` pending nodes."""
     reach = load(float32s(tile), _REACH)
     address = int64s(tile)[_STACK]
     stack = float32s(address)
@@ -152,7 +152,7 @@ def _unfinished_subtiles(tile, count):  # type: ignore[no-untyped-def]
 
 @called_by_address(types.int64(*5 * INT64))
 def walk_tile(tile, rays, mesh, instance, mask):  # type: ignore[no-untyped-def]
-    """Cast the rays of a mask of subtiles at a mesh, and return the mask of unfinished subtiles.
+    """Cast the rays in selected subtiles at a mesh, and return a mask of unfinished subtiles.
 
     The traversal stops if the tile visits more leaves than it has rays. In this case, the subtiles
     that may intersect a pending node are unfinished.
@@ -190,7 +190,7 @@ def walk_tile(tile, rays, mesh, instance, mask):  # type: ignore[no-untyped-def]
 
 @called_by_address(types.int64(*3 * INT64))
 def list_instances(tile, nodes, mask):  # type: ignore[no-untyped-def]
-    """List the instances that a tile may hit, the closest last, and return their number.
+    """List the instances that a tile may hit, the closest one last, and return their number.
 
     `nodes` is the address of the instance tree, and `mask` contains the subtiles to cast.
     """

@@ -1,4 +1,4 @@
-"""Wide, flat bounding volume hierarchies for traversal.
+"""Wide, flat bounding volume hierarchies for fast traversal.
 
 The boxes are padded and rounded outward, so that a float32 test of a ray and a box never misses a
 box whose triangle the ray hits in exact arithmetic. In the following, u = 2**-24, and the local
@@ -27,7 +27,7 @@ LEAF_BITS = 3
 
 @dataclass(frozen=True)
 class WideTree:
-    """Nodes with up to `width` children. Node 0 is the root.
+    """Tree nodes with up to `width` children each. Node 0 is the root.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ def build_tree(
 
 
 def build_instance_tree(boxes: Floats, width: int) -> WideTree:
-    """Build a tree over the boxes of instances, with a single box per leaf.
+    """Build a tree over the boxes of instances, with one box per leaf.
 
     Leaves contain the index of an instance instead of a position in `order`.
     """
@@ -91,7 +91,7 @@ def build_instance_tree(boxes: Floats, width: int) -> WideTree:
 
 
 def join_trees(trees: list[WideTree]) -> tuple[WideTree, Ints]:
-    """Join several trees into one, and return it with the root of each tree.
+    """Join several trees into one, and return it together with the root of each tree.
 
     Triangles are numbered consecutively over all trees.
     """
@@ -117,7 +117,7 @@ def join_trees(trees: list[WideTree]) -> tuple[WideTree, Ints]:
 def _choose_leaves(
     tree: ploc.BinaryTree, leaf_size: int, triangle_cost: float | None
 ) -> tuple[Ints32, Bools]:
-    """Return the number of triangles below each node, and whether each node is best made a leaf.
+    """Return the number of triangles below each node, and whether the node should become a leaf.
 
     The decision is based on the surface area heuristic with the costs that `build_tree` describes.
     """
@@ -139,7 +139,7 @@ def _choose_leaves(
 
 
 def _positions(tree: ploc.BinaryTree, count: Ints32) -> Ints32:
-    """Return the position of the first triangle below each node in leaf order."""
+    """Return the position in leaf order of the first triangle below each node."""
     first = np.zeros(len(count), np.int32)
     for start, stop in reversed(tree.rounds):
         first_child = tree.first_child[start:stop]
@@ -156,7 +156,7 @@ def _widen(
     order: Ints32,
     width: int,
 ) -> WideTree:
-    """Combine binary nodes into nodes with up to `width` children, level by level.
+    """Combine binary nodes to nodes with up to `width` children, one level at a time.
 
     In each node, the child with the largest surface area is replaced by its own children until all
     slots are used.
@@ -186,7 +186,7 @@ def _widen(
 
 
 def _wide_children(tree: ploc.BinaryTree, area: Floats32, roots: Indices, width: int) -> Indices:
-    """Return up to `width` descendants of each binary node in `roots`.
+    """Choose up to `width` descendants of each binary node in `roots`.
 
     The result has shape (len(roots), width) and is padded with -1.
     """

@@ -1,4 +1,4 @@
-"""The intersection test that decides whether a ray hits a triangle, in float64.
+"""The float64 intersection test that decides whether a ray hits a triangle.
 
 The test is that of Woop, Benthin and Wald (2013), "Watertight Ray/Triangle Intersection". The
 vertices are translated to the origin of the ray and sheared so that the ray runs along an axis.
@@ -26,7 +26,7 @@ from .arrays import Bools, Floats, Indices
 
 @dataclass(frozen=True)
 class ShearedRays:
-    """Rays prepared for the test, with one element per ray in each array.
+    """Rays that are prepared for the test, with one element per ray in each array.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ def shear_rays(origins: Floats, directions: Floats) -> ShearedRays:
 
 
 def intersect(rays: ShearedRays, ray: Indices, corners: Floats, triangle: Indices) -> PlaneHits:
-    """Compute the signed areas and distances for pairs of rays and triangles.
+    """Compute signed areas and distances for pairs of a ray and a triangle.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def intersect(rays: ShearedRays, ray: Indices, corners: Floats, triangle: Indice
 def _sheared_corners(
     rays: ShearedRays, ray: Indices, corners: Floats, triangle: Indices
 ) -> tuple[list[Floats], list[Floats], list[Floats]]:
-    """Return the coordinates of the three vertices of each triangle relative to its ray.
+    """Return the coordinates of each triangle's three vertices relative to the ray.
 
     The result is three lists with one array (m,) per vertex: sheared x and y, and z along kz.
     """
@@ -143,6 +143,6 @@ def _sheared_corners(
 
 
 def is_inside(a: Floats, b: Floats, c: Floats, det: Floats) -> Bools:
-    """Return whether rays pass through triangles, including their edges and vertices."""
+    """Return whether each ray passes through its triangle, including edges and vertices."""
     same_sign = ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
     return same_sign & (det != 0)

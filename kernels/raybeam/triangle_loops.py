@@ -1,4 +1,4 @@
-"""The intersection test of triangle.py for compiled loops."""
+"""The intersection test of triangle.py as compiled functions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from .compiled import inlined
 
 
 class PlaneHit(NamedTuple):
-    """Intersection of a ray with the plane of a triangle.
+    """Intersection of a ray with a triangle's plane.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class PlaneHit(NamedTuple):
 
 @inlined
 def shear_ray(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Return the longest axis of a ray, its origin with this axis last, and its shear."""
+    """Return a ray's longest axis, its origin with this axis last, and its shear."""
     ax = abs(dx)
     ay = abs(dy)
     az = abs(dz)
@@ -54,7 +54,7 @@ def shear_ray(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 @inlined
 def intersect_plane(corners, ray):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Return the `PlaneHit` of a sheared ray with the plane of a triangle.
+    """Return the `PlaneHit` of a sheared ray on a triangle's plane.
 
     The coordinates of the three vertices have the longest axis of the ray last.
     """
@@ -78,5 +78,5 @@ def intersect_plane(corners, ray):  # type: ignore[no-untyped-def]  # noqa: PLR0
 
 @inlined
 def same_sign(a, b, c):  # type: ignore[no-untyped-def]
-    """Return whether no area is negative or none is positive."""
+    """Return whether all three areas have the same sign, where zero counts as both."""
     return ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))

@@ -1,4 +1,4 @@
-"""Vectors of 8 float32 or 4 float64 numbers for compiled loops, held in the CPU's registers.
+"""Vectors of 8 float32 or 4 float64 numbers that compiled loops keep in CPU registers.
 
 numba vectorizes loops over arrays, but not the body of a tree traversal, and it stores each
 intermediate result of such a loop in memory. Values of a type that is an LLVM vector remain in
@@ -47,7 +47,7 @@ class _VectorModel(models.PrimitiveModel):
 
 
 def _define_operator(function: Any, instruction: str) -> None:
-    """Implement an operator for two vectors of the same type by an LLVM instruction."""
+    """Implement an operator for two vectors of the same type with an LLVM instruction."""
 
     @infer_global(function)
     class _Typing(AbstractTemplate):
@@ -70,12 +70,12 @@ for _operator, _instruction in (
 
 
 def _element_pointer(builder: Any, pointer: Any, index: Any, kind: Any) -> Any:
-    """Return a pointer to a type, `index` elements after `pointer`."""
+    """Return a pointer to the element `index` after `pointer`."""
     return builder.bitcast(builder.gep(pointer, [index]), kind.as_pointer())
 
 
 def _splat(builder: Any, number: Any, kind: Any) -> Any:
-    """Return a vector of an LLVM type with equal elements."""
+    """Return a vector of an LLVM type in which all elements are equal."""
     undefined = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(undefined, number, _I32(0))
     lanes = ir.Constant(ir.VectorType(_I32, kind.count), [0] * kind.count)
@@ -110,7 +110,7 @@ def store(context: Any, pointer: Any, index: Any, value: Any) -> Any:
 
 @intrinsic
 def splat(context: Any, number: Any) -> Any:
-    """Return a vector whose lanes are all equal to a float32 or float64 number."""
+    """Return a vector in which all lanes are equal to a float32 or float64 number."""
     kind = _VECTOR[number]
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
@@ -126,13 +126,13 @@ def _call(builder: Any, name: str, result: Any, arguments: Any) -> Any:
 
 
 def _suffix(kind: Any) -> str:
-    """Return the suffix of the names of LLVM intrinsics for a vector type."""
+    """Return the suffix that LLVM intrinsics have for a vector type."""
     return f"v{kind.count}f{kind.element.bitwidth}"
 
 
 @intrinsic
 def multiply_add(context: Any, a: Any, b: Any, c: Any) -> Any:
-    """Return ``a * b + c``, fused if the CPU supports it.
+    """Return ``a * b + c``, computed by a fused instruction if the CPU has one.
 
     Whether it is fused affects the last bits, so it must not be used where a hit is decided.
     """
@@ -189,7 +189,7 @@ maximum = _select(">")
 
 @intrinsic
 def greater_equal(context: Any, a: Any, b: Any) -> Any:
-    """Return the mask of the lanes in which ``a >= b``."""
+    """Return a mask of the lanes in which ``a >= b``."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         lanes = builder.fcmp_ordered(">=", *arguments)
@@ -228,7 +228,7 @@ min_lane = _reduce_lanes("<")
 
 @intrinsic
 def to_float32(context: Any, a: Any, b: Any) -> Any:
-    """Convert two vectors of 4 float64 to a vector of 8 float32."""
+    """Convert two vectors of 4 float64 numbers to one vector of 8 float32 numbers."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         lanes = ir.Constant(ir.VectorType(_I32, 8), list(range(8)))
@@ -249,7 +249,7 @@ def lowest_bit(context: Any, mask: Any) -> Any:
 
 @intrinsic
 def bit_count(context: Any, mask: Any) -> Any:
-    """Return the number of set bits of a mask."""
+    """Return the number of set bits in a mask."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         return _call(builder, "llvm.ctpop.i64", _I64, arguments)
@@ -259,7 +259,7 @@ def bit_count(context: Any, mask: Any) -> Any:
 
 @intrinsic
 def prefetch(context: Any, pointer: Any, index: Any) -> Any:
-    """Prefetch the cache line that contains a byte, `index` elements after `pointer`."""
+    """Prefetch the cache line that contains the byte `index` bytes after `pointer`."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         pointer, index = arguments
@@ -272,7 +272,7 @@ def prefetch(context: Any, pointer: Any, index: Any) -> Any:
 
 @intrinsic
 def store_masked(context: Any, mask: Any, pointer: Any, index: Any, value: Any) -> Any:
-    """Store the lanes of a vector that a mask selects, starting at an index, without a branch."""
+    """Store the vector lanes that a mask selects at an index, without a branch."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         mask, pointer, index, value = arguments
@@ -290,7 +290,7 @@ def store_masked(context: Any, mask: Any, pointer: Any, index: Any, value: Any) 
 
 @intrinsic
 def store_int64(context: Any, pointer: Any, index: Any, value: Any) -> Any:
-    """Store an int64 at a byte index, in the byte order of the CPU."""
+    """Store an int64 at a byte index in the byte order of the CPU."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         pointer, index, value = arguments
@@ -302,7 +302,7 @@ def store_int64(context: Any, pointer: Any, index: Any, value: Any) -> Any:
 
 @intrinsic
 def splat_bits(context: Any, number: Any) -> Any:
-    """Return a float64 vector whose lanes have the bits of an int64.
+    """Return a float64 vector in which each lane has the bits of an int64.
 
     The vector is only meant to be stored.
     """

@@ -1,4 +1,4 @@
-"""Pool partitions and pipes for Dask clusters."""
+"""Divide the workers of a Dask cluster into partitions, and connect tasks with pipes."""
 
 from . import extras as extras  # registers the features
 from ._version import __version__

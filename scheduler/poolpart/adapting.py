@@ -1,4 +1,4 @@
-"""Adaptive partitions, whose number of jobs follows their work.
+"""Adaptive partitions, whose number of jobs depends on the amount of work.
 
 A scheduler plugin stores a record of each partition, with the allowed number of jobs, the slots
 that clients request, and the time when its workers last ran a task. Jobs are started by the process
@@ -49,7 +49,7 @@ _LOST_S = 120.0  # time without a report after which the process that starts job
 
 @dataclass(frozen=True)
 class JobBounds:
-    """Allowed number of jobs of an adaptive partition."""
+    """Minimum and maximum number of jobs in an adaptive partition."""
 
     minimum: int
     maximum: int
@@ -57,7 +57,7 @@ class JobBounds:
 
     @classmethod
     def validated(cls, name: str, minimum: Any, maximum: Any, idle_s: Any = IDLE_S) -> JobBounds:
-        """Create bounds from values that a user has passed.
+        """Create job bounds from values that a user has passed.
 
         Raises
         ------
@@ -76,7 +76,7 @@ class JobBounds:
 
 @dataclass(frozen=True)
 class JobSpec:
-    """Size and allowed number of the jobs of a partition."""
+    """Size of a partition's jobs, and how many jobs the partition may have."""
 
     slots: int  # slots per worker
     workers: int = 1  # workers per job
@@ -86,7 +86,7 @@ class JobSpec:
 
 @dataclass(frozen=True)
 class JobAdvice:
-    """Instructions to the process with the cluster object, for one partition."""
+    """Instructions on one partition, for the process that has the cluster object."""
 
     jobs_to_start: int = 0
     jobs_to_forget: Sequence[str] = ()  # jobs to cancel, and jobs whose workers were closed
@@ -94,7 +94,7 @@ class JobAdvice:
 
 @dataclass(frozen=True)
 class GroupReport:
-    """Report about a worker group, sent to the scheduler by the process that scales the group."""
+    """Report on a worker group, sent to the scheduler by the process that scales the group."""
 
     size: int  # number of workers that the group was last scaled to
     removed: Sequence[str] = ()  # names of workers that were removed and will not return
@@ -102,7 +102,7 @@ class GroupReport:
 
 @dataclass(frozen=True)
 class GroupAdvice:
-    """Instructions to the process that scales a worker group."""
+    """Instructions for the process that scales a worker group."""
 
     size: int  # number of workers that the group should have
     leaving: tuple[str, ...] = ()  # names of closed workers to remove from the group
@@ -110,7 +110,7 @@ class GroupAdvice:
 
 @dataclass(frozen=True)
 class _Decision:
-    """Decision about the jobs of a partition."""
+    """Decision about a partition's jobs."""
 
     advice: JobAdvice
     idle: dict[str, list[Any]]  # {job to close: states of its workers}
@@ -118,7 +118,7 @@ class _Decision:
 
 @dataclass
 class _Record:
-    """State of a partition. All times are values of `time.monotonic`."""
+    """State of an adaptive partition. All times are values of `time.monotonic`."""
 
     spec: JobSpec
     queued_jobs: int = 0  # number of jobs whose workers have not joined
@@ -134,7 +134,7 @@ class _Record:
 
 
 class AdaptivePartitions(SchedulerPlugin):
-    """Scheduler plugin with the records of all partitions whose workers are started as jobs."""
+    """Scheduler plugin that keeps a record of each partition whose workers are started as jobs."""
 
     name = NAME
 
@@ -148,7 +148,7 @@ class AdaptivePartitions(SchedulerPlugin):
     # -- hooks of the scheduler --------------------------------------------------------
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
-        """Start to measure the idle time of a worker, or reject the worker of a canceled job."""
+        """Start measuring a worker's idle time, or reject the worker if its job was canceled."""
         self._busy_at[worker] = time.monotonic()
         state = scheduler.workers[worker]
         if str(state.name) in self._cancelled:
@@ -174,10 +174,10 @@ class AdaptivePartitions(SchedulerPlugin):
     # -- decisions ---------------------------------------------------------------------
 
     def group_jobs(self, name: str, report: GroupReport) -> dict[str, list[str]]:
-        """Return the jobs of a worker group with the names of their workers, for `decide`.
+        """Return the jobs of a worker group, and the workers of each job, for `decide`.
 
-        Each member is a job, and so is each worker that has not joined yet, under a placeholder
-        name.
+        Each member counts as a job. Each worker that has not joined yet also counts as a job, under
+        a placeholder name.
         """
         leaving = self.records[name].leaving
         leaving.difference_update(report.removed)
@@ -191,7 +191,7 @@ class AdaptivePartitions(SchedulerPlugin):
         return {job: [job] for job in (*members, *pending)}
 
     def waiting_slots(self) -> dict[str, float]:
-        """Return the total slots that tasks without a worker request, by partition."""
+        """Count the slots that tasks without a worker request in each partition."""
         waiting: dict[str, float] = {}
         for task in unrunnable_tasks(self.scheduler):  # there may be 100,000
             if task.resource_restrictions and not is_bound(task):
@@ -200,7 +200,7 @@ class AdaptivePartitions(SchedulerPlugin):
         return waiting
 
     def missing_slots(self, name: str, waiting: float, limit: float) -> float:
-        """Return the number of slots that a partition lacks, which is negative if slots are unused.
+        """Return how many slots a partition lacks. The number is negative if slots are unused.
 
         Tasks that are bound to a worker, or that have seceded there, occupy slots of that worker.
         All other tasks can run on any worker of the partition, including a new one.
@@ -242,7 +242,7 @@ class AdaptivePartitions(SchedulerPlugin):
     def decide(
         self, name: str, jobs: Mapping[str, Sequence[str]], waiting: float
     ) -> _Decision | None:
-        """Decide which jobs of a partition to start and to end.
+        """Decide which of a partition's jobs to start and which to end.
 
         Parameters
         ----------
@@ -280,7 +280,7 @@ class AdaptivePartitions(SchedulerPlugin):
         record.missing_slots = missing
 
         def jobs_needed(slots: float) -> int:
-            """Return the number of queued jobs that are needed to provide missing slots."""
+            """Return how many queued jobs are needed to provide the missing slots."""
             number = math.ceil(max(0.0, slots) / slots_per_job)
             lower = bounds.minimum - len(running)
             upper = bounds.maximum - len(running)
@@ -304,7 +304,7 @@ class AdaptivePartitions(SchedulerPlugin):
     def _idle(
         self, name: str, running: Mapping[str, Sequence[Any]], spare_jobs: float, bounds: JobBounds
     ) -> dict[str, list[Any]]:
-        """Return the jobs to close with their workers, the longest idle jobs first.
+        """Return the jobs to close and their workers, starting with the longest idle job.
 
         `spare_jobs` is the number of jobs that the partition does not need at the moment.
         """
@@ -328,7 +328,7 @@ class AdaptivePartitions(SchedulerPlugin):
         return {job: [*members[job]] for job in idle[:number]}
 
     async def close_idle(self, workers: Sequence[Any]) -> bool:
-        """Close workers that have stopped receiving tasks.
+        """Close workers to which no more tasks are assigned.
 
         If one of them turns out to be busy, all of them receive tasks again, and the result is
         False.
@@ -362,7 +362,7 @@ def _is_busy(dask_worker: Any = None) -> bool:
 
 
 def add_partitions(specs: Mapping[str, JobSpec], dask_scheduler: Any = None) -> None:
-    """Create the records of partitions whose workers are started as jobs."""
+    """Create a record for each partition whose workers are started as jobs."""
     record = _adaptation_of(dask_scheduler) or AdaptivePartitions(dask_scheduler)
     if NAME not in dask_scheduler.plugins:
         dask_scheduler.add_plugin(record)
@@ -373,7 +373,7 @@ def add_partitions(specs: Mapping[str, JobSpec], dask_scheduler: Any = None) -> 
 async def advise_jobs(
     jobs: Mapping[str, Mapping[str, Sequence[str]]], dask_scheduler: Any = None
 ) -> dict[str, JobAdvice]:
-    """Close idle workers, and return the jobs to start and to forget, by partition.
+    """Close idle workers, and return advice on each partition's jobs.
 
     `jobs` maps each partition to its jobs, and each job to the names of its workers. Partitions
     with a fixed number of jobs are omitted from the result.
@@ -404,7 +404,7 @@ async def advise_jobs(
 async def advise_groups(
     reports: Mapping[str, GroupReport], dask_scheduler: Any = None
 ) -> dict[str, GroupAdvice]:
-    """Close idle workers, and return the target sizes of the worker groups, by partition.
+    """Close idle workers, and return the size that each partition's worker group should have.
 
     Closed workers are listed in each response until a report confirms their removal, because an
     earlier response may have been lost.
@@ -434,7 +434,7 @@ def set_bounds(name: str, bounds: JobBounds, dask_scheduler: Any = None) -> bool
 
 
 def request_slots(name: str, slots: int, client_id: str, dask_scheduler: Any = None) -> bool:
-    """Replace a client's slot request for a partition. A request for 0 slots ends it.
+    """Replace a client's request for slots in a partition, or end it if `slots` is 0.
 
     The result is False if the partition is not adaptive.
     """
@@ -459,12 +459,12 @@ def adaptive_names(dask_scheduler: Any = None) -> set[str]:
 
 
 def slots_of_new_worker(scheduler: Any, name: str) -> int:
-    """Return the number of slots that a new worker adds, or 0 if the partition is not adaptive."""
+    """Return the number of slots that a new worker would add, or 0 without adaptation."""
     return _upper_bound(scheduler, name)[1]
 
 
 def max_running_tasks(scheduler: Any, name: str, slots: int) -> int:
-    """Return the number of tasks that a partition can run at a time once all its jobs have started.
+    """Return how many tasks a partition can run at a time once all of its jobs have started.
 
     `slots` is the number of slots that each task takes.
     """
@@ -475,12 +475,12 @@ def max_running_tasks(scheduler: Any, name: str, slots: int) -> int:
 
 
 def max_slots(scheduler: Any, name: str) -> int:
-    """Return the number of slots with the maximum number of jobs, or 0 if there is no maximum."""
+    """Return the number of slots if all allowed jobs run, or 0 if the partition is not adaptive."""
     return math.prod(_upper_bound(scheduler, name))
 
 
 def queued_jobs_of(scheduler: Any, name: str) -> int:
-    """Return the number of jobs of an adaptive partition that are queued or starting."""
+    """Return the number of an adaptive partition's jobs that are queued or starting."""
     record = _record(scheduler, name)
     if record is None or record.spec.bounds is None:
         return 0
@@ -488,7 +488,7 @@ def queued_jobs_of(scheduler: Any, name: str) -> int:
 
 
 def expects_workers(scheduler: Any, name: str) -> bool:
-    """Return whether a partition has jobs that are queued, starting, or can be started."""
+    """Return whether any job of a partition is queued, is starting, or can be started."""
     record = _record(scheduler, name)
     if record is None or not record.is_current:
         return False
@@ -496,7 +496,7 @@ def expects_workers(scheduler: Any, name: str) -> bool:
 
 
 def _upper_bound(scheduler: Any, name: str) -> tuple[int, int]:
-    """Return the maximum number of workers and the number of slots of each worker.
+    """Return the maximum number of workers and the number of slots per worker.
 
     Both are 0 if the partition is not adaptive.
     """

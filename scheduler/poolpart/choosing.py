@@ -1,4 +1,4 @@
-"""Placement of tasks on workers in a time that does not depend on the size of the cluster.
+"""Place tasks on workers in a time that does not depend on the size of the cluster.
 
 If a task requires a resource, or if a fence keeps it out of a partition, Dask compares all workers
 that may run it. This takes the scheduler several microseconds per worker (see
@@ -68,7 +68,7 @@ class _Group:
         return workers
 
     def in_turn(self) -> list[Any]:
-        """Return `MAX_COMPARED` workers that are evenly spaced and differ from call to call."""
+        """Return `MAX_COMPARED` evenly spaced workers, which differ from call to call."""
         number = len(self.workers)
         start = self._next_index
         self._next_index = (start + 1) % number
@@ -78,7 +78,7 @@ class _Group:
 
 
 class WorkerChooser(SchedulerPlugin):
-    """Scheduler plugin that selects the workers of tasks in partitions and outside fences."""
+    """Scheduler plugin that chooses workers for tasks in partitions and outside fences."""
 
     name = NAME
 
@@ -92,22 +92,22 @@ class WorkerChooser(SchedulerPlugin):
         scheduler.add_plugin(self)
 
     def uninstall(self) -> None:
-        """Remove the rule from the scheduler."""
+        """Remove the rule and the plugin from the scheduler."""
         self._rules.remove_all()
         self.scheduler.remove_plugin(NAME)
 
     # -- groups ------------------------------------------------------------------------
 
     def invalidate_groups(self) -> None:
-        """Invalidate the groups after a worker has changed its declared resources."""
+        """Invalidate all groups after a worker has changed its declared resources."""
         self._changes += 1
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
-        """Invalidate the groups after a worker has joined."""
+        """Invalidate all groups after a worker has joined."""
         self._changes += 1
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
-        """Delete the groups after a worker has left, so that no reference to its state remains."""
+        """Delete all groups after a worker has left, so that they do not keep its state alive."""
         self._changes += 1
         self._groups.clear()
 
@@ -121,7 +121,7 @@ class WorkerChooser(SchedulerPlugin):
                     group.free[state] = None
 
     def _group(self, name: str) -> _Group | None:
-        """Return a group of workers by partition name, rebuilt after changes.
+        """Return the workers of a partition as a group, which is rebuilt after changes.
 
         For `_OUTSIDE`, the group contains the workers outside all fences. The result is None if
         there are no fences.
@@ -139,7 +139,6 @@ class WorkerChooser(SchedulerPlugin):
         return group
 
     def _members(self, name: str) -> list[Any]:
-        """Return the states of the workers that currently belong to a group."""
         if name != _OUTSIDE:
             return workers_declaring(self.scheduler, name)
         enclosed: set[Any] = self.scheduler.plugins[FENCES].enclosed
@@ -148,7 +147,7 @@ class WorkerChooser(SchedulerPlugin):
     # -- the rule ----------------------------------------------------------------------
 
     def choose(self, task: Any) -> Any:
-        """Return the state of the worker for a task, or NotImplemented to let Dask decide."""
+        """Choose the worker for a task, or return NotImplemented to let Dask decide."""
         resource = only_resource_of(task)
         if resource is None:
             return NotImplemented

@@ -1,9 +1,9 @@
-"""Assignment of a CUDA device to each worker, stored on the scheduler.
+"""Assign a CUDA device to each worker, and record this on the scheduler.
 
-The assignment is part of the scheduler's state of the worker and is removed with the worker.
-Therefore, all tasks of a worker get the same device, and nothing has to be cleaned up. A restarted
-worker is a new worker for Dask and may have a new name, but it finds the device of its predecessor
-free.
+The assignment is part of the worker's state on the scheduler, and is removed together with the
+worker. Therefore, all tasks of a worker get the same device, and nothing has to be cleaned up. A
+restarted worker is a new worker for Dask and may have a new name, but it finds the device of its
+predecessor free.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _own: dict[str, int | None] = {}  # {worker address in this process: device inde
 
 @translate_leaving_errors()
 def own_device() -> int | None:
-    """Return the index of the CUDA device for this task's worker, or None if the worker has no GPU.
+    """Return the CUDA device index for this task's worker, or None if the worker has no GPU.
 
     The index refers to the devices that are visible to the worker. Workers are distributed evenly
     over the devices, because each worker is assigned the device with the fewest workers of its
@@ -68,7 +68,7 @@ def own_device() -> int | None:
 
 @translate_leaving_errors()
 def own_device_share() -> float:
-    """Return the fraction of the device memory that this task's worker may use, between 0 and 1.
+    """Return the fraction of device memory, from 0 to 1, that this task's worker may use.
 
     The fraction is 1 if no other worker shares the device. Workers of a partition that run on the
     same host and see the same number of devices share them evenly. A worker is counted as soon as
@@ -95,7 +95,7 @@ def own_device_share() -> float:
 
 
 def assign_device(address: str, gpus: Sequence[str], dask_scheduler: Any = None) -> int | None:
-    """Return the index of a worker's device in its list of UUIDs, or None if the worker has left.
+    """Return the index of a worker's device among its UUIDs, or None if the worker has left.
 
     The first call for a worker selects its device.
     """
@@ -108,7 +108,7 @@ def assign_device(address: str, gpus: Sequence[str], dask_scheduler: Any = None)
 
 
 def count_sharers(address: str, gpus: Sequence[str], dask_scheduler: Any = None) -> int:
-    """Return the number of workers that use a worker's device or are expected to, at least 1."""
+    """Return how many workers use, or are expected to use, the same device as a worker."""
     worker = dask_scheduler.workers.get(address)
     if worker is None:
         return 1
@@ -124,7 +124,7 @@ def count_sharers(address: str, gpus: Sequence[str], dask_scheduler: Any = None)
 
 
 def _least_used(scheduler: Any, worker: Any, gpus: Sequence[str]) -> str:
-    """Return the UUID of the device with the fewest workers in the partition.
+    """Return the UUID of the device that is used by the fewest workers in the partition.
 
     Ties are resolved in favor of the device with the fewest workers in the cluster.
     """

@@ -1,7 +1,7 @@
-"""Requests of clients that create partitions, move workers, and dissolve partitions.
+"""Handle client requests to create partitions, move workers, and dissolve partitions.
 
-Each of them is a single request to the scheduler, which completes or rejects it even if the client
-dies in the meantime. Concurrent requests are processed one after the other.
+Each operation is a single request, which the scheduler completes or rejects even if the client dies
+in the meantime. Concurrent requests are processed one after the other.
 """
 
 from __future__ import annotations
@@ -61,9 +61,10 @@ def call_steward(client: Client, operation: Callable[..., Any], **arguments: Any
 async def _run_operation(
     operation: Callable[..., Any], arguments: Mapping[str, Any], dask_scheduler: Any = None
 ) -> tuple[Any, str]:
-    """Call a function with the steward.
+    """Call a function on the scheduler, with the steward as its first argument.
 
-    The result is the return value and "", or None and the message of a PoolError.
+    The result consists of the return value and "" or, after a PoolError, of None and the error
+    message.
     """
     # If the error were raised here, Dask would log it with a traceback.
     with steward_of(dask_scheduler) as steward:
@@ -83,7 +84,7 @@ async def create_partitions(
     known_partitions: Collection[str],
     own_partitions: Collection[str],
 ) -> tuple[dict[str, str], list[WorkerInfo]]:
-    """Create all new partitions or none, and apply their rules to workers that join later.
+    """Create either all new partitions or none, and apply their rules to workers that join later.
 
     Parameters
     ----------
@@ -166,7 +167,7 @@ async def create_partitions(
 
 
 def _exists_message(steward: Steward, name: str, members: Sequence[WorkerRecord]) -> str:
-    """Return the error message if a rule does not select all workers of an existing partition."""
+    """Return an error message if a rule does not select all workers of an existing partition."""
     if name in steward.rules:
         return (
             f"Partition {name!r} already exists, and this call does not select all of its workers. "
@@ -193,7 +194,7 @@ def _exists_message(steward: Steward, name: str, members: Sequence[WorkerRecord]
 
 
 async def _expect_arrival(steward: Steward, members: Sequence[WorkerRecord]) -> None:
-    """Wait until new members of partitions declare their resources.
+    """Wait until the new members of partitions have declared their resources.
 
     Raises
     ------
@@ -211,7 +212,7 @@ async def _expect_arrival(steward: Steward, members: Sequence[WorkerRecord]) -> 
 
 
 def _prepare_scheduler(steward: Steward, rules: Mapping[str, Rule]) -> str:
-    """Prepare the scheduler for tasks of new partitions, and return a note for users or "".
+    """Prepare the scheduler for tasks in new partitions, and return a note for users or "".
 
     This enables features such as inheritance (see `features.py`), raises fences around exclusive
     partitions (see `fence.py`), and starts counting tasks (see `stats.py`). The note lists features
@@ -250,7 +251,7 @@ def _prepare_scheduler(steward: Steward, rules: Mapping[str, Rule]) -> str:
 async def grow_partition(
     steward: Steward, name: str, count: int, source: str | None, timeout_s: float
 ) -> list[str]:
-    """Move workers into a partition and return their names."""
+    """Move workers into a partition, and return their names."""
     check_count(_MOVES, count)
     steward.adopt_partition(name)
     joining = _select_joining(steward, name, count, source)
@@ -258,7 +259,7 @@ async def grow_partition(
 
 
 async def shrink_partition(steward: Steward, name: str, count: int, timeout_s: float) -> list[str]:
-    """Move workers out of a partition and return their names."""
+    """Move workers out of a partition, and return their names."""
     check_count(_MOVES, count)
     steward.adopt_partition(name)
     return await _move(steward, _select_leaving(steward, name, count), timeout_s)
@@ -267,7 +268,7 @@ async def shrink_partition(steward: Steward, name: str, count: int, timeout_s: f
 async def resize_partition(
     steward: Steward, name: str, count: int, source: str | None, timeout_s: float
 ) -> list[str]:
-    """Set the number of workers in a partition, and return the names of the workers moved."""
+    """Change the number of workers in a partition, and return the names of the workers moved."""
     check_count(f"the number of workers of partition {name!r}", count, minimum=0)
     steward.adopt_partition(name)
     rule = steward.rules[name]
@@ -294,7 +295,7 @@ async def resize_partition(
 
 
 def _requested_workers(rule: Rule, default: int) -> int:
-    """Return the number of workers that a rule requests, or the default if there is none."""
+    """Return the number of workers that an `n_workers` rule requests, or else the default."""
     return rule.workers if isinstance(rule, n_workers) else default
 
 
@@ -341,7 +342,7 @@ def _select_joining(
 
 
 def _select_leaving(steward: Steward, name: str, count: int) -> dict[WorkerRecord, str | None]:
-    """Select the workers to move out of a partition, and return the destination of each.
+    """Select workers to move out of a partition, and return the destination of each worker.
 
     Raises
     ------
@@ -360,7 +361,7 @@ def _select_leaving(steward: Steward, name: str, count: int) -> dict[WorkerRecor
 
 
 def _destination(steward: Steward, record: WorkerRecord) -> str | None:
-    """Return the partition that a worker moves to when it leaves its partition, or None.
+    """Return the partition to which a worker moves when it leaves its own, or None.
 
     A borrowed worker returns to its home, and other workers go to the partition with the rule
     `rest`. A worker that leaves the latter partition has no partition afterwards.
@@ -374,7 +375,7 @@ def _destination(steward: Steward, record: WorkerRecord) -> str | None:
 async def _move(
     steward: Steward, targets: Mapping[WorkerRecord, str | None], timeout_s: float
 ) -> list[str]:
-    """Move workers to the given partitions, or out of all partitions if the target is None.
+    """Move workers to the given partitions. The target None stands for no partition.
 
     The result contains the names of the workers. A worker whose tasks do not finish in time stays
     in its partition.
@@ -410,7 +411,7 @@ async def _move(
 
 
 def _settled_members(steward: Steward, name: str) -> list[WorkerRecord]:
-    """Return the members that can be moved.
+    """Return the members that can be moved now.
 
     Members that are about to arrive are excluded, because they may still return to their former
     partition.
@@ -421,7 +422,7 @@ def _settled_members(steward: Steward, name: str) -> list[WorkerRecord]:
 def _in_order(
     steward: Steward, records: Sequence[WorkerRecord], destination: str | None = None
 ) -> list[WorkerRecord]:
-    """Sort workers by the order in which they are moved to a destination.
+    """Sort workers into the order in which they are moved to a destination.
 
     Workers whose home is the destination come first, followed by workers without a partition and
     borrowed workers, and then by all others. Within each of these groups, workers without
@@ -443,7 +444,7 @@ def _in_order(
 def request_dissolution(
     client: Client, names: Collection[str] | None, timeout_s: float
 ) -> list[str]:
-    """Dissolve partitions, or all partitions if `names` is None, and return their names."""
+    """Dissolve the named partitions, or all if `names` is None, and return their names."""
     arguments = {"names": names, "timeout_s": timeout_s, "client_id": client.id}
     try:
         dissolved: list[str] = call_steward(client, dissolve_partitions, **arguments)
@@ -455,7 +456,7 @@ def request_dissolution(
 async def dissolve_partitions(
     steward: Steward, names: Collection[str] | None, timeout_s: float, client_id: str
 ) -> list[str]:
-    """Dissolve partitions, or all partitions if `names` is None, and return their names.
+    """Dissolve the named partitions, or all if `names` is None, and return their names.
 
     `client_id` is the ID of the client that sends the request. The client has to register again
     afterwards.
@@ -498,18 +499,18 @@ async def dissolve_partitions(
 
 
 def _format_partitions(partitions: Sequence[str]) -> str:
-    """Format partition names for a message, for example "partitions 'A' and 'B'"."""
+    """Format partition names for a message, such as "partitions 'A' and 'B'"."""
     plural = "s" if len(partitions) > 1 else ""
     return f"partition{plural} {' and '.join(map(repr, partitions))}"
 
 
 def _existing(steward: Steward, names: Collection[str] | None) -> list[str]:
-    """Return the partitions with one of the names, or all partitions if `names` is None."""
+    """Return the names of existing partitions, restricted to `names` unless it is None."""
     return [name for name in steward.rules if names is None or name in names]
 
 
 def _belongs(record: WorkerRecord, names: Collection[str]) -> bool:
-    """Return whether a worker belongs to one of the partitions.
+    """Return whether a worker belongs to one of the given partitions.
 
     A worker without a partition belongs to a partition if it was started with its resource.
     """
@@ -521,7 +522,7 @@ def _belongs(record: WorkerRecord, names: Collection[str]) -> bool:
 async def _wait_for_tasks(
     steward: Steward, names: Collection[str] | None, timeout_s: float
 ) -> None:
-    """Wait until the tasks of partitions have finished.
+    """Wait until all tasks in the given partitions have finished.
 
     Raises
     ------
@@ -544,6 +545,5 @@ async def _wait_for_tasks(
 
 
 def _unfinished(scheduler: Any, names: Collection[str]) -> list[Any]:
-    """Return the states of the unfinished tasks of partitions."""
     tasks = scheduler.tasks.values()
     return [task for task in tasks if task.state in _UNFINISHED and requires_any(task, names)]

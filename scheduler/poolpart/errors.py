@@ -6,7 +6,7 @@ class PoolError(RuntimeError):
 
 
 class PipeClosed(Exception):  # noqa: N818 - not an error, like StopIteration
-    """Raised by `put` if the pipe is closed, and by `get` if it is closed and empty."""
+    """Raised by `put` if the pipe is closed, and by `get` if the pipe is closed and empty."""
 
 
 class PipeFailed(RuntimeError):  # noqa: N818 - describes the state of the pipe

@@ -1,4 +1,4 @@
-"""Fences, which keep other tasks off the workers of exclusive partitions.
+"""Fences that keep other tasks off the workers of exclusive partitions.
 
 A Dask resource only works in one direction. Tasks that request it run on workers that have it, but
 all other tasks can run there as well. A fence adds the other direction. Only tasks that take a slot
@@ -51,7 +51,7 @@ _EXPECTED = "poolpart-partition"  # key in the scheduler's state of a worker: it
 
 
 def raise_fence(scheduler: Any, name: str) -> None:
-    """Keep tasks without the resource of a partition off its workers from now on.
+    """From now on, keep tasks that do not request a partition's resource off its workers.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def raise_fence(scheduler: Any, name: str) -> None:
 
 
 def set_expected_partition(scheduler: Any, worker: Any, name: str | None) -> None:
-    """Record the future partition of a worker, and enclose the worker in its fence immediately."""
+    """Record a worker's future partition, and enclose the worker in its fence immediately."""
     worker.extra.pop(_EXPECTED, None)
     if name is not None:
         worker.extra[_EXPECTED] = name
@@ -91,7 +91,7 @@ def fence_names(scheduler: Any) -> frozenset[str]:
 
 
 class Fences(SchedulerPlugin):
-    """Scheduler plugin that keeps tasks without the resource of a fence off enclosed workers."""
+    """Scheduler plugin that keeps tasks off fenced workers whose resource they do not request."""
 
     name = NAME
 
@@ -106,19 +106,19 @@ class Fences(SchedulerPlugin):
         scheduler.add_plugin(self)
 
     def uninstall(self) -> None:
-        """Remove all rules from the scheduler."""
+        """Remove all rules and the plugin from the scheduler."""
         remove_fence_rules(self._rules, self.scheduler)
         self.scheduler.remove_plugin(NAME)
 
     # -- enclosed workers --------------------------------------------------------------
 
     def update_workers(self) -> None:
-        """Enclose or release all workers after a fence was raised or lowered."""
+        """Enclose or release each worker after a fence was raised or lowered."""
         for worker in self.scheduler.workers.values():
             self.update_worker(worker)
 
     def update_worker(self, worker: Any) -> None:
-        """Enclose or release a worker according to its resources and its future partition."""
+        """Enclose or release a worker, depending on its resources and its future partition."""
         declares = any(worker.resources.get(name) for name in self.names)
         if declares or worker.extra.get(_EXPECTED) in self.names:
             self.changes += worker not in self.enclosed
@@ -130,24 +130,24 @@ class Fences(SchedulerPlugin):
             admit_other_tasks(self.scheduler, worker)
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
-        """Enclose a joining worker if necessary."""
+        """Enclose a joining worker if it belongs to a fence."""
         self.update_worker(scheduler.workers[worker])
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
-        """Remove a worker that has left from the enclosed workers."""
+        """Forget a worker that has left."""
         self.enclosed.intersection_update(scheduler.workers.values())
 
     # -- the rule ----------------------------------------------------------------------
 
     def keeps_out(self, task: Any) -> bool:
-        """Return whether fences keep a task out, because it requests no resource of a fence."""
+        """Return whether fences exclude a task because it does not request their resources."""
         resources = task.resource_restrictions
         return not resources or self.names.isdisjoint(resources)
 
     # -- warnings ----------------------------------------------------------------------
 
     def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:
-        """Warn if a task has to wait because of fences."""
+        """Warn if a task has to wait because of a fence."""
         if finish not in ("no-worker", "queued"):
             return
         # A queued task may also be waiting for other tasks to finish.

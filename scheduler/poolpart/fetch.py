@@ -1,4 +1,4 @@
-"""Direct transfer of results and other data from workers, without passing through the scheduler."""
+"""Transfer results and other data directly from workers, bypassing the scheduler."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _held: dict[str, Any] = {}  # held bytes by name
 def fetch_available(
     client: Client, keys: Collection[str], patience_s: float = 2.0, *, holder: str | None = None
 ) -> dict[str, Any]:
-    """Fetch the results that are currently available.
+    """Fetch those results that are currently available.
 
     Call this function repeatedly to fetch further results. Unlike `Client.gather`, it is suitable
     for a long-running consumer. If a worker dies, `gather` tries to connect to it for half a minute
@@ -88,7 +88,7 @@ async def _fetch_from(
 async def _unless_silent(
     client: Client, address: str, request: Coroutine[Any, Any, T], patience_s: float
 ) -> T | None:
-    """Await a request to a worker, or return None if the worker stops responding.
+    """Await a request to a worker, but return None if the worker stops responding.
 
     The worker counts as unresponsive if it does not answer a ping within `patience_s` seconds.
     """
@@ -109,7 +109,7 @@ async def _unless_silent(
 
 
 def hold_bytes(name: str, data: Any) -> str:
-    """Keep bytes in this worker's memory until they are fetched, and return the worker's address.
+    """Keep bytes in this worker's memory until they are fetched, and return its address.
 
     The caller must limit the amount of data, because bytes that are never fetched are never freed.
     """
@@ -125,7 +125,7 @@ def holds_bytes() -> bool:
 
 
 def fetch_held_bytes(client: Client, address: str, name: str, patience_s: float = 2.0) -> Any:
-    """Fetch the bytes that a worker holds under a name, and free them on the worker.
+    """Fetch the bytes that a worker holds under a given name, and free them there.
 
     `address` is the return value of `hold_bytes`. The result is None if the bytes have already been
     fetched, if the worker has died, or if it does not respond for `patience_s` seconds. A transfer
@@ -144,6 +144,6 @@ def fetch_held_bytes(client: Client, address: str, name: str, patience_s: float 
 
 
 def _hand_over(name: str) -> dict[str, Any]:
-    """Return held bytes and free them. This is a handler of the worker."""
+    """Return the held bytes, and free them. Workers call this function as a request handler."""
     data = _held.pop(name, None)
     return {"data": None if data is None else wrap_bytes(data)}

@@ -22,7 +22,7 @@ MOST_PER_SLOT = 16  # maximum number of tasks in flight per slot if no window is
 
 
 class TaskSubmitter(Protocol):
-    """The part of a `Partition` that is used here."""
+    """The part of a `Partition` that this module uses."""
 
     name: str
     by_rule: bool  # whether the partition can be dissolved
@@ -36,7 +36,7 @@ class TaskSubmitter(Protocol):
 
 
 class _PipeItems:
-    """Items of a pipe, whose producers wait until the items are taken."""
+    """Items from a pipe, whose producers wait until the items are taken."""
 
     def __init__(self, pipe: Pipe) -> None:
         self.name = f"pipe {pipe.name!r}"
@@ -46,18 +46,17 @@ class _PipeItems:
         _ = pipe.client  # on a worker, a thread without a task would create another client
 
     def take(self, futures: Sequence[Future], limit: int, seconds: float) -> Sequence[Any]:
-        """Return up to `limit` items, after waiting for an item or for the end of a task."""
+        """Return up to `limit` items, after waiting for an item or the end of a task."""
         items, self.closed, self.drained = take_items(self._pipe, futures, limit, seconds)
         return items
 
     def fail(self, reason: str) -> None:
-        """Make the pipe fail, so that its producers end."""
         with suppress(PipeFailed, OSError):  # the pipe or the scheduler is gone
             self._pipe.fail(reason)
 
 
 class _IterableItems:
-    """Items of an iterable, which are read one at a time when a slot is free."""
+    """Items from an iterable, each of which is only read when a slot is free."""
 
     name = "the iterable"
     closed = True  # items never arrive on their own
@@ -67,7 +66,7 @@ class _IterableItems:
         self._iterator = iter(iterable)
 
     def take(self, futures: Sequence[Future], limit: int, seconds: float) -> Sequence[Any]:
-        """Return the next item, or an empty list at the end of the iterable."""
+        """Return the next item, or no items at the end of the iterable."""
         for item in self._iterator:
             return [item]
         self.drained = True
@@ -86,7 +85,7 @@ def _items_of(source: object) -> _PipeItems | _IterableItems:
 
 
 class ItemTasks:
-    """Tasks for the items of a pipe or an iterable, of which at most `window` are in flight.
+    """Tasks that process the items of a pipe or iterable, at most `window` at a time.
 
     By default, the window is two tasks per slot, so that the next item is available when a task
     ends. It doubles if this process finds that a full window has shrunk to fewer tasks than slots,
@@ -125,7 +124,7 @@ class ItemTasks:
         self._stopped = False
 
     def run(self) -> int:
-        """Run tasks until all items have been processed, and return the number of items.
+        """Run tasks until all items are processed, and return the number of items.
 
         If a task or the source of the items raises an error, the other tasks are canceled, the pipe
         fails with the error, and the error is raised.
@@ -160,7 +159,7 @@ class ItemTasks:
         self._cancel()
 
     def _cancel(self) -> None:
-        """Cancel the tasks that have not started."""
+        """Cancel tasks that have not started yet."""
         if self._partition.client.status == "running":  # a closed client has canceled them itself
             self._partition.client.cancel(self._futures())
 
@@ -168,7 +167,7 @@ class ItemTasks:
         return [future for future, _, _ in list(self._running.values())]
 
     def _update_slots(self) -> None:
-        """Update the number of slots, which changes if partitions grow, shrink, or lose workers.
+        """Update the number of slots, which changes when partitions grow, shrink, or lose workers.
 
         Raises
         ------
@@ -202,7 +201,7 @@ class ItemTasks:
             self._count += 1
 
     def _check_tasks(self) -> None:
-        """Remove ended tasks, and raise the error of a failed task.
+        """Remove tasks that have ended, and raise the error of a failed task.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Formatting of tables as plain text and as HTML for notebooks."""
+"""Format tables as plain text, and as HTML for notebooks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def html_table(title: str, head: Sequence[str], rows: Iterable[Sequence[object]]
 
 
 def text_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return a plain-text table whose columns are padded to equal width."""
+    """Return a plain-text table whose columns have a fixed width."""
     cells = [[str(cell) for cell in row] for row in (head, *rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return "\n".join(
@@ -39,12 +39,12 @@ def text_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def html_paragraph(text: str) -> str:
-    """Return a text as an HTML paragraph."""
+    """Format a text as an HTML paragraph."""
     return _PARAGRAPH.generate(text=text).decode()
 
 
 def format_seconds(seconds: float) -> str:
-    """Format a running time with three significant digits, or as a dash if it is zero."""
+    """Format a duration with three significant digits, or as a dash if it is zero."""
     if not seconds:
         return "–"
     return f"{seconds:,.0f}" if seconds >= 100 else f"{seconds:.3g}"

@@ -1,4 +1,4 @@
-"""Amount of work that a map keeps in flight so that workers do not wait for the client."""
+"""Determine how much work a map keeps in flight so that workers do not wait for the client."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ IDLE = 0.1  # the lead time is too short if both sides are idle for more than th
 
 
 class LeadTime:
-    """Amount of work in flight for each slot of a map, in seconds.
+    """Amount of work in flight per slot of a map, in seconds.
 
     A client that computes between results, or that runs on a busy machine, sends the next tasks
     late. The lead time covers this delay. It doubles if both the slots and the client were idle for
@@ -52,11 +52,11 @@ class LeadTime:
         self._busy_s.update(busy_s)
 
     def count_wait(self, seconds: float) -> None:
-        """Record a time in seconds for which the client has waited for tasks."""
+        """Record for how many seconds the client has waited for tasks."""
         self._waited_s += seconds
 
     def review(self, window: int) -> None:
-        """Double the lead time if both sides were idle during the last `window` tasks."""
+        """Double the lead time if client and slots were idle during the last `window` tasks."""
         if self._tasks < window:
             return
         elapsed_s = time.monotonic() - self._since

@@ -1,4 +1,4 @@
-"""Maps of a function over many items, with several items per task and few tasks in flight.
+"""Apply a function to many items, with several items per task and few tasks in flight.
 
 A map over the results of another map is a single map with two stages. Each task of the first stage
 is followed by a task of the second stage, which fetches the result of the first directly from its
@@ -52,7 +52,7 @@ Row = tuple[Call, ...]  # calls of an item by stage
 
 @dataclass(frozen=True)
 class Chunk:
-    """Items of a task, with the index of the first item and the calls of each item by stage."""
+    """Items of a task, with the index of the first item and the calls in each stage."""
 
     first: int
     rows: Sequence[Row]
@@ -60,7 +60,7 @@ class Chunk:
 
 @dataclass(frozen=True)
 class ChunkResult:
-    """Results of a chunk, with the time that each stage took."""
+    """Results of a chunk, and the time spent in each stage."""
 
     results: list[Any]  # at least one, but not all if an item failed or the time limit was reached
     seconds: tuple[float, ...]  # duration by stage
@@ -142,7 +142,7 @@ def _call(function: Callable[..., Any], call: Call, keywords: dict[str, Any]) ->
 
 
 def _sendable(error: Exception) -> Exception:
-    """Return a copy of an error without its traceback, or a similar error that can be pickled."""
+    """Return a copy of an error without its traceback, or a substitute that can be pickled."""
     try:
         copy: Exception = loads(dumps(error))
     except Exception:
@@ -152,7 +152,7 @@ def _sendable(error: Exception) -> Exception:
 
 
 class ChunkSize:
-    """Number of items for a task of about `target_s` seconds, learned from previous chunks.
+    """Number of items that take about `target_s` seconds, learned from previous chunks.
 
     The first chunk has one item. Later chunks have at most four times as many items as have been
     processed so far, and their items and results are limited to about 1 MiB.
@@ -175,7 +175,7 @@ class ChunkSize:
         self._item_s = self._item_bytes = 0.0  # moving averages
 
     def learn(self, items: int, seconds: float, nbytes: int) -> None:
-        """Update the averages with a chunk that has been processed."""
+        """Update the averages with the measurements of a processed chunk."""
         weight = 0.3 if self._tried else 1.0
         self._item_s += weight * (seconds / items - self._item_s)
         self._item_bytes += weight * (nbytes / items - self._item_bytes)
@@ -188,7 +188,7 @@ class ChunkSize:
         return round(max(1, min(GROWTH * self._tried, by_time, by_bytes, MOST_ITEMS)))
 
     def chunks(self, items: int, seconds: float, nbytes: int) -> int:
-        """Return the number of chunks of `items` items that take `seconds` or have `nbytes` bytes.
+        """Return how many chunks of `items` items take `seconds` or contain `nbytes` bytes.
 
         The smaller of both numbers is returned, or 0 if no item has been processed yet.
         """
@@ -199,13 +199,13 @@ class ChunkSize:
         return int(min(by_time, by_bytes))
 
     def will_grow(self, items: int) -> bool:
-        """Return whether `items` is limited because few items have been processed so far."""
+        """Return whether `items` is only limited because few items were processed so far."""
         return items >= GROWTH * self._tried
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Stage of a map, with its function, partition and options."""
+    """Stage of a map, which calls one function in one partition."""
 
     client: Client
     partition: str
@@ -233,7 +233,7 @@ class Stage:
         check_wait_s(self.empty_s)
 
     def request_capacity(self) -> PartitionCapacity:
-        """Ask the scheduler whether and how many tasks of this stage the partition can run."""
+        """Ask the scheduler how many tasks of this stage the partition can run, if any."""
         return request_capacity(self.client, self.partition, self.slots, self.by_rule)
 
     def send(
@@ -243,7 +243,7 @@ class Stage:
         calls: Sequence[Sequence[Call]],
         previous_tasks: Sequence[Future] | None = None,
     ) -> list[Future]:
-        """Submit a task for each chunk, optionally after the tasks of the previous stage."""
+        """Submit a task for each chunk, to run after the chunk's task in the previous stage."""
         # Dask only retries tasks that fail, so errors must not become results if `retries` is set.
         keep_errors = self.return_exceptions and not self.retries
         # A single message for all tasks is cheaper for the scheduler than one message per task.
@@ -272,7 +272,7 @@ class Stage:
 
 
 class Results(Iterator[Any]):
-    """Iterator over the results of a function for many items, as returned by `Partition.map`.
+    """Iterator over a function's results for many items, as returned by `Partition.map`.
 
     The first tasks start immediately. While results are read, further items are submitted and their
     results are fetched. Close or delete the iterator to stop early. It has a length if all
@@ -317,7 +317,7 @@ class Results(Iterator[Any]):
     def _continue_map(
         self, previous: Results, stage: Stage, iterables: Sequence[Iterable[Any]]
     ) -> None:
-        """Take over the source and the running tasks of an unread map as the previous stages."""
+        """Take over the source and running tasks of an unread map as the preceding stages."""
         calls: Iterator[Call] = zip(*iterables, strict=False) if iterables else repeat(())
         self._stages = (*previous._stages, stage)
         self._waits = [*previous._waits, _worker_wait(stage)]
@@ -373,7 +373,7 @@ class Results(Iterator[Any]):
         )
 
     def close(self) -> None:
-        """Cancel pending tasks and discard unread results."""
+        """Cancel pending tasks, and discard unread results."""
         self._closed = True
         self._failed = None
         for held in (self._ready, self._undelivered, self._unfinished):
@@ -390,7 +390,7 @@ class Results(Iterator[Any]):
     # -- steps -------------------------------------------------------------------------
 
     def _step(self) -> None:
-        """Wait for tasks, fetch their results, and send further tasks."""
+        """Wait for tasks, fetch their results, and submit further tasks."""
         if not self._running:
             self._submit()
         if self._running:
@@ -402,7 +402,7 @@ class Results(Iterator[Any]):
             self.close()
 
     def _grow_if_idle(self) -> None:
-        """Increase the lead time if the client is about to wait while slots are idle.
+        """Increase the lead time if the client is about to wait while some slots are idle.
 
         This happens in an ordered map if later tasks have finished before a slow one.
         """
@@ -412,7 +412,7 @@ class Results(Iterator[Any]):
             self._submit()
 
     def _update_slots(self) -> None:
-        """Update the number of slots, which changes if partitions grow, shrink, or lose workers.
+        """Update the number of slots, which changes when partitions grow, shrink, or lose workers.
 
         Raises
         ------
@@ -427,7 +427,7 @@ class Results(Iterator[Any]):
         self._next_check = time.monotonic() + until_next
 
     def _submit(self) -> None:
-        """Send chunks until the window is full, in as few messages as possible."""
+        """Submit chunks until the window is full, in as few messages as possible."""
         size, window = self._sizes()
         free = window - len(self._running)
         # Several chunks are sent in one message, since the tasks in flight keep the slots busy.
@@ -451,7 +451,7 @@ class Results(Iterator[Any]):
         self._run(chunks)
 
     def _sizes(self) -> tuple[int, int]:
-        """Return the number of items in the next chunk, and the maximum number of tasks."""
+        """Return the number of items per chunk, and the maximum number of tasks in flight."""
         learned = self._size.items(self._target_s())
         given = next((stage.chunk for stage in self._stages[::-1] if stage.chunk), None)
         size = given or learned
@@ -468,7 +468,7 @@ class Results(Iterator[Any]):
         return size, window
 
     def _run(self, chunks: Sequence[Chunk], previous_tasks: list[Future] | None = None) -> None:
-        """Send chunks through all stages, or through the last stage after `previous_tasks`."""
+        """Submit chunks to all stages, or only to the last stage, after `previous_tasks`."""
         if not chunks:
             return
         firsts = [chunk.first for chunk in chunks]
@@ -484,7 +484,7 @@ class Results(Iterator[Any]):
             call_when_done(future, self._ended.put)
 
     def _next_chunk(self, size: int, fresh: bool) -> Chunk | None:
-        """Return the next chunk, or None if there is none.
+        """Return the next chunk, or None if no items are left.
 
         Items that have to be sent again come first. New items are only read if `fresh` is true.
         """
@@ -510,7 +510,7 @@ class Results(Iterator[Any]):
         return max(CHUNK_S, CHUNK_S_PER_SLOT * max(self._slots))
 
     def _wait(self) -> list[Future]:
-        """Wait until tasks have ended, lending the slots of the calling task in the meantime."""
+        """Wait until at least one task has ended. Meanwhile, the calling task lends its slots."""
         ended: list[Future] = []
         started = time.monotonic()
         with lend_slots(self._ended.empty()):
@@ -524,7 +524,7 @@ class Results(Iterator[Any]):
         return ended
 
     def _check_while_waiting(self) -> None:
-        """Update the number of slots regularly, and raise if the client was closed."""
+        """Update the number of slots at intervals, and raise an error if the client was closed."""
         if self._stages[-1].client.status in ("closing", "closed"):
             raise CancelledError(
                 f"The client that partition {self._stages[-1].partition!r} uses was closed."
@@ -534,7 +534,7 @@ class Results(Iterator[Any]):
             self._update_slots()
 
     def _collect_results(self, ended: list[Future]) -> None:
-        """Fetch the results of ended tasks in a single request."""
+        """Fetch the results of all ended tasks in a single request."""
         finished = []
         for future in ended:
             if future.status == "finished":
@@ -553,14 +553,14 @@ class Results(Iterator[Any]):
         self._lead.review(self._sizes()[1])
 
     def _busy_s(self, seconds: Sequence[float]) -> dict[str, float]:
-        """Return the time that a task took by partition, divided by the number of slots."""
+        """Return the time spent in each partition, divided by the number of slots."""
         busy_s: dict[str, float] = {}
         for stage, stage_s, slots in zip(self._stages, seconds, self._slots, strict=True):
             busy_s[stage.partition] = busy_s.get(stage.partition, 0.0) + stage_s / max(1, slots)
         return busy_s
 
     def _deliver(self) -> None:
-        """Move the results that come next to the queue of ready results."""
+        """Move results to the queue of ready results when it is their turn."""
         while self._undelivered and self._failed is None:
             first = self._next_item if self._stages[-1].ordered else next(iter(self._undelivered))
             if first not in self._undelivered:
@@ -579,7 +579,7 @@ class Results(Iterator[Any]):
                 heapq.heappush(self._unfinished, (first + count, chunk.rows[count:]))
 
     def _raise(self, chunk: Chunk, future: Future) -> NoReturn:
-        """Close the map, and raise the error of a task with a note that names the item."""
+        """Close the map, and raise a task's error with a note that names the items."""
         self.close()
         try:
             future.result()
@@ -599,12 +599,12 @@ def _worker_wait(stage: Stage) -> WorkerWait:
 
 
 def _is_item_error(error: BaseException | None) -> bool:
-    """Return whether an error was raised by the function for an item, rather than by Dask."""
+    """Return whether an error was raised by the mapped function, rather than by Dask."""
     return any(note.startswith(NOTE) for note in getattr(error, "__notes__", ()))
 
 
 def _length(iterable: Iterable[Any]) -> float:
-    """Return the number of remaining items, or infinity if an iterable has no length."""
+    """Return the number of remaining items, or infinity if the iterable has no length."""
     if isinstance(iterable, Results):
         return iterable._length - iterable.done
     return len(iterable) if isinstance(iterable, Sized) else math.inf

@@ -1,4 +1,4 @@
-"""Registration of clients, and rejection of tasks that could never run.
+"""Register clients, and reject tasks that could never run.
 
 A client registers with the scheduler before its first task for a partition (`register`). From then
 on, features such as inheritance are enabled in the partition (see `features.py`), and a rule checks
@@ -49,13 +49,13 @@ NAME = "poolpart-registrations"
 
 
 class MemberName(str):
-    """Name or address of a member, which the scheduler resolves to an address."""
+    """Name or address of a member, which the scheduler translates to an address."""
 
     __slots__ = ()
 
 
 def register(client: Client, name: str, slots: int, by_rule: bool) -> bool:
-    """Register a client for a partition unless it is already registered.
+    """Register a client for a partition, unless it is already registered.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def register(client: Client, name: str, slots: int, by_rule: bool) -> bool:
 
 @dataclass(frozen=True)
 class PartitionCapacity:
-    """Ability of a partition to run tasks of a certain size."""
+    """How many tasks of a given size a partition can run."""
 
     max_running: int  # number of tasks that run at a time, once all adaptive jobs have started
     has_workers: bool  # whether a worker exists, is queued or starting, or can be started
@@ -114,7 +114,7 @@ class PartitionCapacity:
 
 
 def request_capacity(client: Client, name: str, slots: int, by_rule: bool) -> PartitionCapacity:
-    """Ask the scheduler whether and how many tasks with `slots` slots a partition can run.
+    """Ask the scheduler how many tasks with `slots` slots a partition can run, if any.
 
     The arguments are the same as in `register`.
     """
@@ -128,7 +128,7 @@ def request_capacity(client: Client, name: str, slots: int, by_rule: bool) -> Pa
 
 
 class Registrations(SchedulerPlugin):
-    """Scheduler plugin that stores the registered clients and rejects their impossible tasks."""
+    """Scheduler plugin that stores registered clients and rejects their impossible tasks."""
 
     name = NAME
 
@@ -156,12 +156,12 @@ class Registrations(SchedulerPlugin):
             self.with_rule.add(name)
 
     def remove_client(self, scheduler: Any, client: str) -> None:
-        """Remove the registrations of a client that has left."""
+        """Remove all registrations of a client that has left."""
         for name in [name for name, clients in self.clients.items() if client in clients]:
             self.unregister(name, client)
 
     def unregister(self, name: str, client: str) -> None:
-        """Remove the registration of a client for a partition.
+        """Remove a client's registration for a partition.
 
         If no other client keeps the registrations of a partition without a rule, all of them are
         removed.
@@ -184,7 +184,7 @@ class Registrations(SchedulerPlugin):
     # -- tasks -------------------------------------------------------------------------
 
     def _check(self, graph: dict[str, Any]) -> dict[str, Any]:
-        """Return the arguments of a graph, with the names of members replaced by addresses.
+        """Check an arriving graph, and replace the names of members by addresses.
 
         Raises
         ------
@@ -207,7 +207,7 @@ class Registrations(SchedulerPlugin):
         return {**graph, "global_annotations": {**annotations, "workers": workers}}
 
     def _refuse(self, client: str, resources: Mapping[str, float]) -> None:
-        """Raise PoolError if tasks of a client with these resources could never run."""
+        """Raise PoolError if a client's tasks with these resources could never run."""
         for name, slots in resources.items():
             if client in self.clients.get(name, ()):
                 objection = rejection_reason(self.scheduler, name, slots, name in self.with_rule)
@@ -223,7 +223,7 @@ async def _register(
     in_task: bool,
     dask_scheduler: Any = None,
 ) -> tuple[bool, str, list[str] | None]:
-    """Register a client unless its task could never run.
+    """Register a client, unless its task could never run.
 
     Returns
     -------
@@ -257,7 +257,7 @@ async def _register(
 
 
 def partition_names(dask_scheduler: Any = None) -> list[str]:
-    """Return the names of all partitions, including created and adaptive ones without workers.
+    """Return the names of all partitions, including those without workers.
 
     Runs on the scheduler.
     """
@@ -271,7 +271,7 @@ def partition_names(dask_scheduler: Any = None) -> list[str]:
 
 
 def expects_any_worker(scheduler: Any, name: str, slots: float) -> bool:
-    """Return whether a partition has a worker, or a worker is starting or can be started."""
+    """Return whether a partition has a worker, or can expect one."""
     steward: Steward | None = scheduler.plugins.get(STEWARD)
     return bool(
         has_worker_for(scheduler, name, slots)
@@ -315,7 +315,7 @@ def release_partitions(
 
 
 def release_statistics(scheduler: Any) -> None:
-    """Delete the statistics, or let them end with the last registered client if there is one."""
+    """Delete the statistics or, if clients are registered, let them end with the last one."""
     if NAME in scheduler.plugins:
         statistics_of(scheduler).is_kept = False
     else:
@@ -323,13 +323,13 @@ def release_statistics(scheduler: Any) -> None:
 
 
 def has_rule(scheduler: Any, name: str) -> bool:
-    """Return whether a partition was created by a division of the pool and is not dissolved."""
+    """Return whether a partition was created by dividing the pool and still exists."""
     steward: Steward | None = scheduler.plugins.get(STEWARD)
     return steward is not None and name in steward.rules
 
 
 def rejection_reason(scheduler: Any, name: str, slots: float, has_or_had_rule: bool) -> str:
-    """Return the reason why a task could never run in a partition, or "".
+    """Return why a task could never run in a partition, or "" if it can.
 
     If the partition has no members, the task waits, because the only member may be restarting.
     """
@@ -356,7 +356,7 @@ def rejection_reason(scheduler: Any, name: str, slots: float, has_or_had_rule: b
 
 
 def addresses_of_members(scheduler: Any, name: str, workers: Sequence[str]) -> list[str]:
-    """Return the current addresses of members that are given by name or address.
+    """Return the current address of each member, given its name or address.
 
     An address without a worker is returned unchanged, because the worker may have just left.
 

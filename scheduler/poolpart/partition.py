@@ -1,4 +1,4 @@
-"""Partitions, which run tasks on the workers that declare a Dask resource."""
+"""Partitions, which run tasks on workers that declare a Dask resource."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _entered: ContextVar[tuple[ExitStack, ...]] = ContextVar("_entered", default=())
 
 
 class Partition:
-    """Group of workers that declare the resource `name`, with methods to run tasks on them.
+    """Group of workers that declare the resource `name`. Its methods run tasks on these workers.
 
     Each task of a partition occupies a slot of the resource, and therefore runs only on these
     workers. The members are the workers that currently declare the resource, including restarted
@@ -110,13 +110,13 @@ class Partition:
 
     @property
     def workers(self) -> tuple[WorkerInfo, ...]:
-        """Current members, sorted by name."""
+        """Current members of the partition, sorted by name."""
         members = (w for w in all_workers(self.client) if w.resources.get(self.name))
         return tuple(sorted(members, key=lambda w: (len(w.name), w.name)))  # sorts 9 before 10
 
     @property
     def slots(self) -> int:
-        """Maximum number of tasks that the partition runs at the same time."""
+        """Maximum number of tasks that the partition can run at the same time."""
         return int(sum(worker.resources[self.name] for worker in self.workers))
 
     def __len__(self) -> int:
@@ -131,15 +131,16 @@ class Partition:
         return str(query_for_repr(self._client, size_of, name=self.name) or "")
 
     def _repr_html_(self) -> str:
-        """Return the table of the partition's statistics for notebooks."""
+        """Return the partition's statistics as an HTML table for notebooks."""
         return table_of_partition(lambda: self.client, repr(self), self.name)
 
     def stats(self) -> PartitionStats:
-        """Return the partition's current load and counts of finished tasks, for all clients.
+        """Return the partition's current load and its counts of finished tasks, for all clients.
 
-        In a divided pool, counting begins with the division. In a partition that the workers were
-        started with, it begins when a client submits its first task through `Partition`, or when
-        this method is first called. `PartitionStats.since` contains the time when counting began.
+        In a divided pool, counting begins with the division. In a partition whose workers were
+        started with its resource, counting begins when a client submits its first task through
+        `Partition`, or when this method is first called. `PartitionStats.since` contains the time
+        when counting began.
 
         Raises
         ------
@@ -155,7 +156,7 @@ class Partition:
         return stats[0]
 
     def tasks(self) -> TaskTable:
-        """Return a table of the tasks of the partition, for all clients.
+        """Return a table of the partition's tasks, for all clients.
 
         The table contains all unfinished tasks, and the last 1,000 tasks that have finished since
         counting began. See `stats` for the time when counting begins.
@@ -187,7 +188,7 @@ class Partition:
         workers: str | int | Sequence[str | int] | None = None,
         **kwargs: Any,
     ) -> Future:
-        """Submit a task to the workers of this partition.
+        """Submit a task to this partition's workers.
 
         Parameters
         ----------
@@ -260,7 +261,7 @@ class Partition:
             )
 
     def _resources_for(self, slots: int, asks: bool = True) -> dict[str, int]:
-        """Check the number of slots, and return the resources of a task.
+        """Validate the number of slots, and return the resources of a task.
 
         If `asks` is true, the client is registered for the partition, which may send a request to
         the scheduler.
@@ -288,7 +289,7 @@ class Partition:
         empty_s: float = WAIT_S,
         **kwargs: Any,
     ) -> Results:
-        """Call a function for each item and return an iterator over the results.
+        """Call a function for each item, and return an iterator over the results.
 
         The iterables may be infinite, because items are submitted only while results are read, and
         the number of tasks in flight is limited. Small items are grouped into tasks according to
@@ -415,7 +416,7 @@ class Partition:
         empty_s: float = WAIT_S,
         **kwargs: Any,
     ) -> int | concurrent.futures.Future[int]:
-        """Run a task for each item of a pipe or an iterable.
+        """Run a task for each item of a pipe or iterable.
 
         This method returns when the pipe has been closed or the iterable is exhausted, and all
         tasks have finished. The number of tasks in flight is limited. Further items remain in the
@@ -488,7 +489,7 @@ class Partition:
         *,
         running: Literal["continue", "restart"] = "continue",
     ) -> dict[Any, str]:
-        """Cancel tasks of this partition and return the outcome for each task.
+        """Cancel tasks of this partition, and return the outcome for each task.
 
         Parameters
         ----------
@@ -550,7 +551,7 @@ class Partition:
     # -- collections and data ----------------------------------------------------------
 
     def compute(self, collections: Any, *, slots: int = 1, **options: Any) -> Any:
-        """Compute Dask collections (arrays, dataframes, bags or delayed values) on these workers.
+        """Compute Dask collections, such as arrays, dataframes, bags, or delayed values.
 
         Each task of a collection occupies a slot. Rechunking and shuffling also stay on these
         workers. If a client still holds the result of a collection, Dask returns that result and
@@ -581,7 +582,7 @@ class Partition:
         return self.client.compute(collections, resources=self._resources_for(slots), **options)
 
     def scatter(self, data: Any, **options: Any) -> Any:
-        """Scatter data into the memory of these workers and return futures.
+        """Scatter data into the memory of these workers, and return futures.
 
         Scattered data cannot be recomputed if its worker dies.
 
@@ -611,7 +612,7 @@ class Partition:
         return self.client.scatter(data, workers=addresses, **options)
 
     def __enter__(self) -> Self:
-        """Run everything that is computed or submitted in the block on these workers.
+        """Within the block, run everything that is computed or submitted on these workers.
 
         In the current thread, this applies to `compute` and `persist` of Dask collections,
         including dataframes, to `dask.compute`, and to `Client.submit` and `Client.map` of this
@@ -648,7 +649,7 @@ class Partition:
     def grow(
         self, workers: int = 1, *, source: str | None = None, timeout_s: float = 60.0
     ) -> list[str]:
-        """Move workers into this partition while tasks run, and return their names.
+        """Move workers into this partition while tasks are running, and return their names.
 
         A worker first finishes the tasks of its former partition that are already running. Its
         waiting tasks are moved to other members of that partition. If the rule of this partition is
@@ -687,7 +688,7 @@ class Partition:
     def resize(
         self, workers: int, *, source: str | None = None, timeout_s: float = 60.0
     ) -> list[str]:
-        """Set the number of workers in this partition, and return the names of the workers moved.
+        """Set the number of workers in this partition, and return the names of those moved.
 
         Workers are moved into the partition as by `grow`, or out of it as by `shrink`.
 
@@ -730,13 +731,13 @@ class Partition:
         return moved
 
     def shrink(self, workers: int = 1, *, timeout_s: float = 60.0) -> list[str]:
-        """Move workers out of this partition while tasks run, and return their names.
+        """Move workers out of this partition while tasks are running, and return their names.
 
-        Workers that this partition has borrowed leave first, and return to the partition that they
-        were started in or that a rule has selected them for. Further workers, those with the lowest
-        load first, are moved to the partition with the rule `rest`. If no other partition has this
-        rule, they no longer belong to any partition. All workers first finish their tasks, as
-        described for `grow`.
+        Workers that this partition has borrowed leave first, and return to the partition in which
+        they were started or for which a rule has selected them. Further workers, those with the
+        lowest load first, are moved to the partition with the rule `rest`. If no other partition
+        has this rule, they no longer belong to any partition. All workers first finish their tasks,
+        as described for `grow`.
 
         Raises
         ------
@@ -756,7 +757,7 @@ class Partition:
     # -- adaptive size -----------------------------------------------------------------
 
     def adapt(self, minimum: int, maximum: int, *, idle_s: float = IDLE_S) -> None:
-        """Set the minimum and maximum number of jobs for an adaptive partition.
+        """Set the minimum and maximum number of jobs in an adaptive partition.
 
         Once per second, jobs are started for tasks that are ready to run but have no slot, and for
         slots that clients request with `request_slots`. A job that has not been needed for `idle_s`
@@ -791,7 +792,7 @@ class Partition:
             )
 
     def request_slots(self, slots: int) -> bool:
-        """Request slots for this client, and return whether the partition is adaptive.
+        """Request slots on behalf of this client, and return whether the partition is adaptive.
 
         This method is intended for programs that assign each task to a specific worker, so that
         their tasks never wait for a slot. While slots are requested, jobs are started and kept as
@@ -813,10 +814,10 @@ class Partition:
         return bool(run_on_scheduler(self.client, request_slots, name=self.name, **arguments))
 
     def dissolve(self, timeout_s: float = 30.0) -> None:
-        """Dissolve this partition, in the same way as `Pool.dissolve` dissolves all partitions.
+        """Dissolve this partition, as `Pool.dissolve` does for all partitions.
 
-        Workers that this partition has borrowed return to the partition that they were started in
-        or that a rule has selected them for. Other workers declare their original resources again.
+        Workers that this partition has borrowed return to the partition in which they were started
+        or for which a rule has selected them. Other workers declare their original resources again.
         """
         request_dissolution(self.client, [self.name], timeout_s)
 
@@ -835,14 +836,14 @@ _OF_MAPS = {
 
 
 def _refuse_options(method: str, options: Mapping[str, Any], **instead: str) -> None:
-    """Raise PoolError if a Dask option is passed that the partition sets itself."""
+    """Raise PoolError for Dask options that the partition itself sets."""
     for option, advice in instead.items():
         if option in options:
             raise PoolError(f"`Partition.{method}` does not accept `{option}`. {advice}")
 
 
 def _names_of_pipes(arguments: Iterable[Any]) -> list[str]:
-    """Return the names of the pipes among the arguments that fail with their tasks.
+    """Return the names of those pipes among the arguments that fail with their tasks.
 
     Pipes in lists and tuples are included.
     """
@@ -852,7 +853,7 @@ def _names_of_pipes(arguments: Iterable[Any]) -> list[str]:
 
 
 def _check_function(name: str, function: Callable[..., Any]) -> None:
-    """Raise PoolError if a function cannot be called, or is a coroutine function.
+    """Raise PoolError if a function is not callable, or is a coroutine function.
 
     A coroutine function runs in the worker's event loop, where it is unknown which task submits
     further tasks. Therefore, these tasks would not stay in the partition, and the coroutine could

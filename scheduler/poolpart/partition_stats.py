@@ -16,7 +16,7 @@ _HEAD_OF_PARTITIONS = ("partition", "workers", "slots", "busy", *COUNTS, "second
 
 
 def describe_size(workers: int, target: int | None, slots: int) -> str:
-    """Return a description of the size of a partition, for example "1 of 2 workers, 4 slots"."""
+    """Describe the size of a partition, for example as "1 of 2 workers, 4 slots"."""
     counted = format_workers(workers)
     if target is not None and target != workers:
         counted = f"{workers} of {format_workers(target)}"
@@ -25,7 +25,7 @@ def describe_size(workers: int, target: int | None, slots: int) -> str:
 
 @dataclass(frozen=True)
 class StageStats:
-    """Statistics of a stage, which comprises all tasks with the same key prefix.
+    """Statistics of a stage, which consists of all tasks with the same key prefix.
 
     For most tasks, the prefix is the name of the function. Tasks of `Partition.map` have the suffix
     ``-map``.
@@ -70,13 +70,13 @@ class StageStats:
 
     @property
     def _figures(self) -> list[object]:
-        """Table cells with the number of tasks in each state and the running time in seconds."""
+        """Table cells with the number of tasks in each state, and the running time in seconds."""
         return [*(getattr(self, count) for count in COUNTS), format_seconds(self.seconds)]
 
 
 @dataclass(frozen=True, repr=False)
 class PartitionStats(StageStats):
-    """Statistics of a partition, with its workers, slots, and current and finished tasks.
+    """Statistics of a partition, its workers, and its tasks.
 
     Counting of finished tasks begins when the cluster is divided, a client submits its first task
     to a partition, statistics are first requested, or the page is opened, whichever comes first.

@@ -1,4 +1,4 @@
-"""Bounded, closable pipes between the tasks of a Dask cluster.
+"""Pipes between tasks, which are bounded and can be closed.
 
 A pipe consists of a `distributed.Queue` with the items and a `distributed.Variable` with the state,
 both under the name of the pipe. `pipe_states.py` is the scheduler's side. Any client can inspect
@@ -59,7 +59,7 @@ _LINGER_S = 0.002  # time that `get` waits for further items to reduce the numbe
 
 
 class Pipe:
-    """Bounded first-in, first-out pipe between tasks, which can be closed and can fail.
+    """Bounded first-in, first-out pipe between tasks that can be closed and can fail.
 
     The creator of the pipe calls `create`, passes the pipe to the tasks at both ends, and finally
     calls `delete`. A ``with`` block calls both methods. The pipe is also deleted when its creator's
@@ -182,7 +182,7 @@ class Pipe:
         return str(query_for_repr(self._client, describe_pipe, name=self.name) or "")
 
     def _repr_html_(self) -> str:
-        """Return the table of depth, capacity and state for notebooks."""
+        """Return an HTML table with the pipe's depth, capacity, and state for notebooks."""
         return table_of_pipe(lambda: self.client, repr(self), self.name)
 
     @property
@@ -196,7 +196,7 @@ class Pipe:
     # -- creating and deleting ---------------------------------------------------------
 
     def create(self) -> Pipe:
-        """Create the pipe on the scheduler and return it.
+        """Create the pipe on the scheduler, and return this object.
 
         Raises
         ------
@@ -216,7 +216,7 @@ class Pipe:
         return self
 
     def delete(self) -> None:
-        """Delete the pipe and its queued items from the scheduler, if the pipe exists."""
+        """Delete the pipe and its items from the scheduler, if the pipe exists."""
         delete_pipes(self.client, [self.name])
 
     def __enter__(self) -> Pipe:
@@ -226,7 +226,7 @@ class Pipe:
         self.delete()
 
     def _reply(self, replies: Replies) -> Reply:
-        """Return the reply for this pipe, and store the advice that it contains.
+        """Return the reply for this pipe, and remember the advice in it.
 
         A reply contains the state of the pipe (`closed`, `failure`, `advice`) and the `answer` to
         the request: the number of queued items (CHANGE), the number of items that were put (PUT),
@@ -244,9 +244,9 @@ class Pipe:
         return reply
 
     def _change(self, **changes: Any) -> Reply:
-        """Change the state of the pipe on the scheduler, and return the reply with the new state.
+        """Change the pipe's state on the scheduler, and return the reply with the new state.
 
-        The possible changes are `producer`, the ID of a producer that closes the pipe, `failure`
+        The possible changes are `producer` (the ID of a producer that closes the pipe), `failure`
         and `advice`. Without changes, the reply contains the current state.
         """
         return self._reply(_ask(self.client, CHANGE, names=[self.name], **changes))
@@ -259,7 +259,7 @@ class Pipe:
         on_reply: Callable[[Reply], None] = lambda reply: None,
         **arguments: Any,
     ) -> Reply:
-        """Repeat a request until a reply ends the wait, and return the last reply.
+        """Repeat a request until the wait is over, and return the last reply.
 
         Parameters
         ----------
@@ -294,7 +294,7 @@ class Pipe:
 
     @property
     def depth(self) -> int:
-        """Current number of queued items."""
+        """Current number of items in the pipe."""
         return int(self._change()["answer"])
 
     def close(self) -> None:
@@ -307,7 +307,7 @@ class Pipe:
         self._change(producer=_producer())
 
     def fail(self, reason: str) -> None:
-        """Make the pipe fail, so that every `put` and `get` at both ends raises `PipeFailed`.
+        """Make the pipe fail, so that each `put` or `get` at either end raises `PipeFailed`.
 
         If the pipe has already failed, the first reason is kept.
 
@@ -321,7 +321,7 @@ class Pipe:
     # -- producers ---------------------------------------------------------------------
 
     def put(self, item: Any, timeout_s: float | None = None, *, unbounded: bool = False) -> None:
-        """Add an item, and wait while the pipe is full.
+        """Add an item, after waiting for space in the pipe.
 
         Parameters
         ----------
@@ -348,7 +348,7 @@ class Pipe:
     def put_many(
         self, items: Iterable[Any], timeout_s: float | None = None, *, unbounded: bool = False
     ) -> None:
-        """Add several items in order, and wait while the pipe is full.
+        """Add several items in order, waiting while the pipe is full.
 
         The iterable may be infinite. Up to `capacity` items at a time are read and sent in one
         request. This method raises the same errors as `put`. If an error is raised, for example
@@ -370,7 +370,7 @@ class Pipe:
     # -- consumers ---------------------------------------------------------------------
 
     def poll(self, timeout_s: float = 0.0) -> tuple[Any, bool]:
-        """Return the next item if one arrives in time, like MATLAB's ``[item, ok] = poll(queue)``.
+        """Return the next item if it arrives in time, like MATLAB's ``[item, ok] = poll(queue)``.
 
         Unlike this method, `get` raises `TimeoutError` if there is no item, and `PipeClosed` at the
         end of the pipe.
@@ -402,7 +402,7 @@ class Pipe:
         return None, False
 
     def drain(self) -> list[Any]:
-        """Remove and return all queued items, possibly none, without waiting.
+        """Remove and return all items in the pipe without waiting. There may be none.
 
         Raises
         ------
@@ -413,7 +413,7 @@ class Pipe:
         return self._unpack(self._remove())
 
     def get_all(self, timeout_s: float | None = None, *, linger_s: float = 0.0) -> list[Any]:
-        """Remove and return all queued items, after waiting until there is at least one.
+        """Remove and return all items in the pipe, after waiting for at least one.
 
         Parameters
         ----------
@@ -440,7 +440,7 @@ class Pipe:
             self._raise_at_end(reply, deadline, timeout_s)
 
     def get(self, timeout_s: float | None = None) -> Any:
-        """Remove and return the next item, after waiting until there is one.
+        """Remove and return the next item, after waiting for one.
 
         After the first item has arrived, this method waits up to 2 ms for further items, which the
         next calls return. It raises the same errors as `get_all`.
@@ -462,7 +462,7 @@ class Pipe:
         is_settled: Callable[[Reply], bool] | None = None,
         **arguments: Any,
     ) -> Reply:
-        """Fetch queued items into the buffer, and return the last reply.
+        """Fetch items into the buffer, and return the last reply.
 
         The items are added in the client's event loop. By default, the wait ends once the buffer
         contains items, even if another thread has fetched them. See `_ask_until` for `deadline` and
@@ -487,7 +487,7 @@ class Pipe:
         return reply
 
     def _remove(self, limit: float = math.inf) -> list[Packed]:
-        """Remove and return at most `limit` items from the buffer, still pickled."""
+        """Remove at most `limit` items from the buffer, and return them still pickled."""
         packed: list[Packed] = []
         with suppress(IndexError):  # threads may share this object
             while len(packed) < limit:
@@ -495,7 +495,7 @@ class Pipe:
         return packed
 
     def _unpack(self, packed: Sequence[Packed]) -> list[Any]:
-        """Unpickle items, up to the first one that cannot be unpickled.
+        """Unpickle items until one of them cannot be unpickled.
 
         If the first item cannot be unpickled, it is lost and its error is raised. Otherwise, the
         item that cannot be unpickled and all later items are returned to the buffer.
@@ -526,7 +526,7 @@ class Pipe:
                 yield self.get()
 
     def listen(self, function: Callable[[Any], Any]) -> PipeListener:
-        """Start calling a function in this process for each item, until the pipe ends.
+        """Start calling a function in this process for each item until the pipe ends.
 
         The function is called in a single background thread, in the order of the items. The
         listener is an ordinary consumer of the pipe, so it does not receive items that other
@@ -555,23 +555,23 @@ class Pipe:
 
 
 def _deadline(timeout_s: float | None) -> float:
-    """Convert a timeout to a value of `time.monotonic`, or to infinity if it is None."""
+    """Convert a timeout to a `time.monotonic` value. None means no limit."""
     return math.inf if timeout_s is None else time.monotonic() + timeout_s
 
 
 def _is_answered(reply: Reply) -> bool:
-    """Return whether at least one item of a PUT request has been put."""
+    """Return whether at least one item was put by a PUT request."""
     return bool(reply["answer"])
 
 
 def _key_of_task() -> str:
-    """Return the key of the task that runs in this thread, or ""."""
+    """Return the key of this thread's task, or "" outside tasks."""
     running = current_task()
     return "" if running is None else str(running[1].key)
 
 
 def _producer() -> str:
-    """Return the ID of a producer.
+    """Return an ID for the current producer.
 
     The ID is the key of the current task, or a random ID outside of tasks.
     """
@@ -579,12 +579,12 @@ def _producer() -> str:
 
 
 def delete_pipes(client: Client, names: Sequence[str]) -> None:
-    """Delete the pipes that exist, and their items, from the scheduler."""
+    """Delete pipes and their items from the scheduler, ignoring pipes that do not exist."""
     run_on_scheduler(client, delete_existing_pipes, names=list(names))
 
 
 def get_advice(pipe: Pipe) -> int:
-    """Return the number of records that the consumer of a pipe recommends to bundle in an item.
+    """Return the number of records per item that the consumer recommends.
 
     The value is from the last request of this `Pipe` object. If there was none, the scheduler is
     asked. Producers may ignore it.
@@ -593,7 +593,7 @@ def get_advice(pipe: Pipe) -> int:
 
 
 def set_advice(pipe: Pipe, amount: int) -> None:
-    """Recommend to producers how many records to bundle in an item, at least 1.
+    """Recommend the number of records per item to producers. It must be at least 1.
 
     Only one consumer of a pipe may call this function.
     """
@@ -606,14 +606,14 @@ def set_advice(pipe: Pipe, amount: int) -> None:
 
 
 def put_back(pipe: Pipe, item: Any) -> None:
-    """Put an item back into a `Pipe` object, so that its next `get` returns the item."""
+    """Put an item back into this `Pipe` object, so that its next `get` returns the item."""
     pipe._buffer.appendleft(dumps(item))
 
 
 def take_items(
     pipe: Pipe, futures: Sequence[Future], limit: int, seconds: float
 ) -> tuple[list[Any], bool, bool]:
-    """Fetch up to `limit` items, after waiting for an item or for the end of a task.
+    """Fetch up to `limit` items, after waiting for an item or the end of a task.
 
     `Partition.for_each` uses this function to wait for items and running tasks at the same time.
 
@@ -667,7 +667,7 @@ def exchange_items(
     puts: Mapping[str, Sequence[Any]] | None = None,
     linger_s: float = 0.0,
 ) -> dict[str, list[Any]]:
-    """Put items into pipes, then wait for items or for the end of a task, and fetch items.
+    """Put items into pipes, wait for items or the end of a task, and fetch the items.
 
     All of this is done in one request, because most of the cost of an item is the cost of its
     request.
@@ -714,7 +714,7 @@ _connections: WeakKeyDictionary[Client, Any] = WeakKeyDictionary()
 
 
 def _install_handlers(client: Client) -> None:
-    """Install the scheduler's handlers for pipe requests, once per connection of the client.
+    """Install the scheduler's handlers for pipe requests, once per client connection.
 
     The handlers are installed even if the scheduler has no pipes yet.
     """
@@ -727,11 +727,11 @@ def _install_handlers(client: Client) -> None:
 
 
 def _ask(client: Client, handler: str, **arguments: Any) -> Replies:
-    """Send a single request to the scheduler, and return its replies by pipe.
+    """Send a single request to the scheduler, and return the reply for each pipe.
 
-    `handler` is CHANGE, PUT or TAKE, the name of a handler that `pipe_states.PipeRegistry` adds to
-    the scheduler and that receives `arguments`. Pipes that do not exist are omitted from the
-    replies.
+    `handler` is CHANGE, PUT or TAKE. These are the names of the handlers that
+    `pipe_states.PipeRegistry` adds to the scheduler. The handler receives `arguments`. Pipes that
+    do not exist are omitted from the replies.
     """
     _install_handlers(client)
     replies: Replies = client.sync(
@@ -748,7 +748,7 @@ def _ask_until(
     on_replies: Callable[[Replies], None],
     **arguments: Any,
 ) -> Replies:
-    """Repeat a request to the scheduler until its replies end the wait, and return them.
+    """Repeat a request to the scheduler until its replies end the wait, and return the last ones.
 
     All requests belong to a single wait of this thread, so that the waiting task of a partition
     lends its slot only once.

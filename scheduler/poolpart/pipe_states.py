@@ -1,4 +1,4 @@
-"""The scheduler's side of pipes, each of which is a Dask Queue and a Dask Variable.
+"""The scheduler's side of pipes, each of which consists of a Dask Queue and a Dask Variable.
 
 The Queue contains the items. The Variable is the only copy of the pipe's state. A client that sets
 it to ``{**state, "closed": True}`` closes the pipe. Other clients can put, get and inspect items
@@ -43,7 +43,7 @@ _SETTABLE = ("closed", "failure", "advice")  # fields that any client may set
 
 
 class PipeState:
-    """State and queue of a pipe on the scheduler.
+    """State and queue of a pipe, on the scheduler.
 
     The value of the Variable, which all clients can read, is a dict with these fields:
 
@@ -89,36 +89,36 @@ class PipeState:
 
     @property
     def exists(self) -> bool:
-        """Whether the Queue and the Variable exist, either of which a client can delete."""
+        """Whether the Queue and the Variable both exist. Clients can delete either of them."""
         return self._dask.exists
 
     @property
     def has_ended(self) -> bool:
-        """Whether the pipe was closed or deleted, or has failed."""
+        """Whether the pipe was closed, was deleted, or has failed."""
         return not self.exists or self.value["closed"] or bool(self.value["failure"])
 
     def get_error(self) -> PipeFailed | None:
-        """Return the error that a `get` would raise now, or None."""
+        """Return the error that `get` would raise now, or None."""
         if not self.exists:
             return PipeFailed(f"Pipe {self.name!r} does not exist. It was deleted.")
         reason = self.value["failure"]
         return PipeFailed(reason) if reason else None
 
     def put_error(self) -> PipeFailed | PipeClosed | None:
-        """Return the error that a `put` would raise now, or None."""
+        """Return the error that `put` would raise now, or None."""
         if (error := self.get_error()) is not None:
             return error
         return PipeClosed(f"Pipe {self.name!r} is closed.") if self.value["closed"] else None
 
     @property
     def summary(self) -> tuple[int, int, str]:
-        """Number of queued items, capacity, and a description of the state."""
+        """Number of items, capacity, and a description of the state."""
         end = self.put_error()
         words = "closed" if isinstance(end, PipeClosed) else f"failed: {end}" if end else "open"
         return self.queue.qsize(), self.queue.capacity, words
 
     def change(self, **changes: Any) -> None:
-        """Change fields of the Variable."""
+        """Change fields of the Variable's value."""
         self._dask.set({**self.value, **changes})
 
     def close(self, producer: str) -> None:
@@ -139,7 +139,7 @@ class PipeState:
         self.change(failure=self.value["failure"] or reason)
 
     def check(self, value: Any) -> None:
-        """Raise ValueError unless a client may set the Variable to the value."""
+        """Raise ValueError if a client may not set the Variable to the given value."""
         if not self.exists:
             raise ValueError(f"Variable {self.name!r} belonged to a pipe that was deleted.")
         if doubt := self._invalid_reason(value):
@@ -150,7 +150,7 @@ class PipeState:
             )
 
     def _invalid_reason(self, value: Any) -> str:
-        """Return the reason why a client may not set the Variable to the value, or ""."""
+        """Return why a client may not set the Variable to the given value, or "" if it may."""
         state = self.value
         if not isinstance(value, dict) or value.keys() != state.keys():
             return f"the value {value!r} has different fields"
@@ -182,7 +182,7 @@ def names_of_pipes(dask_scheduler: Any = None) -> list[str]:
 
 
 def describe_pipe(name: str, dask_scheduler: Any = None) -> str:
-    """Describe the number of queued items and the state of a pipe. Runs on the scheduler."""
+    """Describe a pipe's state and its number of items. Runs on the scheduler."""
     pipe = pipes_of(dask_scheduler).get(name)
     if pipe is None:
         return "does not exist"
@@ -193,7 +193,7 @@ def describe_pipe(name: str, dask_scheduler: Any = None) -> str:
 async def create_pipe(
     name: str, owner: str, capacity: int, producers: int, dask_scheduler: Any = None
 ) -> bool:
-    """Create a pipe, or return False if its name is already in use. Runs on the scheduler."""
+    """Create a pipe, or return False if the name is already in use. Runs on the scheduler."""
     # The last request of a killed owner may arrive after the owner was removed. Nobody would delete
     # its pipe or receive the reply.
     if QueueAndVariable.is_used(dask_scheduler, name) or owner not in dask_scheduler.clients:
@@ -207,12 +207,12 @@ async def create_pipe(
 
 
 def reply_without_pipes(**_: Any) -> Replies:
-    """Reply to any request of a client while the scheduler has no pipes."""
+    """Reply to any client request while there are no pipes."""
     return {}
 
 
 def install_pipe_handlers(dask_scheduler: Any = None) -> None:
-    """Install handlers for pipe requests that also work without pipes. Runs on the scheduler.
+    """Install handlers for pipe requests, even if there are no pipes. Runs on the scheduler.
 
     For a request without a handler, Dask would log a traceback, in addition to the error of the
     client.
@@ -224,19 +224,19 @@ def install_pipe_handlers(dask_scheduler: Any = None) -> None:
 def fail_pipes_of_killed_task(
     scheduler: Any, key: Any, annotations: Mapping[str, Any] | None
 ) -> None:
-    """Make the pipes of a canceled task fail after the task's worker was restarted."""
+    """Make a canceled task's pipes fail after its worker was restarted."""
     if NAME in scheduler.plugins:
         scheduler.plugins[NAME].fail_for_killed(key, (annotations or {}).get(USES_PIPES, ()))
 
 
 def delete_existing_pipes(names: Collection[str], dask_scheduler: Any = None) -> None:
-    """Delete the named pipes that exist. Runs on the scheduler."""
+    """Delete those named pipes that exist. Runs on the scheduler."""
     if NAME in dask_scheduler.plugins:
         dask_scheduler.plugins[NAME].delete(names)
 
 
 class PipeRegistry(SchedulerPlugin):
-    """Scheduler plugin with the states of all pipes, removed when there are no pipes left."""
+    """Scheduler plugin with the states of all pipes. It is removed after the last pipe."""
 
     name = NAME
 
@@ -255,11 +255,11 @@ class PipeRegistry(SchedulerPlugin):
     # -- hooks of the scheduler --------------------------------------------------------
 
     def remove_client(self, scheduler: Any, client: str) -> None:
-        """Delete the pipes of a client that has left."""
+        """Delete the pipes that belong to a client that has left."""
         self.delete([name for name, state in self.states.items() if state.owner == client])
 
     def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:
-        """Notify the requests that wait for the end of a task, and fail the pipes of lost tasks."""
+        """Notify requests that wait for the end of a task, and fail the pipes of lost tasks."""
         # Polling every 5 ms used 2 % of a core on the scheduler of a run.
         if finish in _ENDED and key in self._awaited:
             self._awaited[key].notify()
@@ -268,7 +268,7 @@ class PipeRegistry(SchedulerPlugin):
             self._fail_if_lost(task, names, start, finish)
 
     def _fail_if_lost(self, task: Any, names: Sequence[str], start: str, finish: str) -> None:
-        """Make the pipes of a task fail if the task is lost."""
+        """Make a task's pipes fail if the task is lost."""
         # Otherwise, the tasks at the other end of the pipe would wait until the pipe is deleted.
         if finish == "erred":
             blamed = task.exception_blame or task
@@ -286,7 +286,7 @@ class PipeRegistry(SchedulerPlugin):
             self._released.discard(task.key)
 
     def _fail_soon(self, names: Sequence[str], reason: str, cancelled: str = "") -> None:
-        """Make open pipes fail after the current step of the event loop.
+        """Make pipes fail that are still open after the current step of the event loop.
 
         `cancelled` is the key of a canceled task. If this task has already used a pipe, the pipe
         does not fail, because the task is running and can continue to use the pipe. Dask does not
@@ -303,7 +303,7 @@ class PipeRegistry(SchedulerPlugin):
         asyncio.get_running_loop().call_soon(fail)
 
     def fail_for_killed(self, key: Any, names: Sequence[str]) -> None:
-        """Make the open pipes of a canceled task fail after the task's worker was restarted."""
+        """Make a canceled task's open pipes fail after its worker was restarted."""
         for state in self._existing(names).values():
             # If a consumer is lost, other consumers can continue, so the pipe does not fail.
             if not state.has_ended and str(key) not in state.takers:
@@ -313,7 +313,7 @@ class PipeRegistry(SchedulerPlugin):
                 )
 
     def restart(self, scheduler: Any) -> None:
-        """Make all open pipes fail, because `Client.restart` has ended the tasks that use them."""
+        """Make all open pipes fail, because `Client.restart` has ended the tasks that used them."""
         # Dask does not reset queues and variables in a restart. Without this method, `get`, `put`,
         # `for_each` and listeners would wait until the pipe is deleted, whereas futures and maps
         # raise a CancelledError immediately.
@@ -326,7 +326,7 @@ class PipeRegistry(SchedulerPlugin):
                 )
 
     def delete(self, names: Collection[str]) -> None:
-        """Delete the named pipes that exist, and remove the plugin after the last pipe."""
+        """Delete those named pipes that exist, and remove the plugin after the last pipe."""
         for name in self.states.keys() & set(names):
             self.states.pop(name).delete()
         if not self.states:
@@ -338,12 +338,12 @@ class PipeRegistry(SchedulerPlugin):
             )
 
     def _check(self, name: str, value: Any) -> None:
-        """Raise ValueError if a client sets a pipe's Variable to an invalid value."""
+        """Raise ValueError if a client sets the Variable of a pipe to an invalid value."""
         if (state := self.states.get(name)) is not None:
             state.check(value)
 
     def _notify(self, name: str) -> None:
-        """Notify waiting requests that a client has set a Variable."""
+        """Notify waiting requests after a client has set a Variable."""
         if (state := self.states.get(name)) is not None:
             state.queue.waiters.notify()
 
@@ -357,7 +357,7 @@ class PipeRegistry(SchedulerPlugin):
         failure: str = "",
         advice: int = 0,
     ) -> Replies:
-        """Close pipes for a producer, make pipes fail, or set the advice.
+        """Close pipes on behalf of a producer, make pipes fail, or set the advice.
 
         The answer is the number of queued items.
         """
@@ -380,7 +380,7 @@ class PipeRegistry(SchedulerPlugin):
         seconds: float,
         task: str = "",
     ) -> Replies | Awaitable[Replies]:
-        """Put items into a pipe once it has space for at least one.
+        """Put items into a pipe once it has space for at least one of them.
 
         The answer is the number of items that were put. If there is space, the reply is returned
         directly, because Dask would create a task for a coroutine, which takes longer than the
@@ -418,7 +418,7 @@ class PipeRegistry(SchedulerPlugin):
         limit: int = sys.maxsize,
         task: str = "",
     ) -> Replies:
-        """Take items from pipes after waiting for an item or for the end of a pipe or a task.
+        """Take items from pipes, after waiting for an item or for the end of a pipe or task.
 
         Parameters
         ----------
@@ -476,7 +476,7 @@ class PipeRegistry(SchedulerPlugin):
         return self._replies(states, take_from)
 
     def _states_for_taker(self, task: str, names: Sequence[str]) -> dict[str, PipeState]:
-        """Return the states of the pipes that exist, and record the task that takes their items."""
+        """Return the states of all named pipes that exist, and record the task as their taker."""
         states = self._existing(names)
         for state in states.values():
             state.takers |= {task} - {""}
@@ -487,7 +487,7 @@ class PipeRegistry(SchedulerPlugin):
         return {name: state for name, state in states.items() if state.exists}
 
     def _replies(self, states: dict[str, PipeState], answer: Callable[[PipeState], Any]) -> Replies:
-        """Return a reply with `answer(state)` for each pipe that exists."""
+        """Return a reply that contains `answer(state)` for each pipe that still exists."""
         replies: Replies = {}
         for name, state in states.items():
             if state.exists:

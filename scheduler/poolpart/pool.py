@@ -1,4 +1,4 @@
-"""The pool of all workers of a cluster, which can be divided into partitions."""
+"""The pool of all workers in a cluster, which can be divided into partitions."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 
 
 class Pool:
-    """Pool of Dask workers that can be divided into partitions.
+    """Pool of Dask workers, which can be divided into partitions.
 
     `Pool.from_client` returns all workers of a cluster. `partition` creates a partition, and
     returns it together with a pool of the remaining workers. `divide` creates several partitions
@@ -67,7 +67,7 @@ class Pool:
 
     @classmethod
     def from_client(cls, client: Client, declaring: Set[str] | None = None) -> Pool:
-        """Return a pool of all workers in the client's cluster.
+        """Create a pool of all workers in the client's cluster.
 
         The pool also includes workers that join later.
 
@@ -171,7 +171,7 @@ class Pool:
         return f"<Pool: workers {len(workers)}, hosts {len(hosts)}, GPUs {len(gpus)}{parts}>"
 
     def _repr_html_(self) -> str:
-        """Return the table of all partitions of the cluster for notebooks."""
+        """Return an HTML table of all partitions for notebooks."""
         return table_of_partitions(self.client, repr(self))
 
     def __getitem__(self, name: str) -> Partition:
@@ -210,14 +210,14 @@ class Pool:
 
     @property
     def names(self) -> list[str]:
-        """Names of the workers."""
+        """Names of the workers in the pool."""
         return [worker.name for worker in self.workers]
 
     def partitions(self) -> dict[str, Partition]:
-        """Return all partitions of the cluster by name, including those without workers.
+        """Return all partitions in the cluster by name, including those without workers.
 
         These are the partitions that a division has created, adaptive partitions, and the
-        partitions that workers were started with. A partition of the last kind is not listed while
+        partitions in which workers were started. A partition of the last kind is not listed while
         none of its workers is running, unless workers were moved into or out of it. It has a `note`
         if a worker's number of slots differs from its number of threads.
 
@@ -239,7 +239,7 @@ class Pool:
         }
 
     def require(self, slots: Mapping[str, int], purpose: Mapping[str, str] | None = None) -> None:
-        """Check that partitions have enough slots before tasks are submitted.
+        """Check that partitions have enough slots, before any tasks are submitted.
 
         In plain Dask, if no worker declares the resource of a task, the task waits forever without
         a message.
@@ -356,7 +356,7 @@ class Pool:
         minimum: int = 1,
         exclusive: bool = False,
     ) -> tuple[Partition, Pool]:
-        """Create a partition from workers of this pool.
+        """Create a partition from workers in this pool.
 
         Pass exactly one of the selectors `max_workers_per_gpu`, `max_workers_per_host`, `n_workers`
         and `workers`. It selects from the current workers of the pool that do not belong to another
@@ -424,7 +424,7 @@ class Pool:
         return parts[name], remainder
 
     def page(self) -> str:
-        """Add a page to Dask's dashboard and return its URL.
+        """Add a page to Dask's dashboard, and return its URL.
 
         The page shows partitions, stages, workers and pipes. It is read-only, does not require
         bokeh, and is visible to all users of the cluster. It is as public as the dashboard: on a
@@ -446,23 +446,23 @@ class Pool:
         return open_page(self.client)
 
     def pipes(self) -> list[str]:
-        """Return the names of all pipes in the cluster, whichever client created them.
+        """Return the names of all pipes in the cluster, including those of other clients.
 
         Dask's ``Queue(name)`` contains the items of a pipe, and ``Variable(name)`` its state.
         """
         return sorted(run_on_scheduler(self.client, names_of_pipes))
 
     def leave_page(self) -> None:
-        """Remove the page, unless another client has opened it as well."""
+        """Remove the page, unless another client has also opened it."""
         run_on_scheduler(self.client, leave_page, owner=self.client.id)
 
     def dissolve(self, timeout_s: float = 30.0) -> list[str]:
-        """Dissolve all partitions that any client has created on this cluster.
+        """Dissolve all partitions in this cluster, including those of other clients.
 
         Workers declare their original resources again. Rules, statistics and the page are removed,
         and exclusive workers accept other tasks again. Results that a client holds are kept. If
-        such a result is lost, any worker may recompute it. Partitions that workers were started
-        with remain.
+        such a result is lost, any worker may recompute it. Partitions in which workers were started
+        remain.
 
         Parameters
         ----------
@@ -484,7 +484,7 @@ class Pool:
         return names
 
     def _divide(self, rules: Mapping[str, Rule]) -> tuple[dict[str, Partition], Pool]:
-        """Create all partitions or none, and return them by name, with a pool of the remainder."""
+        """Create either all partitions or none, and return them and the remaining pool."""
         if not isinstance(rules, Mapping):
             raise PoolError(
                 f"Invalid rules {rules!r}. Expected a mapping of partition names to rules, for "
@@ -521,7 +521,7 @@ class Pool:
 
 
 def _all_and_divided(dask_scheduler: Any = None) -> tuple[list[str], Set[str]]:
-    """Return the names of all partitions and of the partitions with a rule.
+    """Return the names of all partitions, and the names of those with a rule.
 
     Runs on the scheduler.
     """
@@ -529,17 +529,17 @@ def _all_and_divided(dask_scheduler: Any = None) -> tuple[list[str], Set[str]]:
 
 
 def _declares_one_of(worker: WorkerInfo, names: Set[str] | None) -> bool:
-    """Return whether a worker declares one of the resources, or True if `names` is None."""
+    """Return whether a worker declares any of the resources, or True if `names` is None."""
     return names is None or not names.isdisjoint(worker.resources)
 
 
 def _is_free(worker: WorkerInfo, of: Callable[[WorkerInfo], bool]) -> bool:
-    """Return whether a worker has no partition and satisfies the predicate of a pool."""
+    """Return whether a worker has no partition and satisfies a pool's predicate."""
     return not worker.partitions and of(worker)
 
 
 def _ask_for_gpus(client: Client, workers: Sequence[WorkerInfo]) -> dict[str, tuple[str, ...]]:
-    """Return the GPUs of workers by address, omitting workers that do not respond.
+    """Return the GPUs of each worker by address, omitting workers that do not respond.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Functions that run on a worker and query its GPUs."""
+"""Functions that query a worker's GPUs. They run on the worker."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ if cuda.cuInit(0) == 0 and cuda.cuDeviceGetCount(ctypes.byref(count)) == 0:
 
 @cache  # a call takes up to a second; errors are not cached
 def list_gpus() -> tuple[str, ...]:
-    """Return the UUIDs of the CUDA devices of this process by ordinal, or () if there is no driver.
+    """Return the UUIDs of this process's CUDA devices in order, or () if there is no driver.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def list_gpus() -> tuple[str, ...]:
 
 
 def visible_gpus() -> tuple[str, ...]:
-    """Return the UUIDs of the CUDA devices of this process by ordinal, or () if there are none.
+    """Return the UUIDs of this process's CUDA devices in order, or () if there are none.
 
     Unlike `list_gpus`, this function logs a warning and returns () if the driver fails.
     """
@@ -64,6 +64,6 @@ def visible_gpus() -> tuple[str, ...]:
 
 
 async def worker_gpus(dask_worker: Any = None) -> tuple[str, ...]:
-    """Return the CUDA devices of a worker, as `visible_gpus` finds them."""
+    """Return a worker's CUDA devices, as found by `visible_gpus`."""
     # Run in a thread to avoid blocking the worker's event loop.
     return await asyncio.to_thread(visible_gpus)

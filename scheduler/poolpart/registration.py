@@ -1,4 +1,4 @@
-"""Record of the partitions for which this process has registered its clients with the scheduler.
+"""Record for which partitions this process has registered its clients with the scheduler.
 
 A client registers once per partition (see `membership.py`) and then submits tasks without a further
 request. The registration ends when the client loses its connection, or when the partition is
@@ -18,7 +18,7 @@ _connections: WeakKeyDictionary[Client, dict[str, Any]] = WeakKeyDictionary()
 
 
 def is_registered(client: Client, name: str) -> bool:
-    """Return whether a client has registered for a partition on its current connection."""
+    """Return whether a client is registered for a partition on its current connection."""
     connection = client.scheduler_comm
     return connection is not None and _connections.get(client, {}).get(name) is connection
 
@@ -29,7 +29,7 @@ def record_registration(client: Client, name: str, connection: Any) -> None:
 
 
 def forget_registrations(name: str | None = None) -> None:
-    """Make the clients of this process register again for a partition, or for all if it is None."""
+    """Make this process's clients register again for a partition, or for all if it is None."""
     for connections in _connections.values():
         if name is None:
             connections.clear()

@@ -1,4 +1,4 @@
-"""Rules that select the workers of a partition, when it is created and when workers join later."""
+"""Rules that select a partition's workers, both initially and when workers join later."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NO_GPU = "The pool has no GPU. The partition uses CPU workers instead."
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """Base class of the rules that select workers for a partition.
+    """Base class for rules that select the workers of a partition.
 
     Parameters
     ----------
@@ -24,8 +24,8 @@ class Rule:
         Number of tasks that each worker runs at the same time. By default, its number of threads.
     minimum
         Minimum number of workers. A partition cannot be created with fewer workers, and moving
-        workers to other partitions never leaves it with fewer. Partitions that workers were started
-        with have no rule, and a minimum of 0.
+        workers to other partitions never leaves it with fewer. Partitions in which workers were
+        started have no rule, and a minimum of 0.
     exclusive
         Whether to keep other tasks off the workers, which are tasks without a partition,
         collections, and tasks of other users. Other tasks that are already assigned to a worker
@@ -43,7 +43,7 @@ class Rule:
                 check_count(f"`{name}` of the rule `{type(self).__name__}`", value, lower_bound)
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Select workers from the available workers, preferring those that come first.
+        """Select workers from those available, preferring the first ones.
 
         The base class selects no workers. It is the rule of partitions whose members were started
         with the resource.
@@ -53,7 +53,7 @@ class Rule:
     def accepts(
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
     ) -> bool:
-        """Return whether to add a worker to the members, given all workers of the cluster."""
+        """Return whether a worker should be added to the members, given all workers."""
         return len(self.choose([*members, worker])) > len(self.choose(members))
 
     @property
@@ -62,7 +62,7 @@ class Rule:
         return None
 
     def slots_of(self, worker: WorkerInfo) -> int:
-        """Return the number of slots that a worker has in the partition."""
+        """Return the number of slots that a worker has in this partition."""
         return self.slots or worker.nthreads
 
 
@@ -82,7 +82,7 @@ class per_gpu(Rule):  # noqa: N801 - reads as a function, like the rules below
     max_workers: int
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Select workers so that they share the GPUs evenly."""
+        """Select workers so that they are distributed evenly over the GPUs."""
         if not any(worker.gpus for worker in free):
             return per_host(self.max_workers).choose(free)
         workers_of_gpu: Counter[str] = Counter()
@@ -99,7 +99,7 @@ class per_gpu(Rule):  # noqa: N801 - reads as a function, like the rules below
     def accepts(
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
     ) -> bool:
-        """Return whether to add a worker, which must have a GPU if any worker has one."""
+        """Return whether a worker should be added. It must have a GPU if any worker has one."""
         if not worker.gpus and any(candidate.gpus for candidate in everyone):
             return False
         same_kind = [member for member in members if bool(member.gpus) == bool(worker.gpus)]
@@ -119,7 +119,7 @@ class per_host(Rule):  # noqa: N801
     max_workers: int
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Select the first workers on each host."""
+        """Select the first available workers on each host."""
         workers_of_host: Counter[str] = Counter()
         chosen = []
         for worker in free:
@@ -144,7 +144,7 @@ class n_workers(Rule):  # noqa: N801
     workers: int
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Select the first workers of the list."""
+        """Select the first available workers."""
         return list(free[: self.workers])
 
     @property
@@ -160,7 +160,7 @@ class NamedWorkers(Rule):
     names: tuple[str, ...]
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Select the named workers that are available."""
+        """Select those named workers that are available."""
         return [worker for worker in free if {worker.name, worker.address} & set(self.names)]
 
     @property
@@ -169,14 +169,14 @@ class NamedWorkers(Rule):
         return len(self.names)
 
     def missing_names(self, members: Sequence[WorkerInfo]) -> list[str]:
-        """Return the names that do not belong to any of the members."""
+        """Return the names that match none of the members."""
         present = {name for worker in members for name in (worker.name, worker.address)}
         return [name for name in self.names if name not in present]
 
 
 @dataclass(frozen=True)
 class rest(Rule):  # noqa: N801
-    """Select all workers that no other rule has selected, possibly none.
+    """Select all workers that no other rule has selected. There may be none.
 
     Only one rule of a division can be `rest`.
 
@@ -194,7 +194,7 @@ class rest(Rule):  # noqa: N801
 
 
 def named(*names: str | int, **common: Any) -> NamedWorkers:
-    """Return a rule that selects workers by name or address, including those that join later.
+    """Return a rule that selects workers by name or address, including workers that join later.
 
     Raises
     ------
@@ -219,7 +219,7 @@ def named(*names: str | int, **common: Any) -> NamedWorkers:
 def divide_workers(
     rules: Mapping[str, Rule], pool: Sequence[WorkerInfo]
 ) -> tuple[dict[str, list[WorkerInfo]], dict[str, str]]:
-    """Divide workers by rules, each of which selects from the workers that earlier rules have left.
+    """Divide workers by rules. Each rule selects from the workers left by earlier rules.
 
     Workers that a rule names are reserved for that rule. Current members of a partition are
     preferred, so repeating the same rules results in the same partitions. Workers that declare
@@ -274,7 +274,7 @@ def divide_workers(
 
 
 class _Choice(NamedTuple):
-    """Selection of workers by one rule."""
+    """Workers from which a rule can select, and those that it selects."""
 
     rule: Rule
     free: list[WorkerInfo]  # workers that the rule can select from
@@ -282,7 +282,7 @@ class _Choice(NamedTuple):
 
 
 def _choices(rules: Mapping[str, Rule], pool: Sequence[WorkerInfo]) -> dict[str, _Choice]:
-    """Apply all rules in order, and return their selections without checking the minimum."""
+    """Apply all rules in order, and return their selections without checking minimums."""
     choices: dict[str, _Choice] = {}
     chosen_addresses: set[str] = set()  # addresses are unique, unlike names
     named_by_rules = {
@@ -324,7 +324,7 @@ def find_shortfalls(
 
 
 def _explain_missing(missing: Sequence[str], pool: Sequence[WorkerInfo]) -> str:
-    """Return sentences that explain why the named workers cannot be selected."""
+    """Explain in full sentences why the named workers cannot be selected."""
     by_name = {name: worker for worker in pool for name in (worker.name, worker.address)}
     absent = [name for name in missing if name not in by_name]
     # {partition names of a worker, or "" if an earlier rule has selected it: names of workers}
@@ -351,20 +351,20 @@ def _explain_missing(missing: Sequence[str], pool: Sequence[WorkerInfo]) -> str:
 
 
 def _largest_partition(workers: Iterable[WorkerInfo]) -> str:
-    """Return the partition to which most of the workers belong, or "" if they belong to none."""
+    """Return the partition that has the most of the given workers, or "" if none has any."""
     sizes = Counter(name for worker in workers for name in sorted(worker.partitions))
     return max(sizes, key=sizes.__getitem__, default="")
 
 
 def _format_names(names: Sequence[str]) -> str:
-    """Format up to nine names for a message."""
+    """Format the first nine names for a message."""
     return ", ".join(map(repr, names[:9])) + (", …" if len(names) > 9 else "")
 
 
 def _advice(
     rule: Rule, free: Sequence[WorkerInfo], pool: Sequence[WorkerInfo], earlier_rules: int
 ) -> str:
-    """Return advice about a rule that selects too few workers.
+    """Return advice for a rule that selects too few workers.
 
     `free` contains the workers that the rule can select from, and `earlier_rules` is the number of
     rules before it.
@@ -409,7 +409,7 @@ def partition_for(
     rules: Mapping[str, Rule],
     members: Mapping[str, Sequence[WorkerInfo]],
 ) -> str | None:
-    """Return the partition that a joining worker is assigned to, or None.
+    """Return the partition to which a joining worker is assigned, or None.
 
     Rules that name the worker have priority, followed by partitions without workers or with fewer
     workers than their minimum, and then by the order of the rules.
@@ -428,18 +428,18 @@ def partition_for(
 
 
 def format_workers(count: int) -> str:
-    """Format a number of workers for a message, for example "1 worker"."""
+    """Format a number of workers for a message, such as "1 worker"."""
     return f"{count} {'worker' if count == 1 else 'workers'}"
 
 
 def check_name(partition: object) -> None:
-    """Raise PoolError unless the value is a valid partition name."""
+    """Raise PoolError if the value is not a valid partition name."""
     if not isinstance(partition, str) or not partition:
         raise PoolError(f"Invalid partition name {partition!r}. Expected a string such as 'GPU'.")
 
 
 def check_count(name: str, count: object, minimum: int = 1) -> None:
-    """Raise PoolError unless the value is an integer of at least `minimum`."""
+    """Raise PoolError if the value is not an integer of at least `minimum`."""
     if not isinstance(count, Integral) or count < minimum:
         raise PoolError(
             f"Invalid value {count!r} for {name}. Expected an integer of at least {minimum}."

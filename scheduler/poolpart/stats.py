@@ -1,4 +1,4 @@
-"""Statistics of tasks by partition and stage.
+"""Statistics of tasks by partition and by stage.
 
 A scheduler plugin counts finished tasks. The partition of a task is the resource that it requests,
 or "". Its stage is the prefix of its key, which is the name of the function for most tasks.
@@ -35,7 +35,7 @@ _WAITING = {
 
 
 class TaskStatistics(SchedulerPlugin):
-    """Scheduler plugin that counts finished tasks, beginning with its creation."""
+    """Scheduler plugin that counts the tasks that finish after its creation."""
 
     name = NAME
 
@@ -56,7 +56,7 @@ class TaskStatistics(SchedulerPlugin):
     def transition(
         self, key: Any, start: str, finish: str, *args: Any, stimulus_id: str = "", **kwargs: Any
     ) -> None:
-        """Count a finished task, or record when a task became ready to run."""
+        """Count a finished task, or record when a task has become ready to run."""
         if start == "waiting" and finish in _RUNNABLE:
             self._runnable[key] = time.time()
         if finish in _RUNNABLE:
@@ -81,7 +81,7 @@ class TaskStatistics(SchedulerPlugin):
             counts["queued_seconds"] += max(0.0, computing[0]["start"] - runnable)
 
     def queued_since(self, key: Any) -> float | None:
-        """Return the time at which a task became ready to run, or None if unknown.
+        """Return when a task became ready to run, or None if this is unknown.
 
         The time is in seconds since 1970.
         """
@@ -95,7 +95,7 @@ class TaskStatistics(SchedulerPlugin):
         computing: list[Any],
         report: Mapping[str, Any],
     ) -> None:
-        """Add a row for a finished task, where `report` is the message of its worker."""
+        """Add a table row for a finished task, given the `report` of its worker."""
         partition = partition_of(task)
         worker = self.scheduler.workers.get(report.get("worker"))
         started = to_datetime(computing[0]["start"] if computing else None)
@@ -117,19 +117,19 @@ class TaskStatistics(SchedulerPlugin):
         )
 
     def all_stats(self) -> list[PartitionStats]:
-        """Return the statistics of all partitions, and of the tasks without a partition."""
+        """Return the statistics of each partition, and of the tasks without a partition."""
         names = {name for name, _ in self.ended}
         for worker in self.scheduler.workers.values():
             names.update(name for name, slots in worker.resources.items() if slots)
         return stats_of(sorted(names | {""}), self.scheduler)
 
     def stop(self) -> None:
-        """Notify all features that counting stops."""
+        """Notify all features that counting has stopped."""
         for feature in FEATURES:
             feature.end_counting(self)
 
     async def close(self) -> None:
-        """Stop when the scheduler closes."""
+        """Stop counting when the scheduler closes."""
         self.stop()
 
 
@@ -140,7 +140,7 @@ def partition_of(task: Any) -> str:
 
 
 def workers_of(scheduler: Any, partition: str) -> list[Any]:
-    """Return the states of the workers of a partition, or of workers without resources for ""."""
+    """Return the states of a partition's workers or, for "", of workers without resources."""
     workers = scheduler.workers.values()
     if partition:
         return [worker for worker in workers if worker.resources.get(partition)]
@@ -148,12 +148,12 @@ def workers_of(scheduler: Any, partition: str) -> list[Any]:
 
 
 def slots_of(worker: Any, partition: str) -> int:
-    """Return the number of slots of a worker in a partition, or its number of threads for ""."""
+    """Return a worker's number of slots in a partition or, for "", its number of threads."""
     return int(worker.resources.get(partition, 0)) if partition else int(worker.nthreads)
 
 
 def running_on(worker: Any, partition: str) -> tuple[Counter[str], int]:
-    """Return the running tasks of a partition on a worker, counted by stage, and their slots.
+    """Count a partition's running tasks on a worker by stage, and their slots.
 
     The scheduler does not know which assigned tasks are running, so it assumes that as many of them
     run as the worker has slots. Therefore, if nested tasks run in the slots of a waiting task, some
@@ -180,7 +180,7 @@ def _slots_taken(task: Any, partition: str) -> int:
 
 
 def tasks_of(name: str, dask_scheduler: Any = None) -> tuple[list[TaskRow], float]:
-    """Return the rows of all unfinished tasks and the last finished tasks of a partition.
+    """Return a table row for each unfinished task and each recently finished task of a partition.
 
     The second value is the time when counting began, in seconds since 1970. Runs on the scheduler.
     """
@@ -214,7 +214,7 @@ def tasks_of(name: str, dask_scheduler: Any = None) -> tuple[list[TaskRow], floa
 
 
 def _times_of_running(task: Any) -> tuple[float | None, float | None]:
-    """Return the start time and the running time of a running task in seconds.
+    """Return when a running task started, and for how many seconds it has been running.
 
     The start is in seconds since 1970. Both values are None until the first heartbeat after the
     start, because workers report running times with their heartbeats.
@@ -228,7 +228,7 @@ def _times_of_running(task: Any) -> tuple[float | None, float | None]:
 
 
 def size_of(name: str, dask_scheduler: Any = None) -> str:
-    """Describe the number of workers and slots of a partition, without counting its tasks.
+    """Describe how many workers and slots a partition has, without counting its tasks.
 
     Runs on the scheduler.
     """
@@ -238,7 +238,7 @@ def size_of(name: str, dask_scheduler: Any = None) -> str:
 
 
 def statistics_of(scheduler: Any, keep: bool = True) -> TaskStatistics:
-    """Return the scheduler's statistics, and start counting if necessary.
+    """Return the scheduler's statistics, and start counting if this has not been done.
 
     If `keep` is true, the counts are kept after the last client of a partition has closed.
     """
@@ -259,7 +259,7 @@ def forget_statistics(scheduler: Any) -> None:
 
 
 def stats_of(names: Sequence[str], dask_scheduler: Any = None) -> list[PartitionStats]:
-    """Return the statistics of the named partitions. Runs on the scheduler."""
+    """Return the statistics of each named partition. Runs on the scheduler."""
     scheduler = dask_scheduler
     statistics = statistics_of(scheduler)
     under_way: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)

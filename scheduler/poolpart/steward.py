@@ -1,4 +1,4 @@
-"""Membership of workers in partitions, stored in a scheduler plugin.
+"""Assign workers to partitions, and record the assignment in a scheduler plugin.
 
 The steward stores the rule of each partition and a record of each worker with its partition.
 Requests of clients (see `division.py`) and workers that join or leave change the records. After any
@@ -57,7 +57,7 @@ _ASSIGN_EVERY_S = 0.1  # about the time that applying all rules to a thousand wo
 
 @dataclass(eq=False)
 class WorkerRecord:
-    """Partition and state of a worker, kept while a nanny restarts the worker process."""
+    """Partition and state of a worker, which are kept while a nanny restarts its process."""
 
     key: Hashable  # identifies the worker (`worker_key`)
     info: WorkerInfo
@@ -99,7 +99,7 @@ class Steward(SchedulerPlugin):
     # -- membership --------------------------------------------------------------------
 
     def members(self, name: str, present: bool = False) -> list[WorkerRecord]:
-        """Return the records of the members of a partition.
+        """Return a record for each member of a partition.
 
         If `present` is true, members that are absent are omitted.
         """
@@ -107,7 +107,7 @@ class Steward(SchedulerPlugin):
         return [record for record in members if not (present and record.is_absent)]
 
     def free_records(self) -> list[WorkerRecord]:
-        """Return the records of present workers without a partition or another resource."""
+        """Return the records of present workers without a partition or any other resource."""
         return [
             record
             for record in self.records.values()
@@ -117,7 +117,7 @@ class Steward(SchedulerPlugin):
         ]
 
     def remainder_name(self) -> str | None:
-        """Return the name of the partition with the rule `rest`, or None."""
+        """Return the name of the partition that has the rule `rest`, or None."""
         return next((name for name, rule in self.rules.items() if isinstance(rule, rest)), None)
 
     def target_resources(self, record: WorkerRecord) -> Resources:
@@ -134,7 +134,7 @@ class Steward(SchedulerPlugin):
         return {**original, record.partition: record.slots}
 
     def home_of(self, record: WorkerRecord) -> str | None:
-        """Return the existing partition that a worker returns to, or None."""
+        """Return the existing partition to which a worker returns, or None."""
         started_in = (name for name, slots in record.original.items() if slots)
         return next((name for name in (record.home, *started_in) if name in self.rules), None)
 
@@ -146,11 +146,11 @@ class Steward(SchedulerPlugin):
     def set_partition(
         self, record: WorkerRecord, name: str | None, slots: float | None = None
     ) -> None:
-        """Record the partition of a worker, or that it has no partition if `name` is None.
+        """Record the partition of a worker. The name None stands for no partition.
 
         The worker is behind the fence of the partition immediately. `reconcile` makes all other
-        changes. If `slots` is not given, the number of slots is that of the rule, that of the
-        resource which the worker was started with, or the number of threads.
+        changes. If `slots` is not given, the number of slots comes from the rule, from the resource
+        with which the worker was started, or from the number of threads, in this order.
         """
         record.partition = name
         record.slots = 0
@@ -166,13 +166,13 @@ class Steward(SchedulerPlugin):
         self._assign_soon()
 
     def set_rule(self, name: str, rule: Rule) -> None:
-        """Add a partition or change its rule, keeping the partition with the rule `rest` last."""
+        """Add a partition, or change its rule. The partition with the rule `rest` remains last."""
         self._names.add(name)
         rules = {**self.rules, name: rule}.items()
         self.rules = dict(sorted(rules, key=lambda item: isinstance(item[1], rest)))
 
     def adopt_partition(self, name: str) -> None:
-        """Add a partition whose workers were started with its resource, if it is not known yet.
+        """Add a partition whose workers were started with its resource, unless it is already known.
 
         Raises
         ------
@@ -192,7 +192,7 @@ class Steward(SchedulerPlugin):
             self.set_home(record, name, record.original[name])
 
     def change_target(self, name: str | None, change: int) -> None:
-        """Change the number of workers that an `n_workers` rule requests.
+        """Change the number of workers requested by an `n_workers` rule.
 
         Other rules are not changed.
         """
@@ -217,7 +217,7 @@ class Steward(SchedulerPlugin):
         return record
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
-        """Assign a joining worker to its former partition, to a declared partition, or by rule."""
+        """Assign a joining worker to its former partition, to a declared one, or by rule."""
         former_keys = set(self.records)
         record = self._add_record(scheduler.workers[worker])
         declared = [name for name in self.rules if record.original.get(name)]
@@ -247,7 +247,7 @@ class Steward(SchedulerPlugin):
                 )
 
     def _remove_record(self, record: WorkerRecord) -> None:
-        """Remove the record of a worker, and fill its place according to the rules.
+        """Remove a worker's record, and fill its place according to the rules.
 
         The worker has not returned in time, or cannot declare resources. Members of the remainder
         that have joined after the division can be assigned again to fill the place.
@@ -262,7 +262,7 @@ class Steward(SchedulerPlugin):
         self.remove_if_done()
 
     def valid_workers_downscaling(self, scheduler: Any, workers: list[Any]) -> list[Any]:
-        """Select the workers that an adaptive cluster may stop without violating a minimum."""
+        """Select workers that an adaptive cluster may stop without falling below a minimum."""
         may_stop = {worker.address: worker for worker in workers}
         for name, rule in self.rules.items():
             members = self.members(name, present=True)
@@ -276,13 +276,13 @@ class Steward(SchedulerPlugin):
     # -- assigning workers that join ---------------------------------------------------
 
     def _assign_soon(self) -> None:
-        """Schedule the assignment of unassigned workers after rules or members have changed."""
+        """Schedule the assignment of unassigned workers, after rules or members have changed."""
         if self._assignment_timer is None:
             loop = asyncio.get_running_loop()
             self._assignment_timer = loop.call_later(_ASSIGN_EVERY_S, self._assign_waiting)
 
     def _assign_waiting(self) -> None:
-        """Assign all present unassigned workers that have reported their GPUs."""
+        """Assign all present workers that are unassigned and have reported their GPUs."""
         self._assignment_timer = None
         waiting = [s for s in self.records.values() if s.is_unassigned and not s.is_absent]
         # Workers that have not reported their GPUs yet are assigned by their reconciliation loop.
@@ -290,7 +290,7 @@ class Steward(SchedulerPlugin):
         self.reconcile([record for record in ready if self._assign(record)])
 
     def _assign(self, record: WorkerRecord) -> bool:
-        """Assign an unassigned worker by the rules, and return whether its partition changed."""
+        """Apply the rules to an unassigned worker, and return whether its partition has changed."""
         groups = {name: [member.info for member in self.members(name)] for name in self.rules}
         name = partition_for(record.info, self.rules, groups)
         if moves := name not in (None, record.partition):
@@ -300,7 +300,7 @@ class Steward(SchedulerPlugin):
         return moves
 
     async def _ask_for_gpus(self, record: WorkerRecord) -> None:
-        """Request the GPUs of a worker if a rule depends on them."""
+        """Request a worker's GPUs if any rule depends on them."""
         if not any(isinstance(rule, per_gpu) for rule in self.rules.values()):
             return
         try:
@@ -313,14 +313,14 @@ class Steward(SchedulerPlugin):
     # -- reconciling workers --------------------------------------------------------------
 
     def is_settled(self, record: WorkerRecord) -> bool:
-        """Return whether a worker declares its target resources and the scheduler knows them."""
+        """Return whether a worker and the scheduler both use the worker's target resources."""
         worker = self.scheduler.workers.get(record.info.address)
         if worker is None or record.is_declaring:
             return False
         return bool(worker.resources == record.declared == self.target_resources(record))
 
     def reconcile(self, records: Iterable[WorkerRecord]) -> None:
-        """Start the loops that make workers declare their target resources."""
+        """Start the loops in which workers declare their target resources."""
         for record in records:
             # A running loop checks the record again before it ends.
             if not record.is_absent and (
@@ -332,7 +332,7 @@ class Steward(SchedulerPlugin):
                 record.reconciliation.add_done_callback(partial(self._on_reconciled, record))
 
     def _on_reconciled(self, record: WorkerRecord, task: asyncio.Task[None]) -> None:
-        """Remove the record of a worker that cannot declare resources.
+        """Remove the record of a worker if it cannot declare resources.
 
         This is the callback at the end of a reconciliation loop. The steward is removed if nothing
         is left to do.
@@ -362,7 +362,7 @@ class Steward(SchedulerPlugin):
             send_waiting_tasks(self.scheduler, worker)
 
     async def _step(self, record: WorkerRecord, worker: Any, requested_moves: set[Any]) -> bool:
-        """Request a worker to declare its target resources, and return whether it did.
+        """Ask a worker to declare its target resources, and return whether it has done so.
 
         The worker refuses while it runs a task that holds a resource to be removed, even if the
         scheduler has already forgotten the task.
@@ -393,7 +393,7 @@ class Steward(SchedulerPlugin):
     def _has_released(
         self, record: WorkerRecord, worker: Any, leaving: Collection[str], requested_moves: set[Any]
     ) -> bool:
-        """Move away the tasks of partitions that a worker leaves, and return whether none is left.
+        """Move tasks of former partitions off a worker, and return whether none are left.
 
         The worker receives no new tasks of these partitions. Tasks that are already running finish
         on the worker, which keeps the resource until then.
@@ -406,7 +406,7 @@ class Steward(SchedulerPlugin):
     def _set_visible_resources(
         self, record: WorkerRecord, worker: Any, resources: Resources
     ) -> None:
-        """Make the scheduler place tasks on a worker only according to the given resources.
+        """Set the resources that the scheduler considers when it places tasks on a worker.
 
         This also invalidates the worker groups of `choosing.py` and updates the fence of the
         worker.
@@ -418,7 +418,7 @@ class Steward(SchedulerPlugin):
     async def wait_until_settled(
         self, records: Collection[WorkerRecord], timeout_s: float
     ) -> list[WorkerRecord]:
-        """Wait until workers declare their target resources, and return the late workers.
+        """Wait until workers have declared their target resources, and return those that are late.
 
         This includes workers that are being restarted, but not workers that were removed.
         """
@@ -435,7 +435,7 @@ class Steward(SchedulerPlugin):
     # -- stopping ----------------------------------------------------------------------
 
     async def close(self) -> None:
-        """Stop when the scheduler closes."""
+        """Stop all activity when the scheduler closes."""
         self._stop()
 
     def _stop(self) -> None:
@@ -448,7 +448,7 @@ class Steward(SchedulerPlugin):
                 task.cancel()
 
     def remove_if_done(self) -> None:
-        """Remove the plugin if there are no partitions and all workers are restored."""
+        """Remove the plugin if there are no partitions and each worker has its own resources."""
         present = [record for record in self.records.values() if not record.is_absent]
         if not self.rules and not self.open_requests and all(map(self.is_settled, present)):
             self._stop()
@@ -469,18 +469,18 @@ def worker_key(name: Hashable, address: str, nanny: str | None) -> Hashable:
 
 
 def join_names(records: Iterable[WorkerRecord]) -> str:
-    """Format the names of workers for a message."""
+    """Format workers' names for a message."""
     return ", ".join(sorted(record.info.name for record in records))
 
 
 def names_with_rule(scheduler: Any) -> frozenset[str]:
-    """Return the names of the partitions that were created by a division of the pool."""
+    """Return the names of the partitions that were created by dividing the pool."""
     steward: Steward | None = scheduler.plugins.get(NAME)
     return frozenset() if steward is None else frozenset(steward.rules)
 
 
 def target_of(scheduler: Any, name: str) -> int | None:
-    """Return the number of workers that the rule of a partition requests.
+    """Return how many workers the rule of a partition requests.
 
     The result is None if the partition has no rule, or if its rule does not request a number.
     """
@@ -491,7 +491,7 @@ def target_of(scheduler: Any, name: str) -> int | None:
 
 @contextmanager
 def steward_of(scheduler: Any) -> Iterator[Steward]:
-    """Yield the scheduler's steward, which is created for the block if necessary.
+    """Provide the scheduler's steward within the block, and create it if necessary.
 
     After the block, the steward is removed if it has no partitions.
     """

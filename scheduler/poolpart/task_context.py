@@ -1,4 +1,4 @@
-"""Access to the client of the current task's worker, and errors if this worker is leaving."""
+"""Access the client of the current task's worker, and detect that this worker is leaving."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _one_at_a_time = threading.Lock()
 
 
 def own_client() -> Client:
-    """Return the client of the current task's worker or, outside of tasks, the current client.
+    """Return the client of the current task's worker, or the current client outside tasks.
 
     This function works around two problems of `distributed.get_client`, which creates the worker's
     client when it is first called. If the scheduler sends a message to all clients while it
@@ -42,7 +42,7 @@ def own_client() -> Client:
 
 
 def in_event_loop() -> bool:
-    """Return whether the caller runs in an event loop, which it must not block."""
+    """Return whether the caller runs in an event loop and therefore must not block."""
     try:
         asyncio.get_running_loop()
     except RuntimeError:
@@ -59,7 +59,7 @@ class WorkerLeavingError(RuntimeError):
 
 @contextmanager
 def translate_leaving_errors() -> Iterator[None]:
-    """Replace any error by `WorkerLeavingError` if the worker is leaving.
+    """Raise `WorkerLeavingError` instead of any other error if the worker is leaving.
 
     Use it as a decorator of a task, or as a context manager around its body. A worker that is
     retired or restarted closes its client while tasks are still running. These tasks fail with

@@ -1,4 +1,4 @@
-"""Snapshot of the slots, unresponsive workers and selected tasks of a partition."""
+"""Snapshot of a partition's slots, unresponsive workers, and selected tasks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .workers import run_on_scheduler, silent_workers
 
 @dataclass(frozen=True)
 class TaskLocation:
-    """State and workers of one task, as the scheduler knows them."""
+    """State and workers of a task, as far as the scheduler knows."""
 
     state: str  # Dask's name, for example waiting, no-worker, queued, processing, memory or erred
     workers: tuple[str, ...]  # addresses of the workers that run the task or hold its result
@@ -25,7 +25,7 @@ class TaskLocation:
 
 @dataclass(frozen=True)
 class PartitionSnapshot:
-    """Members, slots and requested tasks of a partition at one point in time.
+    """Members, slots, and selected tasks of a partition at one point in time.
 
     `free` and `slots` do not include workers that currently accept no tasks: workers that Dask has
     paused because of their memory, workers that are leaving, and silent workers.
@@ -43,7 +43,7 @@ class PartitionSnapshot:
     tasks: dict[str, TaskLocation] = field(default_factory=dict)  # requested tasks that exist
 
     def is_unreachable(self, key: str) -> bool:
-        """Return whether a task is assigned to, or has its result on, silent workers only."""
+        """Return whether a task and its result are only on workers that do not respond."""
         task = self.tasks.get(key)
         return task is not None and bool(task.workers) and self.silent.issuperset(task.workers)
 
@@ -53,7 +53,7 @@ class PartitionSnapshot:
 
 
 def take_snapshot(client: Client, partition: str, keys: Collection[str] = ()) -> PartitionSnapshot:
-    """Request the current slots of a partition, and the locations of the given tasks.
+    """Request a partition's current slots and the locations of the given tasks.
 
     Programs that run several long-running tasks need this to select workers themselves. Dask places
     a task according to the total resources of the workers, not the free ones, and prefers the
@@ -98,6 +98,6 @@ def _task_place(task: Any) -> TaskLocation:
 
 
 def _in_use(worker: Any, resource: str) -> float:
-    """Return the amount of a resource in use, which Dask itself miscounts after work stealing."""
+    """Count how much of a resource is in use, which Dask itself miscounts after work stealing."""
     held = ((task.resource_restrictions or {}).get(resource, 0) for task in worker.processing)
     return float(sum(held))

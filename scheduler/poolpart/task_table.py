@@ -1,4 +1,4 @@
-"""Table of the individual tasks of a partition, as returned by `Partition.tasks`."""
+"""Table of a partition's individual tasks, as returned by `Partition.tasks`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _HEAD = ("state", "key", "function", "worker", "slots", "queued", "started", "se
 
 
 class TaskRow(NamedTuple):
-    """Task of a partition, as a row of a `TaskTable`.
+    """Row of a `TaskTable`, which describes one task.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class TaskRow(NamedTuple):
 
 
 class TaskTable(tuple[TaskRow, ...]):
-    """Table of the tasks of a partition.
+    """Table of a partition's tasks.
 
     Unfinished tasks are listed first, grouped by state. They are followed by the finished tasks,
     newest first.
@@ -108,7 +108,7 @@ class TaskTable(tuple[TaskRow, ...]):
 
     @property
     def _omission(self) -> str:
-        """Note below a truncated table that counts all tasks by state, otherwise ""."""
+        """Note below a truncated table that states the number of tasks in each state, or ""."""
         if len(self) <= _SHOWN:
             return ""
         counts = Counter(row.state for row in self)
@@ -135,7 +135,7 @@ class TaskTable(tuple[TaskRow, ...]):
 
 
 def _cells(row: TaskRow) -> tuple[str, ...]:
-    """Return the cells of a row, with times of day in UTC."""
+    """Return the table cells of a task, with times of day in UTC."""
     seconds = "" if row.seconds is None else format_seconds(row.seconds)
     times = [_time(row.queued), _time(row.started)]
     return (

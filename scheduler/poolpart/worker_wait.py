@@ -1,4 +1,4 @@
-"""Time limit for tasks that wait because their partition has lost all of its workers."""
+"""Limit how long tasks wait after their partition has lost all of its workers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WAIT_S = 300.0  # long enough to restart or replace a machine
 
 
 class WorkerWait:
-    """Timer for a map or `for_each` call whose partition has no workers.
+    """Timer for a map or a `for_each` call in a partition without workers.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class WorkerWait:
         self._since: float | None = None  # time.monotonic()
 
     def check(self, prospects: PartitionCapacity) -> None:
-        """Update the timer from the current state of the partition, and warn when a wait begins.
+        """Update the timer from the partition's current state, and warn when a wait begins.
 
         Raises
         ------
@@ -65,14 +65,14 @@ class WorkerWait:
             )
 
     def seconds_until_check(self, longest_s: float) -> float:
-        """Return the time until the next check in seconds, at most `longest_s`."""
+        """Return the number of seconds until the next check, at most `longest_s`."""
         if self._since is None:
             return longest_s
         return max(0.0, min(longest_s, self._since + self._seconds - time.monotonic()))
 
 
 def check_wait_s(seconds: object) -> None:
-    """Raise ValueError unless the value of `empty_s` is a nonnegative number."""
+    """Raise ValueError if the value of `empty_s` is not a nonnegative number."""
     if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not seconds >= 0:
         raise ValueError(
             f"Invalid value {seconds!r} for `empty_s`. Expected a number of seconds, for example "

@@ -1,4 +1,4 @@
-"""Descriptions of workers, and functions that run code on the workers and the scheduler."""
+"""Descriptions of workers, and functions that run code on workers and on the scheduler."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _CHECK_S = 2.0  # interval between checks for silent workers
 
 @dataclass(frozen=True)
 class WorkerInfo:
-    """Description of a worker in a cluster.
+    """Description of a worker in the cluster.
 
     Parameters
     ----------
@@ -52,16 +52,16 @@ class WorkerInfo:
 
     @property
     def partitions(self) -> frozenset[str]:
-        """Names of the worker's partitions, which are the resources with at least one slot."""
+        """Names of the worker's partitions, that is, its resources with at least one slot."""
         return frozenset(name for name, slots in self.resources.items() if slots)
 
     def with_gpus(self, gpus: Iterable[str]) -> WorkerInfo:
-        """Return a copy of this description with the given GPUs."""
+        """Return a copy of this description that includes the given GPUs."""
         return replace(self, gpus=tuple(gpus))
 
     @classmethod
     def from_identity(cls, address: str, identity: Mapping[str, Any]) -> WorkerInfo:
-        """Create a description from the information that the scheduler has about a worker."""
+        """Create a description from the scheduler's information about a worker."""
         return cls(
             name=str(identity["name"]),
             address=address,
@@ -73,7 +73,7 @@ class WorkerInfo:
 
 
 def slots_note(name: str, workers: Iterable[WorkerInfo]) -> str:
-    """Return a note about the first worker whose slots differ from its threads, or ""."""
+    """Return a note about the first worker whose slots and threads differ, or ""."""
     for worker in workers:
         slots = worker.resources.get(name, 0)
         if not slots or slots == worker.nthreads:
@@ -127,7 +127,7 @@ def run_on_scheduler(
 
 
 def query_for_repr(client: Client | None, function: Callable[..., Any], **kwargs: Any) -> Any:
-    """Call a function on the scheduler for a `repr`, or return None if it is unavailable.
+    """Call a function on the scheduler for a `repr`. Return None if the scheduler is unavailable.
 
     The result is None if there is no response within 2 s, or if waiting would block an event loop.
     """
@@ -160,7 +160,7 @@ def check_client(client: Client) -> None:
 
 
 def worker_identities(client: Client) -> dict[str, dict[str, Any]]:
-    """Request Dask's descriptions of all workers from the scheduler, by address.
+    """Request Dask's description of each worker from the scheduler, by address.
 
     Raises
     ------
@@ -177,14 +177,14 @@ def worker_identities(client: Client) -> dict[str, dict[str, Any]]:
 
 
 def all_workers(client: Client) -> list[WorkerInfo]:
-    """Request descriptions of all workers from the scheduler, without their GPUs."""
+    """Request a description of each worker, without its GPUs, from the scheduler."""
     return [WorkerInfo.from_identity(a, i) for a, i in worker_identities(client).items()]
 
 
 def run_on_workers(
     client: Client, function: Callable[..., Any], addresses: Sequence[str]
 ) -> dict[str, Any]:
-    """Run a function on workers, outside of tasks, and return the results by address.
+    """Run a function on workers, outside tasks, and return the results by address.
 
     If the function raises an exception on a worker, the exception takes the place of the result.
     Silent workers, and workers that die before they respond, are omitted.
@@ -220,11 +220,11 @@ def run_on_workers(
 
 
 def silent_workers(last_seen: Mapping[str, float]) -> set[str]:
-    """Return the addresses of workers without a recent heartbeat.
+    """Return the addresses of workers that have not sent a heartbeat recently.
 
-    `last_seen` contains the time of the last heartbeat of each worker in seconds, by address. The
-    times are compared with the latest heartbeat of all workers, because if all workers are silent,
-    the scheduler itself was stopped or busy.
+    `last_seen` maps each worker's address to the time of its last heartbeat, in seconds. The times
+    are compared with the latest heartbeat of all workers, because if all workers are silent, the
+    scheduler itself was stopped or busy.
     """
     latest = max(last_seen.values(), default=0.0)
     # Dask's heartbeat interval increases with the size of the cluster.

@@ -1,1 +1,1 @@
-"""Add scene formats, robots, procedural scenes, and importers for other simulators to lidarsim."""
+"""Add scene formats, robots, procedural scenes, and importers for other programs to lidarsim."""

@@ -1,4 +1,4 @@
-"""Clusters whose workers form partitions from the start.
+"""Start clusters whose workers form partitions from the beginning.
 
 The workers run locally, in queues, over SSH, or in Kubernetes.
 

@@ -1,7 +1,7 @@
-"""Partitions whose workers are jobs of a queue or processes that are started over SSH.
+"""Start partitions whose workers are queued jobs, or processes on other hosts (SSH).
 
-The number of jobs is fixed, or follows the work. In the latter case, `adapting.py` decides on the
-scheduler which jobs to start and end.
+The number of jobs is either fixed or depends on the amount of work. In the latter case,
+`adapting.py` decides on the scheduler which jobs to start and end.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ Describe = Callable[[Any, str, str, int, int, Mapping[str, Any]], dict[str, Any]
 
 @dataclass
 class _PartitionJobs:
-    """Jobs of a partition."""
+    """Jobs that form a partition."""
 
     name: str
     options: Mapping[str, Any]  # options of the cluster's class that differ for this partition
@@ -131,7 +131,7 @@ class _PartitionJobs:
     def from_options(
         cls, cluster: SpecCluster, describe: Describe, name: str, options: Mapping[str, Any]
     ) -> _PartitionJobs:
-        """Create the jobs of a partition from its options, without starting them.
+        """Create a partition's jobs from its options, without starting them.
 
         Raises
         ------
@@ -158,7 +158,7 @@ class _PartitionJobs:
         return cls(name, cluster_options, count, spec, describe)
 
     def add(self, cluster: SpecCluster, count: int) -> None:
-        """Add further jobs to the cluster, which starts them when it is awaited."""
+        """Add jobs to the cluster, which starts them when it is awaited."""
         for _ in range(count):
             # Each job has a new name. For some time after a worker was lost, Dask would mistake a
             # job with the same name for the lost worker, and cancel the job.
@@ -171,7 +171,7 @@ class _PartitionJobs:
             cluster.worker_spec[job] = spec
 
     def workers(self, cluster: SpecCluster) -> dict[str, list[str]]:
-        """Return the names of the workers of all submitted jobs, by job."""
+        """Return the worker names of each submitted job."""
         return {
             job: [job + suffix for suffix in cluster.worker_spec[job].get("group", [""])]
             for job in self.host_indices
@@ -180,7 +180,7 @@ class _PartitionJobs:
 
 
 def pop_bounds(name: str, options: dict[str, Any]) -> JobBounds | None:
-    """Remove `adapt` and `idle_s` from the options of a partition, and return them as bounds.
+    """Convert the options `adapt` and `idle_s` of a partition to bounds, and remove them.
 
     The result is None if the partition is not adaptive.
 
@@ -210,7 +210,7 @@ def pop_bounds(name: str, options: dict[str, Any]) -> JobBounds | None:
 
 
 class _JobStarter:
-    """Starts the jobs of partitions, and replaces lost jobs."""
+    """Starts the jobs of all partitions, and replaces jobs that were lost."""
 
     def __init__(
         self,
@@ -230,7 +230,7 @@ class _JobStarter:
         self._logs_read_at = time.monotonic()
 
     async def start(self) -> None:
-        """Submit the initial jobs, and start managing all jobs until the cluster is closed."""
+        """Submit the initial jobs, and manage all jobs until the cluster is closed."""
         specs = {name: part.spec for name, part in self._parts.items()}
         try:
             await run_on_cluster_scheduler(self._cluster, add_partitions, specs=specs)
@@ -267,7 +267,7 @@ class _JobStarter:
                         self._report_once(line)
 
     async def _adapt(self) -> bool:
-        """Start and forget jobs as the scheduler advises, and return whether jobs must start."""
+        """Apply the scheduler's advice on jobs, and return whether any jobs must start."""
         jobs = {name: part.workers(self._cluster) for name, part in self._parts.items()}
         advice = await run_on_cluster_scheduler(self._cluster, advise_jobs, jobs=jobs)
         for name, advice_of_part in advice.items():
@@ -285,7 +285,7 @@ class _JobStarter:
         return any(advice_of_part.jobs_to_start for advice_of_part in advice.values())
 
     async def _remove_job(self, part: _PartitionJobs, job: str) -> None:
-        """Remove a job whose workers have been closed, or will be closed if they join."""
+        """Remove a job. Its workers have been closed, or will be closed when they join."""
         self._cluster.worker_spec.pop(job, None)
         part.host_indices.pop(job, None)
         worker = self._cluster.workers.get(job)
@@ -297,7 +297,7 @@ class _JobStarter:
             self._cluster.workers.pop(job, None)
 
     def _report_once(self, message: str) -> None:
-        """Report a message, unless a message that differs only in its numbers was reported."""
+        """Report a message, unless it differs from an earlier message only in its numbers."""
         line = " ".join(message.split())[:400]
         text = re.sub(r"\d+", "", line)
         # An earlier message may be contained in this one, which can be a line of a log file.
@@ -307,7 +307,7 @@ class _JobStarter:
 
 
 async def _start_workers(cluster: SpecCluster) -> None:
-    """Start the workers of the cluster's specification that are missing."""
+    """Start the specified workers that the cluster is missing."""
     try:
         await cluster
     except Exception:
@@ -320,7 +320,7 @@ async def _start_workers(cluster: SpecCluster) -> None:
 
 
 class JobLogs:
-    """Log files of jobs, which contain the reasons why workers are missing.
+    """Log files of jobs, which may explain why workers are missing.
 
     Dask does not notice if a job ends before its worker has connected.
     """
@@ -331,12 +331,12 @@ class JobLogs:
         self._previous: set[tuple[Path, int]] = set()
 
     def _files(self) -> set[tuple[Path, int]]:
-        """Return all log files with their modification times in nanoseconds."""
+        """Return the path and modification time (in nanoseconds) of each log file."""
         files = (path for folder in self._folders for path in folder.glob("*") if path.is_file())
         return {(path, path.stat().st_mtime_ns) for path in files}
 
     def new_last_lines(self) -> Iterator[str]:
-        """Yield the last lines of new log files that have not changed since the previous call."""
+        """Yield the last line of each new log file that has not changed since the previous call."""
         files = self._files()
         unchanged = (files & self._previous) - self._read
         self._read |= unchanged
@@ -357,7 +357,7 @@ def _describe_job(
     index: int,
     partition_options: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return the specification of a job of a dask-jobqueue cluster."""
+    """Return the specification of a dask-jobqueue job."""
     options = {**cluster.new_spec["options"], **partition_options}
     defaults = {"processes": 1, "worker_extra_args": [], "log_directory": None}
     for option, default in defaults.items():
@@ -381,7 +381,7 @@ def _describe_process(
     index: int,
     partition_options: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return the specification of a worker of an SSHCluster on the host with the given index."""
+    """Return the specification of an SSHCluster worker on the host with the given index."""
     common = cluster.scheduler_spec["options"]
     options = {key: common[key] for key in ("connect_options", "remote_python")} | dict(
         partition_options

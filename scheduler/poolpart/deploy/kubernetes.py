@@ -1,4 +1,4 @@
-"""Worker groups of the dask-kubernetes operator, for `scale_groups`."""
+"""Worker groups managed by the dask-kubernetes operator, for `scale_groups`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..errors import PoolError
 
 
 class KubernetesGroups:
-    """Worker groups of a `KubeCluster` of dask-kubernetes, for `scale_groups`.
+    """Worker groups of a dask-kubernetes `KubeCluster`, for `scale_groups`.
 
     This class was tested with a stand-in for the documented interface of dask-kubernetes 2026.3.0.
     It has not been tested on a Kubernetes cluster.
@@ -44,13 +44,13 @@ class KubernetesGroups:
         self._cluster = cluster
 
     def scale(self, group: str, n: int, leaving: Sequence[str] = ()) -> None:
-        """Set the number of workers of a group, as `WorkerGroups.scale` describes."""
+        """Set the number of workers in a group. See `WorkerGroups.scale`."""
         if leaving:
             self._delete(leaving)
         self._cluster.scale(n, worker_group=group.lower().replace("_", "-"))
 
     def _delete(self, workers: Sequence[str]) -> None:
-        """Delete the Deployments of workers, which have the same names as the workers."""
+        """Delete the Deployments of workers. A Deployment has the same name as its worker."""
         from kr8s import NotFoundError  # a dependency of dask-kubernetes
         from kr8s.objects import Deployment
 

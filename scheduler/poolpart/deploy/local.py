@@ -1,4 +1,4 @@
-"""Clusters on this machine that are divided into partitions."""
+"""Start clusters with partitions on this machine."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def local_cluster(
     dashboard_port: int | None = 0,
     security: Security | bool = False,
 ) -> SpecCluster:
-    """Start a Dask cluster on this machine that is divided into partitions.
+    """Start a Dask cluster with partitions on this machine.
 
     The scheduler, the workers and the dashboard only listen on the loopback interface. The workers
     are processes with nannies, which restart them if they die. They do not import the script that
@@ -112,7 +112,7 @@ def local_cluster(
 
 
 def _temporary_security() -> Security:
-    """Return credentials for one cluster, which exist only in memory."""
+    """Create credentials for one cluster that exist only in memory."""
     if find_spec("cryptography") is None:
         raise PoolError(
             "An encrypted cluster requires cryptography, which is not installed. Run "
@@ -122,7 +122,7 @@ def _temporary_security() -> Security:
 
 
 def _worker_spec(partition: str, slots: int, security: Security) -> dict[str, Any]:
-    """Return the SpecCluster specification of a worker of a partition."""
+    """Return the SpecCluster specification of a worker that belongs to a partition."""
     options = {
         "nthreads": slots,
         "resources": {partition: slots},
@@ -139,7 +139,7 @@ def _worker_spec(partition: str, slots: int, security: Security) -> dict[str, An
 
 
 def dask_setup(worker: Any) -> None:
-    """Suppress the log message of a worker's last heartbeat.
+    """Suppress the log message about the last heartbeat of a worker.
 
     If a worker is closed while its heartbeat waits for a response, the connection is closed and
     Dask logs an error with a traceback. This happens in most runs on a busy machine, where the

@@ -1,4 +1,4 @@
-"""Local cluster with its client, closed at the end of its pool or when it is idle."""
+"""A local cluster and its client, which are closed together with their pool or when idle."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CHECK_EVERY_S = 1.0  # interval between checks whether the cluster is in use
 
 
 class LocalPool:
-    """Cluster of `local_cluster` and its client, as started by `Pool.local`."""
+    """The local cluster and the client that `Pool.local` starts."""
 
     def __init__(
         self, partitions: Mapping[str, tuple[int, int]], idle_s: float, options: dict[str, Any]
@@ -47,13 +47,13 @@ class LocalPool:
             run_in_background(lambda: self._close_when_idle(idle_s))
 
     def close(self) -> None:
-        """Close the client and the cluster unless they are already closed."""
+        """Close the client and the cluster unless this has already been done."""
         self._closed.set()
         with self._closing:  # waits if another thread is closing the cluster
             self._stack.close()
 
     def _close_when_idle(self, idle_s: float) -> None:
-        """Close the client and the cluster once they have not been used for `idle_s` seconds."""
+        """Close the client and the cluster after they have not been used for `idle_s` seconds."""
         last_transitions = -1
         used_at = time.monotonic()
         while not self._closed.wait(min(CHECK_EVERY_S, idle_s)):
@@ -67,11 +67,11 @@ class LocalPool:
 
 
 def _begin_to_count(dask_scheduler: Any = None) -> None:
-    """Start counting tasks for `Partition.stats` and `Partition.tasks`."""
+    """Start counting tasks, so that `Partition.stats` and `Partition.tasks` are complete."""
     statistics_of(dask_scheduler)
 
 
 def _usage(dask_scheduler: Any = None) -> tuple[bool, int]:
-    """Return whether a cluster has tasks, results or pipes, and its number of transitions."""
+    """Return whether a cluster is in use, and its number of task transitions."""
     in_use = bool(dask_scheduler.tasks or names_of_pipes(dask_scheduler))
     return in_use, count_transitions(dask_scheduler)

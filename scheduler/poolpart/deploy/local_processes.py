@@ -17,7 +17,7 @@ from ..errors import PoolError
 
 @contextmanager
 def forked_workers() -> Iterator[None]:
-    """Make nannies fork workers from the fork server within the block.
+    """Within the block, make nannies fork their workers from the fork server.
 
     This applies to the first start and to restarts. By default, Dask would make the fork server
     import pandas and other libraries. Here, the fork server has already imported what is needed.
@@ -58,7 +58,7 @@ class ScriptlessNanny(Nanny):
     """
 
     async def instantiate(self) -> Status:
-        """Start or restart the worker process."""
+        """Start or restart the worker process, without importing the script."""
         _spare_workers_the_script()
         _starting.add(self)
         try:
@@ -68,7 +68,7 @@ class ScriptlessNanny(Nanny):
 
 
 class FixedCluster(SpecCluster):
-    """Cluster that cannot be scaled and leaves the restart of dead workers to their nannies.
+    """Cluster that cannot be scaled, and whose nannies alone restart dead workers.
 
     15 seconds after a worker was lost, a plain SpecCluster closes the nanny of this worker unless a
     worker with the same name is present. A worker that dies twice within this time may just be
@@ -79,7 +79,7 @@ class FixedCluster(SpecCluster):
         super(SpecCluster, self)._update_worker_status(op, msg)
 
     def scale(self, n: int = 0, **options: Any) -> None:
-        """Raise PoolError, because SpecCluster would remove workers regardless of their kind."""
+        """Raise PoolError, because SpecCluster would ignore partitions when removing workers."""
         if self.status == Status.closing:  # SpecCluster calls this method to close its workers
             super().scale(n, **options)
             return

@@ -1,7 +1,7 @@
-"""Partitions whose workers are scaled as groups by another system, for example Kubernetes.
+"""Partitions whose workers are scaled as groups by another system, such as Kubernetes.
 
-As for jobs of a queue, `adapting.py` decides on the scheduler. Once per second, a thread of this
-process requests the target size of each group and passes changes on.
+As with queued jobs, `adapting.py` makes the decisions on the scheduler. Once per second, a thread
+of this process requests the target size of each group and passes changes on.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ ADAPT_EVERY_S = 1.0  # interval between requests to the scheduler
 
 
 class WorkerGroups(Protocol):
-    """Interface of objects that set the sizes of worker groups on any system."""
+    """Interface for objects that set the sizes of worker groups on any system."""
 
     def scale(self, group: str, n: int, leaving: Sequence[str] = ()) -> object:
-        """Set the number of workers of a group.
+        """Set the number of workers in a group.
 
         The call is repeated until it succeeds, so a part of the work may already have been done by
         an earlier call.
@@ -56,7 +56,7 @@ def scale_groups(
     partitions: Mapping[str, Mapping[str, Any]],
     report: Callable[[str], object] = logger.warning,
 ) -> GroupScaler:
-    """Adapt the sizes of worker groups to the work of their partitions.
+    """Adapt the sizes of worker groups to the amount of work in their partitions.
 
     Workers join with the resource of their partition, for example with ``--resources "GPU=1"``.
     Initially, each group has its minimum number of workers. Workers that have not joined yet are
@@ -105,7 +105,7 @@ def scale_groups(
 
 
 def _job_spec(name: str, options: Mapping[str, Any]) -> JobSpec:
-    """Read and check the options of a partition.
+    """Validate the options of a partition.
 
     Raises
     ------
@@ -150,7 +150,7 @@ class GroupScaler:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop scaling, after waiting for a call to `scale` that is in progress."""
+        """Stop scaling. If a call to `scale` is in progress, wait for it to return."""
         self._closed.set()
         self._thread.join()
 
@@ -161,7 +161,7 @@ class GroupScaler:
         self.close()
 
     def _run(self) -> None:
-        """Request target sizes and scale the groups until the scaler or the client is closed."""
+        """Scale the groups to the requested sizes until the scaler or the client is closed."""
         while not self._closed.wait(ADAPT_EVERY_S):
             try:
                 advice = run_on_scheduler(self._client, advise_groups, reports=self._reports)
@@ -173,7 +173,7 @@ class GroupScaler:
                 self._scale(name, advice_of_group)
 
     def _scale(self, name: str, advice: GroupAdvice) -> None:
-        """Scale a group. If this fails, the next advice is the same, so the call is repeated."""
+        """Scale a group. A failed call is repeated, because the next advice will be the same."""
         if advice == GroupAdvice(self._reports[name].size):
             return
         try:

@@ -1,4 +1,4 @@
-"""Optional features on top of the core, with one feature per module.
+"""Optional features that extend the core, one per module.
 
 The README lists the purpose of each module. The modules import the core, but they never import
 `Pool`, `Partition`, `Pipe` or `deploy`, which are the only importers of this folder. Modules that

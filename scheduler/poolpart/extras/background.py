@@ -1,4 +1,4 @@
-"""Calls that run in threads of this process, with futures for their results.
+"""Call functions in threads of this process, and return futures for their results.
 
 The futures are those of `concurrent.futures`, so that `concurrent.futures.wait` and
 `asyncio.wrap_future` accept them. Unlike Dask futures, they have no task on the scheduler.
@@ -47,7 +47,7 @@ def run_in_background(
 def _end(
     future: concurrent.futures.Future[Any], set_outcome: Callable[[Any], None], outcome: Any
 ) -> None:
-    """Set the result or the error of a future unless it was canceled."""
+    """Set the result or error of a future, unless the future was canceled."""
     try:
         set_outcome(outcome)
     except concurrent.futures.InvalidStateError:
@@ -58,7 +58,7 @@ def after_all(
     futures: Iterable[Future | concurrent.futures.Future[Any]],
     function: Callable[[list[Any]], Result],
 ) -> concurrent.futures.Future[Result]:
-    """Call `function(results)` once all futures have succeeded, and return a future for its result.
+    """Call `function(results)` once all futures have succeeded, and return a new future.
 
     The function is called in a thread of this process. To call it on a partition, pass the futures
     to a task instead: ``partition.submit(function, futures)``.

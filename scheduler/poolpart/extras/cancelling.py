@@ -1,4 +1,4 @@
-"""Cancellation of tasks, including running ones.
+"""Cancel tasks, including tasks that are already running.
 
 Dask does not stop a running function. Its thread continues and keeps the task's slot. The function
 can check `cancelled`, or the worker process can be restarted if nothing else would be lost. The
@@ -58,7 +58,7 @@ def cancelled() -> bool:
 def cancel_tasks(
     tasks: Mapping[Any, Future], client: Client, name: str, restarts: bool
 ) -> Outcomes:
-    """Cancel tasks of a partition on the scheduler, and return the outcomes by key.
+    """Cancel tasks of a partition on the scheduler, and return the outcome for each key.
 
     Tasks that had not started or had already finished are omitted from the result. If `restarts` is
     true, workers that only run these tasks are restarted.
@@ -90,7 +90,7 @@ async def _cancel_tasks(
     restarts: bool,
     dask_scheduler: Any = None,
 ) -> tuple[Outcomes, str]:
-    """Cancel tasks, and return their outcomes and "", or no outcomes and an error message."""
+    """Cancel tasks, and return their outcomes. If this is not possible, return an error message."""
     scheduler = dask_scheduler
     deadline = time.monotonic() + ARRIVAL_S
     while not scheduler.tasks.keys() >= {*pending_keys} and time.monotonic() < deadline:
@@ -126,7 +126,7 @@ async def _cancel_tasks(
 
 
 async def _restart_if_idle(scheduler: Any, worker: Any, keys: Iterable[Any], restarts: bool) -> str:
-    """Restart a worker if all of its tasks are canceled, and return the outcome."""
+    """Restart a worker if all of its tasks were canceled, and return the outcome."""
     still_running = f"running: worker {worker.name}"
     if not restarts:
         return still_running
@@ -147,14 +147,14 @@ async def _restart_if_idle(scheduler: Any, worker: Any, keys: Iterable[Any], res
 
 
 class _Load(NamedTuple):
-    """Tasks and results of a worker, as reported by the worker itself."""
+    """Tasks and results that a worker reports about itself."""
 
     running: list[Any]  # keys of running tasks, including those that the scheduler has forgotten
     holds_results: bool  # whether the worker holds bytes that a client has not fetched yet
 
 
 async def _load(scheduler: Any, worker: Any) -> _Load | None:
-    """Request the load of a worker, or return None if it does not respond."""
+    """Request the load of a worker. Return None if the worker does not respond."""
     try:
         return await _await_for(call_worker(scheduler, worker.address, _load_here), ANSWER_S)
     except OSError:
@@ -162,7 +162,7 @@ async def _load(scheduler: Any, worker: Any) -> _Load | None:
 
 
 async def _await_for(request: Coroutine[Any, Any, T], seconds: float) -> T | None:
-    """Await a request, or return None if it takes longer than the given time."""
+    """Await a request, but return None if the given time has passed."""
     # `asyncio.wait_for` of Python 3.11 is not used, because it also waits until the canceled
     # request has ended, which may involve closing a connection to a worker that does not read.
     task = asyncio.ensure_future(request)

@@ -1,4 +1,4 @@
-"""Page of Dask's dashboard with tables of partitions, stages, workers and pipes.
+"""A page in Dask's dashboard that shows partitions, stages, workers, and pipes in tables.
 
 The scheduler renders the page, which contains no scripts and reloads every two seconds.
 """
@@ -90,7 +90,7 @@ _OF_A_WORKER = ("worker", "partition", "slots", "busy", "assigned tasks", "statu
 
 
 def render_page(scheduler: Any) -> bytes:
-    """Return the HTML of the page with the current state."""
+    """Return the page as HTML, with the current state of the cluster."""
     workers = list(scheduler.workers.values())
     names = {*partition_names(scheduler)} | fence_names(scheduler)
     names |= {name for name, _ in statistics_of(scheduler).ended if name}
@@ -140,7 +140,7 @@ def _worker_row(worker: Any) -> list[object]:
 
 
 def _by_partition_and_name(row: list[object]) -> tuple[bool, str, int, str]:
-    """Return the sort key of a worker's row.
+    """Return the key by which a worker's row is sorted.
 
     The key sorts 9 before 10, and workers without a partition last.
     """
@@ -160,7 +160,7 @@ class _Handler(web.RequestHandler):
         self.names = owners.names
 
     def prepare(self) -> None:
-        """Reject requests from other websites, except for links to the page."""
+        """Reject requests that come from other websites, except for links to the page."""
         reason = refusal(self.request.headers, self.names, is_page=True)
         if reason:
             self.set_status(HTTPStatus.FORBIDDEN)
@@ -174,7 +174,7 @@ class _Handler(web.RequestHandler):
 
 
 class PageOwners(SchedulerPlugin):
-    """Scheduler plugin that serves the page until the last client that opened it has left."""
+    """Scheduler plugin that serves the page until all clients that opened it have left."""
 
     name = NAME
 
@@ -190,7 +190,7 @@ class PageOwners(SchedulerPlugin):
         add_pages(scheduler, self.page)
 
     def add_owner(self, owner: str, link: str | None) -> None:
-        """Add a client that has opened the page, with its link to the dashboard if known."""
+        """Record that a client has opened the page, and its link to the dashboard if known."""
         self.owners.add(owner)
         host = urlsplit(link or "").hostname
         if link and not host:  # a link relative to the page of a notebook
@@ -199,7 +199,7 @@ class PageOwners(SchedulerPlugin):
             self.names.add(host)
 
     def remove_client(self, scheduler: Any, client: str) -> None:
-        """Remove a client that has left or has closed the page."""
+        """Record that a client has left or has closed the page."""
         self.owners.discard(client)
         if not self.owners:
             close_page(scheduler)
@@ -221,7 +221,7 @@ def open_page(client: Client) -> str:
 
 
 def page_link(client: Client) -> str | None:
-    """Return the URL of the page while it is open, or None if there is no HTTP server."""
+    """Return the URL that the page has while it is open, or None without an HTTP server."""
     link = _dashboard_link(client)
     return link and f"{link.removesuffix('/').removesuffix('/status')}/{PATH}"
 
@@ -252,7 +252,7 @@ async def _open_page(owner: str, link: str | None, dask_scheduler: Any = None) -
 
 
 async def leave_page(owner: str, dask_scheduler: Any = None) -> None:
-    """Close the page for a client.
+    """Close the page on behalf of a client.
 
     The page stays open for other clients. Runs on the scheduler.
     """
@@ -268,10 +268,9 @@ def close_page(scheduler: Any) -> None:
 
 
 class _Page(Feature):
-    """Feature that closes the page after the last partition was dissolved."""
+    """Feature that closes the page after the last partition has been dissolved."""
 
     def clean_up(self, scheduler: Any) -> None:
-        """Stop serving the page."""
         close_page(scheduler)
 
 

@@ -1,4 +1,4 @@
-"""Inheritance of the partition by tasks that a task of the partition submits.
+"""Make nested tasks run in the partition of the task that submits them.
 
 In plain Dask, resources are not inherited, so the tasks that a GPU task submits run on any worker.
 With this feature, the scheduler assigns such tasks, at any depth, to the partition of the
@@ -43,7 +43,7 @@ ANSWER_S = 5.0  # time for workers to start or stop lending, which stopped worke
 
 
 class Inheritance(SchedulerPlugin):
-    """Scheduler plugin that adds the partition to each arriving graph, and controls shuffles."""
+    """Scheduler plugin that keeps nested tasks and shuffles in their partition."""
 
     name = NAME
 
@@ -67,9 +67,9 @@ class Inheritance(SchedulerPlugin):
         scheduler.add_plugin(self)
 
     def _enable_part(self, feature: str, without: str, begin: Callable[[], None]) -> bool:
-        """Enable a part of the feature, and return whether this version of Dask supports it.
+        """Enable one part of the feature, and return whether this version of Dask supports it.
 
-        If not, a note for users that begins with `without` names the missing private API.
+        If it does not, a note for users begins with `without` and names the missing private API.
         """
         try:
             require_feature(feature)
@@ -93,12 +93,12 @@ class Inheritance(SchedulerPlugin):
         self._unreadable = UnreadableInputs(self.scheduler, self.names)
 
     def _inherited_resources(self, task: Any) -> Resources:
-        """Return the resources that tasks inherit from a task, empty outside of partitions."""
+        """Return the resources that nested tasks inherit from a task, empty outside partitions."""
         resources = task.resource_restrictions
         return dict.fromkeys(self.names & resources.keys(), 1) if resources else {}
 
     def uninstall(self) -> None:
-        """Remove all rules from the scheduler."""
+        """Remove all rules and the plugin from the scheduler."""
         self._rules.remove_all()
         if self._choice is not None:
             self._choice.uninstall()
@@ -108,10 +108,10 @@ class Inheritance(SchedulerPlugin):
 
 
 class _Inheriting(Feature):
-    """Feature that enables inheritance in partitions."""
+    """Feature that makes nested tasks inherit the partition."""
 
     def enable(self, scheduler: Any, names: Iterable[str]) -> str:
-        """Keep nested tasks and shuffles of partitions in their partition from now on."""
+        """Keep nested tasks and shuffles within the given partitions from now on."""
         rule: Inheritance = scheduler.plugins.get(NAME) or Inheritance(scheduler)
         for name in names:
             if name not in rule.names:
@@ -121,7 +121,7 @@ class _Inheriting(Feature):
         return rule.note
 
     def disable(self, scheduler: Any, name: str) -> None:
-        """Disable inheritance in a partition."""
+        """Disable inheritance in the given partition."""
         rule: Inheritance | None = scheduler.plugins.get(NAME)
         if rule is None or name not in rule.names:
             return
@@ -131,12 +131,12 @@ class _Inheriting(Feature):
             rule.uninstall()
 
     def names(self, scheduler: Any) -> Set[str]:
-        """Return the names of the partitions in which inheritance is enabled."""
+        """Return the names of the partitions with inheritance."""
         rule: Inheritance | None = scheduler.plugins.get(NAME)
         return frozenset() if rule is None else rule.names
 
     async def wait_for_workers(self) -> None:
-        """Wait up to `ANSWER_S` seconds until the workers have started or stopped lending."""
+        """Wait at most `ANSWER_S` seconds until all workers have started or stopped lending."""
         loop = asyncio.get_running_loop()
         requests = {request for request in _requests if request.get_loop() is loop}
         if requests:
@@ -152,7 +152,7 @@ _requests: set[asyncio.Future[Any]] = set()  # requests in flight of all schedul
 
 
 def _inform_workers(scheduler: Any, name: str, plugin: bytes | None) -> None:
-    """Add the lending plugin of a partition to all workers, or remove it if `plugin` is None."""
+    """Install a partition's lending plugin on all workers, or remove it if `plugin` is None."""
     for request in set_worker_plugin(scheduler, f"poolpart-lending-{name}", plugin):
         _requests.add(request)
         request.add_done_callback(_requests.discard)

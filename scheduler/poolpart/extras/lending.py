@@ -1,4 +1,4 @@
-"""Lending of slots by tasks of a partition while they wait for other tasks.
+"""Let tasks lend their slots while they wait for other tasks of their partition.
 
 A task that waits for tasks that it has submitted to its own partition occupies the slots that these
 tasks need. Therefore, while it waits, other tasks can use its slots and its worker thread:
@@ -72,7 +72,7 @@ _thread = threading.local()
 
 @dataclass
 class _Loan:
-    """Slots that a task has lent."""
+    """Slots that a task lends to other tasks."""
 
     key: Any  # key of the task
     slots: Resources
@@ -81,14 +81,14 @@ class _Loan:
 
 @dataclass(frozen=True)
 class _NestedTask:
-    """Nested task that waits for slots of this worker, with the task that has submitted it."""
+    """Nested task that waits for slots on this worker, and the task that has submitted it."""
 
     submitter: SubmittingTask
     since: float  # time.monotonic()
 
 
 class Lender:
-    """Manages the loans on a worker. Methods that change its state run in the event loop."""
+    """Manages loans of slots on a worker. Methods that change its state run in the event loop."""
 
     def __init__(self, worker: Any) -> None:
         self.worker = worker
@@ -105,14 +105,14 @@ class Lender:
     # -- loans -------------------------------------------------------------------------
 
     def lend(self, loan: _Loan) -> None:
-        """Release the slots of a loan for other tasks."""
+        """Release the slots of a loan, so that other tasks can use them."""
         self._loans[loan.key] += 1
         self._lent.add(loan.key)
         release_slots(self.worker, loan.slots)
         self.return_slots()
 
     def take_back(self, loan: _Loan) -> None:
-        """Reserve the slots of a loan, and set its `returned` event once they are free."""
+        """Reclaim the slots of a loan, and set its `returned` event once they are free."""
         self._loans[loan.key] -= 1
         if not self._loans[loan.key]:
             del self._loans[loan.key]
@@ -121,16 +121,16 @@ class Lender:
         self.return_slots()
 
     def begin_rejoin(self, key: Any) -> None:
-        """Record that a task has its slots back and waits for a thread."""
+        """Record that a task has its slots back but still waits for a thread."""
         self._rejoining.add(key)
         self._notify()
 
     def end_rejoin(self, key: Any) -> None:
-        """Record that a task has a thread again."""
+        """Record that a waiting task has a thread again."""
         self._rejoining.discard(key)
 
     def return_slots(self) -> None:
-        """Return free slots to the waiting tasks in order.
+        """Return free slots to waiting tasks in the order in which the tasks asked for them.
 
         If lending has ended in all partitions, all waiting tasks continue immediately.
         """
@@ -155,11 +155,11 @@ class Lender:
     # -- demand for slots --------------------------------------------------------------
 
     def slots_wanted(self) -> bool:
-        """Return whether any task waits for slots, or waits to get its slots or thread back."""
+        """Return whether any task waits for slots, or has to get its own slots or thread back."""
         return bool(self._nested or self._returning or self._rejoining)
 
     def lends_at_once(self, loan: _Loan) -> bool:
-        """Return whether a task must lend its slots in each wait, even if no task waits for them.
+        """Return whether a task must lend its slots during each wait, even without demand.
 
         This is the case if the task has lent its slots before and the worker has more slots than
         threads. Dask counts a task that has seceded as long-running until it ends, even after it
@@ -171,13 +171,13 @@ class Lender:
         return loan.key in self._lent and slots > threads_of(self.worker)
 
     def _notify(self) -> None:
-        """Wake the threads that lend their slots on demand if slots are needed."""
+        """If slots are needed, wake the threads that lend their slots on demand."""
         if self.slots_wanted():
             for waiter in tuple(self.waiters):
                 waiter.set()
 
     def transition(self, key: Any, finish: str) -> None:
-        """Follow the state of a task. Tasks in the state "constrained" wait for slots."""
+        """Track the state of a task, because tasks in the state "constrained" wait for slots."""
         self._nested.pop(key, None)
         if finish not in ("executing", "long-running"):
             self._lent.discard(key)
@@ -188,7 +188,7 @@ class Lender:
         self.return_slots()
 
     def stop(self) -> None:
-        """Forget waiting tasks and stop the checks after lending has ended in all partitions."""
+        """Forget all waiting tasks and stop the checks, after lending has ended everywhere."""
         self._nested.clear()
         if self._next_check is not None:
             self._next_check.cancel()
@@ -202,7 +202,7 @@ class Lender:
         self._next_check = loop.call_later(WARN_AFTER_S / 2, self._check_nested)
 
     def _check_nested(self) -> None:
-        """For each task that has waited too long, ask whether its submitter occupies slots."""
+        """For each task that has waited too long, check whether its submitter occupies slots."""
         self._next_check = None
         looked_at = time.monotonic()
         for key, nested in self._nested.items():
@@ -223,7 +223,7 @@ class Lender:
         return is_running(self.worker, key) and not (self._loans[key] or waits)
 
     async def _warn(self, key: Any, submitter: SubmittingTask) -> None:
-        """Warn all clients if the submitter of a waiting task occupies slots on any worker."""
+        """Warn all clients if the submitter of a waiting task occupies slots on some worker."""
         try:
             holds = await call_worker(
                 self.worker, submitter.worker, _holds_slots, key=submitter.key
@@ -246,7 +246,7 @@ class Lender:
 
 
 def _holds_slots(key: Any, dask_worker: Any = None) -> bool:
-    """Return whether a task occupies slots of a worker. Runs on that worker."""
+    """Return whether a task occupies slots on a worker. Runs on that worker."""
     lender = _lenders.get(dask_worker)
     return lender is not None and lender.holds_slots(key)
 
@@ -255,7 +255,7 @@ def _holds_slots(key: Any, dask_worker: Any = None) -> bool:
 
 
 def _loan_of_thread() -> tuple[Lender, _Loan] | None:
-    """Return the lender and a new loan for the task of this thread, or None if it has no slots."""
+    """Return the lender and a new loan for this thread's task, or None if it has no slots."""
     running = current_task()
     if running is None or getattr(_thread, "in_loan", False):
         return None
@@ -268,14 +268,14 @@ def _loan_of_thread() -> tuple[Lender, _Loan] | None:
 
 
 class _WaitHooks:
-    """Implementation of `internals.client.WaitHooks`, which Dask's clients call while they wait."""
+    """Implementation of `internals.client.WaitHooks`, which Dask's clients call while waiting."""
 
     def may_lend(self) -> bool:
-        """Return whether the task of this thread has slots to lend."""
+        """Return whether this thread's task has slots to lend."""
         return _loan_of_thread() is not None
 
     def wait_until_wanted(self, answer: concurrent.futures.Future[Any]) -> None:
-        """Wait until a call has been answered or another task needs the slots of this task."""
+        """Wait until a call has been answered or another task needs this task's slots."""
         loan_of_task = _loan_of_thread()
         if loan_of_task is None:
             return
@@ -295,7 +295,7 @@ class _WaitHooks:
 
     @contextmanager
     def lend(self, waits: bool = True) -> Iterator[None]:
-        """Lend the slots and the thread of this thread's task within the block if `waits` is true.
+        """Within the block, lend the slots and thread of this thread's task if `waits` is true.
 
         At the end of the block, the thread waits until the task has its slots and thread back.
         """
@@ -335,7 +335,7 @@ WAIT_HOOKS = _WaitHooks()
 
 
 def begin_lending(worker: Any, name: str) -> Lender:
-    """Make the tasks of a partition lend their slots. Runs in the worker's event loop."""
+    """Let a partition's tasks lend their slots. Runs in the worker's event loop."""
     with _lock:
         install_wait_hooks(WAIT_HOOKS)
         lender = _lenders.setdefault(worker, Lender(worker))
@@ -344,7 +344,7 @@ def begin_lending(worker: Any, name: str) -> Lender:
 
 
 def end_lending(worker: Any, name: str) -> None:
-    """Make the tasks of a partition keep their slots again. Runs in the worker's event loop."""
+    """Let a partition's tasks keep their slots again. Runs in the worker's event loop."""
     with _lock:
         lender = _lenders[worker]
         lender.names.discard(name)
@@ -355,7 +355,7 @@ def end_lending(worker: Any, name: str) -> None:
 
 
 def lending_plugin(name: str) -> bytes:
-    """Return a pickled worker plugin that enables lending for a partition until it is removed.
+    """Return a pickled worker plugin that enables lending in a partition until it is removed.
 
     A plugin is used because a joining worker receives plugins before its first tasks, whereas a
     request could arrive after them. Workers on which poolpart is not installed ignore the plugin.

@@ -1,4 +1,4 @@
-"""Listeners, which call a function of this process for each item of a pipe."""
+"""Listeners that call a function in this process for each item of a pipe."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class PipeListener:
         self._done = run_in_background(self._listen)
 
     def join(self, timeout_s: float | None = None) -> None:
-        """Wait until the pipe has ended and the function has been called for all items.
+        """Wait until the pipe has ended and the function has processed all items.
 
         After `close`, this method returns immediately.
 

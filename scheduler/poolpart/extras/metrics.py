@@ -1,4 +1,4 @@
-"""Metrics of partitions for Prometheus, at the scheduler's ``/metrics`` endpoint.
+"""Publish metrics of partitions for Prometheus at the scheduler's ``/metrics`` endpoint.
 
 Like Dask's own metrics, they require the package prometheus-client in the scheduler's environment.
 They can be used to scale or to send alerts according to the demand of each partition, which Dask's
@@ -20,17 +20,17 @@ _LABELS = ["partition"]
 
 
 class PartitionCollector:
-    """Prometheus collector for the statistics of all partitions of a scheduler."""
+    """Prometheus collector that provides the statistics of all partitions."""
 
     def __init__(self, collect_stats: Callable[[], list[PartitionStats]]) -> None:
         self._collect_stats = collect_stats
 
     def describe(self) -> Iterator[Any]:
-        """Return no metrics, since the scheduler may not be ready when the collector is added."""
+        """Return no metrics, because the scheduler may not be ready when the collector is added."""
         return iter(())
 
     def collect(self) -> Iterator[Any]:
-        """Yield the metric families, with the label "" for tasks without a partition."""
+        """Yield all metric families. The label "" stands for tasks without a partition."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
         namespace = dask.config.get("distributed.dashboard.prometheus.namespace", "dask")
@@ -65,7 +65,7 @@ class PartitionCollector:
 
 
 class _Metrics(Feature):
-    """Feature that publishes metrics while a scheduler counts its tasks."""
+    """Feature that publishes metrics as long as the scheduler counts tasks."""
 
     def __init__(self) -> None:
         self._collectors: WeakKeyDictionary[Any, PartitionCollector] = WeakKeyDictionary()
@@ -81,7 +81,7 @@ class _Metrics(Feature):
         REGISTRY.register(collector)
 
     def end_counting(self, statistics: Any) -> None:
-        """Remove the metrics."""
+        """Remove the metrics from the endpoint."""
         collector = self._collectors.pop(statistics, None)
         if collector is not None:
             from prometheus_client import REGISTRY

@@ -1,4 +1,4 @@
-"""HTML representations of pools, partitions and pipes for notebooks, with a link to the page."""
+"""HTML representations of pools, partitions, and pipes in notebooks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _OPENER = "Pool.from_client(client).page()"
 
 
 def table_of_partitions(client: Client, title: str) -> str:
-    """Return the HTML of a table of all partitions, and of workers and tasks without one.
+    """Return a table of all partitions as HTML, including workers and tasks without one.
 
     If the page is open, the table is followed by a link to it. If the scheduler is unavailable,
     only the title is returned.
@@ -42,13 +42,13 @@ def table_of_partitions(client: Client, title: str) -> str:
 
 
 def table_of_partition(get_client: Callable[[], Client], title: str, name: str) -> str:
-    """Return the HTML of a partition's statistics, or a sentence if it does not exist."""
+    """Return a partition's statistics as HTML, or state that the partition does not exist."""
     gone = "No worker declares this partition. It was dissolved, or its workers have left."
     return _table_of_one(get_client, _one_partition, name, (title, _HEAD, gone))
 
 
 def table_of_pipe(get_client: Callable[[], Client], title: str, name: str) -> str:
-    """Return the HTML of a pipe's state, or a sentence if the pipe does not exist."""
+    """Return a pipe's state as HTML, or state that the pipe does not exist."""
     gone = "The pipe does not exist. It was deleted or never created."
     return _table_of_one(get_client, _one_pipe, name, (title, _HEAD_OF_A_PIPE, gone))
 
@@ -59,7 +59,7 @@ def _table_of_one(
     name: str,
     words: tuple[str, Sequence[str], str],
 ) -> str:
-    """Return the HTML of a table with one row, which a function returns on the scheduler.
+    """Return an HTML table whose only row is the result of a function on the scheduler.
 
     `words` contains the title, the column names, and the sentence that is shown if there is no row.
     If the scheduler is unavailable, only the title is returned.
@@ -79,29 +79,28 @@ def _plain(text: str) -> str:
 
 
 def _link(link: str | None, opener: str) -> str:
-    """Return the HTML of a link to the page, or of the call that opens it."""
+    """Return a link to the page as HTML, or the call that opens the page."""
     return _LINK.generate(link=link, opener=opener).decode()
 
 
 def _request(client: Client, look: Callable[..., Any], **arguments: Any) -> tuple[Any, str | None]:
-    """Call a function on the scheduler, and return its result and the URL of the page if open."""
+    """Call a function on the scheduler, and return its result and the URL of an open page."""
     found, has_page = run_on_scheduler(client, look, **arguments)
     return found, page_link(client) if has_page else None
 
 
 def _row(stats: PartitionStats) -> list[object]:
-    """Return the table row of a partition's statistics."""
     return [stats.name or NO_PARTITION, *(getattr(stats, column) for column in _HEAD[1:])]
 
 
 def _all_partitions(dask_scheduler: Any = None) -> tuple[list[Sequence[object]], bool]:
-    """Return the rows of all partitions and whether the page is open. Runs on the scheduler."""
+    """Return the rows of all partitions, and whether the page is open. Runs on the scheduler."""
     names = [*partition_names(dask_scheduler), ""]
     return [_row(stats) for stats in stats_of(names, dask_scheduler)], is_page_open(dask_scheduler)
 
 
 def _one_partition(name: str, dask_scheduler: Any = None) -> tuple[Sequence[object] | None, bool]:
-    """Return the row of a partition, or None, and whether the page is open.
+    """Return a partition's row, or None if it does not exist, and whether the page is open.
 
     Partitions of a divided pool and adaptive partitions exist even without workers. Runs on the
     scheduler.
@@ -113,7 +112,7 @@ def _one_partition(name: str, dask_scheduler: Any = None) -> tuple[Sequence[obje
 
 
 def _one_pipe(name: str, dask_scheduler: Any = None) -> tuple[Sequence[object] | None, bool]:
-    """Return the row of a pipe, or None, and whether the page is open. Runs on the scheduler."""
+    """Return a pipe's row, or None if it does not exist, and whether the page is open."""
     pipe = pipes_of(dask_scheduler).get(name)
     row = None if pipe is None else [name, *pipe.summary]
     return row, is_page_open(dask_scheduler)

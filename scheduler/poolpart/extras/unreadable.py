@@ -1,4 +1,4 @@
-"""Errors for tasks whose inputs cannot be unpickled on their worker.
+"""Raise errors for tasks whose inputs cannot be unpickled on their worker.
 
 In plain Dask, such a task waits forever, for example in ``b.submit(use, a.submit(f))`` if the
 result of ``f`` can only be unpickled in the process that created it, or in a map over a map. The
@@ -28,7 +28,7 @@ MAX_ATTEMPTS = 10  # maximum attempts for an input that is only readable individ
 
 
 class UnreadableInputs:
-    """Rule on the scheduler that handles reports about unreadable inputs.
+    """Scheduler rule that handles reports about unreadable inputs.
 
     `names` are the names of the partitions, a set that the caller updates.
     """
@@ -47,14 +47,14 @@ class UnreadableInputs:
         self._rules.remove_all()
 
     def _examine_soon(self, task: Any, worker: str) -> None:
-        """Examine an input that a worker could not fetch, unless this is already in progress."""
+        """Examine an input that a worker could not fetch, unless this is already being done."""
         request = task.key, worker
         if request not in self._open and self._waiting(task, worker):
             self._open[request] = asyncio.ensure_future(self._examine(task, worker))
             self._open[request].add_done_callback(lambda _: self._open.pop(request))
 
     def _waiting(self, task: Any, worker: str) -> list[Any]:
-        """Return the tasks of partitions that wait on a worker for the result of a task."""
+        """Return a partition's tasks on a worker that wait for the result of another task."""
         return [
             waiting
             for waiting in task.dependents
@@ -64,7 +64,7 @@ class UnreadableInputs:
         ]
 
     async def _examine(self, task: Any, worker: str) -> None:
-        """Make tasks fail if their worker cannot unpickle a result that they wait for."""
+        """Make tasks fail if their worker cannot unpickle a result for which they wait."""
         holder = next(iter(task.who_has)).address
         request = call_worker(self.scheduler, worker, why_unreadable, key=task.key, holder=holder)
         try:

@@ -1,4 +1,4 @@
-"""Waits that lend slots, callbacks, and requests for clients, based on private API."""
+"""Client waits that lend slots, callbacks, and requests, based on private API."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _OPTIONS_OF_SYNC = {"asynchronous", "callback_timeout"}  # options that `sync` i
 
 
 class WaitHooks(Protocol):
-    """Methods that a wait calls to lend the slots of the waiting task."""
+    """Methods called by a waiting client so that the task lends its slots."""
 
     def may_lend(self) -> bool:
-        """Return whether the task of this thread has slots to lend."""
+        """Return whether this thread's task has slots to lend."""
 
     def wait_until_wanted(self, answer: concurrent.futures.Future[Any]) -> None:
         """Wait until a call has been answered or another task needs the slots."""
 
     def lend(self, waits: bool = True) -> AbstractContextManager[None]:
-        """Lend the slots within the block if `waits` is true."""
+        """Within the block, lend the slots if `waits` is true."""
 
 
 _hooks: list[WaitHooks] = []  # set by `install_wait_hooks`
@@ -35,7 +35,7 @@ _hooks: list[WaitHooks] = []  # set by `install_wait_hooks`
 
 @cache  # only once per process, because another library may have wrapped the wrapper since
 def install_wait_hooks(hooks: WaitHooks) -> None:
-    """Wrap the waits of Dask's clients so that waiting tasks in this process lend their slots.
+    """Wrap the wait functions of Dask's clients so that waiting tasks lend their slots.
 
     `Future.result` and `Future.exception`, `Client.gather`, `wait`, the computation of collections,
     and `as_completed` lend slots immediately if they have to wait. All other calls of the
@@ -98,7 +98,7 @@ def install_wait_hooks(hooks: WaitHooks) -> None:
 
 
 def lend_slots(waits: bool) -> AbstractContextManager[None]:
-    """Lend the slots of this thread's task within the block if `waits` is true.
+    """Within the block, lend the slots of this thread's task if `waits` is true.
 
     Nothing happens if the hooks are not installed in this process.
     """
@@ -106,7 +106,7 @@ def lend_slots(waits: bool) -> AbstractContextManager[None]:
 
 
 def call_when_done(future: Future, function: Callable[[Future], Any]) -> None:
-    """Call `function(future)` once a task has succeeded, failed or been canceled.
+    """Call `function(future)` once a task has succeeded, failed, or been canceled.
 
     The function is called in the client's event loop and must not block. `Future.add_done_callback`
     is not used for two reasons. All of its callbacks share a thread, so a user's callback that
@@ -123,7 +123,7 @@ def call_when_done(future: Future, function: Callable[[Future], Any]) -> None:
 
 
 async def fetch_from_worker(client: Client, address: str, keys: Collection[str]) -> dict[str, Any]:
-    """Fetch results directly from a worker, without involving the scheduler."""
+    """Fetch results directly from a worker, bypassing the scheduler."""
     from distributed.utils_comm import gather_from_workers
 
     data, *_ = await gather_from_workers({key: [address] for key in keys}, rpc=client.rpc)
@@ -131,7 +131,7 @@ async def fetch_from_worker(client: Client, address: str, keys: Collection[str])
 
 
 async def send_request(client: Client, address: str | None, handler: str, **arguments: Any) -> Any:
-    """Call a handler of a worker, or of the scheduler if the address is None.
+    """Call a request handler on a worker, or on the scheduler if the address is None.
 
     If the scheduler lacks the handler, it logs an error and the result is None. For a worker, the
     caller sets a time limit. For the scheduler, the limit is that of `await_scheduler`.
@@ -168,7 +168,7 @@ async def await_scheduler(
 
 
 def gather(client: Client, futures: Sequence[Future]) -> list[Any]:
-    """Return the results of finished tasks, like `Client.gather`, but with a time limit.
+    """Return the results of finished tasks like `Client.gather`, but with a time limit.
 
     Raises
     ------
@@ -191,7 +191,7 @@ def gather(client: Client, futures: Sequence[Future]) -> list[Any]:
 
 
 def wrap_bytes(data: Any) -> Any:
-    """Wrap bytes so that Dask sends them without copying them."""
+    """Wrap bytes so that Dask sends them without copying."""
     from distributed.protocol import to_serialize
 
     return to_serialize(memoryview(data))

@@ -1,4 +1,4 @@
-"""Rules that are called before, after or instead of methods of a running scheduler.
+"""Rules that a running scheduler applies before, after, or instead of its own methods.
 
 They are required because scheduler plugins can only observe. A rule is installed as an attribute of
 the scheduler instance, which hides the method of the class until the attribute is deleted.
@@ -24,7 +24,7 @@ Instead = Callable[..., Any]  # receives the arguments; NotImplemented means to 
 
 
 class _Method:
-    """Replacement of a method that calls rules before, after and instead of the original.
+    """Replacement of a method that applies rules before, after, and instead of the original.
 
     If a rule raises an exception, the rule is skipped and the first such exception is logged, so
     that other users of the cluster get Dask's own behavior. Errors of the original method reach the
@@ -65,7 +65,7 @@ class _Method:
         return result
 
     def _log_failure(self, rule: Any) -> None:
-        """Log the exception of a rule when it fails for the first time."""
+        """Log a rule's exception when the rule fails for the first time."""
         if rule not in self._logged:
             self._logged.add(rule)
             logger.exception(
@@ -77,7 +77,7 @@ class _Method:
 
 
 class MethodRules:
-    """Set of rules for methods of a running scheduler.
+    """Set of rules for the methods of a running scheduler.
 
     Several sets can have rules for the same method.
     """
@@ -86,7 +86,7 @@ class MethodRules:
         self._added: list[tuple[Any, str, Any]] = []  # (object, method name, rule)
 
     def call_after(self, owner: Any, name: str, rule: After, parameter: str) -> None:
-        """Call `rule(result, …)` after a method, and return the rule's result instead.
+        """Call `rule(result, …)` after a method, and return the result of the rule instead.
 
         `parameter` is the name of a parameter that the method must have.
 
@@ -99,7 +99,7 @@ class MethodRules:
         self._added.append((owner, name, rule))
 
     def call_before(self, owner: Any, name: str, rule: Before, *parameters: str) -> None:
-        """Call `rule(keywords)` before a method, and call the method with the returned keywords.
+        """Call `rule(keywords)` before a method, and pass the returned keywords to the method.
 
         `parameters` are the names of parameters that the method must have. This method raises the
         same error as `call_after`.
@@ -132,7 +132,7 @@ class MethodRules:
         return stand_in
 
     def remove_all(self) -> None:
-        """Remove all rules of this set, and restore methods that have no further rules."""
+        """Remove all rules in this set, and restore methods without other rules."""
         while self._added:
             owner, name, rule = self._added.pop()
             method = vars(owner)[name]
@@ -146,7 +146,7 @@ class MethodRules:
 def add_graph_rule(
     rules: MethodRules, scheduler: Any, inherited_resources: Callable[[Any], Resources]
 ) -> None:
-    """Make nested tasks inherit resources from the task that submits their graph.
+    """Make nested tasks inherit resources from the task that submits them.
 
     `inherited_resources` returns these resources for the state of the submitting task. Tasks that
     specify resources or workers inherit nothing. Each nested task is also annotated with its
@@ -180,7 +180,7 @@ def add_graph_rule(
 
 
 def add_arrival_rule(rules: MethodRules, scheduler: Any, check: Before) -> None:
-    """Call `check` with the arguments of each arriving graph, which it may change or reject.
+    """Call `check` for each arriving graph, which it may change or reject.
 
     If `check` raises a PoolError, all futures of the graph raise this error.
     """
@@ -193,7 +193,7 @@ def add_arrival_rule(rules: MethodRules, scheduler: Any, check: Before) -> None:
 
 
 def add_shuffle_rule(rules: MethodRules, scheduler: Any) -> None:
-    """Make shuffles and rechunks choose permitted workers for their outputs.
+    """Make shuffles and rechunks place their outputs on permitted workers.
 
     Dask assigns each output to any worker of the cluster, even if its task requests a resource that
     the worker does not have. Such a task would wait forever.
@@ -220,7 +220,7 @@ def add_shuffle_rule(rules: MethodRules, scheduler: Any) -> None:
 def add_fence_rules(
     rules: MethodRules, scheduler: Any, enclosed: set[Any], keeps_out: Callable[[Any], bool]
 ) -> None:
-    """Keep tasks off workers behind a fence.
+    """Keep tasks off workers within a fence.
 
     `enclosed` contains the states of these workers, and may change later. `keeps_out` returns
     whether a task is not allowed on them.
@@ -258,7 +258,7 @@ def add_fence_rules(
 
 
 def add_choice_rule(rules: MethodRules, scheduler: Any, choose: Callable[[Any], Any]) -> None:
-    """Let `choose` select the workers of tasks, unless it returns NotImplemented.
+    """Let `choose` select a worker for each task, unless it returns NotImplemented.
 
     Raises
     ------
@@ -296,7 +296,7 @@ def workers_without_fences(scheduler: Any, task: Any) -> Any:
 
 
 class _OpenWorkers(set[Any]):
-    """Replacement of the scheduler's set of idle workers that excludes workers behind fences."""
+    """Replacement of the scheduler's set of idle workers that excludes workers within fences."""
 
     def __init__(self, enclosed: set[Any], workers: Iterable[Any]) -> None:
         super().__init__(workers)

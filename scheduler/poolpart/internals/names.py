@@ -1,4 +1,4 @@
-"""List of the private API of Dask that poolpart uses, and checks that it exists.
+"""List the private API of Dask that poolpart uses, and check that it exists.
 
 Private names may change in any release of Dask. Before a feature is used, `require_feature` checks
 the names that it needs. If a name is missing, a `PoolError` reports it, and all other features
@@ -40,7 +40,7 @@ READING = "errors for inputs that cannot be unpickled"
 
 @dataclass(frozen=True)
 class PrivateNames:
-    """Private names of Dask that a feature needs for a certain purpose."""
+    """Private Dask names that a feature needs for a given purpose."""
 
     feature: str
     names: tuple[str, ...]  # "module:object.attribute", followed by "(parameters)" for methods
@@ -330,7 +330,7 @@ PRIVATE_NAMES = (
 
 
 def require_feature(feature: str) -> None:
-    """Check that this version of Dask has the private names that a feature needs.
+    """Check that this version of Dask provides the private names that a feature needs.
 
     The first call in a process also warns if this version of Dask was not tested.
 
@@ -350,14 +350,14 @@ def require_feature(feature: str) -> None:
 
 @cache
 def missing_names(feature: str) -> tuple[str, ...]:
-    """Return the private names of a feature that this version of Dask does not have."""
+    """Return the private names for a feature that this version of Dask does not provide."""
     names = [name for row in PRIVATE_NAMES if row.feature == feature for name in row.names]
     return tuple(name.partition(":")[2] for name in names if not _exists(name))
 
 
 @cache
 def warn_if_untested() -> None:
-    """Warn if this version of Dask was not tested, once per process."""
+    """Warn once per process if poolpart was not tested with this version of Dask."""
     oldest, version, newest = map(_numbers, (TESTED[0], distributed.__version__, TESTED[1]))
     if not oldest <= version <= newest:
         warnings.warn(
@@ -368,14 +368,14 @@ def warn_if_untested() -> None:
 
 
 def table_row(row: PrivateNames) -> str:
-    """Return a row of the table in docs/pool-partitions.md."""
+    """Return a row for the table in docs/pool-partitions.md."""
     short = ", ".join(f"`{name.partition(':')[2]}`" for name in row.names)
     tests = ", ".join(f"`{test}`" for test in row.tests)
     return f"| {row.feature} | {short} | {row.purpose} | {tests} |"
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """Return the numbers of a version, for example of 2026.8.0 or 2026.8.0+14.g1234abc."""
+    """Return the numbers in a version such as 2026.8.0 or 2026.8.0+14.g1234abc."""
     return tuple(int(number) for number in version.partition("+")[0].split(".") if number.isdigit())
 
 
@@ -399,7 +399,7 @@ def _exists(name: str) -> bool:
 
 
 def _attributes(owner: Any) -> set[str]:
-    """Return the names of all attributes of an object, or of a class and its instances."""
+    """Return the names of all attributes that an object, or an instance of a class, may have."""
     names = set(dir(owner))
     if isinstance(owner, type):
         for kind in owner.__mro__:
@@ -414,7 +414,7 @@ def _slots(kind: type) -> Iterator[str]:
 
 
 def _assigned(kind: type) -> tuple[str, ...]:
-    """Return the names used in the constructor of a class, which include unannotated attributes."""
+    """Return the names that a class constructor uses, which include unannotated attributes."""
     constructor = vars(kind).get("__init__")
     code = getattr(inspect.unwrap(constructor), "__code__", None) if constructor else None
     return code.co_names if code is not None else ()

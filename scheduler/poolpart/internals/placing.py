@@ -1,4 +1,4 @@
-"""State of tasks and workers that the scheduler uses to place tasks."""
+"""Task and worker states on which the scheduler bases the placement of tasks."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 
 def only_resource_of(task: Any) -> tuple[str, float] | None:
-    """Return the name and amount of the only resource that a task requests, or ("", 1).
+    """Return the name and amount of a task's only resource, or ("", 1) if it requests none.
 
     The result is None if the task is bound to workers or hosts, requests several resources, or is
     an actor.
@@ -19,7 +19,7 @@ def only_resource_of(task: Any) -> tuple[str, float] | None:
 
 
 def workers_declaring(scheduler: Any, name: str) -> list[Any]:
-    """Return the states of the workers that declare a resource."""
+    """Return the states of all workers that declare a resource."""
     return [scheduler.workers[address] for address in scheduler.resources.get(name, ())]
 
 
@@ -34,23 +34,23 @@ def count_declaring(scheduler: Any, name: str) -> int:
 
 
 def free_slots_of(worker: Any, name: str) -> float:
-    """Return the number of free slots of a worker for a resource, or its free threads for ""."""
+    """Return a worker's free slots for a resource, or its free threads if `name` is ""."""
     if not name:
         return float(worker.nthreads - len(worker.processing) + len(worker.long_running))
     return float(worker.resources.get(name, 0) - worker.used_resources.get(name, 0))
 
 
 def can_run(scheduler: Any, worker: Any, name: str, slots: float) -> bool:
-    """Return whether a worker is running and declares enough slots of a resource, if any."""
+    """Return whether a worker is running and, if a resource is named, declares enough slots."""
     enough = not name or worker.resources.get(name, 0) >= slots
     return bool(enough and worker in scheduler.running)
 
 
 def holders_of_inputs(task: Any) -> list[Any]:
-    """Return the workers that hold inputs of a task, with one entry per input."""
+    """Return the workers that hold a task's inputs, with one entry per copy of an input."""
     return [worker for task_input in task.dependencies for worker in task_input.who_has or ()]
 
 
 def earliest_worker(scheduler: Any, task: Any, workers: list[Any]) -> Any:
-    """Return the worker on which Dask expects a task to start first."""
+    """Return the worker on which a task is expected to start first, according to Dask."""
     return min(workers, key=partial(scheduler.worker_objective, task))

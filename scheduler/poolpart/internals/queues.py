@@ -1,4 +1,4 @@
-"""Implementation of the Queue and the Variable of a pipe in Dask's scheduler extensions."""
+"""Implementation of a pipe's Queue and Variable in Dask's scheduler extensions."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _PICKLED = "pickled"
 
 
 class Waiters:
-    """Requests that wait for changes of a queue, or for the end of a task.
+    """Requests that wait until a queue changes or a task ends.
 
     After each `notify`, a request checks its condition again.
     """
@@ -48,16 +48,16 @@ class Waiters:
         self._events: set[asyncio.Event] = set()
 
     def notify(self) -> None:
-        """Make all requests check their conditions again."""
+        """Make all waiting requests check their conditions again."""
         for event in self._events:
             event.set()
 
     def subscribe(self, event: asyncio.Event) -> None:
-        """Set an event at each notification from now on."""
+        """From now on, set an event at each notification."""
         self._events.add(event)
 
     def unsubscribe(self, event: asyncio.Event) -> None:
-        """Stop setting an event."""
+        """No longer set an event at notifications."""
         self._events.discard(event)
 
     def __len__(self) -> int:
@@ -68,7 +68,7 @@ class Waiters:
 async def wait_until(
     condition: Callable[[], bool], waiters: Collection[Waiters], seconds: float = math.inf
 ) -> None:
-    """Wait until a condition holds, for at most `seconds`.
+    """Wait until a condition is true, but at most `seconds`.
 
     The condition is checked after each notification of one of the `waiters`.
     """
@@ -90,11 +90,12 @@ async def wait_until(
 
 
 class BoundedQueue:
-    """Queue of items whose waits end with an error once the pipe has ended.
+    """Queue in which waits end with an error once the pipe has ended.
 
-    It takes the place of an `asyncio.Queue` in Dask's queue extension, which calls its methods
-    `put`, `get` and `qsize` for the methods of a `distributed.Queue`. Therefore, the capacity
-    applies to the items of all clients, and all waiting requests are notified of them.
+    It takes the place of an `asyncio.Queue` in Dask's queue extension. The extension calls its
+    methods `put`, `get` and `qsize` when a client calls the methods of a `distributed.Queue`.
+    Therefore, the capacity applies to the items of all clients, and all waiting requests are
+    notified of them.
 
     Parameters
     ----------
@@ -129,11 +130,11 @@ class BoundedQueue:
 
     @property
     def free_capacity(self) -> int:
-        """Number of items that can be put without waiting."""
+        """Number of items for which there is space."""
         return max(0, self.capacity - len(self._queue))
 
     async def put(self, record: Record) -> None:
-        """Add an item after waiting until the queue has space."""
+        """Add an item once the queue has space for it."""
         await wait_until(
             lambda: self.free_capacity > 0 or self._why_no_put() is not None, [self.waiters]
         )
@@ -142,7 +143,7 @@ class BoundedQueue:
         self.extend([record])
 
     async def get(self) -> Record:
-        """Remove and return the first item after waiting until there is one."""
+        """Remove and return the first item once there is one."""
         await wait_until(
             lambda: bool(self._queue) or self._why_no_put() is not None, [self.waiters]
         )
@@ -152,7 +153,7 @@ class BoundedQueue:
         return self.pop_items(1)[0]
 
     def extend(self, records: Iterable[Record]) -> None:
-        """Add items, ignoring the capacity."""
+        """Add items even if this exceeds the capacity."""
         was_empty = not self._queue
         self._queue.extend(records)
         # Consumers wait for the first item, or linger until the queue is full.
@@ -160,7 +161,7 @@ class BoundedQueue:
             self.waiters.notify()
 
     def pop_items(self, number: int) -> list[Record]:
-        """Remove and return at most `number` items from the beginning of the queue."""
+        """Remove and return at most `number` items from the front of the queue."""
         had_room = self.free_capacity > 0
         records = [self._queue.popleft() for _ in range(min(number, len(self._queue)))]
         if records and not had_room:  # producers wait only while the queue is full
@@ -169,7 +170,10 @@ class BoundedQueue:
 
 
 class QueueAndVariable:
-    """Queue of items and Variable with plain data under the same name, visible to all clients."""
+    """Queue of items and Variable of plain data, which have the same name.
+
+    All clients can access both of them.
+    """
 
     def __init__(self, scheduler: Any, name: str, queue: BoundedQueue, value: Any) -> None:
         self.name = name
@@ -182,7 +186,7 @@ class QueueAndVariable:
 
     @staticmethod
     def is_used(scheduler: Any, name: str) -> bool:
-        """Return whether the cluster has a queue or a variable with a name."""
+        """Return whether a queue or a variable with the given name exists in the cluster."""
         extensions = scheduler.extensions
         return name in extensions["queues"].queues or name in extensions["variables"].variables
 
@@ -203,16 +207,16 @@ class QueueAndVariable:
         self.queue.waiters.notify()
 
     async def wake_early_readers(self) -> None:
-        """Answer the requests that tried to read the variable before it was created."""
+        """Answer requests that tried to read the variable before it existed."""
         async with self._variables.started:
             self._variables.started.notify_all()
 
     def put(self, items: Iterable[bytes]) -> None:
-        """Add pickled items to the queue, ignoring its capacity."""
+        """Add pickled items to the queue, even if this exceeds the capacity."""
         self.queue.extend([_record_of(item) for item in items])
 
     def pop_items(self, limit: int) -> list[Packed]:
-        """Remove at most `limit` items from the queue, and return them packed."""
+        """Remove at most `limit` items from the queue, and return them in packed form."""
         records = self.queue.pop_items(limit)
         return [_packed(self.name, record) for record in records]
 
@@ -234,9 +238,9 @@ def _record_of(item: bytes) -> Record:
 
 
 def _packed(name: str, record: Record) -> Packed:
-    """Pack an item for a client.
+    """Convert an item to the form in which it is sent to a client.
 
-    An item of a pipe becomes the pickled item, and an item of `Queue.put` becomes its record.
+    An item from a pipe becomes pickled bytes, and an item from `Queue.put` becomes its record.
     """
     if record["type"] == _PICKLED:
         item: bytes = record["value"].frames[0]
@@ -245,7 +249,7 @@ def _packed(name: str, record: Record) -> Packed:
 
 
 def unpack_item(client: Client, packed: Packed) -> Any:
-    """Return the item that `QueueAndVariable.pop_items` has packed, like `Queue.get` would."""
+    """Unpack an item from `QueueAndVariable.pop_items`, with the same result as `Queue.get`."""
     from distributed.protocol.pickle import loads
 
     if isinstance(packed, bytes | bytearray | memoryview):
@@ -262,7 +266,7 @@ def unpack_item(client: Client, packed: Packed) -> Any:
 def intercept_variable_set(
     handlers: dict[str, Any], check: Callable[[str, Any], None], on_change: Callable[[str], None]
 ) -> Callable[[], None]:
-    """Intercept all requests that set a variable, and return a function that ends this.
+    """Intercept requests that set a variable, and return a function that ends the interception.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Functions that use private API in the scheduler's event loop, mostly to place and move tasks."""
+"""Functions for the scheduler's event loop that use private API, mostly to place and move tasks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SUBMITTER = "poolpart-submitter"  # annotation of nested tasks, a `SubmittingTas
 
 
 class SubmittingTask(NamedTuple):
-    """Task of a partition that has submitted another task. This is the value of the annotation."""
+    """Task of a partition that has submitted another task. It is stored in an annotation."""
 
     key: Any
     worker: str  # address of the worker on which it ran when it submitted the other task
@@ -30,7 +30,7 @@ class SubmittingTask(NamedTuple):
 
 
 def set_visible_resources(scheduler: Any, worker: Any, resources: Resources) -> None:
-    """Make the scheduler place tasks on a worker only according to the given resources."""
+    """Set the resources that the scheduler considers when it places tasks on a worker."""
     for name in worker.resources.keys() | resources.keys():
         declaring = scheduler.resources.setdefault(name, {})
         declaring.pop(worker.address, None)
@@ -43,7 +43,7 @@ def set_visible_resources(scheduler: Any, worker: Any, resources: Resources) -> 
 
 
 def recount_used_resources(worker: Any) -> None:
-    """Recount the resources in use on a worker, which Dask miscounts in two cases.
+    """Recount a worker's resources in use, which Dask miscounts in two cases.
 
     Dask resets them when a busy worker declares resources, and attributes a task that was moved by
     work stealing to the original worker.
@@ -56,7 +56,7 @@ def recount_used_resources(worker: Any) -> None:
 
 
 def send_waiting_tasks(scheduler: Any, worker: Any) -> None:
-    """Send a worker the tasks that wait for its resources.
+    """Send tasks to a worker that have been waiting for its resources.
 
     Dask only does this when a worker joins. If a running worker gets a resource, the tasks would
     wait forever.
@@ -69,7 +69,7 @@ def send_waiting_tasks(scheduler: Any, worker: Any) -> None:
 
 
 def admit_other_tasks(scheduler: Any, worker: Any) -> None:
-    """Send waiting tasks to a worker that is no longer behind a fence."""
+    """Send waiting tasks to a worker that is no longer within a fence."""
     scheduler.check_idle_saturated(worker)
     if worker.status is Status.running:
         send_waiting_tasks(scheduler, worker)
@@ -77,7 +77,7 @@ def admit_other_tasks(scheduler: Any, worker: Any) -> None:
 
 
 def actor_of_method(scheduler: Any, name: Any) -> Any:
-    """Return the state of the actor whose method has submitted tasks, or None.
+    """Return the state of the actor that has submitted tasks in a method, or None.
 
     Dask's name for the submitting method consists of the prefix of the actor's key and the name of
     the method. The result is None if the name has another form, or if actors with this prefix
@@ -101,12 +101,12 @@ def actor_of_method(scheduler: Any, name: Any) -> Any:
 
 
 def requires_any(task: Any, names: Collection[str]) -> bool:
-    """Return whether a task takes a slot of one of the named partitions."""
+    """Return whether a task occupies a slot in one of the named partitions."""
     return not (task.resource_restrictions or {}).keys().isdisjoint(names)
 
 
 def lift_restrictions(scheduler: Any, names: Collection[str]) -> None:
-    """Allow any worker to recompute results of dissolved partitions that are still needed.
+    """Let any worker recompute results of dissolved partitions that are still needed.
 
     Otherwise, lost results would wait forever, because no worker declares their resource anymore.
     """
@@ -123,7 +123,7 @@ def lift_restrictions(scheduler: Any, names: Collection[str]) -> None:
 
 
 def keys_held_by(scheduler: Any, worker: Any, names: Collection[str]) -> list[str]:
-    """Return the keys of the tasks on a worker, or on their way to it, that use the partitions."""
+    """Return the keys of a worker's tasks in the named partitions, including tasks in transfer."""
     tasks = {task for task in worker.processing if requires_any(task, names)}
     if stealing := scheduler.extensions.get("stealing"):
         moves = stealing.in_flight.items()
@@ -136,7 +136,7 @@ def keys_held_by(scheduler: Any, worker: Any, names: Collection[str]) -> list[st
 def hand_off_tasks(
     scheduler: Any, worker: Any, names: Collection[str], requested: set[Any]
 ) -> None:
-    """Move tasks that have not started from a worker to other members of their partition.
+    """Move tasks that have not started to other members of their partition.
 
     A task that no other worker can run stays on this worker.
 
@@ -191,7 +191,7 @@ def holds_nothing(scheduler: Any, worker: Any) -> bool:
 
 
 def accepts_tasks(worker: Any) -> bool:
-    """Return whether a worker accepts tasks, now or after it has joined."""
+    """Return whether a worker accepts tasks, either now or once it has joined."""
     return worker.status in (Status.running, Status.init)
 
 
@@ -202,7 +202,7 @@ def stop_assigning(scheduler: Any, worker: Any) -> None:
 
 
 def resume_assigning(scheduler: Any, worker: Any) -> None:
-    """Assign tasks to a worker again after `stop_assigning` or a failed retirement."""
+    """Assign tasks to a worker again, after `stop_assigning` or a failed retirement."""
     if scheduler.workers.get(worker.address) is worker:
         stimulus = f"poolpart-reopened-{time.time()}"
         message = {"op": "worker-status-change", "status": "running", "stimulus_id": stimulus}
@@ -211,7 +211,7 @@ def resume_assigning(scheduler: Any, worker: Any) -> None:
 
 
 async def retire_workers(scheduler: Any, workers: Collection[Any]) -> bool:
-    """Close workers, and return whether all of them were closed.
+    """Retire workers, and return whether all of them were closed.
 
     A worker is not closed if no other worker can store its results.
     """
@@ -221,7 +221,7 @@ async def retire_workers(scheduler: Any, workers: Collection[Any]) -> bool:
 
 
 def reject_worker(scheduler: Any, worker: Any) -> None:
-    """Close a joining worker before it receives tasks of a partition."""
+    """Close a joining worker before it receives any tasks of a partition."""
     stop_assigning(scheduler, worker)
     # The worker reports that it is running before it reads the request to close.
     set_visible_resources(scheduler, worker, {})
@@ -229,12 +229,12 @@ def reject_worker(scheduler: Any, worker: Any) -> None:
 
 
 def count_transitions(scheduler: Any) -> int:
-    """Return the number of task transitions so far, which is unchanged while nothing happens."""
+    """Return the number of task transitions so far, which only changes if something happens."""
     return int(scheduler.transition_counter)
 
 
 def cancel_keys(scheduler: Any, keys: Collection[Any], client: str) -> None:
-    """Cancel tasks on behalf of a client, like `Client.cancel`, ignoring unknown tasks."""
+    """Cancel tasks on behalf of a client like `Client.cancel`, but ignore unknown tasks."""
     scheduler.stimulus_cancel(
         list(keys), client=client, force=False, reason="unknown", msg="by Partition.cancel"
     )
@@ -252,7 +252,7 @@ async def restart_worker(scheduler: Any, worker: Any, seconds: float) -> bool:
 
 
 def fail_task(scheduler: Any, task: Any, worker: str, error: Exception) -> None:
-    """Make a task that waits for its inputs on a worker fail, or retry it if it has retries."""
+    """Make a task fail that waits for inputs on a worker, or retry it if it has retries left."""
     from distributed.core import error_message
 
     stimulus = f"poolpart-failed-{time.time()}"
@@ -266,18 +266,18 @@ def fail_task(scheduler: Any, task: Any, worker: str, error: Exception) -> None:
 
 
 def reschedule_tasks(scheduler: Any, tasks: Collection[Any]) -> None:
-    """Take tasks from their workers and place them again."""
+    """Take tasks away from their workers, and place them again."""
     stimulus = f"poolpart-again-{time.time()}"
     scheduler.transitions({task.key: "waiting" for task in tasks}, stimulus)
 
 
 def is_bound(task: Any) -> bool:
-    """Return whether a task can only run on certain workers or hosts."""
+    """Return whether a task may only run on certain workers or hosts."""
     return bool(task.worker_restrictions or task.host_restrictions) and not task.loose_restrictions
 
 
 def unrunnable_tasks(scheduler: Any) -> Collection[Any]:
-    """Return the tasks that are ready to run but for which there is no worker."""
+    """Return tasks that are ready to run, but for which there is no worker."""
     tasks: Collection[Any] = scheduler.unrunnable
     return tasks
 
@@ -312,7 +312,7 @@ async def call_worker(
 
 
 def _unpacked(result: Any) -> Any:
-    """Return the object of a reply, which is either serialized or, within a process, wrapped."""
+    """Unpack a reply, whose object is either serialized or, within a process, only wrapped."""
     from distributed.protocol.serialize import Serialize, Serialized, deserialize
 
     if isinstance(result, Serialized):
@@ -355,7 +355,7 @@ def set_worker_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[a
 
 
 def handlers_of(scheduler: Any) -> dict[str, Any]:
-    """Return the request handlers of a scheduler by name, which receive and return plain data."""
+    """Return a scheduler's request handlers by name. They receive and return plain data."""
     handlers: dict[str, Any] = scheduler.handlers
     return handlers
 

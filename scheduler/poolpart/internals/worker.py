@@ -1,4 +1,4 @@
-"""Access to the resources, slots, and inputs of a worker through private API."""
+"""Access a worker's resources, slots, and inputs through private API."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from .scheduler import SUBMITTER, Resources, SubmittingTask
 
 
 def has_running_tasks(dask_worker: Any = None) -> bool:
-    """Return whether a worker runs a task, including tasks that its scheduler has forgotten."""
+    """Return whether a worker runs any task, including tasks unknown to its scheduler."""
     return bool(dask_worker.state.all_running_tasks)
 
 
 def running_keys(worker: Any) -> list[Any]:
-    """Return the keys of the tasks that a worker runs, including canceled tasks."""
+    """Return the keys of all tasks that a worker runs, including canceled tasks."""
     return [task.key for task in worker.state.all_running_tasks]
 
 
@@ -23,7 +23,7 @@ def running_keys(worker: Any) -> list[Any]:
 
 
 class _Available(dict[str, float]):
-    """Available slots by resource, which are 0 for undeclared resources.
+    """Available slots by resource, with 0 for undeclared resources.
 
     The request to declare resources and the tasks use different connections. Therefore, a canceled
     task may arrive late, and the worker would fail if its resource were unknown.
@@ -55,12 +55,12 @@ def declare_on_worker(resources: Resources, dask_worker: Any = None) -> bool:
 
 
 def resources_of(task: Any) -> Resources:
-    """Return the resources that a running task takes from its worker."""
+    """Return the worker resources that a running task occupies."""
     return {name: slots for name, slots in (task.resource_restrictions or {}).items() if slots}
 
 
 def declared_resources(worker: Any) -> tuple[str, ...]:
-    """Return the sorted names of the resources that a worker has. Runs on the worker."""
+    """Return the sorted names of the resources that a worker declares. Runs on the worker."""
     return tuple(sorted(name for name, slots in worker.state.total_resources.items() if slots))
 
 
@@ -72,7 +72,7 @@ def declared_resources(worker: Any) -> tuple[str, ...]:
 
 
 def current_task() -> tuple[Any, Any] | None:
-    """Return the worker and the state of the task that runs in this thread, or None."""
+    """Return the worker and the state of this thread's task, or None outside tasks."""
     from distributed.worker import thread_state
 
     if (key := getattr(thread_state, "key", None)) is None:
@@ -83,24 +83,24 @@ def current_task() -> tuple[Any, Any] | None:
 
 
 def submitter_of(worker: Any, key: Any) -> SubmittingTask | None:
-    """Return the task that has submitted a nested task of this worker, or None."""
+    """Return the task that submitted a nested task on this worker, or None if it is unknown."""
     task = worker.state.tasks.get(key)
     submitter = (task.annotations or {}).get(SUBMITTER) if task is not None else None
     return None if submitter is None else SubmittingTask(*submitter)
 
 
 def threads_of(worker: Any) -> int:
-    """Return the number of task threads of a worker."""
+    """Return the number of threads in which a worker runs tasks."""
     return int(worker.state.nthreads)
 
 
 def is_running(worker: Any, key: Any) -> bool:
-    """Return whether a worker runs a task, even if the task has seceded."""
+    """Return whether a worker is running a task, which may have seceded."""
     return any(task.key == key for task in worker.state.all_running_tasks)
 
 
 def release_slots(worker: Any, slots: Resources) -> None:
-    """Make slots of a worker available to its waiting tasks. Runs in its event loop."""
+    """Make slots available to a worker's waiting tasks. Runs in the worker's event loop."""
     from distributed.worker_state_machine import UnpauseEvent
 
     for name, number in slots.items():
@@ -110,18 +110,18 @@ def release_slots(worker: Any, slots: Resources) -> None:
 
 
 def reserve_slots(worker: Any, slots: Resources) -> None:
-    """Reserve slots of a worker, even if fewer are available. Runs in its event loop."""
+    """Reserve slots, even if fewer are available. Runs in the worker's event loop."""
     for name, number in slots.items():
         worker.state.available_resources[name] -= number
 
 
 def count_slots(worker: Any, name: str) -> tuple[float, float]:
-    """Return the available slots of a worker, negative if reserved, and its total slots."""
+    """Return a worker's available slots, which may be negative, and its total slots."""
     return worker.state.available_resources[name], worker.state.total_resources[name]
 
 
 def add_handler(worker: Any, name: str, handler: Callable[..., Any]) -> None:
-    """Add a request handler to a worker unless it already exists."""
+    """Add a request handler to a worker, unless it already has one with this name."""
     worker.handlers.setdefault(name, handler)
 
 
@@ -129,7 +129,7 @@ def add_handler(worker: Any, name: str, handler: Callable[..., Any]) -> None:
 
 
 async def why_unreadable(key: Any, holder: str, dask_worker: Any = None) -> str:
-    """Return the reason why a worker cannot unpickle another worker's result, or "" if it can.
+    """Return why a worker cannot unpickle another worker's result, or "" if it can.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""Read OpenUSD, COLLADA, 3MF, IFC, CityJSON, AMAPVox, and elevation rasters."""
+"""Read OpenUSD, COLLADA, 3MF, IFC, CityJSON, and AMAPVox files, and elevation rasters."""

@@ -1,4 +1,4 @@
-"""Read files in a separate process with libraries that may crash.
+"""Read files with libraries that may crash, in a separate process.
 
 The process runs a script of this package. The script writes frames to standard output: a line of
 JSON, followed by the bytes of the arrays whose data types and shapes are listed in the field
@@ -26,7 +26,7 @@ Frame = tuple[dict[str, Any], list[AnyArray]]
 
 
 class ReaderProcess(NamedTuple):
-    """A process that reads a file.
+    """A process that reads one file.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class ReaderProcess(NamedTuple):
     def frames(
         self, path: Path, request: dict[str, Any], take: Callable[[dict[str, Any], int], None]
     ) -> Generator[Frame]:
-        """Read a file, and yield the frames.
+        """Read a file in the process, and yield its frames.
 
         `take` is called with the frame and the size of each array before the array is read.
 
@@ -87,7 +87,6 @@ class ReaderProcess(NamedTuple):
         raise ValueError(self._end(code))
 
     def _environment(self) -> dict[str, str]:
-        """Return the environment variables of the process."""
         variables = {
             name: text for name, text in os.environ.items() if not name.startswith(self.hidden)
         }
@@ -95,7 +94,7 @@ class ReaderProcess(NamedTuple):
         return variables | {"OPENBLAS_NUM_THREADS": "1"} | {**self.environment}
 
     def _end(self, code: int) -> str:
-        """Describe why the process ended before its last frame was read."""
+        """Describe why the process ended before it had sent its last frame."""
         if code == -signal.SIGALRM:
             return f"{self.library} exceeded its time limit"
         status = signal.Signals(-code).name if code < 0 else f"status {code}"
@@ -107,7 +106,7 @@ class ReaderProcess(NamedTuple):
 
 
 def _next_frame(stream: IO[bytes], take: Callable[[dict[str, Any], int], None]) -> Frame | None:
-    """Read a frame, or return None at the end.
+    """Read a frame, or return None at the end of the stream.
 
     None is also returned if the process has ended within a frame.
     """

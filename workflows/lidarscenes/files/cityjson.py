@@ -1,4 +1,4 @@
-"""Read CityJSON and CityJSONSeq, versions 1.0 to 2.0 (Ledoux et al. 2019, cityjson.org).
+"""Read CityJSON and CityJSONSeq files, versions 1.0 to 2.0 (Ledoux et al. 2019, cityjson.org).
 
 cjio is not used, because it triangulates in a Python loop and does not preserve names in its
 exports.
@@ -90,9 +90,9 @@ _Json = dict[str, Any]
 
 
 class _Polygons(NamedTuple):
-    """The polygons of the objects in a document.
+    """The polygons of all objects in a document.
 
-    An owner is (index of the object, material).
+    An owner is a tuple of an object index and a material index.
     """
 
     corners: list[Ints]  # vertices of the polygons without holes, one array per object
@@ -134,12 +134,12 @@ def read_cityjson(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 def _unpacked_bytes(text: bytes) -> int:
-    """Estimate the peak memory for parsing JSON in bytes."""
+    """Estimate the peak memory for parsing a JSON text, in bytes."""
     return 5 * len(text) + 100 * text.count(b"[") + 300 * text.count(b"{") + 48 * text.count(b",")
 
 
 class _CityFile:
-    """The objects in a file, placed as nodes.
+    """The objects in a file, each of which is placed as a node.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ class _CityFile:
         self._unread: Counter[str] = Counter()  # number of unread items by kind
 
     def add(self, document: _Json) -> None:
-        """Add the objects in a file or a line."""
+        """Add the objects in a file, or in one line of a sequence."""
         points = _points(document["vertices"]) * self._scale + self._translate
         objects: dict[str, _Json] = document["CityObjects"]
         levels: dict[str, list[tuple[float, _Json]]] = {}
@@ -204,7 +204,7 @@ class _CityFile:
             self._placed += [PlacedNode(mesh, np.eye(4), mesh.name) for mesh in meshes]
 
     def _with_levels(self, geometries: Sequence[_Json]) -> Iterator[tuple[float, _Json]]:
-        """Yield geometries with their levels of detail, and count geometries that are not read."""
+        """Yield each geometry with its level of detail, and count geometries that are not read."""
         for geometry in geometries:
             kind = geometry["type"]
             if kind == "GeometryInstance":
@@ -216,7 +216,7 @@ class _CityFile:
                 self._unread[str(kind)[:40]] += 1
 
     def _place_template(self, name: str, geometry: _Json, points: Floats) -> None:
-        """Place a template at a point."""
+        """Place a template at the point that a geometry specifies."""
         if self._templates is None:
             templates = self._head["geometry-templates"]
             shapes = [(f"template {k}", [shape]) for k, shape in enumerate(templates["templates"])]
@@ -231,10 +231,10 @@ class _CityFile:
     def _meshes(
         self, points: Floats, objects: list[tuple[str, list[_Json]]], document: _Json
     ) -> list[list[SceneMesh]]:
-        """Return the mesh of each object in a list, which is empty without triangles.
+        """Return the mesh of each object as a list, which is empty if it has no triangles.
 
-        `objects` are names and geometries. All polygons in a document are triangulated at once,
-        which is ten times as fast.
+        `objects` are names and geometries. It is ten times as fast to triangulate all polygons in a
+        document at once.
         """
         faces, owners = self._triangles(points, self._polygons(points, objects))
         if not len(faces):
@@ -253,7 +253,7 @@ class _CityFile:
         ]
 
     def _polygons(self, points: Floats, objects: list[tuple[str, list[_Json]]]) -> _Polygons:
-        """Collect the polygons of objects, and triangulate polygons with holes."""
+        """Collect the polygons of all objects, and triangulate those with holes."""
         polygons = _Polygons([np.zeros(0, np.int64)], [], [], [], [])
         for number, (name, geometries) in enumerate(objects):
             corners: list[int] = []
@@ -277,7 +277,7 @@ class _CityFile:
         return polygons
 
     def _triangles(self, points: Floats, polygons: _Polygons) -> tuple[Ints, Ints]:
-        """Triangulate polygons, and return the triangles and their owners."""
+        """Triangulate polygons, and return the triangles and the owner of each triangle."""
         corners = np.concatenate(polygons.corners)
         sizes = np.array(polygons.sizes, np.int64)
         self._allowance.take(100 * len(corners))
@@ -294,7 +294,7 @@ class _CityFile:
         return faces, owners
 
     def _piece(self, points: Floats, faces: Ints, material: int, document: _Json) -> Piece:
-        """Return triangles with the color and name of a material, or without a material for -1."""
+        """Apply the color and name of a material to triangles, unless its index is -1."""
         colors = None
         name = ""
         if material >= 0:
@@ -306,7 +306,7 @@ class _CityFile:
         return Piece(points, faces, None, colors, name)
 
     def _surfaces(self, geometries: Sequence[_Json]) -> Iterator[tuple[list[list[int]], int]]:
-        """Yield the rings of polygons, and the indices of their materials or -1."""
+        """Yield the rings of each polygon, and the index of its material or -1."""
         for geometry in geometries:
             if geometry["type"] not in _DEPTHS:  # only in templates
                 self._unread[str(geometry["type"])[:40]] += 1
@@ -328,7 +328,7 @@ class _CityFile:
                 yield rings, -1 if material is None else int(material)
 
     def content(self) -> Content:
-        """Return all objects, in meters."""
+        """Return all objects as scene content, in meters."""
         bounds = [
             np.zeros((1, 3)),
             *(node.mesh.bounds + node.matrix[:3, 3] for node in self._placed),
@@ -364,7 +364,7 @@ class _CityFile:
 
 @dataclass(frozen=True)
 class _System:
-    """The coordinate system of a file.
+    """The coordinate system that a file uses.
 
     Its properties are known if rasterio is installed.
     """
@@ -378,7 +378,7 @@ class _System:
 
     @classmethod
     def from_head(cls, head: _Json, corners: Floats) -> _System:
-        """Return the coordinate system stated in a file or the first line of a sequence."""
+        """Read the coordinate system from a file or from the first line of a sequence."""
         text = str((head.get("metadata") or {}).get("referenceSystem") or "")
         looks_like_angles = _looks_like_angles(corners)
         codes = _CODES.findall(text)  # the first code of a compound system is horizontal
@@ -400,7 +400,7 @@ class _System:
         return cls(name, epsg, crs, is_of_angles, unit_m, (up_m or unit_m) / unit_m)
 
     def check(self, corners: Floats) -> None:
-        """Raise MeshFileError if coordinates are angles or not true to scale."""
+        """Raise MeshFileError if the coordinates are angles, or are not true to scale."""
         reproject = "Reproject it, for example with `cjio FILE crs_reproject {} save NEW`"
         if self.is_of_angles:
             raise MeshFileError(
@@ -430,14 +430,14 @@ class _System:
 
 
 def _looks_like_angles(corners: Floats) -> bool:
-    """Return True if the corners of a city are apparently in degrees."""
+    """Return True if a city's corners are apparently in degrees."""
     width, depth, height = np.ptp(corners, axis=0)
     is_small = np.abs(corners[:, :2]).max() <= 360
     return bool(is_small and height > _MAX_SLOPE * max(width, depth))
 
 
 def _points(coordinates: Any) -> Floats:
-    """Return coordinates as an array with three columns.
+    """Convert coordinates to an array with three columns.
 
     Raises ValueError if they have another shape.
     """
@@ -451,7 +451,7 @@ def _points(coordinates: Any) -> Floats:
 
 
 def _integers(numbers: Sequence[int]) -> Ints:
-    """Return integers.
+    """Convert numbers to an int64 array.
 
     Raises ValueError if the values are not integers.
     """
@@ -465,7 +465,7 @@ def _integers(numbers: Sequence[int]) -> Ints:
 
 
 def _item(items: Any, number: Any) -> Any:
-    """Return an item by its index.
+    """Return the item with the given index.
 
     Raises ValueError if the index is invalid.
     """
@@ -477,7 +477,7 @@ def _item(items: Any, number: Any) -> Any:
 
 
 def _level(geometry: _Json) -> float:
-    """Return the level of detail of a geometry, or -1 if it is unknown."""
+    """Return a geometry's level of detail, or -1 if it is unknown."""
     try:
         return float(geometry["lod"])
     except (KeyError, TypeError, ValueError):
@@ -485,7 +485,7 @@ def _level(geometry: _Json) -> float:
 
 
 def _surfaces_at(tree: Any, depth: int, *values: Any) -> Iterator[tuple[Any, ...]]:
-    """Yield the items at a depth of nested lists, with their nested or shared values."""
+    """Yield the items at a given depth of nested lists, each with its values."""
     if not depth:
         yield (tree, *values)
         return

@@ -1,4 +1,4 @@
-"""Read COLLADA files (.dae), following specification 1.4.1 by the Khronos Group (2008).
+"""Read COLLADA files (.dae) according to specification 1.4.1 (Khronos Group, 2008).
 
 Triangles are read with the diffuse colors and images of their materials. Lights, cameras, and
 animations are not read.
@@ -54,7 +54,7 @@ _SURFACES = ("triangles", "polylist", "polygons", "tristrips", "trifans")
 
 
 class _Inputs(NamedTuple):
-    """The points of a primitive, and the layout of the numbers in <p>."""
+    """The points of a primitive, and how the numbers in <p> are arranged."""
 
     points: Floats  # (v, 3)
     offset: int  # position of the point index among the numbers of a corner
@@ -62,7 +62,7 @@ class _Inputs(NamedTuple):
 
 
 def read_dae(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the visual scene of a file, with the colors and names of its materials."""
+    """Read a file's visual scene, including the colors and names of materials."""
     root = xml_root(data)
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
@@ -87,7 +87,7 @@ def read_dae(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 class _Document:
-    """The elements of a file by ID.
+    """The elements in a file, by ID.
 
     Each geometry is read only once.
     """
@@ -109,14 +109,14 @@ class _Document:
         self._floats = cache(_numbers)
 
     def roots(self) -> list[Element]:
-        """Return the visual scene that the file selects, or its first one, in a list."""
+        """Return a list with the visual scene that the file selects, or else the first one."""
         shown = self._root.find("scene/instance_visual_scene")
         if shown is not None:
             return [self._target(shown, "visual_scene")]
         return self._root.findall("library_visual_scenes/visual_scene")[:1]
 
     def node(self, element: Element) -> Node:
-        """Return the node for a <node> or a <visual_scene>."""
+        """Read a <node> or a <visual_scene> as a node."""
         meshes: list[SceneMesh] = []
         children = []
         matrix = np.eye(4)
@@ -148,7 +148,7 @@ class _Document:
         return Node(name, matrix, meshes, children, skinned=is_skinned)
 
     def _skin(self, controller: Element, instance: Element) -> list[SceneMesh]:
-        """Return the meshes of a skin in its rest pose, in the coordinates of the file."""
+        """Return the meshes of a skin in its rest pose, in file coordinates."""
         skin = controller.find("skin")
         if skin is None:
             raise MeshFileError(
@@ -169,7 +169,7 @@ class _Document:
         ]
 
     def _target(self, element: Element, kind: str) -> Element:
-        """Return the element of a kind that an element refers to.
+        """Return the element with the tag `kind` to which another element refers.
 
         Raises MeshFileError if it is not in the file.
         """
@@ -185,7 +185,7 @@ class _Document:
     def _read_geometry(
         self, geometry: Element, bound: tuple[tuple[str, Element], ...]
     ) -> list[SceneMesh]:
-        """Return the mesh of all primitives in a list, which is empty without triangles.
+        """Return a geometry as a list with one mesh, or an empty list if it has no triangles.
 
         The primitives differ only in their materials. `bound` maps material symbols to the elements
         that they refer to.
@@ -215,7 +215,7 @@ class _Document:
         return symbol if bound is None else bound.get("name") or bound.get("id") or symbol
 
     def _bound_materials(self, instance: Element) -> tuple[tuple[str, Element], ...]:
-        """Return the materials that a geometry instance assigns to symbols."""
+        """Return the materials that a geometry instance assigns to symbols, as pairs."""
         entries = instance.findall("bind_material/technique_common/instance_material")
         materials = [
             (entry.get("symbol", ""), self._ids.get(("material", entry.get("target", "")[1:])))
@@ -224,7 +224,7 @@ class _Document:
         return tuple((symbol, material) for symbol, material in materials if material is not None)
 
     def _piece(self, primitive: Element, material: Element | None) -> Piece:
-        """Return the triangles of a primitive in the colors of a material."""
+        """Return a primitive's triangles, colored according to a material."""
         points, offset, stride = self._inputs(primitive)
         lists = [e for e in primitive.iter() if e.tag in ("p", "h")]
         numbers = map(_integers, lists)
@@ -252,7 +252,7 @@ class _Document:
         corners: Ints,
         triangle_corners: Ints,
     ) -> Colors | None:
-        """Return the colors of triangles, or None if the effect of the material has no color.
+        """Return the colors of triangles, or None if the material's effect has no color.
 
         `corners` (c, stride) are the numbers in <p>, and `triangle_corners` (t, 3) are the rows of
         `corners` that form the triangles.
@@ -266,7 +266,7 @@ class _Document:
         return None if shade is None else Colors.plain(shade, len(triangle_corners))
 
     def _coordinates(self, primitive: Element) -> tuple[Floats, int]:
-        """Return texture coordinates, and the offset of their indices in <p>."""
+        """Return texture coordinates, and the position of their index among the numbers in <p>."""
         inputs = [e for e in primitive.findall("input") if e.get("semantic") == "TEXCOORD"]
         if not inputs:
             raise MaskError("texture coordinates are missing")
@@ -275,7 +275,7 @@ class _Document:
         return np.column_stack([s, 1 - t]), _whole_number(first, "offset")
 
     def _inputs(self, primitive: Element) -> _Inputs:
-        """Return the points of a primitive.
+        """Read the points of a primitive.
 
         Raises ValueError if there are none.
         """
@@ -293,7 +293,7 @@ class _Document:
         return _Inputs(points, offset, stride)
 
     def _read_points(self, vertices: Element) -> Floats:
-        """Return the positions in <vertices>."""
+        """Return the positions that <vertices> refers to."""
         entry = vertices.find("input[@semantic='POSITION']")
         if entry is None:
             raise ValueError(f"{_tag(vertices)} has no <input> with the semantic POSITION")
@@ -309,7 +309,7 @@ class _Document:
         return rows[:, columns]
 
     def _rows(self, source: Element) -> Floats:
-        """Return the numbers in a <source>. Shape (count, stride)."""
+        """Return the numbers in a <source> as a table. Shape (count, stride)."""
         accessor = source.find("technique_common/accessor")
         if accessor is None:
             raise ValueError(f"{_tag(source)} has no <accessor>")
@@ -326,7 +326,7 @@ class _Document:
 
 
 class _Effects:
-    """The diffuse colors of effects.
+    """Reads the diffuse colors of effects.
 
     Each image is read only once.
     """
@@ -339,7 +339,7 @@ class _Effects:
         self._texture = cache_with_errors(self._read_texture)
 
     def shade(self, effect: Element, ids: dict[tuple[str, str], Element]) -> Texture | Bytes | None:
-        """Return the image or the color of an effect, or None if it has neither."""
+        """Return the image or color of an effect, or None if it has neither."""
         diffuse = effect.find(".//technique/*/diffuse")
         if diffuse is None:
             return None
@@ -385,7 +385,7 @@ class _Effects:
 def _triangles(
     primitive: Element, points: Floats, corners: Callable[[Element], Ints]
 ) -> Iterator[Ints]:
-    """Yield the triangles of a primitive.
+    """Yield arrays of triangles for a primitive.
 
     `corners` returns the corners in a <p> or <h>.
     """
@@ -415,17 +415,15 @@ def _triangles(
 
 
 def _integers(element: Element) -> Ints:
-    """Return the integers in the text of an element."""
     return _words(element, np.int64, "integers")
 
 
 def _numbers(element: Element) -> Floats:
-    """Return the numbers in the text of an element."""
     return _words(element, np.float64, "numbers")
 
 
 def _words(element: Element, kind: type, expected: str) -> AnyArray:
-    """Return the numbers of a type in the text of an element.
+    """Convert the text of an element to an array of the given type.
 
     Raises ValueError if the text contains anything else.
     """
@@ -440,7 +438,7 @@ def _words(element: Element, kind: type, expected: str) -> AnyArray:
 
 
 def _is_number(word: str, kind: type) -> bool:
-    """Return True if a word is a number of a type."""
+    """Return True if a word can be converted to the given number type."""
     try:
         np.array([word], kind)
     except (ValueError, OverflowError):
@@ -463,13 +461,13 @@ def _whole_number(element: Element, attribute: str, default: int = 0) -> int:
 
 
 def _tag(element: Element) -> str:
-    """Return the start of an element for messages, for example ``<source id='positions'>``."""
+    """Format the start tag of an element for messages, for example ``<source id='positions'>``."""
     name = element.get("id") or element.get("sid")
     return f"<{element.tag} id={name[:40]!r}>" if name else f"<{element.tag}>"
 
 
 def _step(element: Element) -> Floats:
-    """Return the matrix of a transform element.
+    """Return the matrix that a transform element describes.
 
     Raises ValueError if it has the wrong number of values.
     """
@@ -481,13 +479,16 @@ def _step(element: Element) -> Floats:
 
 
 def _rotate(numbers: Floats) -> Floats:
-    """Return a rotation about an axis in degrees, or the identity without an axis."""
+    """Return a rotation by an angle about an axis, or the identity if the axis is zero.
+
+    The angle is in degrees.
+    """
     *axis, degrees = numbers
     return affine(rotation_about(axis, degrees) if np.any(axis) else np.eye(3), np.zeros(3))
 
 
 def _look_at(numbers: Floats) -> Floats:
-    """Return the matrix for a camera position, a target, and an up vector (nine numbers)."""
+    """Return the matrix for nine numbers: a camera position, a target, and an up vector."""
     eye, target, up = numbers.reshape(3, 3)
     z = (eye - target) / norm(eye - target)
     x = np.cross(up, z) / norm(np.cross(up, z))

@@ -1,4 +1,4 @@
-"""List the mesh formats that lidarscenes adds.
+"""List the mesh formats that lidarscenes adds to lidarsim.
 
 `mesh_formats` in lidarsim finds this table.
 """

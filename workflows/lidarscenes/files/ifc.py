@@ -87,7 +87,7 @@ _EMPTY = "contains no elements with geometry, such as walls or slabs, in the sel
 
 @dataclass(frozen=True)
 class IfcOptions:
-    """Options for reading buildings."""
+    """Options for reading IFC buildings."""
 
     storeys: Annotated[
         Annotated[Several[Text], Field(min_length=1)] | None,
@@ -96,7 +96,7 @@ class IfcOptions:
 
 
 def read_ifc(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the elements of a building, optionally restricted to storeys."""
+    """Read the elements of a building, optionally only those on certain storeys."""
     own: IfcOptions = options.own
     storeys = own.storeys
     is_packed = path.suffix.lower() == ".ifczip"
@@ -148,7 +148,7 @@ def read_ifc(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 def _check_end(path: Path) -> None:
-    """Check that a file has its last line, because ifcopenshell reads truncated files silently."""
+    """Check that a file is complete, because ifcopenshell reads truncated files silently."""
     with path.open("rb") as stream:
         stream.seek(max(path.stat().st_size - _END_BYTES, 0))
         if _END not in stream.read():
@@ -169,7 +169,7 @@ def _check_storeys(wanted: Sequence[str] | None, storeys: list[str]) -> None:
 
 
 class _Shapes:
-    """The meshes of the shapes in a file, which elements share."""
+    """The meshes of all shapes in a file. Elements can share a shape."""
 
     def __init__(self, options: ReadOptions, allowance: Allowance) -> None:
         self.notes = MaskNotes()
@@ -179,11 +179,10 @@ class _Shapes:
         self._meshes: dict[tuple[int, str], list[SceneMesh]] = {}
 
     def add(self, frame: dict[str, Any], arrays: list[AnyArray]) -> None:
-        """Add a shape."""
         self._frames.append((frame, arrays))
 
     def meshes(self, number: int, name: str, plain_material: str) -> list[SceneMesh]:
-        """Return the mesh of a shape in a list, which is empty without triangles.
+        """Return a shape as a list with one mesh, or an empty list if it has no triangles.
 
         `plain_material` is the material name for faces without a style.
         """
@@ -215,7 +214,7 @@ class _Shapes:
 def _content(
     building: dict[str, Any], frame: dict[str, Any], matrices: AnyArray, shapes: _Shapes
 ) -> Content:
-    """Place the shapes of elements, and add classes and notes."""
+    """Place the shapes of all elements, and add object classes and notes."""
     placed = [
         PlacedNode(mesh, matrix, name)
         for (name, _, number, material), matrix in zip(frame["elements"], matrices, strict=True)
@@ -247,7 +246,7 @@ def _content(
 
 
 def _classes(names: set[str], ancestors: dict[str, list[str]]) -> dict[int, ObjectClass]:
-    """Return the semantic classes for the IFC classes in a file."""
+    """Return the semantic classes that correspond to the IFC classes in a file."""
     patterns: dict[tuple[int, str], list[str]] = defaultdict(list)
     for name in sorted(names):
         matches = (
@@ -263,7 +262,7 @@ def _classes(names: set[str], ancestors: dict[str, list[str]]) -> dict[int, Obje
 
 
 def _reference_notes(building: dict[str, Any], middle: Floats) -> list[str]:
-    """Return notes on the coordinate system that a file states.
+    """Return notes on the coordinate system stated in a file.
 
     `middle` (2,) is the center of the building in plan.
     """
@@ -295,7 +294,7 @@ def _reference_notes(building: dict[str, Any], middle: Floats) -> list[str]:
 
 
 def _conversion_note(conversion: _MapConversion, system: str, *, is_known: bool) -> str:
-    """Return a note on a map conversion that moves, rotates, or scales a building.
+    """Describe a map conversion that moves, rotates, or scales a building.
 
     `is_known` states whether `system` is an EPSG code.
     """
@@ -333,7 +332,7 @@ def _scale_list(conversion: _MapConversion) -> str:
 
 @dataclass(frozen=True)
 class _MapConversion:
-    """The validated map conversion of a building."""
+    """A building's map conversion, after validation."""
 
     system: str  # name of the coordinate system, or empty
     unit_m: float  # meters in the unit of the map
@@ -346,10 +345,10 @@ class _MapConversion:
     def from_file(cls, stated: dict[str, Any]) -> _MapConversion:
         """Validate the conversion that a file states.
 
-        The map unit is that of the coordinate system. If it is not stated, it is the unit, meters
-        or the project unit, for which the scale is close to 1. Without a scale, it is the project
-        unit. A missing scale means that only units are converted. Raises ValueError if the
-        conversion is inconsistent.
+        The map unit is that of the coordinate system. If none is stated, it is either meters or the
+        project unit, whichever makes the scale close to 1. Without a scale, it is the project unit.
+        A missing scale means that only units are converted. Raises ValueError if the conversion is
+        inconsistent.
         """
         if stated["count"] > 1:
             raise ValueError(
@@ -382,17 +381,17 @@ class _MapConversion:
 
     @property
     def is_true(self) -> bool:
-        """Whether lengths in the building are equal to lengths on the map."""
+        """Whether lengths in the building are the same as on the map."""
         return all(abs(scale - 1) <= 1e-9 for scale in self.scales)
 
     @property
     def is_identity(self) -> bool:
-        """Whether coordinates in the building are equal to map coordinates, except for the unit."""
+        """Whether building coordinates equal map coordinates, apart from the unit."""
         return self.is_true and not any(self.offset) and not self.heading_deg
 
 
 def _number(stated: dict[str, Any], name: str) -> float | None:
-    """Return a number in a map conversion, or None if it is not stated.
+    """Return a number from a map conversion, or None if it is not stated.
 
     Property sets may contain it as text.
     """
@@ -409,7 +408,7 @@ def _number(stated: dict[str, Any], name: str) -> float | None:
 
 
 def _map_unit_m(unit: float | str | None, project_m: float, scale: float | None) -> float:
-    """Return the length of a map unit in meters, given its length, its name, or the scale."""
+    """Determine how many meters a map unit has, from its length, its name, or the scale."""
     if isinstance(unit, str):
         unit_m = unit_by_name(unit)
         if unit_m is None:

@@ -1,6 +1,6 @@
-"""Script that reads an IFC building with ifcopenshell in the process that `ifc.py` starts.
+"""Script that `ifc.py` runs in a separate process to read an IFC building with ifcopenshell.
 
-Invalid files can crash ifcopenshell, and here this affects only this process. The script imports
+Invalid files can crash ifcopenshell, but this only affects the separate process. The script imports
 nothing from lidarpool. It writes frames to standard output (see `child_process.py`): first the
 building, then each shape that elements share, and finally the elements.
 """
@@ -81,7 +81,7 @@ _MAP_NUMBERS = (
 
 
 class Building:
-    """The elements in a file."""
+    """The elements in an IFC file."""
 
     def __init__(self, path: str, request: dict[str, Any], write: Any) -> None:
         self._file = _open(path, request["max_unpacked"])
@@ -93,7 +93,7 @@ class Building:
         self._ancestors: dict[str, list[str]] = {}  # {class: itself and its superclasses}
 
     def read(self) -> None:
-        """Write the frames of the building."""
+        """Write all frames that describe the building."""
         storeys = self._file.by_type("IfcBuildingStorey")
         self._write(
             {
@@ -113,7 +113,7 @@ class Building:
             self._write_elements([], [], [])
 
     def _elements(self) -> Iterable[Any]:
-        """Yield the elements of the requested storeys whose shapes reflect light."""
+        """Yield the elements on the requested storeys whose shapes reflect light."""
         for product in self._file.by_type("IfcProduct"):
             ancestors = self._ancestors_of(product.is_a())
             if product.Representation is None:
@@ -124,7 +124,7 @@ class Building:
                 yield product
 
     def _ancestors_of(self, name: str) -> list[str]:
-        """Return the names of a class and its superclasses."""
+        """Return the names of a class and all of its superclasses."""
         if name not in self._ancestors:
             names = []
             declaration = self._schema.declaration_by_name(name).as_entity()
@@ -145,7 +145,7 @@ class Building:
         raise ValueError("the containment of its elements is circular")
 
     def _write_shapes(self, elements: dict[int, Any]) -> None:
-        """Write the shapes and the elements."""
+        """Write each distinct shape, followed by the elements."""
         settings = ifcopenshell.geom.settings()
         settings.set("no-normals", True)
         settings.set("apply-default-materials", False)
@@ -178,7 +178,7 @@ class Building:
     def _write_elements(
         self, rows: list[Any], matrices: list[NDArray[Any]], missing: list[str]
     ) -> None:
-        """Write the frame of all elements, with the names of elements without triangles."""
+        """Write the frame with all elements, including the names of elements without triangles."""
         self._write(
             {
                 "what": "elements",
@@ -191,7 +191,7 @@ class Building:
         )
 
     def _write_shape(self, geometry: Any) -> None:
-        """Write the triangles and the materials of a shape."""
+        """Write a shape's triangles and materials."""
         faces = np.frombuffer(geometry.faces_buffer, np.int32).reshape(-1, 3)
         # The styles of triangles are followed by those of curves.
         styles = np.frombuffer(geometry.material_ids_buffer, np.int32)[: len(faces)]
@@ -206,7 +206,7 @@ class Building:
         )
 
     def _material(self, style: Any) -> dict[str, Any]:
-        """Return the name, color, and transparency of a style.
+        """Return a style's name, color, and transparency.
 
         The color is None if it is not stated.
         """
@@ -222,12 +222,12 @@ class Building:
         }
 
     def _states_unit(self) -> bool:
-        """Return True if the project states a length unit."""
+        """Return True if the project specifies a length unit."""
         units = [unit for entry in self._file.by_type("IfcUnitAssignment") for unit in entry.Units]
         return any(getattr(unit, "UnitType", None) == "LENGTHUNIT" for unit in units)
 
     def _map_conversion(self) -> dict[str, Any] | None:
-        """Return the map conversion as the file states it, or None.
+        """Return the map conversion with the values in the file, or None without a conversion.
 
         Entities take precedence over the property sets that replace them in IFC2X3. `ifc.py`
         validates and converts the values.
@@ -240,7 +240,7 @@ class Building:
         return {"unit_m": calculate_unit_scale(self._file), "count": 1} | stated
 
     def _stated_operation(self) -> dict[str, Any] | None:
-        """Return the first coordinate operation, which exists since IFC4, or None."""
+        """Return the first coordinate operation, or None. Only IFC4 and later have this class."""
         try:
             operations = self._file.by_type("IfcCoordinateOperation")
         except RuntimeError:  # IFC2X3 has no such class
@@ -266,7 +266,7 @@ class Building:
         return stated | {name: getattr(operation, name, None) for name in names}
 
     def _stated_sets(self) -> dict[str, Any] | None:
-        """Return the map conversion in property sets of any object, or None.
+        """Return the map conversion from the property sets of any object, or None.
 
         According to the "User Guide for Geo-referencing in IFC", version 2, by buildingSMART, the
         project has the property sets. Some programs assign them to the site, and the case of the
@@ -290,7 +290,7 @@ class Building:
         }
 
     def _position_of_site(self) -> list[float] | None:
-        """Return the latitude and longitude of the site in degrees, or None."""
+        """Return the site's latitude and longitude in degrees, or None if they are not stated."""
         for site in self._file.by_type("IfcSite"):
             angles = [site.RefLatitude, site.RefLongitude]
             if all(angles) and any(map(any, angles)):
@@ -303,7 +303,7 @@ class Building:
 
 
 def _open(path: str, max_unpacked: int) -> Any:
-    """Open a file, unpacking an .ifczip in memory.
+    """Open an IFC file. An .ifczip is unpacked in memory.
 
     Raises UnreadSchemaError if the library does not support the schema of the file.
     """
@@ -320,7 +320,7 @@ def _open(path: str, max_unpacked: int) -> Any:
 
 
 def _unpacked(path: str, max_bytes: int) -> bytes:
-    """Return the content of the building in an .ifczip."""
+    """Return the content of the building file in an .ifczip."""
     with zipfile.ZipFile(path) as archive:
         entries = [e for e in archive.infolist() if e.filename.lower().endswith(".ifc")]
         if len(entries) != 1:
@@ -335,7 +335,7 @@ def _unpacked(path: str, max_bytes: int) -> bytes:
 
 
 def _with_read_schema(head: bytes) -> bytes:
-    """Replace the schema in the header of a file by an equivalent schema that the library supports.
+    """Replace the schema name in a file header by an equivalent one that the library supports.
 
     Raises UnreadSchemaError if there is no equivalent schema.
     """
@@ -353,14 +353,14 @@ def _with_read_schema(head: bytes) -> bytes:
 
 
 class UnreadSchemaError(Exception):
-    """Raised if the library does not support the schema of a file.
+    """Raised if the library does not support the schema that a file uses.
 
     The arguments are the schema and the supported schemas.
     """
 
 
 def _parent(element: Any) -> Any:
-    """Return the element or spatial structure that contains an element, or None."""
+    """Return the element or spatial structure that directly contains an element, or None."""
     for attribute, parent in _PARENTS:
         relations = getattr(element, attribute, None)
         if relations:
@@ -369,7 +369,7 @@ def _parent(element: Any) -> Any:
 
 
 def _properties(entity: Any) -> dict[str, Any]:
-    """Return the single values in a property set."""
+    """Return the properties in a set that have a single value."""
     values = {}
     for item in entity.HasProperties or ():
         if item.is_a("IfcPropertySingleValue") and item.NominalValue is not None:
@@ -379,7 +379,7 @@ def _properties(entity: Any) -> dict[str, Any]:
 
 
 def _name(element: Any) -> str:
-    """Return the class and the name of an element."""
+    """Return an element's class and name as one text."""
     return f"{element.is_a()} {element.Name or element.GlobalId}"
 
 
@@ -394,12 +394,12 @@ def _material_of(element: Any) -> str:
 
 
 def main(path: str, request: dict[str, Any]) -> None:
-    """Read a file, and write frames to standard output."""
+    """Read a file, and write frames to the standard output."""
     output = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
     def write(frame: dict[str, Any], *arrays: NDArray[Any]) -> None:
-        """Write a frame, which is a line of JSON followed by the bytes of arrays."""
+        """Write a frame: a line of JSON, followed by the bytes of its arrays."""
         signal.alarm(0)  # the receiving process may take long
         kinds = [(array.dtype.str, array.shape) for array in arrays]
         output.write(json.dumps(frame | {"arrays": kinds}).encode() + b"\n")

@@ -27,7 +27,7 @@ _CDATA = ("<![CDATA[", "]]>")
 
 
 def parse_lenient_xml(data: bytes) -> Element:
-    """Return the root element of a file.
+    """Parse an XML file, and return its root element.
 
     Prefixes remain in tags, and comments are skipped.
 
@@ -44,7 +44,7 @@ def parse_lenient_xml(data: bytes) -> Element:
 
 
 class _Parser:
-    """A parser that builds the elements in a text."""
+    """A parser that builds elements from a text."""
 
     def __init__(self, text: str) -> None:
         self._text = text
@@ -54,7 +54,6 @@ class _Parser:
         self._count = 0
 
     def root(self) -> Element:
-        """Return the root element."""
         text = self._text
         position = 0
         while (start := text.find("<", position)) >= 0:
@@ -67,7 +66,7 @@ class _Parser:
         return self._root
 
     def _after_markup(self, start: int) -> int:
-        """Parse the markup at a position, and return the position after it."""
+        """Parse the markup at a position, and return the position where it ends."""
         text = self._text
         for first, last in _SKIPPED.items():
             if text.startswith(first, start):
@@ -91,7 +90,7 @@ class _Parser:
         return tag.end()
 
     def _end_of(self, start: int, mark: str) -> int:
-        """Return the position after the next end mark."""
+        """Return the position after the next occurrence of an end mark."""
         stop = self._text.find(mark, start)
         if stop < 0:
             raise ValueError(
@@ -111,7 +110,7 @@ class _Parser:
         return stop
 
     def _start_element(self, tag: re.Match[str], start: int) -> None:
-        """Start an element, which is complete if its tag is empty."""
+        """Start an element. It is also complete if its tag is empty."""
         self._count += 1
         if self._count > MAX_ELEMENTS:
             raise ValueError(f"it contains more than {MAX_ELEMENTS:,} elements")
@@ -140,21 +139,20 @@ class _Parser:
         element.text = "".join(self._texts.pop()) or None
 
     def _add_text(self, text: str, *, is_literal: bool = False) -> None:
-        """Add text to the innermost element."""
         if self._open and not text.isspace() and text:
             self._texts[-1].append(text if is_literal else self._resolved(text))
 
     def _resolved(self, text: str) -> str:
-        """Return text with its character references resolved."""
+        """Replace the character references in a text."""
         return _REFERENCE.sub(_character, text) if "&" in text else text
 
     def _line(self, position: int) -> int:
-        """Return the line number of a position, starting from 1."""
+        """Return the line number at a position, starting from 1."""
         return self._text.count("\n", 0, position) + 1
 
 
 def _character(reference: re.Match[str]) -> str:
-    """Return the character of a reference.
+    """Return the character for an XML reference such as ``&amp;``.
 
     Raises ValueError if it is an entity that is not predefined.
     """

@@ -1,4 +1,4 @@
-"""Read elevation rasters, such as GeoTIFF, with rasterio and its GDAL.
+"""Read elevation rasters, such as GeoTIFF files, with rasterio and its GDAL.
 
 Each file is opened with the driver for its extension, without access to other files. Formats that
 can refer to other files are read from memory. A raster can therefore not cause other files to be
@@ -114,10 +114,10 @@ class RasterOptions:
 def read_raster(_data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read the first band as a mesh with a vertex at each pixel center and two triangles per cell.
 
-    A cell with a pixel that has no height is a hole. The coordinate system is `epsg` in
-    `options.own`. By default, it is that of the raster if its coordinates are in meters that are
-    true to scale at its center, otherwise the UTM zone of its center. A window includes the pixels
-    whose centers are inside.
+    Cells are omitted if one of their pixels has no height. The coordinate system is `epsg` in
+    `options.own`. By default, it is the raster's own system if this uses meters that are true to
+    scale at the raster's center. Otherwise, it is the UTM zone of the center. A window includes the
+    pixels whose centers are inside.
     """
     if find_spec("rasterio") is None:
         raise MeshFileError(
@@ -141,7 +141,7 @@ def read_raster(_data: bytes, path: Path, options: ReadOptions) -> Content:
 def _raster_mesh(
     source: _Source, target_crs: Any, path: Path, options: ReadOptions, notes: list[str]
 ) -> tuple[SceneMesh, str]:
-    """Return the mesh of a raster in a coordinate system, and a summary.
+    """Convert a raster to a mesh in a coordinate system, and summarize it.
 
     Notes are appended to `notes`.
     """
@@ -168,7 +168,7 @@ def _raster_mesh(
 def _read_values(
     grid: _RasterGrid, column_range: PixelRange, row_range: PixelRange
 ) -> tuple[Floats, Bools]:
-    """Return the values in the first band, and a mask of the valid values."""
+    """Read the values in the first band, and a mask of the valid ones."""
     band = grid.file.read(1, window=(row_range, column_range), masked=True)
     values = np.ma.getdata(band).astype(np.float64)
     return values, ~np.ma.getmaskarray(band) & np.isfinite(values)
@@ -177,7 +177,7 @@ def _read_values(
 def _height_notes(
     pixels: _RasterGrid, grid: _RasterGrid, path: Path, mesh: SceneMesh, no_data_m: float
 ) -> list[str]:
-    """Return a note if heights are implausible for the Earth's surface.
+    """Return a note if the heights are implausible for the Earth's surface.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ def _value_near(pixels: _RasterGrid, grid: _RasterGrid, vertex: Floats) -> float
 
 @dataclass(frozen=True)
 class _Source:
-    """An open raster, with the coordinates of its pixels."""
+    """An open raster, and the coordinates of its pixels."""
 
     file: Any
     affine: Any  # transform from columns and rows to x and y, in meters in a local system
@@ -239,13 +239,13 @@ class _Source:
     local: _LocalSystem | None = None  # stated system without a position on Earth
 
     def heights_m(self, values: Floats, unit_m: float) -> Floats:
-        """Convert values in the first band, which have a unit, to heights in meters."""
+        """Convert values in the first band, whose unit is `unit_m`, to heights in meters."""
         return (values * self.file.scales[0] + self.file.offsets[0]) * unit_m
 
 
 @dataclass(frozen=True)
 class _LocalSystem:
-    """A coordinate system without a position on Earth, such as a site grid."""
+    """A coordinate system that has no position on Earth, such as a site grid."""
 
     name: str
     unit: str
@@ -263,7 +263,7 @@ class _LocalSystem:
 
 
 def _source(file: Any, path: Path) -> _Source:
-    """Determine the coordinates of the pixels of an open raster."""
+    """Determine the pixel coordinates of an open raster."""
     from rasterio.transform import Affine
 
     affine = _affine(file, path)
@@ -286,7 +286,7 @@ def _source(file: Any, path: Path) -> _Source:
 
 
 def _stated_crs(file: Any, path: Path) -> Any:
-    """Return the coordinate system of a raster, or None.
+    """Return the coordinate system that a raster states, or None.
 
     An ASCII grid may have it in a `.prj` file. GDAL itself reads `.prj` files in WKT 1 only, and
     ignores others.
@@ -305,7 +305,7 @@ def _stated_crs(file: Any, path: Path) -> Any:
 
 @contextmanager
 def _open_raster(path: Path) -> Iterator[Any]:
-    """Open a file with the driver for its extension, and yield the rasterio dataset."""
+    """Open a file with the GDAL driver for its extension, and yield the rasterio dataset."""
     import rasterio
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
     from rasterio.io import MemoryFile
@@ -341,7 +341,7 @@ def _open_raster(path: Path) -> Iterator[Any]:
 
 
 def _failure(reason: str, driver: str) -> ValueError:
-    """Return the error for a file that a GDAL driver has refused."""
+    """Return an error for a file that a GDAL driver cannot read."""
     if "File short" in reason:
         return CutShortError("it contains fewer heights than its header declares")
     if "not recognized as being in a supported file format" in reason:
@@ -352,7 +352,7 @@ def _failure(reason: str, driver: str) -> ValueError:
 
 
 def _read_beside(path: Path, suffix: str) -> bytes:
-    """Return the content of a small file beside a raster, or nothing if it does not exist."""
+    """Return the content of a small file beside a raster, or b"" if it does not exist."""
     for ending in (suffix, suffix.upper()):
         if (file := path.with_suffix(ending)).is_file():
             return read_input(file, _MAX_BESIDE_BYTES)
@@ -360,7 +360,7 @@ def _read_beside(path: Path, suffix: str) -> bytes:
 
 
 def _check_kind(source: Any) -> None:
-    """Raise MeshFileError if the band has no heights, or its blocks exceed the memory."""
+    """Raise MeshFileError if a band has no heights, or if its blocks do not fit into memory."""
     if not source.dtypes[0].startswith(("int", "uint", "float")):
         raise MeshFileError(
             f"has pixels of type {source.dtypes[0]}, which cannot be read as heights"
@@ -386,7 +386,7 @@ def _check_kind(source: Any) -> None:
 
 
 def _target_crs(source: _Source, epsg: int | None, notes: list[str]) -> Any:
-    """Choose the coordinate system of the mesh, which must be in meters that are true to scale.
+    """Choose the coordinate system of the mesh. It must be in meters that are true to scale.
 
     A note is appended if the raster is reprojected, or if lengths have errors at the edges of the
     mesh. Raises MeshFileError if there is no suitable coordinate system.
@@ -423,7 +423,7 @@ def _target_crs(source: _Source, epsg: int | None, notes: list[str]) -> Any:
 
 
 def _chosen_crs(crs: Any, epsg: int, middle: Floats) -> Any:
-    """Return the coordinate system with a given code.
+    """Return the coordinate system with the given EPSG code.
 
     Raises MeshFileError if it is not in meters that are true to scale.
     """
@@ -438,7 +438,7 @@ def _chosen_crs(crs: Any, epsg: int, middle: Floats) -> Any:
 
 
 def _zone_crs(source: _Source, middle: Floats) -> Any:
-    """Return the UTM zone of a position in a raster's coordinate system.
+    """Return the UTM zone for a position in a raster's coordinate system.
 
     Raises MeshFileError if the raster is too wide.
     """
@@ -460,7 +460,7 @@ def _zone_crs(source: _Source, middle: Floats) -> Any:
 
 
 def _width_deg(source: _Source) -> float:
-    """Return the width of a raster in degrees of longitude, or infinity if it has none."""
+    """Return a raster's width in degrees of longitude, or infinity if it cannot be determined."""
     corners = _corners(source.file, source.affine)
     if source.crs.is_geographic:
         return float(np.ptp(corners[:, 0]))
@@ -473,7 +473,7 @@ def _width_deg(source: _Source) -> float:
 
 
 def _scale_error_at_edges(source: _Source, target: Any) -> float:
-    """Return the largest scale error at the corners of a raster, or 0 if it is negligible."""
+    """Return the largest scale error at a raster's corners, or 0 if it is negligible."""
     corners = _corners(source.file, source.affine)
     if source.crs is not None and source.crs != target:
         try:
@@ -487,7 +487,7 @@ def _scale_error_at_edges(source: _Source, target: Any) -> float:
 
 
 def _affine(file: Any, path: Path) -> Any:
-    """Return the transform from columns and rows to x and y.
+    """Return the affine transform from columns and rows to x and y.
 
     By default, pixels have a size of 1 m.
     """
@@ -514,13 +514,13 @@ def _apply(affine: Any, x: Any, y: Any) -> tuple[Any, Any]:
 
 
 def _corners(file: Any, affine: Any) -> Floats:
-    """Return the corners of a file in its coordinate system."""
+    """Return the corners of a raster in its own coordinate system."""
     return np.array([_apply(affine, x, y) for x in (0, file.width) for y in (0, file.height)])
 
 
 @dataclass(frozen=True)
 class _RasterGrid:
-    """The pixels of a raster, with their coordinates in the file and in the mesh."""
+    """The pixels of a raster, with coordinates both in the file and in the mesh."""
 
     file: Any
     affine: Any  # transform from columns and rows to x and y
@@ -529,11 +529,11 @@ class _RasterGrid:
 
     @property
     def keeps_crs(self) -> bool:
-        """Whether the mesh has the same coordinates as the file."""
+        """Whether mesh coordinates are the same as file coordinates."""
         return self.crs is None or bool(self.crs == self.target_crs)
 
     def coordinates(self, column: AnyArray, row: AnyArray) -> tuple[AnyArray, AnyArray]:
-        """Return x and y in the coordinates of the mesh."""
+        """Return x and y in mesh coordinates."""
         from rasterio.warp import transform
 
         x, y = _apply(self.affine, column, row)
@@ -544,7 +544,7 @@ class _RasterGrid:
 
     @cached_property
     def extent(self) -> Floats:
-        """Minimum and maximum x and y in the coordinates of the mesh. Shape (2, 2)."""
+        """Minimum and maximum x and y in mesh coordinates. Shape (2, 2)."""
         from rasterio.warp import transform_bounds
 
         corners = _corners(self.file, self.affine)
@@ -557,14 +557,14 @@ class _RasterGrid:
 
     @cached_property
     def pixel_m(self) -> float:
-        """Side length in meters of a square with the area of the central pixel."""
+        """Side length of a square that has the same area as the central pixel, in meters."""
         column = np.array([0.0, 1.0, 0.0])
         row = np.array([0.0, 0.0, 1.0])
         x, y = self.coordinates(column + self.file.width // 2, row + self.file.height // 2)
         return math.sqrt(abs((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])))
 
     def pixels_in(self, window: Window | None) -> tuple[PixelRange, PixelRange]:
-        """Return the half-open ranges of columns and rows whose pixel centers are in a window.
+        """Return half-open ranges of the columns and rows whose pixel centers are in a window.
 
         If the raster is rotated or reprojected, the ranges enclose the window.
         """
@@ -599,7 +599,7 @@ class _RasterGrid:
 
 @contextmanager
 def _coarser_grid(grid: _RasterGrid, step_m: float, window: Window | None) -> Iterator[_RasterGrid]:
-    """Yield a grid with mean heights, aligned with the axes of the mesh."""
+    """Yield a grid of mean heights that is aligned with the axes of the mesh."""
     from rasterio.crs import CRS
     from rasterio.enums import Resampling
     from rasterio.transform import Affine
@@ -648,7 +648,7 @@ def _coarser_grid(grid: _RasterGrid, step_m: float, window: Window | None) -> It
 def _check_size(
     grid: _RasterGrid, column_range: PixelRange, row_range: PixelRange, name: str, *, chosen: bool
 ) -> None:
-    """Raise MeshFileError if there are too many pixels, suggesting a window and a step that fit.
+    """Raise MeshFileError for too many pixels, and suggest a window and a step that fit.
 
     Unless a window or step is `chosen`, the limit is lower, so that the mesh is quick to read and
     display.
@@ -695,7 +695,7 @@ def _grid_mesh(
     heights: Floats,
     valid: Bools,
 ) -> SceneMesh:
-    """Return a mesh with a vertex at each pixel center and two triangles for each complete cell.
+    """Create a mesh with a vertex at each pixel center, and two triangles for each complete cell.
 
     Pixel centers are transformed and keep their heights. GDAL's bilinear warp is not used, because
     it widens its kernel where pixels grow along an axis, and rasterio does not support XSCALE.
@@ -723,7 +723,7 @@ def _grid_mesh(
 
 
 def _height_unit_m(source: _Source, notes: list[str]) -> float:
-    """Return the length of the height unit in meters.
+    """Return the length of the height unit, in meters.
 
     The unit is that of the band, of the vertical coordinate system, or of the coordinates.
     """
@@ -753,7 +753,7 @@ def _height_unit_m(source: _Source, notes: list[str]) -> float:
 
 
 def _notes(source: _Source, path: Path) -> list[str]:
-    """Return notes on missing coordinate systems, additional bands, and files that are not read."""
+    """Return notes on missing coordinate systems, additional bands, and unread files."""
     file = source.file
     notes = []
     unit_m = 1.0 if source.local is None else source.local.unit_m
@@ -783,13 +783,13 @@ def _notes(source: _Source, path: Path) -> list[str]:
 
 
 def _crs_label(crs: Any) -> str:
-    """Return the code or the name of a coordinate system for summaries."""
+    """Return a coordinate system's code or name for summaries."""
     key, code = crs_key(crs)
     return key if code else f"{projjson(crs)['name'][:80]} (no EPSG code)"
 
 
 def _summary(source: _Source, grid: _RasterGrid, step_m: float | None, valid: Bools) -> str:
-    """Describe the size and the coordinate systems of a mesh."""
+    """Describe a mesh's size and coordinate systems."""
     rows, columns = valid.shape
     words = f"{columns:,} x {rows:,} {'means' if step_m else 'pixels'} of {grid.pixel_m:.6g} m"
     if (rows, columns) != source.file.shape:

@@ -1,4 +1,4 @@
-"""Read 3MF files, following the core, production, and materials specifications.
+"""Read 3MF files according to the core, production, and materials specifications.
 
 The specifications are by the 3MF Consortium (2018).
 
@@ -62,7 +62,7 @@ _Key = tuple[str, str]  # inner file and ID of an object
 
 @dataclass
 class _MeshObject:
-    """An object in a model, which is a mesh or consists of components."""
+    """An object in a model. It is a mesh or consists of components."""
 
     name: str
     vertices: array[float] = field(default_factory=lambda: array("d"))
@@ -75,7 +75,7 @@ class _MeshObject:
 
     @cached_property
     def meshes(self) -> list[SceneMesh]:
-        """The mesh of the object in a list, which is empty without triangles."""
+        """The object as a list with one mesh, or an empty list if it has no triangles."""
         if not self.faces:
             return []
         vertices = np.frombuffer(self.vertices, np.float64).reshape(-1, 3)
@@ -96,7 +96,7 @@ class _MeshObject:
 
 @dataclass(frozen=True, eq=False)
 class _Placement:
-    """A component or build item, which is an object that a matrix places."""
+    """A component or build item, that is, an object and the matrix that places it."""
 
     key: _Key
     name: str
@@ -104,7 +104,7 @@ class _Placement:
 
 
 def read_3mf(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the build items in a file, with the colors of base materials and color groups."""
+    """Read the build items in a file, with colors from base materials and color groups."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         package = _Package(archive, Allowance(len(data), SMALLER), options)
         root = package.model(package.start())
@@ -131,7 +131,7 @@ def read_3mf(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 class _Package:
-    """The inner files in an archive, each of which is read when one of its objects is placed."""
+    """The inner files of an archive. Each one is read when an object in it is first placed."""
 
     def __init__(
         self, archive: zipfile.ZipFile, allowance: Allowance, options: ReadOptions
@@ -142,7 +142,7 @@ class _Package:
         self.models: dict[str, _Model] = {}
 
     def start(self) -> str:
-        """Return the name of the inner file with the model to build."""
+        """Return the name of the inner file that contains the model to build."""
         names = self._archive.namelist()
         relations = ""
         if "_rels/.rels" in names:
@@ -165,7 +165,7 @@ class _Package:
         return self.models[name]
 
     def _pieces(self, name: str) -> Iterator[bytes]:
-        """Yield the content of an inner file, which is never longer than its stated size."""
+        """Yield the content of an inner file in pieces, never more than its stated size."""
         if name not in self._archive.namelist():
             raise ValueError(f"the archive does not contain {name[:80]!r}")
         entry = self._archive.getinfo(name)
@@ -180,7 +180,7 @@ class _Package:
                 yield piece
 
     def object(self, key: _Key) -> _MeshObject:
-        """Return an object.
+        """Return the object with the given key.
 
         Raises ValueError if it is not defined.
         """
@@ -191,7 +191,7 @@ class _Package:
 
 
 class _Model:
-    """The objects and build items in an inner file.
+    """The objects and build items of an inner file.
 
     The file is parsed without building a tree, which would need ten times the size of the file.
     """
@@ -239,7 +239,7 @@ class _Model:
             ) from error
 
     def _begin(self, tag: str, attributes: dict[str, str]) -> None:
-        """Read the start of an element."""
+        """Process the start tag of an element."""
         tag = tag.rpartition(":")[2]
         if tag == "vertex":
             self._object.vertices.extend([float(attributes[axis]) for axis in "xyz"])
@@ -255,13 +255,12 @@ class _Model:
             raise MeshFileError(f"contains <{tag}>, which is not supported. Export it as triangles")
 
     def _begin_group(self, attributes: dict[str, str]) -> None:
-        """Start a group of colors or materials."""
         self._allowance.take(_OBJECT_BYTES)
         self._group = self._groups.setdefault(attributes["id"], [])
         self._names_of_group = self._names.setdefault(attributes["id"], [])
 
     def _add_color(self, attributes: dict[str, str]) -> None:
-        """Add a color and its name to the group."""
+        """Add a color and its name to the current group."""
         self._allowance.take(_COLOR_BYTES)
         color = attributes.get("displaycolor", attributes.get("color", ""))
         match = _COLOR.fullmatch(color)
@@ -269,7 +268,6 @@ class _Model:
         self._names_of_group.append(attributes.get("name", ""))
 
     def _begin_object(self, attributes: dict[str, str]) -> None:
-        """Start an object."""
         self._allowance.take(_OBJECT_BYTES)
         self._object = _MeshObject(attributes.get("name", ""))
         self._object.default_property = attributes.get("pid", ""), attributes.get("pindex", "0")
@@ -290,14 +288,14 @@ class _Model:
                 )
 
     def _material(self, attributes: dict[str, str]) -> str:
-        """Return the material name at a triangle's first corner, or an empty string."""
+        """Return the name of the material at a triangle's first corner, or an empty string."""
         group, number = self._object.default_property
         index = int(attributes.get("p1", number))
         names = self._names.get(attributes.get("pid", group), [])
         return names[index] if 0 <= index < len(names) else ""
 
     def _shade(self, attributes: dict[str, str]) -> None:
-        """Add the colors at a triangle's corners, or gray if it has none."""
+        """Add the colors of a triangle's corners, or gray if there are none."""
         group, number = self._object.default_property
         group = attributes.get("pid", group)
         first = attributes.get("p1", number)

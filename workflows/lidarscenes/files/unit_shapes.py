@@ -1,4 +1,4 @@
-"""Define unit shapes, with size 1 or radius 1 and centered at the origin, for robots and worlds."""
+"""Define shapes of size 1 or radius 1, centered at the origin, for robots and worlds."""
 
 from __future__ import annotations
 

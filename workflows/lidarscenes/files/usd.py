@@ -65,7 +65,7 @@ _SEGMENTS = 64  # sides of spheres, cylinders, cones, and capsules
 
 
 def read_usd(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read all visible prims in a scene at its first time, with their motions or an animation."""
+    """Read all prims that are visible at the first time, including motions or an animation."""
     if find_spec("pxr") is None:
         command = install_command("lidarpool[usd]")
         raise MeshFileError(
@@ -93,7 +93,7 @@ def _contents(
     options: ReadOptions,
     allowance: Allowance,
 ) -> Iterator[Content]:
-    """Yield the content at each pose of an animation, or at the first time."""
+    """Yield the content for each pose of an animation, or only for the first time."""
     materials = UsdMaterials(allowance, options)
     meshes: dict[int, list[SceneMesh]] = {}
     for frame, arrays in frames:
@@ -112,10 +112,10 @@ def _contents(
 
 
 def _frames(path: Path, options: ReadOptions, allowance: Allowance) -> Generator[Frame]:
-    """Read a file in a separate process, and yield the frames of its output."""
+    """Read a file in a separate process, and yield the frames that it writes."""
 
     def take(frame: dict[str, Any], size: int) -> None:
-        """Count the size of an array toward the memory limit.
+        """Count an array's size toward the memory limit.
 
         Images also raise the limit for the content.
         """
@@ -151,7 +151,7 @@ def _frames(path: Path, options: ReadOptions, allowance: Allowance) -> Generator
 def _polygon_mesh(
     frame: dict[str, Any], arrays: list[AnyArray], allowance: Allowance, materials: UsdMaterials
 ) -> list[SceneMesh]:
-    """Return the mesh of polygons in a list, which is empty without triangles."""
+    """Return polygons as a list with one mesh, or an empty list if there are no triangles."""
     name = frame["name"]
     allowance.take(24 * len(arrays[2]) + 4 * 8 * len(arrays[1]))
     sizes, corners, points, holes = arrays[:4]
@@ -179,7 +179,7 @@ def _polygon_mesh(
 def _shape_mesh(
     frame: dict[str, Any], arrays: list[AnyArray], materials: UsdMaterials
 ) -> list[SceneMesh]:
-    """Return the mesh of a primitive shape in a list, which is empty if its size is zero."""
+    """Return a primitive shape as a list with one mesh, or an empty list if its size is zero."""
     mesh = _plain_shape(frame)
     if mesh is None or "materials" not in frame:
         return [mesh] if mesh else []
@@ -193,7 +193,7 @@ def _shape_mesh(
 
 
 def _plain_shape(frame: dict[str, Any]) -> SceneMesh | None:
-    """Return the triangles of a primitive shape without materials, or None if a size is zero."""
+    """Return a primitive shape without materials, or None if one of its sizes is zero."""
     name = frame["name"]
     kind = frame["kind"]
     size = frame["sizes"]
@@ -225,7 +225,7 @@ def _content(
     stem: str,
     allowance: Allowance,
 ) -> Content:
-    """Place meshes according to the nodes of a scene."""
+    """Place the meshes as the nodes of a scene specify."""
     moving = frame["moving"]
     matrices = arrays[0].copy()
     motions = arrays[1 : 1 + len(moving)]
@@ -272,7 +272,7 @@ def _content(
 
 
 def _with_distinct_names(nodes: list[PlacedNode]) -> list[PlacedNode]:
-    """Give nodes distinct names if their prims share a name.
+    """Give distinct names to nodes whose prims have the same name.
 
     The new name is that of an enclosing prim that contains no other prim with the shared name. The
     least frequent such name is chosen, or the innermost of several. For example, a chess set has
@@ -305,7 +305,7 @@ def _with_distinct_names(nodes: list[PlacedNode]) -> list[PlacedNode]:
 
 
 def _with_notes(content: Content, stage: dict[str, Any], counts: dict[str, int]) -> Content:
-    """Set the unit and the up axis of a content, and add notes on content that is not read."""
+    """Set the unit and up axis of scene content, and add notes on what is not read."""
     content.unit_m = stage["unit_m"]
     content.up_axis = stage["up_axis"]
     if not 0 < stage["unit_m"] < np.inf:
@@ -325,7 +325,7 @@ def _with_notes(content: Content, stage: dict[str, Any], counts: dict[str, int])
 
 
 def _notes(stage: dict[str, Any], counts: dict[str, int]) -> Iterator[str]:
-    """Yield notes on content that is not read, given the stage and counts of its prims."""
+    """Yield notes on content that is not read, given prim counts by kind."""
     moving, skinned, smooth = (counts.pop(k, 0) for k in ("moving", "skinned", "subdivided"))
     if stage["materialx"]:
         yield (

@@ -1,10 +1,10 @@
-"""Script that reads an OpenUSD scene with usd-core in the process that `usd.py` starts.
+"""Script that `usd.py` runs in a separate process to read an OpenUSD scene with usd-core.
 
-Some invalid files crash usd-core, and others need unlimited memory. Here, this affects only this
-process. The script imports nothing from lidarpool, so that it starts quickly. It writes frames to
-standard output: first the stage, then each mesh, preceded by the images and materials that it is
-the first to use, and finally the nodes. Content that several prims share is written once. For an
-animation, meshes and nodes are written again for each pose.
+Some invalid files crash usd-core, and others need unlimited memory, but this only affects the
+separate process. The script imports nothing from lidarpool, so that it starts quickly. It writes
+frames to standard output: first the stage, then each mesh, preceded by the images and materials
+that it is the first to use, and finally the nodes. Content that several prims share is written
+once. For an animation, meshes and nodes are written again for each pose.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class StageLimitError(Exception):
 
 
 class _Inherited(NamedTuple):
-    """Properties of a node that are set by enclosing prims.
+    """Properties that enclosing prims set for a node.
 
     Together with the path of the node, they identify the node.
     """
@@ -63,9 +63,9 @@ class _Inherited(NamedTuple):
 
 
 class StageNodes:
-    """The nodes of a stage, numbered in the order of discovery.
+    """The nodes of a stage, numbered in the order in which they are found.
 
-    A node that several instances share is the node in their prototype.
+    If several instances share a node, it is the node in their prototype.
     """
 
     def __init__(
@@ -91,13 +91,13 @@ class StageNodes:
 
     @property
     def start(self) -> float:
-        """Time code at which the survey starts."""
+        """Time code at which a survey starts."""
         first_codes = [float(motion[0, 0]) for motion in self.motions]
         time = self._time.GetValue()
         return time if self._stage.HasAuthoredTimeCodeRange() else min(first_codes, default=0.0)
 
     def read(self) -> None:
-        """Collect all nodes, and write their meshes."""
+        """Collect all nodes of the stage, and write their meshes."""
         # With a rate of 0, usd-core would search for samples forever.
         still = not self._stage.GetTimeCodesPerSecond() > 0
         root = self._number(self._stage.GetPseudoRoot(), _Inherited(False, still, None))
@@ -106,7 +106,7 @@ class StageNodes:
             self.nodes.append(self._node(prim, inherited))
 
     def _number(self, prim: Any, inherited: _Inherited) -> int:
-        """Return the number of a node, assigning a new one to a new node."""
+        """Return the number of a node. A new node gets the next number."""
         key = _shared(prim).GetPath(), inherited
         if key not in self._numbers:
             self._numbers[key] = len(self._numbers)
@@ -115,7 +115,7 @@ class StageNodes:
         return self._numbers[key]
 
     def _count(self, count: int, kind: str = "prims and instances") -> None:
-        """Count toward the limit for a kind of content.
+        """Count items toward the limit for their kind.
 
         Raises StageLimitError beyond the limit.
         """
@@ -124,7 +124,7 @@ class StageNodes:
             raise StageLimitError(kind)
 
     def _node(self, prim: Any, inherited: _Inherited) -> list[Any]:
-        """Return a node, which consists of its name, mesh number, child numbers, and copies.
+        """Describe a node by its name, mesh number, child numbers, and copies.
 
         A copy is (node number, index into `copies`).
         """
@@ -157,7 +157,7 @@ class StageNodes:
         return node
 
     def _add_child(self, node: list[Any], child: Any, inherited: _Inherited) -> None:
-        """Add a child to its node, to the roots, or to the moving nodes."""
+        """Add a child to its node, or to the roots or the moving nodes."""
         xformable = UsdGeom.Xformable(child)
         number = self._number(child, inherited)
         motion = None
@@ -176,7 +176,7 @@ class StageNodes:
             node[2].append(number)
 
     def _any_below(self, prim: Any, test: Callable[[Any], bool]) -> bool:
-        """Return whether a prim or one of its descendants passes a test.
+        """Return whether a prim or any of its descendants passes a test.
 
         Each prototype is tested once.
         """
@@ -193,7 +193,7 @@ class StageNodes:
         return False
 
     def _motion(self, prim: Any) -> NDArray[np.float64] | None:
-        """Return the time codes and world poses of a prim, or None if it does not move.
+        """Return a prim's time codes and world poses, or None if it does not move.
 
         Interpolating positions linearly, and rotations about a single axis, deviates from OpenUSD
         by at most `_MAX_OFFSET_M` and `_MAX_ANGLE_RAD`.
@@ -221,7 +221,7 @@ class StageNodes:
         return None
 
     def _copies(self, instancer: Any, excluded: bool) -> list[tuple[int, int]]:
-        """Return the nodes that an instancer copies, each with an index into `copies`."""
+        """Return pairs of a node that an instancer copies and an index into `copies`."""
         prototype_numbers = np.array(
             instancer.GetProtoIndicesAttr().Get(self._time) or (), np.int64
         )
@@ -254,7 +254,7 @@ class StageNodes:
         return nodes
 
     def _mesh(self, prim: Any) -> int | None:
-        """Write the triangles of a prim if they are new, and return the number of the mesh."""
+        """Write a prim's triangles unless they are known, and return the number of the mesh."""
         kind = str(prim.GetTypeName())
         arrays: list[Any] = []
         if prim.IsA(UsdGeom.Mesh):
@@ -295,7 +295,7 @@ class StageNodes:
 
 
 class _TimedPose:
-    """The world pose of a prim at a time code."""
+    """A prim's world pose at a time code."""
 
     def __init__(self, prim: Any, code: float) -> None:
         matrix = UsdGeom.Imageable(prim).ComputeLocalToWorldTransform(code)
@@ -305,7 +305,7 @@ class _TimedPose:
 
 
 def _sample_codes(prim: Any) -> list[float]:
-    """Return the time codes of the samples of a prim and its ancestors, in ascending order."""
+    """Return the time codes of all samples of a prim and its ancestors, in ascending order."""
     codes: set[float] = set()
     above = prim
     while above:
@@ -316,7 +316,7 @@ def _sample_codes(prim: Any) -> list[float]:
 
 
 def _is_rigid(poses: list[_TimedPose]) -> bool:
-    """Return whether poses differ only by rotations and translations."""
+    """Return whether poses differ only by rotations and translations, not by scales."""
     linear = np.array([pose.matrix[:3, :3] for pose in poses])
     if np.linalg.matrix_rank(linear[0]) < 3:
         return False
@@ -328,7 +328,7 @@ def _is_rigid(poses: list[_TimedPose]) -> bool:
 def _poses_up_to(
     prim: Any, start: _TimedPose, stop: _TimedPose, max_offset: float, depth: int
 ) -> list[_TimedPose]:
-    """Return the poses after `start`, up to `stop`, that are needed for accurate interpolation.
+    """Return the poses after `start`, up to `stop`, that accurate interpolation requires.
 
     `max_offset` is the tolerance in units of the stage, and `depth` the number of remaining
     bisections.
@@ -350,7 +350,7 @@ def _poses_up_to(
 
 
 class MaterialReader:
-    """Reads the images and materials in a stage, and the colors of its meshes.
+    """Reads the images and materials in a stage, and the colors of meshes.
 
     An image or a material is written when it is first used.
     """
@@ -368,7 +368,7 @@ class MaterialReader:
         self._numbers_by_content: dict[str, int] = {}  # {description of a material: number}
 
     def inherited(self, instance: Any) -> Any:
-        """Return the material and color that prims in an instance inherit, or None."""
+        """Return the material and color that the prims in an instance inherit, or None."""
         if not (self._masks or self._colors or self._names_materials):
             return None
         color = self._values(instance, "displayColor") if self._colors else None
@@ -376,7 +376,7 @@ class MaterialReader:
         return None if look == (None, None) else look
 
     def mesh_fields(self, prim: Any, arrays: list[Any]) -> dict[str, Any]:
-        """Return the frame fields for the materials and values of a mesh.
+        """Return the frame fields for a mesh's materials and values.
 
         The values are appended to the arrays of the frame. According to the OpenUSD interpolation,
         they belong to corners, vertices, or polygons, or are constant.
@@ -403,7 +403,7 @@ class MaterialReader:
         return {"materials": materials, "values": values} if materials or values else {}
 
     def _values(self, prim: Any, name: str) -> tuple[str, NDArray[np.float32]] | None:
-        """Return the interpolation and the values of a primvar, or None if it is not set."""
+        """Return a primvar's interpolation and values, or None if it is not set."""
         primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
         values = np.array(primvar.ComputeFlattened(self.time) if primvar else None)
         if values.dtype.kind != "f" or values.ndim != 2:
@@ -411,7 +411,7 @@ class MaterialReader:
         return str(primvar.GetInterpolation()), values.astype(np.float32)
 
     def _bound(self, prim: Any) -> tuple[int | None, list[str]]:
-        """Return the material of a prim as `_material` does, or (None, []) without a material."""
+        """Return a prim's material like `_material`, or (None, []) if it has none."""
         binding = UsdShade.MaterialBindingAPI(prim)
         material = binding.ComputeBoundMaterial(UsdShade.Tokens.preview)[0]
         if not material:
@@ -422,7 +422,7 @@ class MaterialReader:
         return self._materials[path]
 
     def _material(self, material: Any) -> tuple[int | None, list[str]]:
-        """Write a new material, and return its number and the names of the primvars that it uses.
+        """Write a new material, and return its number and the primvars that it uses.
 
         The number is None if the material has none of the requested properties.
         """
@@ -439,7 +439,7 @@ class MaterialReader:
         return number, [source["values"] for source in sources if "values" in source]
 
     def _properties(self, shader: Any, kind: str) -> dict[str, Any]:
-        """Return the requested properties among color, opacity, and opacity threshold."""
+        """Return those of the properties color, opacity, and threshold that were requested."""
         properties: dict[str, Any] = {}
         if kind not in _SURFACES:
             if self._colors:
@@ -473,7 +473,7 @@ class MaterialReader:
         return {"value": [a * b for a, b in zip(plain or (0.2, 0.2, 0.2), tint, strict=True)]}
 
     def _source(self, surface_input: Any) -> dict[str, Any] | None:
-        """Return the source of a surface input, or None if the input is not set."""
+        """Describe the source of a surface input, or return None if the input is not set."""
         attributes = (
             UsdShade.Utils.GetValueProducingAttributes(surface_input) if surface_input else ()
         )
@@ -504,7 +504,7 @@ class MaterialReader:
         return source | self._coordinates(shader.GetInput("st"))
 
     def _coordinates(self, coordinate_input: Any) -> dict[str, Any]:
-        """Return the name of texture coordinates, and the 3 x 2 matrix that maps (u, v, 1)."""
+        """Return the name of texture coordinates, and their 3 x 2 matrix for (u, v, 1)."""
         matrix = np.eye(3)
         for _ in range(_MAX_LINKS):
             attributes = (
@@ -534,7 +534,7 @@ class MaterialReader:
         return {"unread": "its texture coordinates are computed in an unsupported way"}
 
     def _image(self, asset: Any) -> int:
-        """Write an image if it is new, and return its number."""
+        """Write an image unless it is known, and return its number."""
         path = getattr(asset, "resolvedPath", "") or getattr(asset, "path", "")
         number = self._images.setdefault(path, len(self._images))
         if number < len(self._images) - 1:
@@ -557,7 +557,7 @@ class MaterialReader:
 
 
 def _surface_shader(material: Any) -> tuple[Any, str]:
-    """Return the surface shader of a material and its kind, preferring supported kinds."""
+    """Return a material's surface shader and its kind. Supported kinds are preferred."""
     shader = None
     kind = ""
     for context in ("", "mdl", "mtlx"):
@@ -570,7 +570,7 @@ def _surface_shader(material: Any) -> tuple[Any, str]:
 
 
 def _constant(shader_input: Any) -> Any:
-    """Return the value of an input, or None if it is not set or computed by a shader."""
+    """Return the constant value of an input, or None if it has none."""
     attributes = UsdShade.Utils.GetValueProducingAttributes(shader_input) if shader_input else ()
     return attributes[0].Get() if attributes else None
 
@@ -600,23 +600,21 @@ _SIZES = {
 
 
 def _shared(prim: Any) -> Any:
-    """Return the corresponding prim in the prototype if instances share the prim, else the prim."""
+    """Return a prim, or its counterpart in the prototype if instances share it."""
     return prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim
 
 
 def _transform_varies(prim: Any) -> bool:
-    """Return whether the transform of a prim may vary over time."""
     xformable = UsdGeom.Xformable(prim)
     return bool(xformable and xformable.TransformMightBeTimeVarying())
 
 
 def _has_surface(prim: Any) -> bool:
-    """Return whether a prim is a shape or an instancer."""
     return bool(prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.PointInstancer))
 
 
 class _Animation(NamedTuple):
-    """The motion of a stage, and the times of its poses."""
+    """Animations and moving attributes of a stage, and the time codes of its poses."""
 
     animations: list[dict[str, str]]  # names of the skeleton animations
     attributes: list[Any]  # moving attributes
@@ -624,7 +622,7 @@ class _Animation(NamedTuple):
 
 
 def _select_animation(stage: Any, request: dict[str, Any]) -> _Animation:
-    """Bind the requested animation to its skeletons, and return the motion of the stage."""
+    """Bind the requested animation to its skeletons, and return the stage's motion."""
     name = request["animation"]
     rate_hz = stage.GetTimeCodesPerSecond()
     while name is not None and (proxies := [p for p in stage.Traverse() if p.IsInstance()]):
@@ -659,7 +657,7 @@ def _stage_files(stage: Any) -> list[str]:
 
 
 def _missing_files(stage: Any) -> list[str]:
-    """Return the names of referenced files and prims that usd-core cannot read."""
+    """Return the names of all referenced files and prims that usd-core cannot read."""
     folder = os.path.dirname(stage.GetRootLayer().realPath) + "/"  # noqa: PTH120
     missing_names = set()
     for error in map(str, stage.GetCompositionErrors()):
@@ -669,7 +667,7 @@ def _missing_files(stage: Any) -> list[str]:
 
 
 def _reason(error: Exception, path: str) -> str:
-    """Return the reason for an error without C++ names and folders."""
+    """Return the reason for an error, without C++ names and folders."""
     try:
         text = error.args[0].commentary if isinstance(error, Tf.ErrorException) else str(error)
     except UnicodeDecodeError:
@@ -679,7 +677,7 @@ def _reason(error: Exception, path: str) -> str:
 
 
 def _checked_layers(path: str) -> list[Any]:
-    """Open a layer and its sublayers, checking that all files that they refer to are regular.
+    """Open a layer and its sublayers, after checking that all referenced files are regular.
 
     Opening a named pipe would wait for a writer. Files that references in other layers name are not
     checked, because only composition determines which of them are opened.
@@ -705,12 +703,12 @@ def _checked_layers(path: str) -> list[Any]:
 
 
 def main(path: str, request: dict[str, Any]) -> None:
-    """Read a file, and write frames to standard output."""
+    """Read a file, and write frames to the standard output."""
     output = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
     def write(frame: dict[str, Any], *arrays: NDArray[Any]) -> None:
-        """Write a frame, which is a line of JSON followed by the bytes of arrays."""
+        """Write a frame: a line of JSON, followed by the bytes of its arrays."""
         signal.alarm(0)  # the receiving process may take long
         kinds = [(array.dtype.str, array.shape) for array in arrays]
         output.write(json.dumps(frame | {"arrays": kinds}).encode() + b"\n")

@@ -35,7 +35,7 @@ _DISPLAY: ColorSource = {"values": "displayColor"}
 
 
 class _Use(NamedTuple):
-    """The use of an image by a material, which several meshes may share."""
+    """How a material uses an image. Several meshes may share this."""
 
     image: int
     channels: str  # "rgb", or a letter of "rgba"
@@ -46,7 +46,7 @@ class _Use(NamedTuple):
 
     @classmethod
     def from_source(cls, source: ColorSource) -> _Use:
-        """Return the use of an image that a source describes."""
+        """Create the use of an image from the description of a source."""
         scale = tuple(source.get("scale", (1,) * 4))
         bias = tuple(source.get("bias", (0,) * 4))
         raw = source.get("raw", False)
@@ -54,13 +54,13 @@ class _Use(NamedTuple):
         return cls(source["image"], source["channels"], scale, bias, raw, wraps)
 
     def light(self, channel: str) -> Floats:
-        """Return the linear light for each byte value of a channel. Shape (256,)."""
+        """Return the linear light for each byte value in a channel. Shape (256,)."""
         k = "rgba".index(channel)
         return (_BYTES if self.raw or k == 3 else LINEAR) * self.scale[k] + self.bias[k]
 
 
 class MeshAppearance:
-    """Texture coordinates and colors of a mesh, as used by its materials.
+    """Texture coordinates and colors of a mesh, in the form that its materials require.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class MeshAppearance:
         self._values: dict[str, tuple[str, int]] = frame.get("values", {})
 
     def coordinates(self, source: ColorSource, face_indices: Ints) -> tuple[Floats, Ints]:
-        """Return texture coordinates in glTF's convention, and their indices.
+        """Return texture coordinates in glTF's convention, and the indices at triangle corners.
 
         The indices have shape (k, 3), with an index for each corner of the triangles.
         """
@@ -88,7 +88,7 @@ class MeshAppearance:
         return np.stack([u, 1 - v], axis=1), corners
 
     def value_colors(self, name: str, face_indices: Ints) -> Colors | None:
-        """Return colors of triangles from values in linear light, or None without values."""
+        """Convert linear values to triangle colors, or return None if there are no values."""
         if name not in self._values:
             return None
         values, corners = self._corner_values(name, face_indices, 3)
@@ -98,7 +98,7 @@ class MeshAppearance:
         return Colors.from_vertex_colors(colors[corners])
 
     def _corner_values(self, name: str, face_indices: Ints, width: int) -> tuple[Floats, Ints]:
-        """Return values, and their indices at the corners of triangles.
+        """Return values, and their indices at triangle corners.
 
         Raises MaskError if the mesh has no suitable values.
         """
@@ -120,7 +120,7 @@ class MeshAppearance:
 
 
 class UsdMaterials:
-    """The numbered images and materials in a scene, which provide colors and masks."""
+    """The numbered images and materials of a scene, from which colors and masks are created."""
 
     def __init__(self, allowance: Allowance, options: ReadOptions) -> None:
         self._allowance = allowance
@@ -134,7 +134,7 @@ class UsdMaterials:
         self.notes = MaskNotes()
 
     def add(self, frame: dict[str, Any], arrays: list[AnyArray]) -> None:
-        """Store the frame of an image or a material."""
+        """Store the frame of an image or material."""
         if frame["what"] == "material":
             self._materials[frame["number"]] = frame
             return
@@ -150,7 +150,7 @@ class UsdMaterials:
         )
 
     def colors(self, number: int | None, look: MeshAppearance, face_indices: Ints) -> Colors | None:
-        """Return the colors of triangles with a material, or None."""
+        """Return the colors of triangles that have a material, or None if there are none."""
         if not self.colored:
             return None
         material = self._materials[number]
@@ -171,7 +171,7 @@ class UsdMaterials:
         return None
 
     def cutout(self, number: int | None, look: MeshAppearance, face_indices: Ints) -> Cutout | None:
-        """Return the mask of triangles with a material, or None if they are opaque."""
+        """Return the mask of triangles that have a material, or None if they are opaque."""
         material = self._materials[number]
         source = material.get("opacity", {"value": 1.0})
         with self.notes.record_mask_error(material["name"]):
@@ -199,7 +199,7 @@ class UsdMaterials:
         return content
 
     def _read_shades(self, use: _Use) -> Texture:
-        """Read the colors in an image as a texture."""
+        """Read an image as a texture with colors."""
         image = read_colors(self._image(use.image), self._allowance, self.notes)
         names = use.channels if use.channels == "rgb" else use.channels * 3
         tables = [as_srgb(np.nan_to_num(use.light(name))) for name in names]
@@ -207,7 +207,7 @@ class UsdMaterials:
         return Texture(np.stack(shades, axis=-1), use.wraps, self._allowance)
 
     def _read_mask(self, key: tuple[_Use, float]) -> Texture | Literal["glass"] | None:
-        """Read the mask in an image.
+        """Read an image as a mask.
 
         Returns "glass" if the image is opaque nowhere, and None if it is opaque everywhere.
         """
@@ -235,7 +235,7 @@ def material_pieces(
     polygons: tuple[Ints, Ints, Bools],
     materials: UsdMaterials,
 ) -> Iterator[Piece]:
-    """Triangulate polygons, and divide the triangles by their materials.
+    """Triangulate polygons, and divide the triangles by material.
 
     `polygons` are the sizes of the polygons, the vertices at their corners, and a mask of the
     polygons that are not holes.

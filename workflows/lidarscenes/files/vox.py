@@ -1,4 +1,4 @@
-"""Read AMAPVox voxel files (.vox) as grids of leaf area, as HELIOS++ does."""
+"""Read AMAPVox files (.vox) as grids of leaf area, like HELIOS++."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MARGIN = 0.02
 
 
 def read_vox(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read a voxel file as an object, which is a box around the voxels with leaves.
+    """Read a voxel file as one object, which is a box around all voxels with leaves.
 
     As in HELIOS++, the first voxel starts at `min_corner`, and each voxel has the edge length
     `res`. Voxels that are not listed or whose density is NaN have no leaves.
@@ -67,7 +67,7 @@ def read_vox(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 class _Grid(NamedTuple):
-    """The grid in a voxel file."""
+    """The voxel grid that a file describes."""
 
     counts: Floats  # (3,) number of voxels along x, y, and z
     min_corner: Floats  # (3,) start of the first voxel in meters
@@ -75,7 +75,7 @@ class _Grid(NamedTuple):
 
 
 class _Table(NamedTuple):
-    """The header and the rows in a voxel file."""
+    """The header and the rows of a voxel file."""
 
     header: dict[str, str]
     grid: _Grid
@@ -108,7 +108,7 @@ def _read_table(data: bytes) -> _Table:
 
 
 def _numbers(text: bytes, columns: list[str], used: tuple[int, ...], first_line: int) -> Floats:
-    """Return the numbers in the used columns.
+    """Return the numbers in those columns that are used.
 
     Raises ValueError, with the line number, if a line is invalid.
     """
@@ -120,7 +120,7 @@ def _numbers(text: bytes, columns: list[str], used: tuple[int, ...], first_line:
 
 
 def _box_around(name: str, densities: Floats32, min_corner: Floats, edges_m: Floats) -> SceneMesh:
-    """Return a box around voxels that start at a corner, in meters."""
+    """Return a box around voxels, starting at the given corner in meters."""
     sides_m = np.array(densities.shape) * edges_m
     margin_m = _MARGIN * edges_m.min()
     shell = box(name, tuple(sides_m + 2 * margin_m))
@@ -130,13 +130,13 @@ def _box_around(name: str, densities: Floats32, min_corner: Floats, edges_m: Flo
 
 
 def _grid(header: dict[str, str]) -> _Grid:
-    """Read the grid in a header.
+    """Read the voxel grid from a header.
 
     Raises MeshFileError if values are missing or invalid.
     """
 
     def three(name: str, times: int = 1) -> Floats:
-        """Return three numbers in the header, or raise MeshFileError."""
+        """Return three numbers from the header, or raise MeshFileError."""
         try:
             values = np.array([float(word) for word in header[name].split()] * times)[:3]
         except (KeyError, ValueError):
@@ -165,7 +165,7 @@ def _grid(header: dict[str, str]) -> _Grid:
 
 
 def _density_column(columns: list[str]) -> int:
-    """Return the index of the plant area density column in AMAPVox 1 or 2."""
+    """Return the index of the column with the plant area density, for AMAPVox 1 or 2."""
     if DENSITY in columns:
         return columns.index(DENSITY)
     named = [row for row, name in enumerate(columns) if name.lower().startswith("pad")]
@@ -178,7 +178,7 @@ def _density_column(columns: list[str]) -> int:
 
 
 def _check_rows(indices: Floats, density: Floats, shape: Floats) -> None:
-    """Raise MeshFileError for voxels outside the grid, repeated voxels, and invalid densities."""
+    """Raise MeshFileError if voxels are outside the grid, repeated, or have invalid densities."""
     is_bad = ~((indices == np.floor(indices)) & (indices >= 0) & (indices < shape)).all(axis=1)
     if is_bad.any():
         raise MeshFileError(
@@ -199,5 +199,4 @@ def _check_rows(indices: Floats, density: Floats, shape: Floats) -> None:
 
 
 def _spaced(numbers: Floats) -> str:
-    """Return numbers separated by spaces."""
     return " ".join(f"{number:g}" for number in numbers)

@@ -1,4 +1,4 @@
-"""Read SDFormat models as trees of bodies, with frames that place links and nested models."""
+"""Read SDFormat models as trees of bodies, whose frames place links and nested models."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Link(NamedTuple):
 
 
 class PlacedModel(NamedTuple):
-    """A model placed in a world or in another model."""
+    """A model that is placed in a world or in another model."""
 
     name: str
     body: GazeboBody
@@ -57,7 +57,7 @@ class PlacedModel(NamedTuple):
 
 @dataclass(eq=False)
 class GazeboBody:
-    """The content of a model or a world, without its own pose.
+    """Content of a model or world, excluding its own pose.
 
     Identical includes share a body.
 
@@ -82,14 +82,14 @@ class GazeboBody:
 
 
 class _Included(NamedTuple):
-    """The model in a file that an <include> refers to."""
+    """The model to which an <include> refers."""
 
     element: Element  # its <model>
     source: Source
 
 
 class BodyReader:
-    """Reads the bodies in a world, each file and each model once."""
+    """Reads the bodies of a world. Each file and each model is read only once."""
 
     def __init__(self, resources: Resources, notes: Notes, allowance: Allowance) -> None:
         self.resources = resources
@@ -101,7 +101,7 @@ class BodyReader:
         self._ground: Element | None = None
 
     def world(self, element: Element, source: Source) -> GazeboBody:
-        """Return the body of a <world>, or of a root element with models."""
+        """Read a <world>, or a root element that contains models, as a body."""
         body = GazeboBody(FrameGraph(WORLD_FRAME))
         self._fill(body, element, source)
         if body.size > MAX_NODES:
@@ -112,7 +112,7 @@ class BodyReader:
         return body
 
     def _fill(self, body: GazeboBody, element: Element, source: Source) -> None:
-        """Read the links, frames, and models in an element into a body."""
+        """Read the links, frames, and models of an element into a body."""
         self.notes.check_children(element)
         frames = body.frames
         for link in element.findall("link"):
@@ -136,7 +136,7 @@ class BodyReader:
     def _nested(
         self, body: GazeboBody, element: Element, source: Source
     ) -> Iterator[tuple[str, GazeboBody, RelativePose]]:
-        """Yield the names, bodies, and poses of nested models, after defining their frames."""
+        """Define the frames of nested models, and yield each model's name, body, and pose."""
         for child in element:
             if child.tag == "model":
                 name = _name(child)
@@ -149,7 +149,7 @@ class BodyReader:
     def _include(
         self, body: GazeboBody, include: Element, source: Source
     ) -> Iterator[tuple[str, GazeboBody, RelativePose]]:
-        """Yield the model that an <include> refers to, or merge the model into the body."""
+        """Yield the model to which an <include> refers, or merge this model into the body."""
         self.notes.check_children(include)
         uri = (include.findtext("uri") or "").strip()
         included = self._included(uri, source)
@@ -180,7 +180,7 @@ class BodyReader:
     def _merge(
         self, body: GazeboBody, nested: GazeboBody, posed: Element, placing: Element
     ) -> None:
-        """Merge the links and nested models of an included model into the body."""
+        """Merge an included model's links and nested models into the body."""
         pose = read_pose(posed)
         frames = body.frames
         matrix = placement_matrix(pose.matrix, nested.frames, _placement_frame(placing, posed))
@@ -192,7 +192,7 @@ class BodyReader:
         ]
 
     def model(self, element: Element, source: Source) -> GazeboBody:
-        """Return the body of a <model>.
+        """Read a <model> as a body.
 
         Raises LidarError if includes are circular.
         """
@@ -217,7 +217,7 @@ class BodyReader:
         return self._bodies[key]
 
     def _included(self, uri: str, source: Source) -> _Included | None:
-        """Return the model at a URI, or None if it is a light or missing."""
+        """Return the model at a URI, or None if it is missing or is a light."""
         if not uri:
             self.notes.missing_models["an <include> without <uri>"] += 1
             return None
@@ -239,7 +239,7 @@ class BodyReader:
         return self._ground
 
     def _read(self, source: Source) -> _Included | None:
-        """Return the model in a file, or None if the file is unreadable or has no model."""
+        """Read the model in a file, or return None if the file is unreadable or has no model."""
         path = source.path.resolve()
         if path not in self._files:
             self._files[path] = None
@@ -260,18 +260,18 @@ class BodyReader:
 
 
 def _placement_frame(placing: Element, posed: Element) -> str:
-    """Return the frame of a model that its pose refers to, or "" for the model's own frame."""
+    """Return the frame within a model to which its pose refers, or "" for its own frame."""
     text = placing.findtext("placement_frame") or posed.get("placement_frame") or ""
     return printable(text)
 
 
 def _name(element: Element) -> str:
-    """Return the name of an element without unprintable characters."""
+    """Return an element's name without unprintable characters."""
     return printable(element.get("name", ""))
 
 
 def scoped_name(path: tuple[str, ...]) -> str:
-    """Join the names of nested models and a link in Gazebo's notation.
+    """Join the names of nested models and a link, in the notation of Gazebo.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Resolve SDFormat poses and the frames that they are relative to."""
+"""Resolve SDFormat poses, which are relative to named frames."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MIN_NORM = 1e-6  # smallest norm of a quaternion
 
 
 class RelativePose(NamedTuple):
-    """A pose in a named frame."""
+    """A pose relative to a named frame."""
 
     matrix: Floats  # (4, 4) matrix from the posed frame to the named frame
     frame: str  # empty for the default frame of the element
@@ -30,7 +30,7 @@ class RelativePose(NamedTuple):
 def child_numbers(
     element: Element, name: str, count: int, default: str, *, at_least: float | None = None
 ) -> Floats:
-    """Return the `count` numbers in a child element, or in `default` if it is missing or empty.
+    """Return `count` numbers from a child element, or from `default` if it is missing or empty.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def parse_numbers(
     at_least: float | None = None,
     of_any_size: bool = False,
 ) -> Floats:
-    """Parse `count` numbers in a text, which error messages call `subject`.
+    """Parse `count` numbers from a text, which is called `subject` in error messages.
 
     With `of_any_size`, numbers may also be infinite, NaN, or very large. Raises LidarError as
     `child_numbers` does.
@@ -68,7 +68,7 @@ def parse_numbers(
 
 
 def read_pose(element: Element) -> RelativePose:
-    """Return the pose of an element, or the identity if it has no <pose>."""
+    """Return an element's pose, or the identity if it has no <pose>."""
     pose = element.find("pose")
     if pose is None:
         return RelativePose(np.eye(4), "")
@@ -77,7 +77,7 @@ def read_pose(element: Element) -> RelativePose:
 
 
 def read_matrix(pose: Element) -> Floats:
-    """Return the 4 x 4 matrix of a <pose>.
+    """Return the 4 x 4 matrix that a <pose> describes.
 
     The pose consists of x, y, z, and either roll, pitch, and yaw or a quaternion. In a recorded
     state, physics may have moved a model to a pose with infinite or very large numbers. The matrix
@@ -118,7 +118,7 @@ class FrameGraph:
         self._poses: dict[str, RelativePose] = {}
 
     def define(self, name: str, pose: RelativePose, default: str) -> str:
-        """Define a frame, and return its name, with a number if the name is already used.
+        """Define a frame, and return its name. A number is appended if the name is already used.
 
         `default` is the reference frame if the pose does not name one.
         """
@@ -135,14 +135,14 @@ class FrameGraph:
         return [self.root, *self._poses]
 
     def merge(self, nested: FrameGraph, placement: Floats) -> None:
-        """Add the frames of a merged model whose root is placed by a matrix."""
+        """Add the frames of a merged model, given the matrix that places its root."""
         for name in nested.names()[1:]:
             matrix = matmul(placement, nested.matrix(name))
             self.define(name, RelativePose(matrix, self.root), self.root)
         self.nested.update(nested.nested)
 
     def matrix(self, name: str) -> Floats:
-        """Return the 4 x 4 matrix from a frame to the root.
+        """Return the 4 x 4 matrix that transforms from a frame to the root.
 
         Raises
         ------
@@ -161,7 +161,7 @@ class FrameGraph:
         return self._matrices[chain[0] if chain else name]
 
     def _pose(self, name: str) -> RelativePose:
-        """Return the pose of a frame, which may be MODEL::FRAME of a nested model."""
+        """Return the pose of a frame. MODEL::FRAME refers to a frame of a nested model."""
         model, mark, inner = name.partition("::")
         if name not in self._poses and mark and model in self.nested:
             self._poses[name] = RelativePose(self.nested[model].matrix(inner), model)
@@ -172,12 +172,12 @@ class FrameGraph:
         return self._poses[name]
 
     def transform_between(self, frame: str, target: str) -> Floats:
-        """Return the 4 x 4 matrix from a frame to another frame."""
+        """Return the 4 x 4 matrix that transforms from one frame to another."""
         return matmul(inverse_pose(self.matrix(target)), self.matrix(frame))
 
 
 def placement_matrix(pose: Floats, frames: FrameGraph, placement_frame: str) -> Floats:
-    """Return the 4 x 4 matrix of a model whose `placement_frame` has a given pose."""
+    """Return the 4 x 4 matrix of a model whose `placement_frame` has the given pose."""
     if not placement_frame:
         return pose
     return matmul(pose, inverse_pose(frames.matrix(placement_frame)))

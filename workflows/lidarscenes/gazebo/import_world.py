@@ -1,4 +1,4 @@
-"""Convert Gazebo worlds to scenarios, with a sensor for each lidar on a stationary platform."""
+"""Convert Gazebo worlds to scenarios. Each lidar becomes a sensor on a stationary platform."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .world import GazeboOptions, World, build_content, load_world
 
 
 def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
-    """Write a world as a scenario, with a `scenario.yaml` file and a data file for each lidar.
+    """Write a world as a scenario, which is a `scenario.yaml` file and a data file for each lidar.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]
 def _unseen_objects(
     world: World, masks: Sequence[int], folders: tuple[Path, ...]
 ) -> dict[int, list[str]]:
-    """Return the name patterns of objects that lidars do not see, by <visibility_mask>.
+    """Return name patterns for the objects that lidars do not see, by <visibility_mask>.
 
     The names are those in the scene. The meshes of the world are read only if a lidar does not see
     one of the visuals.
@@ -95,7 +95,7 @@ def _unseen_objects(
 
 
 def _patterns(names: Sequence[str], is_unseen: Sequence[bool]) -> list[str]:
-    """Return patterns that match exactly the names of unseen objects.
+    """Return patterns that match the names of unseen objects and no others.
 
     If a model has several objects that are all unseen, the pattern is MODEL/*.
     """
@@ -112,12 +112,12 @@ def _patterns(names: Sequence[str], is_unseen: Sequence[bool]) -> list[str]:
 
 
 def _folders(world: Path, assets: Sequence[Path]) -> tuple[Path, ...]:
-    """Return the resolved folders of a world, its own folder first."""
+    """Return the folders that may contain files of a world, starting with its own folder."""
     return world.parent.resolve(), *(folder.resolve() for folder in assets)
 
 
 def _loaded(world: Path, assets: Sequence[Path]) -> World:
-    """Load a world.
+    """Load the world that is to be converted.
 
     Raises LidarError if the file cannot be read.
     """
@@ -132,13 +132,13 @@ def _loaded(world: Path, assets: Sequence[Path]) -> World:
 
 
 def _materials(world: World) -> dict[str, Any]:
-    """Return the `materials` section if a shape has a <laser_retro>."""
+    """Return a `materials` section if any shape has a <laser_retro>, otherwise no section."""
     if not any(_has_retro(link.link.element) for link in world.links):
         return {}
     return {"materials": [{"objects": "*", "reflectance": "texture"}]}
 
 
 def _has_retro(link: Element) -> bool:
-    """Return True if a shape of a link has a positive <laser_retro>."""
+    """Return True if any shape of a link has a positive <laser_retro>."""
     shapes = [*link.findall("visual"), *link.findall("collision")]
     return any(child_numbers(shape, "laser_retro", 1, "0").item() > 0 for shape in shapes)

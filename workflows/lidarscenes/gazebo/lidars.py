@@ -46,14 +46,14 @@ _MAX_SAMPLES = 1_000_000
 
 
 class GazeboLidar(NamedTuple):
-    """A lidar and its <visibility_mask>."""
+    """A lidar, together with its <visibility_mask>."""
 
     lidar: Lidar
     mask: int
 
 
 def find_lidars(world: World) -> Iterator[GazeboLidar]:
-    """Yield the lidars in a world.
+    """Yield all lidars in a world.
 
     Raises LidarError if a lidar has invalid values.
     """
@@ -66,7 +66,7 @@ def find_lidars(world: World) -> Iterator[GazeboLidar]:
 
 
 def unknown_sensors(world: World) -> Iterator[str]:
-    """Yield a clause for each sensor whose type is not defined by SDFormat."""
+    """Yield a clause for each sensor whose type SDFormat does not define."""
     for link in world.links:
         for element in link.link.element.findall("sensor"):
             kind = element.get("type") or ""
@@ -77,7 +77,7 @@ def unknown_sensors(world: World) -> Iterator[str]:
 
 
 def _unknown_elements(element: Element, figures: Element) -> Iterator[str]:
-    """Yield a clause if a lidar has elements that are not defined by SDFormat."""
+    """Yield a clause if a lidar has elements that SDFormat does not define."""
     scans = figures.findall("scan")
     parents = [element, figures, *scans]
     parents += [child for scan in scans for name in _SCANS for child in scan.findall(name)]
@@ -130,7 +130,7 @@ def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lid
 
 
 class _Scan(NamedTuple):
-    """Evenly spaced angles, including both ends."""
+    """Evenly spaced angles, including the first and the last one."""
 
     first_deg: float
     last_deg: float
@@ -138,12 +138,12 @@ class _Scan(NamedTuple):
 
     @property
     def step_deg(self) -> float:
-        """Angle between two samples, or 0 for a single sample."""
+        """Angle between successive samples, or 0 for a single sample."""
         return (self.last_deg - self.first_deg) / (self.samples - 1) if self.samples > 1 else 0.0
 
 
 def _scan(figures: Element, name: str, samples: str) -> _Scan:
-    """Return the samples in <horizontal> or <vertical>.
+    """Read the angles in <horizontal> or <vertical>.
 
     `samples` is the default number.
     """
@@ -161,7 +161,7 @@ def _scan(figures: Element, name: str, samples: str) -> _Scan:
 
 
 def _directions(figures: Element) -> dict[str, Any]:
-    """Return the data file fields that describe the ray directions."""
+    """Return the fields of a data file that describe the ray directions."""
     vertical = _scan(figures, "vertical", "1")
     elevations: Any = [rounded(vertical.first_deg)]
     if vertical.samples > 1:
@@ -183,7 +183,7 @@ def _directions(figures: Element) -> dict[str, Any]:
 
 
 def _range_m(ranges: Element | None) -> tuple[float, float]:
-    """Return the minimum and the maximum range in meters."""
+    """Return the minimum and maximum range in meters."""
     if ranges is None:
         return 0.0, math.inf
     longest = (ranges.findtext("max") or "inf").strip()
@@ -193,7 +193,7 @@ def _range_m(ranges: Element | None) -> tuple[float, float]:
 
 
 def _noise(element: Element, figures: Element, unsupported: list[str]) -> dict[str, Any]:
-    """Return the data file fields for noise, and add differences from Gazebo to `unsupported`."""
+    """Return the fields of a data file that describe noise, and note differences from Gazebo."""
     noise = figures.find("noise")
     noise = element.find("noise") if noise is None else noise
     if noise is None:

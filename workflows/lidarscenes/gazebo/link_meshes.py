@@ -1,4 +1,4 @@
-"""Read the meshes of links, in the frames of the links."""
+"""Read the meshes of links, in link coordinates."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MESHES = (".dae", ".obj", ".stl", ".glb", ".gltf")
 
 
 class LinkMesh(NamedTuple):
-    """The shapes of a link that are visible to the same lidars."""
+    """Those shapes of a link that are visible to the same lidars."""
 
     mesh: SceneMesh
     flags: int  # <visibility_flags> of the first shape
@@ -47,7 +47,7 @@ class LinkMesh(NamedTuple):
 
 @dataclass(eq=False)
 class LinkMeshes:
-    """Reads the visuals or the collision shapes of links, each file once.
+    """Reads the visuals or collision shapes of links. Each file is read only once.
 
     `masks` are the <visibility_mask> values of the lidars in the world.
     """
@@ -69,7 +69,7 @@ class LinkMeshes:
     def link_meshes(
         self, body: GazeboBody, link: Link, name: str, scale: tuple[float, ...]
     ) -> list[LinkMesh]:
-        """Return the meshes of a link, which instances of the model share.
+        """Return the meshes of a link. All instances of the model share them.
 
         A link has several meshes if a lidar sees some of its visuals but not others, and none if it
         has no shapes. `name` is the name of the link in the world, for notes. `scale` are factors
@@ -84,7 +84,7 @@ class LinkMeshes:
     def _read_link(
         self, body: GazeboBody, link: Link, name: str, scale: tuple[float, ...]
     ) -> list[LinkMesh]:
-        """Read the meshes of a link, as `link_meshes` returns them."""
+        """Read the meshes of a link for `link_meshes`."""
         # Shapes grouped by the masks that see them, as the first shape, its flags, and all meshes.
         groups: dict[tuple[bool, ...], tuple[Element, int, list[SceneMesh]]] = {}
         for shape in self._shapes(link, name):
@@ -103,7 +103,7 @@ class LinkMeshes:
         ]
 
     def _flags_of(self, shape: Element, name: str) -> int:
-        """Return the visibility flags of a visual, and note a visual that no lidar sees."""
+        """Return a visual's visibility flags, and add a note if no lidar sees it."""
         with prefixed(f"visual {printable(shape.get('name', ''))!r}"):
             flags = read_flags(shape)
         if not flags:
@@ -111,7 +111,7 @@ class LinkMeshes:
         return flags
 
     def _shapes(self, link: Link, name: str) -> list[Element]:
-        """Return the shapes of a link that are read."""
+        """Return the shapes of a link that have to be read."""
         self.notes.check_children(link.element)
         kind = "collision" if self._collisions else "visual"
         shapes = link.element.findall(kind)
@@ -123,7 +123,7 @@ class LinkMeshes:
     def _shape_meshes(
         self, body: GazeboBody, link: Link, shape: Element, name: str, scale: tuple[float, ...]
     ) -> list[SceneMesh]:
-        """Return the meshes of a visual or collision shape in the frame of its link."""
+        """Return the meshes of a visual or collision shape in link coordinates."""
         self.notes.check_children(shape)
         with prefixed(f"{shape.tag} {printable(shape.get('name', ''))!r}"):
             retro = _retro(link.element, shape)
@@ -148,7 +148,7 @@ class LinkMeshes:
         return moved
 
     def with_appearance(self, mesh: SceneMesh, appearance: Appearance) -> SceneMesh:
-        """Apply the color and material of a visual, unless the mesh file defines its own."""
+        """Apply a visual's color and material to a mesh that does not define its own."""
         color = appearance.color
         is_plain = mesh.colors is None or appearance.is_retro
         if self.options.colors and color is not None and is_plain:
@@ -158,7 +158,7 @@ class LinkMeshes:
         return mesh
 
     def geometry_meshes(self, geometry: Element, source: Source) -> list[SceneMesh]:
-        """Return the meshes of a <geometry>, or none for a shape without a size or a file."""
+        """Return the meshes of a <geometry>. There are none if the shape has no size or no file."""
         shapes = [child for child in geometry if ":" not in child.tag]
         if not shapes:
             return []
@@ -180,7 +180,7 @@ class LinkMeshes:
         return [] if mesh is None else [mesh]
 
     def _mesh(self, shape: Element, source: Source) -> list[SceneMesh]:
-        """Return the scaled meshes in a file or of its <submesh>."""
+        """Return the scaled meshes in a file, restricted to a <submesh> if there is one."""
         uri = (shape.findtext("uri") or "").strip()
         scale = child_numbers(shape, "scale", 3, "1 1 1")
         meshes = self.file_meshes(uri, source)
@@ -192,7 +192,7 @@ class LinkMeshes:
         return [mesh.moved(mesh.name, np.diag(scale), np.zeros(3)) for mesh in meshes]
 
     def _part(self, meshes: list[SceneMesh], part: Element, uri: str) -> list[SceneMesh]:
-        """Return the meshes of a <submesh>, centered at the origin if <center> is true."""
+        """Return the meshes that a <submesh> selects, centered if <center> is true."""
         name = printable(part.findtext("name") or "")
         if not name or not meshes:
             return meshes
@@ -211,7 +211,7 @@ class LinkMeshes:
         return chosen
 
     def _height_map(self, shape: Element, source: Source) -> list[SceneMesh]:
-        """Return the surface of a height map, or nothing if its image is unusable."""
+        """Return a height map as a mesh, or no mesh if its image cannot be used."""
         uri = (shape.findtext("uri") or "").strip()
         file = self._file(uri, source)
         if file is None:
@@ -227,14 +227,14 @@ class LinkMeshes:
             return []
 
     def file_meshes(self, uri: str, source: Source) -> list[SceneMesh]:
-        """Return the meshes in a file, in the axes of the file.
+        """Return the meshes in a file without changing their axes.
 
         If the file is unusable, the list is empty, and a note is added.
         """
         return self._read_once(uri, source, self._load)
 
     def skin_meshes(self, uri: str, source: Source) -> list[SceneMesh]:
-        """Return the skin of an actor in its rest pose.
+        """Return an actor's skin in its rest pose.
 
         If the file is unusable, the list is empty, and a note is added.
         """
@@ -243,7 +243,7 @@ class LinkMeshes:
     def _read_once(
         self, uri: str, source: Source, load: Callable[[Source], list[SceneMesh]]
     ) -> list[SceneMesh]:
-        """Return the meshes in a file from the cache, or load them.
+        """Return the meshes in a file, which is loaded on first use.
 
         If the file is unusable, the list is empty, and a note is added.
         """
@@ -280,7 +280,7 @@ class LinkMeshes:
         return [mesh.flat() if isinstance(mesh, SceneInstance) else mesh for mesh in meshes]
 
     def _load_skin(self, file: Source) -> list[SceneMesh]:
-        """Load the meshes in a file, with skins in their rest pose."""
+        """Load the meshes in a file, including skins in their rest pose."""
         if file.path.suffix.lower() != ".dae":
             return self._load(file)
         options = self.options._replace(
@@ -298,14 +298,14 @@ class LinkMeshes:
         return [mesh.moved(mesh.name, unit, np.zeros(3)) for mesh in flat]
 
     def _asset_folders(self, file: Source) -> list[Path]:
-        """Return the folders with images for a mesh file, starting with the model's textures."""
+        """Return the folders that may contain a mesh file's images, its model's textures first."""
         textures = (folder / "materials" / "textures" for folder in file.path.resolve().parents)
         within = (folder for folder in textures if folder.is_relative_to(file.root))
         existing = (folder for folder in within if folder.is_dir())
         return [*existing, file.root, *self.resources.trusted]
 
     def _file(self, uri: str, source: Source) -> Source | None:
-        """Return the file at a URI, or add a note and return None if it is missing."""
+        """Return the file at a URI. If it is missing, add a note and return None."""
         try:
             return self.resources.find_file(uri, source)
         except ResourceNotFoundError as error:
@@ -314,7 +314,7 @@ class LinkMeshes:
 
 
 def _retro(link: Element, shape: Element) -> float:
-    """Return the <laser_retro> of a shape or of the first collision shape that has one, or 0."""
+    """Return the <laser_retro> of a shape, or else of the first collision shape with one, or 0."""
     for candidate in (shape, *link.findall("collision")):
         value = float(child_numbers(candidate, "laser_retro", 1, "0").item())
         if value > 0:
@@ -323,5 +323,5 @@ def _retro(link: Element, shape: Element) -> float:
 
 
 def _without_path(line: str, path: Path) -> str:
-    """Replace the path of a file in a line of text by the file's name."""
+    """Shorten the path of a file in a line of text to the file name."""
     return line.replace(str(path), path.name)

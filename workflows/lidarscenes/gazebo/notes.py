@@ -1,4 +1,4 @@
-"""Collect notes on what a world lacks and on content that is not read, and report them briefly."""
+"""Collect notes on what is missing from a world or not read, and report them briefly."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _KNOWN: dict[str, frozenset[str]] = {
 
 
 def unknown_children(element: Element) -> list[str]:
-    """Return the children of an element that are not defined by SDFormat, as PARENT/TAG.
+    """Return an element's children that SDFormat does not define, as PARENT/TAG.
 
     Tags with a namespace prefix are allowed.
     """
@@ -62,7 +62,7 @@ def unknown_children(element: Element) -> list[str]:
 
 
 class Notes:
-    """Notes on a world, each of which is reported once."""
+    """Notes on a world, each of which is only reported once."""
 
     def __init__(self) -> None:
         self.missing_models: Counter[str] = Counter()  # {name: number of uses}
@@ -78,11 +78,11 @@ class Notes:
         self.of_meshes: dict[str, None] = {}  # lines on mesh files
 
     def check_children(self, element: Element) -> None:
-        """Note the children of an element that are not defined by SDFormat."""
+        """Note which children of an element are not defined by SDFormat."""
         self.unknown |= dict.fromkeys(unknown_children(element))
 
     def remote_lines(self) -> Iterator[str]:
-        """Yield a phrase on the models that are too far away, if there are any."""
+        """Yield a phrase on models that are too far away, unless there are none."""
         if self.remote:
             names = listed([*self.remote], _MAX_NAMES)
             yield (
@@ -91,7 +91,7 @@ class Notes:
             )
 
     def lines(self) -> Iterator[str]:
-        """Yield the notes as clauses that follow the name of the file."""
+        """Yield all notes as clauses that can follow the name of the file."""
         yield from _line("model", self.missing_models)
         yield from _line("file", self.missing_files)
         for name, reason in list(self.unread_files.items())[:_MAX_NAMES]:
@@ -115,7 +115,7 @@ class Notes:
 
 
 def _line(noun: str, names: Counter[str]) -> Iterator[str]:
-    """Yield a clause on missing models or files, if there are any."""
+    """Yield a clause on missing models or files unless there are none."""
     if names:
         count = plural(len(names), f"missing {noun}")
         uses = f" in {names.total():,} places" if names.total() > len(names) else ""
@@ -124,7 +124,7 @@ def _line(noun: str, names: Counter[str]) -> Iterator[str]:
 
 
 def _first_lines(lines: Iterable[str], max_lines: int = 3) -> Iterator[str]:
-    """Yield the first notes on meshes, and the number of further notes."""
+    """Yield the first few notes on meshes, and how many more there are."""
     all_lines = [*lines]
     yield from (f"has a note on a mesh: {line.rstrip('.')}" for line in all_lines[:max_lines])
     further = len(all_lines) - max_lines

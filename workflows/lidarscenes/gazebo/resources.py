@@ -1,4 +1,4 @@
-"""Find the files of models, meshes, and images that Gazebo worlds refer to by URI."""
+"""Find the model, mesh, and image files to which Gazebo worlds refer by URI."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ _SDF_VERSION = (1, 12)  # newest supported version
 
 
 class ResourceNotFoundError(Exception):
-    """Raised if a file or model is not found in any folder.
+    """Raised if no folder contains a file or model.
 
     The argument of the error is the name to report.
     """
 
 
 class Candidate(NamedTuple):
-    """A path that a URI may refer to, and the folder that must contain the path.
+    """A path to which a URI may refer, and the folder that must contain this path.
 
     If `is_allowed` is False, the path must not be read, because its folder is merely near the
     world, and contains no file that identifies it as a model or package.
@@ -64,7 +64,7 @@ class Source(NamedTuple):
 
 @dataclass(frozen=True)
 class Resources:
-    """Finds the files that a world refers to.
+    """Finds the files to which a world refers.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class Resources:
 
     @classmethod
     def for_world(cls, path: Path, assets: tuple[Path, ...]) -> Resources:
-        """Return the resources of a world.
+        """Determine the folders in which the files of a world are searched for.
 
         The folders in `assets` are searched first.
         """
@@ -115,7 +115,7 @@ class Resources:
         )
 
     def find_model(self, uri: str, source: Source) -> Source:
-        """Return the SDFormat file of a model, in the newest version that its model.config lists.
+        """Return a model's SDFormat file, in the newest version that its model.config lists.
 
         Raises
         ------
@@ -132,7 +132,7 @@ class Resources:
         raise ResourceNotFoundError(short_name(uri))
 
     def find_file(self, uri: str, source: Source) -> Source:
-        """Return a mesh or image file.
+        """Return the path of a mesh or image file.
 
         Raises ResourceNotFoundError and LidarError as `find_model` does.
         """
@@ -142,7 +142,7 @@ class Resources:
         raise ResourceNotFoundError(printable(uri))
 
     def _targets(self, uri: str, source: Source) -> Iterator[Source]:
-        """Yield the existing paths that a URI may refer to.
+        """Yield those paths to which a URI may refer that exist.
 
         Raises LidarError if a path must not be read.
         """
@@ -172,7 +172,7 @@ class Resources:
             )
 
     def _candidates(self, uri: str, source: Source) -> Iterator[Candidate]:
-        """Yield the paths that a URI may refer to."""
+        """Yield all paths to which a URI may refer."""
         name = unquote(uri.strip())
         scheme, mark, location = name.partition("://")
         if mark and scheme in ("http", "https"):
@@ -188,7 +188,7 @@ class Resources:
             raise ResourceNotFoundError(printable(uri))
 
     def _in_folders(self, location: str, scheme: str = "") -> Iterator[Candidate]:
-        """Yield the paths NAME/FILE in all folders."""
+        """Yield the path NAME/FILE in each folder."""
         name, _, file = location.lstrip("/").partition("/")
         file = file.lstrip("/")  # otherwise, it would be an absolute path
         if name in ("", ".", ".."):
@@ -210,7 +210,7 @@ class Resources:
             yield Candidate(model / file, root, is_allowed)
 
     def _downloads(self, uri: str) -> Iterator[Candidate]:
-        """Yield the paths of a Fuel model or its file, first in the caches and then by name."""
+        """Yield the paths of a Fuel model or of a file in it, first in the caches, then by name."""
         parts = [unquote(part) for part in urlsplit(uri.strip()).path.split("/") if part]
         if len(parts) < 4 or parts[2].lower() != "models" or ".." in parts:
             return
@@ -232,7 +232,7 @@ class Resources:
 
 
 def short_name(uri: str) -> str:
-    """Return a short name of a model for messages, which is OWNER/NAME for a model on Fuel."""
+    """Return a short model name for messages, which is OWNER/NAME for models on Fuel."""
     name = printable(unquote(uri.strip()))
     parts = [part for part in name.split("/") if part]
     if name.startswith(("http://", "https://")) and len(parts) >= 6:
@@ -241,19 +241,19 @@ def short_name(uri: str) -> str:
 
 
 def _folders_of(variables: tuple[str, ...]) -> list[Path]:
-    """Return the existing folders in environment variables."""
+    """Return the existing folders that are listed in environment variables."""
     values = (os.environ.get(variable, "") for variable in variables)
     return _existing([folder for value in values for folder in value.split(os.pathsep) if folder])
 
 
 def _existing(names: list[str] | tuple[str, ...]) -> list[Path]:
-    """Return the names that are existing folders."""
+    """Return only those folders that exist."""
     folders = [Path(os.path.expanduser(name)) for name in names]  # noqa: PTH111 - never fails
     return [folder for folder in folders if folder.is_dir()]
 
 
 def _existing_folders(parent: Path, name: str) -> list[Path]:
-    """Return the subfolders with a name, ignoring case, or all subfolders for ``*``."""
+    """Return the subfolders that have a name, ignoring case, or all of them for ``*``."""
     try:
         folders = [entry for entry in parent.iterdir() if entry.is_dir()]
     except OSError:
@@ -262,12 +262,11 @@ def _existing_folders(parent: Path, name: str) -> list[Path]:
 
 
 def _resolved(path: Path) -> Path:
-    """Return a path without symbolic links."""
     return path.resolve()
 
 
 def _newest_file(folder: Path) -> Path:
-    """Return the newest supported SDFormat file that a model's configuration lists.
+    """Return the newest supported SDFormat file listed in a model's configuration.
 
     Raises
     ------
@@ -287,7 +286,7 @@ def _newest_file(folder: Path) -> Path:
 
 
 def _configured_files(path: Path) -> dict[tuple[int, ...], str]:
-    """Return the file names in a model's configuration by version."""
+    """Return the file name for each SDFormat version in a model's configuration."""
     try:
         root = parse_lenient_xml(read_input(path))
     except (OSError, ValueError, LidarError):
@@ -296,6 +295,6 @@ def _configured_files(path: Path) -> dict[tuple[int, ...], str]:
 
 
 def _version(entry: Element) -> tuple[int, ...]:
-    """Return the version of an <sdf> element, for example (1, 6), or (0,) if it has none."""
+    """Return an <sdf> element's version, for example (1, 6), or (0,) if it has none."""
     parts = entry.get("version", "").split(".")
     return tuple(map(int, parts)) if all(part.isdecimal() for part in parts) else (0,)

@@ -26,7 +26,7 @@ _PARALLEL = 1e-12  # unit vectors are parallel if 1 minus their cosine is smalle
 
 
 def shape_mesh(shape: Element) -> SceneMesh | None:
-    """Return the mesh of a primitive shape in its own frame, or None if its size is zero.
+    """Return a primitive shape as a mesh in its own frame, or None if its size is zero.
 
     Raises
     ------
@@ -39,12 +39,12 @@ def shape_mesh(shape: Element) -> SceneMesh | None:
 
 
 def _sizes(shape: Element, name: str, count: int, default: str = "") -> Floats:
-    """Return `count` sizes of a shape, which must not be negative."""
+    """Read `count` sizes of a shape, which must not be negative."""
     return child_numbers(shape, name, count, default, at_least=0.0)
 
 
 def _scaled(mesh: SceneMesh, factors: Sequence[float] | Floats) -> SceneMesh | None:
-    """Return a mesh scaled along the axes, or None if a factor is zero."""
+    """Return a mesh that is scaled along the axes, or None if a factor is zero."""
     scale = np.asarray(factors, np.float64)
     return mesh.moved(mesh.name, np.diag(scale), np.zeros(3)) if scale.all() else None
 
@@ -79,7 +79,7 @@ def _capsule(shape: Element) -> SceneMesh | None:
 
 
 def _plane(shape: Element) -> SceneMesh | None:
-    """Return a rectangle perpendicular to a normal."""
+    """Return a rectangle that is perpendicular to the given normal."""
     normal = child_numbers(shape, "normal", 3, "0 0 1")
     size = norm(normal)
     if not size > 0:
@@ -93,7 +93,7 @@ def _plane(shape: Element) -> SceneMesh | None:
 
 
 def _from_z(normal: Floats) -> Floats:
-    """Return the shortest rotation from the z axis to a unit vector."""
+    """Return the shortest rotation that moves the z axis to a unit vector."""
     x, y, z = normal.tolist()
     if 1 + z < _PARALLEL:  # rotate by 180 degrees about x
         return np.diag([1.0, -1.0, -1.0])
@@ -118,7 +118,7 @@ _SHAPES: dict[str, Callable[[Element], SceneMesh | None]] = {
 
 
 def polyline_mesh(polylines: Sequence[Element]) -> SceneMesh | None:
-    """Extrude outlines along z to the height of the first outline, or return None without an area.
+    """Extrude outlines along z by the height of the first one, or return None without an area.
 
     Outlines inside another outline are holes.
     """
@@ -143,7 +143,7 @@ def polyline_mesh(polylines: Sequence[Element]) -> SceneMesh | None:
 
 
 def _ring(polyline: Element) -> Floats:
-    """Return the points of a polyline without repetitions."""
+    """Return the points of a polyline without repeated points."""
     texts = [point.text or "" for point in polyline.findall("point")]
     points = np.array([parse_numbers(text, "<point>", 2) for text in texts]).reshape(-1, 2)
     follows = np.ones(len(points), np.bool_)
@@ -153,13 +153,13 @@ def _ring(polyline: Element) -> Floats:
 
 
 def _area(ring: Floats) -> float:
-    """Return the signed area of a ring, which is positive if the ring is counterclockwise."""
+    """Return a ring's signed area, which is positive if the ring is counterclockwise."""
     x, y = (ring - ring[0]).T
     return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2)
 
 
 def _grouped(rings: Sequence[Floats]) -> list[tuple[Floats, list[Floats]]]:
-    """Return counterclockwise outlines, the largest first, with their clockwise holes."""
+    """Return counterclockwise outlines with their clockwise holes, the largest outline first."""
     by_size = sorted(rings, key=lambda ring: -abs(_area(ring)))
     groups: list[tuple[Floats, list[Floats]]] = []
     for ring in by_size:
@@ -182,7 +182,7 @@ def _contains(ring: Floats, point: Floats) -> bool:
 
 
 def _wall(ring: Ints, above: int) -> Ints:
-    """Return the faces between two rings of vertices.
+    """Return the faces that connect two rings of vertices.
 
     `ring` (n,) contains the vertices of the first ring. The vertices of the second ring have the
     same order and are `above` larger.
@@ -194,7 +194,7 @@ def _wall(ring: Ints, above: int) -> Ints:
 
 
 def height_map_mesh(shape: Element, image: Path, allowance: Allowance) -> SceneMesh:
-    """Return the surface of a height map.
+    """Return the surface of a height map as a mesh.
 
     The brightest pixel has the full height, and the first row of the image has the largest y.
 
@@ -228,7 +228,7 @@ def height_map_mesh(shape: Element, image: Path, allowance: Allowance) -> SceneM
 
 
 def road_mesh(road: Element) -> SceneMesh | None:
-    """Return a strip with the width of a road along its points.
+    """Return a strip that follows the points of a road and has the road's width.
 
     Returns None if the road has fewer than two distinct points.
     """

@@ -1,4 +1,4 @@
-"""Determine which visuals the lidars in a world see.
+"""Determine which visuals are seen by the lidars in a world.
 
 A lidar sees a visual if its <visibility_mask> and the <visibility_flags> of the visual have a
 common bit (SDFormat 1.12).
@@ -18,12 +18,12 @@ ALL_BITS = 0xFFFF_FFFF  # default for flags and masks
 
 
 def lidar_elements(link: Element) -> Iterator[Element]:
-    """Yield the <sensor> elements of a link that are lidars."""
+    """Yield those <sensor> elements of a link that are lidars."""
     return (sensor for sensor in link.findall("sensor") if sensor.get("type") in LIDARS)
 
 
 def lidar_settings(sensor: Element) -> Element | None:
-    """Return the <lidar> or <ray> element of a <sensor>, or None."""
+    """Return the <lidar> or <ray> element in a <sensor>, or None."""
     figures = sensor.find("lidar")
     return sensor.find("ray") if figures is None else figures
 
@@ -46,7 +46,7 @@ def read_mask(sensor: Element) -> int:
 
 
 def distinct_masks(links: Iterable[Element]) -> tuple[int, ...]:
-    """Return the distinct visibility masks of the lidars in links, in ascending order."""
+    """Return the distinct visibility masks of all lidars on the given links, in ascending order."""
     masks = set()
     for link in links:
         for sensor in lidar_elements(link):
@@ -56,7 +56,7 @@ def distinct_masks(links: Iterable[Element]) -> tuple[int, ...]:
 
 
 def _bits(element: Element, name: str) -> int:
-    """Return the 32-bit number in a child element, or all bits if it is missing."""
+    """Return a 32-bit number from a child element, or all bits if the element is missing."""
     text = (element.findtext(name) or "").strip()
     if not text:
         return ALL_BITS

@@ -1,4 +1,4 @@
-"""Read Gazebo actors, which are skins that follow waypoints."""
+"""Read Gazebo actors, whose skins follow waypoints."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Actors(NamedTuple):
 
 
 def read_actors(world: Element, source: Source, meshes: LinkMeshes, notes: Notes) -> Actors:
-    """Return the actors in a world, with their skins in the rest pose."""
+    """Read the actors in a world, with skins in their rest pose."""
     actors = Actors([], [])
     for element in world.findall("actor"):
         notes.check_children(element)
@@ -52,7 +52,7 @@ def read_actors(world: Element, source: Source, meshes: LinkMeshes, notes: Notes
 
 
 def _skin(actor: Element, source: Source, meshes: LinkMeshes) -> SceneMesh | None:
-    """Return the skin of an actor, or None if there is none or its file is missing."""
+    """Return an actor's skin, or None if it has none or if the file is missing."""
     skin = actor.find("skin")
     if skin is None:
         return None
@@ -65,7 +65,7 @@ def _skin(actor: Element, source: Source, meshes: LinkMeshes) -> SceneMesh | Non
 
 
 def _waypoints(actor: Element, name: str, notes: Notes) -> tuple[Floats, Floats]:
-    """Return the times in seconds and the poses of an actor.
+    """Return an actor's times in seconds, and its poses at these times.
 
     A stationary actor has a single pose.
     """
@@ -90,7 +90,7 @@ def _waypoints(actor: Element, name: str, notes: Notes) -> tuple[Floats, Floats]
 
 
 def _waypoint_pose(waypoint: Element) -> Floats:
-    """Return the pose of a waypoint in the world.
+    """Return a waypoint's pose in the world.
 
     Raises LidarError if the waypoint has no pose.
     """
@@ -101,7 +101,7 @@ def _waypoint_pose(waypoint: Element) -> Floats:
 
 
 def _repeated(times_s: Floats, poses: Floats) -> tuple[Floats, Floats]:
-    """Repeat waypoints for at least `_LOOP_S`, but with at most `_MAX_POSES` poses."""
+    """Repeat waypoints for at least `_LOOP_S` seconds, or up to `_MAX_POSES` poses."""
     duration_s = float(times_s[-1])
     # Each repetition begins shortly after the previous one ends.
     start_s = np.maximum(times_s, _JUMP_S) if duration_s > _JUMP_S else times_s

@@ -63,7 +63,7 @@ class GazeboOptions:
 
 
 class PlacedLink(NamedTuple):
-    """A link placed in the world."""
+    """A link that is placed in the world."""
 
     path: tuple[str, ...]  # names of the enclosing models and of the link
     body: GazeboBody
@@ -75,7 +75,7 @@ class PlacedLink(NamedTuple):
 
 @dataclass
 class _State:
-    """The <state> of a Gazebo classic world, whose poses replace those of the models.
+    """The <state> of a Gazebo classic world. Its poses replace those of the models.
 
     Poses are in world coordinates, by the names of models and links (MODEL::LINK).
     """
@@ -88,7 +88,7 @@ class _State:
 
 @dataclass(eq=False)
 class World:
-    """A world, or a file of models, with the links of all models."""
+    """A world, or a file that only contains models, with the links of all models."""
 
     element: Element
     source: Source
@@ -100,7 +100,7 @@ class World:
 
     @cached_property
     def links(self) -> list[PlacedLink]:
-        """All links except those that are too far away, whose models are noted."""
+        """All links except those that are too far away. The models of the latter are noted."""
         links = []
         for link in self._placed_links():
             if is_in_reach(link.matrix):
@@ -110,7 +110,7 @@ class World:
         return links
 
     def _placed_links(self) -> Iterator[PlacedLink]:
-        """Yield the links of all models, with poses from the state where it has any."""
+        """Yield the links of all models, with poses from the state if it contains any."""
         state = self.state
         # Models with the names, the matrix, and the outermost matrix of their enclosing models.
         stack: list[tuple[PlacedModel, tuple[str, ...], Floats | None, Floats | None]] = [
@@ -140,19 +140,19 @@ class World:
 
 
 class PlacedObject(NamedTuple):
-    """A stationary object in the world."""
+    """A stationary object that is placed in the world."""
 
     node: PlacedNode
     flags: int  # <visibility_flags> of its visuals
 
 
 def is_in_reach(matrix: Floats) -> bool:
-    """Return whether the position of a matrix is finite and plausible for a world."""
+    """Return whether the position in a matrix is finite and plausible for a world."""
     return bool(np.isfinite(matrix).all() and (np.abs(matrix[:3, 3]) < _REACH_M).all())
 
 
 def read_sdf(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the visuals or the collision shapes of all links, and the moving actors."""
+    """Read the visuals or collision shapes of all links, and the actors."""
     world = load_world(data, path, options.folders)
     content = build_content(world, options)[0]
     if not content.meshes and not content.moving:
@@ -166,7 +166,7 @@ def read_sdf(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 def build_content(world: World, options: ReadOptions) -> tuple[Content, list[PlacedObject]]:
-    """Return the content of a world, and its stationary objects.
+    """Convert a world to scene content, and also return its stationary objects.
 
     The objects include those without an area, which the content lacks.
     """
@@ -238,7 +238,7 @@ def load_world(data: bytes, path: Path, folders: tuple[Path, ...]) -> World:
 
 
 def _world_element(root: Element, notes: Notes) -> Element:
-    """Return the <world> of a file, or a new <world> that contains its models."""
+    """Return the <world> in a file, or create one that contains the file's models."""
     if root.tag == "world":
         return root
     if root.tag == "sdf":
@@ -254,7 +254,7 @@ def _world_element(root: Element, notes: Notes) -> Element:
 
 
 def _roads(world: World, meshes: LinkMeshes) -> Iterator[PlacedNode]:
-    """Yield the roads in a world."""
+    """Yield all roads in a world."""
     for road in world.element.findall("road"):
         world.notes.check_children(road)
         name = printable(road.get("name", "")) or "road"
@@ -267,7 +267,7 @@ def _roads(world: World, meshes: LinkMeshes) -> Iterator[PlacedNode]:
 
 
 def _state_of(world: Element) -> _State:
-    """Return the last <state> of a world, or an empty state if there is none."""
+    """Return the last <state> in a world, or an empty state if there is none."""
     state = _State()
     elements = world.findall("state")
     if not elements:
@@ -291,7 +291,7 @@ def _state_of(world: Element) -> _State:
 def _state_entries(
     element: Element, path: tuple[str, ...]
 ) -> Iterator[tuple[tuple[str, ...], Element]]:
-    """Yield the names and elements of the models and links in a state."""
+    """Yield the name and element of each model and link in a state."""
     for child in element:
         if child.tag in ("model", "link"):
             inner = (*path, printable(child.get("name", "")))

@@ -1,4 +1,4 @@
-"""Find the XML files of a HELIOS++ survey, and read values from them."""
+"""Find the XML files to which a HELIOS++ survey refers, and read values from them."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ _MAX_TEMPLATES = 10  # maximum length of a chain of templates
 
 
 class Asset(NamedTuple):
-    """An element in an XML file."""
+    """An element, and the XML file that contains it."""
 
     element: Element
     home: Path  # file that contains the element, for references without a file
 
 
 class Assets:
-    """The files that a survey may refer to.
+    """The files to which a survey may refer.
 
     Files are searched for in `folders`, in the folder of the survey, and in its parent folders. All
     other files are refused.
@@ -66,7 +66,7 @@ class Assets:
             )
 
     def find_file(self, name: str) -> Path:
-        """Return the path of a file, given its name.
+        """Find the path of a file, given its name.
 
         Raises LidarError if no folder contains the file, or if the survey may not refer to it.
         """
@@ -80,7 +80,7 @@ class Assets:
         )
 
     def find_element(self, reference: str, kind: str, home: Path) -> Asset:
-        """Return the element of a kind for a reference such as FILE.xml#ID.
+        """Return the element with the tag `kind` to which a reference such as FILE.xml#ID refers.
 
         A reference without a file refers to the file `home`.
         """
@@ -92,7 +92,7 @@ class Assets:
         return Asset(elements[name], path)
 
     def read_settings(self, element: Element | None, home: Path, depth: int = 0) -> dict[str, str]:
-        """Return the attributes of a settings element, with defaults from its template."""
+        """Return the attributes of a settings element, with default values from its template."""
         if element is None:
             return {}
         attributes = dict(element.attrib)
@@ -107,7 +107,7 @@ class Assets:
 
 
 def _root(path: Path) -> Element:
-    """Return the <document> element of a file.
+    """Return the <document> element in a file.
 
     Raises LidarError if the file is not a HELIOS++ document.
     """
@@ -148,20 +148,20 @@ def read_number(values: Element | dict[str, str], name: str, default: float) -> 
 
 
 def read_flag(values: dict[str, str], name: str, default: bool) -> bool:
-    """Return an attribute as a Boolean value."""
+    """Return an attribute as a bool, or the default if it is missing."""
     return values[name].lower() in ("true", "1") if name in values else default
 
 
 def read_vector(values: Element | dict[str, str] | None) -> Floats:
-    """Return the attributes x, y, and z as an array, with zeros for missing attributes."""
+    """Return the attributes x, y, and z as an array. Missing attributes count as zero."""
     return np.array([read_number({} if values is None else values, axis, 0.0) for axis in "xyz"])
 
 
 def read_rotation(element: Element | None) -> Floats:
-    """Return the product of the <rot> rotations in an element, in their order.
+    """Return the product of all <rot> rotations in an element, in the given order.
 
-    The axes are fixed unless the element states ``rotations="local"``, in which case each rotation
-    is about the axes that the previous rotations have rotated.
+    The axes are fixed unless the element states ``rotations="local"``. In this case, each rotation
+    also rotates the axes of the following ones.
     """
     total = np.eye(3)
     for step in () if element is None else element.findall("rot"):
@@ -177,7 +177,7 @@ def read_rotation(element: Element | None) -> Floats:
 
 
 def rounded(values: Floats | float | Sequence[float]) -> list[float] | float:
-    """Round numbers to 12 significant digits for a scenario, with tiny values set to zero."""
+    """Round numbers to 12 significant digits for a scenario, and set tiny values to zero."""
     array = np.asarray(values, np.float64)
     if array.ndim:
         return [rounded(value) for value in array.tolist()]  # type: ignore[misc]

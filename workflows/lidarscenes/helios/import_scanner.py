@@ -1,4 +1,4 @@
-"""Convert HELIOS++ scanners without a survey to scenarios.
+"""Convert HELIOS++ scanners to scenarios if there is no survey.
 
 Channels become separate sensors unless they differ only in their beams.
 """
@@ -42,7 +42,7 @@ class _Reference(NamedTuple):
 
     @classmethod
     def from_path(cls, survey: Path) -> _Reference:
-        """Return the file and the scanner ID in a path such as FILE.xml#ID."""
+        """Divide a path such as FILE.xml#ID into the file and the scanner ID."""
         name, mark, scanner = survey.name.rpartition("#")
         if mark and not survey.exists():
             return cls(survey.with_name(name), scanner)
@@ -50,7 +50,7 @@ class _Reference(NamedTuple):
 
 
 def is_scanner(survey: Path) -> bool:
-    """Return True if a path refers to a HELIOS++ file with scanners and without a survey."""
+    """Return True if a path refers to a HELIOS++ file that contains scanners but no survey."""
     with suppress(OSError, LidarError, ValueError, ParseError):
         root = xml_root(read_input(_Reference.from_path(survey).file))
         has_scanner = root.find("scanner") is not None
@@ -107,7 +107,7 @@ def import_scanner(survey: Path, folder: Path, assets: Sequence[Path]) -> list[s
 
 
 def _element(files: Assets, reference: _Reference) -> Element:
-    """Return the <scanner> element of a reference.
+    """Return the <scanner> element to which a reference refers.
 
     Raises LidarError if the reference is ambiguous or invalid.
     """
@@ -128,7 +128,7 @@ def _element(files: Assets, reference: _Reference) -> Element:
 
 
 def _settings(files: Assets, home: Path, scanner: Element) -> dict[str, str] | None:
-    """Return the scanner settings with the scanner's ID or, if unambiguous, the only settings.
+    """Return the settings that have the scanner's ID or, if unambiguous, the only settings.
 
     Returns None if the file has no such settings.
     """
@@ -140,7 +140,7 @@ def _settings(files: Assets, home: Path, scanner: Element) -> dict[str, str] | N
 
 
 def _highest_rates(scanner: HeliosScanner) -> dict[str, str]:
-    """Return settings with the highest rates that a scanner supports."""
+    """Return settings with the highest rates that the scanner supports."""
     pulses = scanner.values.get("pulseFreqs_Hz", "").split(",")
     settings = {"pulseFreq_hz": max(pulses, key=lambda hz: read_number({"hz": hz}, "hz", 0))}
     if scanner.number("scanFreqMax_Hz") > 0:
@@ -185,13 +185,13 @@ def _merged(devices: dict[str, Device]) -> dict[str, Device]:
 
 
 def _count(table: dict[str, Any]) -> int:
-    """Return the number of beams in a beam table."""
+    """Return the number of beams in a table."""
     angles = table.get("elevation_deg", [0.0])
     return int(angles["count"]) if isinstance(angles, dict) else len(angles)
 
 
 def _only(angles: Any) -> float:
-    """Return the single angle in a column of a beam table."""
+    """Return the only angle in a column of a beam table."""
     if isinstance(angles, dict):
         return float(angles["first"])
     return float(angles[0]) if isinstance(angles, list) else float(angles)
@@ -204,7 +204,7 @@ def _write(
     sensors: dict[str, Device],
     lines: list[str],
 ) -> None:
-    """Write the scenario and the data files of its sensors."""
+    """Write the scenario and the data files for its sensors."""
     entries = {}
     for name, mounted in sensors.items():
         stem = re.sub(r"[^\w.-]+", "_", f"{mounted.data['name']} {name}").strip("._").lower()
@@ -236,7 +236,7 @@ def _write(
 
 
 def _entry(file: str, mounted: Device) -> dict[str, Any]:
-    """Return the scenario entry of a sensor."""
+    """Return a sensor's entry in the scenario."""
     min_range_m, max_range_m = mounted.range_m
     pose = Pose.from_rotation(AHEAD @ mounted.position, AHEAD @ mounted.rotation)
     mount: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""Convert HELIOS++ legs to a trajectory.
+"""Convert the legs of a HELIOS++ survey to a trajectory.
 
 The platform moves from leg to leg, is stationary at each leg, or follows a trajectory file.
 """
@@ -33,7 +33,7 @@ _X, _Y, _Z = np.eye(3)
 
 @dataclass
 class Leg:
-    """A leg of a survey, with its start position and its settings."""
+    """A leg of a survey, with its start position and settings."""
 
     number: int
     position: Floats  # (3,) start in meters
@@ -49,7 +49,7 @@ class Leg:
 
 @dataclass
 class LegSegment:
-    """The part of the trajectory that belongs to a leg."""
+    """The part of a trajectory that belongs to one leg."""
 
     leg: int  # number
     active: bool
@@ -59,7 +59,7 @@ class LegSegment:
 
 @dataclass
 class HeliosTrajectory:
-    """The poses of a platform, and the segments of its legs.
+    """The poses of a platform, and the segment for each leg.
 
     The columns of `rows` are time in seconds, x, y, z, and either the yaw in degrees or a
     quaternion x, y, z, w.
@@ -69,7 +69,7 @@ class HeliosTrajectory:
     segments: list[LegSegment]
 
     def section_and_files(self) -> tuple[dict[str, Any] | str, dict[str, str]]:
-        """Return the `trajectory` section of a scenario, and the text of the files it refers to."""
+        """Return a scenario's `trajectory` section, and the content of the files it refers to."""
         if self.rows.shape[1] == 5:
             names = ("time_s", "position", "yaw_deg")
             rows = ((r[0], r[1:4], r[4]) for r in self.rows)
@@ -83,9 +83,9 @@ class HeliosTrajectory:
 def read_legs(
     survey: Element, assets: Assets, home: Any, height: Callable[[float, float], float]
 ) -> list[Leg]:
-    """Return the legs of a survey.
+    """Read the legs of a survey.
 
-    `height` returns the height of the ground at x, y in meters.
+    `height` returns the height of the ground at x and y, in meters.
     """
     legs = []
     for index, element in enumerate(survey.findall("leg")):
@@ -105,7 +105,7 @@ def read_legs(
 
 
 def moving_trajectory(legs: Sequence[Leg]) -> HeliosTrajectory:
-    """Return a trajectory that moves straight from leg to leg at the speed of each leg.
+    """Return a trajectory that goes straight from leg to leg, at the speed of each leg.
 
     The platform turns on the spot between legs.
     """
@@ -137,9 +137,10 @@ def moving_trajectory(legs: Sequence[Leg]) -> HeliosTrajectory:
 
 
 def stationary_trajectory(legs: Sequence[Leg], heads: dict[int, float]) -> HeliosTrajectory:
-    """Return a trajectory that is stationary at each leg until the scanner head has rotated.
+    """Return a trajectory that stops at each leg until the scanner head has finished rotating.
 
-    `heads` are the rotation times in seconds by leg number, 0 for a head that does not rotate.
+    `heads` maps leg numbers to the time in seconds for which the head rotates, which is 0 if it
+    does not rotate.
     """
     rows = []
     segments = []
@@ -195,7 +196,7 @@ def read_trajectory(survey: Element, legs: Sequence[Leg], assets: Assets) -> Hel
 
 
 def _segment_between(leg: Leg, first_s: float, last_s: float) -> LegSegment:
-    """Return the segment of a leg in a trajectory between two times."""
+    """Return the part of a trajectory between two times that belongs to a leg."""
     start = max(read_number(leg.platform, "tStart", first_s), first_s)
     stop = min(read_number(leg.platform, "tEnd", last_s), last_s, start + leg.longest_s)
     if stop <= start:
@@ -206,7 +207,7 @@ def _segment_between(leg: Leg, first_s: float, last_s: float) -> LegSegment:
 
 
 def _platform_rotation(kind: str, roll: float, pitch: float, yaw: float) -> Floats:
-    """Return a platform rotation for angles in degrees, as HELIOS++ interprets them."""
+    """Return a platform's rotation for angles in degrees, as HELIOS++ interprets them."""
     if kind == "CANONICAL":
         return rotation_about(_X, roll) @ rotation_about(_Y, pitch) @ rotation_about(_Z, yaw)
     if kind == "ARINC 705":
@@ -215,7 +216,7 @@ def _platform_rotation(kind: str, roll: float, pitch: float, yaw: float) -> Floa
 
 
 def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
-    """Return the columns of a trajectory by name.
+    """Return the columns of a trajectory file by name.
 
     The names come from column indices in the settings, from the header, or from the default order.
     """

@@ -1,4 +1,4 @@
-"""Convert HELIOS++ scanners to sensors with data files and rotations on their platforms.
+"""Convert HELIOS++ scanners to sensor data files and rotations on the platform.
 
 HELIOS++ scanners look along y, with z up and x to the right. Mirrors and heads move by a step
 between two pulses. This is reproduced, including the rounding to whole pulses per scan line.
@@ -39,7 +39,7 @@ ScannerSection = tuple[dict[str, Any], Floats]
 
 @dataclass(frozen=True)
 class Device:
-    """A scanner, or a channel of a scanner, with the settings of a leg.
+    """A scanner, or one of its channels, with the settings of a leg.
 
     Parameters
     ----------
@@ -62,14 +62,14 @@ class Device:
     range_m: tuple[float, float]
 
     def steps(self, seconds: float) -> tuple[float, int]:
-        """Return the rotation per time step in degrees, and the number of steps in a time."""
+        """Return the rotation per time step in degrees, and the number of steps in a duration."""
         turned = 360 * self.data["rate_hz"] * seconds
         count = max(ceil(turned / (360 if self.head_s is None else _HEAD_STEP_DEG) - _SLACK), 1)
         return turned / count, count
 
 
 class HeliosScanner:
-    """The attributes of a scanner or of one of its channels.
+    """The attributes of a scanner or one of its channels.
 
     The attributes of a channel take precedence over those of the scanner.
     """
@@ -80,7 +80,7 @@ class HeliosScanner:
         self.values = {**element.attrib, **({} if channel is None else channel.attrib)}
 
     def child(self, tag: str) -> Element | None:
-        """Return the first element with a tag in the channel or the scanner, or None."""
+        """Return the first element with a tag in the channel or else in the scanner, or None."""
         candidates = (element.find(tag) for element in self._elements)
         return next((child for child in candidates if child is not None), None)
 
@@ -90,7 +90,7 @@ class HeliosScanner:
 
 
 def read_channels(element: Element) -> dict[str, HeliosScanner]:
-    """Return the channels of a scanner by ID.
+    """Return the channels of a scanner, keyed by ID.
 
     A scanner without channels is returned with an empty ID.
     """
@@ -104,7 +104,7 @@ def read_channels(element: Element) -> dict[str, HeliosScanner]:
 
 
 def unsupported_features(scanner: HeliosScanner) -> Iterator[str]:
-    """Describe the features of a scanner that a scenario does not support."""
+    """Describe features of a scanner that scenarios do not support."""
     for tag in ("rangeError", "deflectionError", "headError"):
         if scanner.child(tag) is not None:
             yield f"<{tag}> of {scanner.name}"
@@ -117,7 +117,7 @@ def unsupported_features(scanner: HeliosScanner) -> Iterator[str]:
 
 
 def make_device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
-    """Convert a scanner with the settings of a leg.
+    """Convert a scanner to a device for the settings of one leg.
 
     Raises
     ------
@@ -160,7 +160,7 @@ def make_device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
 
 
 def _light(scanner: HeliosScanner, settings: dict[str, str]) -> dict[str, float]:
-    """Return the `optics` fields of a scanner with the settings of a leg."""
+    """Return the `optics` fields for a scanner and the settings of one leg."""
     divergence = read_number(
         settings, "beamDivergence_rad", scanner.number("beamDivergence_rad", 3e-4)
     )
@@ -173,7 +173,7 @@ def _light(scanner: HeliosScanner, settings: dict[str, str]) -> dict[str, float]
 
 
 class _Head(NamedTuple):
-    """The rotation of a scanner's head."""
+    """How a scanner's head rotates."""
 
     axis: Floats  # (3,)
     start_deg: float
@@ -184,7 +184,7 @@ class _Head(NamedTuple):
     def from_settings(
         cls, scanner: HeliosScanner, settings: dict[str, str], line: _Line | None
     ) -> _Head:
-        """Return the head of a scanner with the settings of a leg.
+        """Return how a scanner's head rotates with the settings of one leg.
 
         `line` is the scan line of rotating optics, or None for other optics.
         """
@@ -202,7 +202,7 @@ class _Head(NamedTuple):
 
 
 def _turning_head(scanner: HeliosScanner, head: _Head, line: _Line | None) -> ScannerSection:
-    """Return the section of a sensor with a rotating head.
+    """Return the sensor section for a rotating head.
 
     Raises LidarError if the settings do not describe a supported rotation.
     """
@@ -223,14 +223,14 @@ def _turning_head(scanner: HeliosScanner, head: _Head, line: _Line | None) -> Sc
 
 
 class _Aim(NamedTuple):
-    """The rotation of an emitter, first about x and then about z."""
+    """The rotation of an emitter, which is first about x and then about z."""
 
     tilt_deg: float
     azimuth_deg: float
 
 
 def _aim(emitter: Floats) -> _Aim | None:
-    """Decompose a rotation, or return None if it includes a roll."""
+    """Decompose a rotation into two angles, or return None if it includes a roll."""
     if abs(emitter[2, 0]) > 1e-12:
         return None
     tilt = np.arctan2(emitter[2, 1], emitter[2, 2])
@@ -239,14 +239,14 @@ def _aim(emitter: Floats) -> _Aim | None:
 
 
 def _exact_us(pulses: int, pulse_hz: float) -> int | str:
-    """Return the exact duration of `pulses` in microseconds, as text if it is a fraction."""
+    """Return the exact duration of `pulses` in microseconds, as text if it is not an integer."""
     exact = Fraction(pulses * 1_000_000) / Fraction(pulse_hz)
     return exact.numerator if exact.denominator == 1 else str(exact)
 
 
 @dataclass(frozen=True)
 class _Line:
-    """The pulses of a scan line made by a rotating polygon mirror.
+    """The pulses in a scan line of a rotating polygon mirror.
 
     A scan line takes the time of `pulses_per_line` pulses, of which `count` are within its angles.
     """
@@ -262,7 +262,7 @@ class _Line:
     def from_settings(
         cls, scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float
     ) -> _Line:
-        """Return the scan line of a scanner with the settings of a leg.
+        """Return a scanner's scan line with the settings of one leg.
 
         Raises LidarError if the scan line contains no pulse.
         """
@@ -304,7 +304,7 @@ class _Line:
         )
 
     def mirror_sections(self) -> ScannerSection:
-        """Return the section of a sensor with a mirror and no head, whose firings are pulses.
+        """Return the sensor section for a mirror without a head. Each pulse becomes a firing.
 
         Raises
         ------
@@ -323,7 +323,7 @@ class _Line:
         return _mirror(self.count, self.pulse_hz / self.pulses_per_line, mirror, middle), _LINE
 
     def head_sections(self, deg_per_s: float, aim: _Aim) -> dict[str, Any]:
-        """Return the section of a sensor with a rotating head, whose firings are scan lines."""
+        """Return the sensor section for a rotating head. Each scan line becomes a firing."""
         between_us = 1e6 / self.pulse_hz
         last = rounded((self.count - 1) * between_us)
         times = {"time_us": {"first": 0, "last": last, "count": self.count}}
@@ -335,7 +335,7 @@ class _Line:
         return data if deg_per_s > 0 else {"clockwise": True, **data}
 
     def _angles(self, aim: _Aim) -> dict[str, Any]:
-        """Return the angles of the pulses.
+        """Return the beam angles of the pulses.
 
         Pulses beyond the zenith have the opposite azimuth.
         """
@@ -359,7 +359,7 @@ class _Line:
 def _mirror(
     firings: int, rate_hz: float, mirror: dict[str, Any], middle: float = 0.0
 ) -> dict[str, Any]:
-    """Return the section of a sensor with a mirror.
+    """Return the sensor section for a mirror.
 
     The center of the scan lines is at `middle` degrees.
     """
@@ -370,7 +370,7 @@ def _mirror(
 def _oscillating(
     scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float
 ) -> ScannerSection:
-    """Return the section of a sensor with an oscillating mirror.
+    """Return the sensor section for an oscillating mirror.
 
     The angle of the mirror is limited by the scan product.
     """
@@ -388,14 +388,14 @@ def _oscillating(
 
 
 def _fibers(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> ScannerSection:
-    """Return the section of a sensor with adjacent fibers that each fire once per scan line."""
+    """Return the sensor section for adjacent fibers, each of which fires once per scan line."""
     fibers = max(int(scanner.number("numFibers", 1)), 1)
     mirror = {"motion": "sawtooth", "width_deg": rounded(2 * _half_angle_deg(scanner, settings))}
     return _mirror(fibers, pulse_hz / fibers, mirror), _LINE
 
 
 def _cone(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> ScannerSection:
-    """Return the section of a sensor with a rotating wedge (Palmer scanner).
+    """Return the sensor section for a rotating wedge (Palmer scanner).
 
     As in HELIOS++, the wedge rotates at its maximum rate.
     """
@@ -407,7 +407,7 @@ def _cone(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> 
 
 
 def _prisms(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> ScannerSection:
-    """Return the section of a sensor with Risley prisms."""
+    """Return the sensor section for Risley prisms."""
     air = scanner.number("refrIndex_air", 1)
     prisms = [
         {
@@ -446,7 +446,7 @@ _OPTICS: dict[str, Callable[[HeliosScanner, dict[str, str], float], ScannerSecti
 
 
 def _half_angle_deg(scanner: HeliosScanner, settings: dict[str, str]) -> float:
-    """Return the scan angle to either side, which is limited by the scanner's maximum.
+    """Return the scan angle to either side, up to the scanner's maximum.
 
     The maximum is also the default.
     """
@@ -460,7 +460,7 @@ def _half_angle_deg(scanner: HeliosScanner, settings: dict[str, str]) -> float:
 def _scan_hz(
     scanner: HeliosScanner, settings: dict[str, str], requested_hz: float | None = None
 ) -> float:
-    """Return the number of scan lines per second.
+    """Return the scan frequency in lines per second.
 
     Raises LidarError if it is outside the scanner's limits.
     """

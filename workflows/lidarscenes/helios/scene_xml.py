@@ -39,7 +39,7 @@ _LOADERS = ("objloader", "detailedvoxels", "geotiffloader", "xyzloader")
 
 @dataclass
 class HeliosPart:
-    """A mesh file in a scene with its rotation, scale, and translation."""
+    """A mesh file in a scene, and how it is rotated, scaled, and translated."""
 
     assets: Assets
     file: Path
@@ -54,7 +54,7 @@ class HeliosPart:
 
     @cached_property
     def materials(self) -> dict[str, dict[str, str]]:
-        """The HELIOS++ attributes of each material that the faces use."""
+        """The HELIOS++ attributes of all materials that the faces use, by name."""
         text = _text(self.file) if self.file.suffix.lower() == ".obj" else ""
         used = {self.material, *re.findall(r"^\s*usemtl\s+(.+?)\s*$", text, re.MULTILINE)}
         values_by_material: dict[str, dict[str, str]] = {}  # {name of a material: values}
@@ -75,9 +75,9 @@ class HeliosPart:
         return {name: values for name, values in values_by_material.items() if name in used}
 
     def material_fields(self, spectra: Callable[[str], float | None]) -> dict[str, dict[str, Any]]:
-        """Return the `materials` fields, reflectance and class, for each material.
+        """Return the `materials` fields for each material, which are reflectance and class.
 
-        `spectra` returns a reflectance by the name of a spectrum.
+        `spectra` returns the reflectance for the name of a spectrum.
         """
         kinds: dict[str, dict[str, Any]] = {}
         for name, values in self.materials.items():
@@ -97,14 +97,14 @@ class HeliosPart:
 
     @property
     def is_ground(self) -> bool:
-        """Whether the part is ground for platforms and other parts."""
+        """Whether platforms and other parts stand on this part."""
         if self.surfels is not None and self.library is None:
             return True
         grounds = (values.get("isGround", "").lower() for values in self.materials.values())
         return any(ground in ("true", "1") for ground in grounds)
 
     def meshes(self) -> tuple[SceneMesh | SceneInstance, ...]:
-        """Return the meshes of the part in world coordinates."""
+        """Return the meshes of this part in world coordinates."""
         placed = Transform(self.rotation * self.scale, self.offset)
         if (points := self.surfels) is not None:
             return (points.moved(points.name, placed.linear, placed.offset),)
@@ -117,7 +117,7 @@ class HeliosPart:
         )
 
     def entry(self, name: str) -> dict[str, Any]:
-        """Return the entry of the part in `scene.files`, with `name` as its file."""
+        """Return the part's entry in `scene.files`, with `name` as its file."""
         angles = Pose.from_rotation((0, 0, 0), self.rotation)
         degrees = (angles.roll_deg, angles.pitch_deg, angles.yaw_deg)
         placement = {
@@ -160,7 +160,7 @@ class HeliosScene:
                 self._let_fall(falling)
 
     def _read(self, part: Element, name: str) -> list[HeliosPart]:
-        """Read a <part>, which results in a part for each file of its loader."""
+        """Read a <part>. Each file of its loader becomes a part."""
         for tag, moving in self._moving.items():
             if part.find(tag) is not None:
                 moving.append(name)
@@ -183,7 +183,7 @@ class HeliosScene:
         return draft.parts(self._assets)
 
     def _load(self, draft: _PartDraft, kind: str, text: dict[str, str], name: str) -> None:
-        """Set the files of a part according to the parameters of a loader."""
+        """Set the files of a part from the parameters of its loader."""
         draft.files = _files(text, self._assets)
         if kind == "objloader":
             draft.up_axis = text.get("up")
@@ -201,12 +201,12 @@ class HeliosScene:
 
     @cached_property
     def _ground(self) -> Scene | None:
-        """The simplified scene of the ground parts, or None."""
+        """The ground parts as a simplified scene, or None if there are none."""
         meshes = [mesh for part in self.parts if part.is_ground for mesh in part.meshes()]
         return SimplifiedScene.from_scene(Scene.from_meshes(meshes)).scene if meshes else None
 
     def height(self, x: float, y: float) -> float:
-        """Return the height of the lowest ground at x, y in meters, or 0 without ground."""
+        """Return the height of the lowest ground at x and y in meters, or 0 without ground."""
         heights = np.zeros(0) if self._ground is None else surface_heights(self._ground, x, y)
         if not len(heights):
             self._missing.add(f"{x:g}, {y:g}")
@@ -214,13 +214,13 @@ class HeliosScene:
         return float(heights.min())
 
     def _let_fall(self, part: HeliosPart) -> None:
-        """Move a part vertically so that its lowest point touches the ground."""
+        """Move a part vertically until its lowest point touches the ground."""
         points = join_meshes("", part.meshes()).vertices
         x, y, z = points[points[:, 2].argmin()].tolist()
         part.offset[2] += self.height(x, y) - z
 
     def materials(self, wavelength_nm: float) -> list[dict[str, Any]]:
-        """Return the entries of `materials` for all objects.
+        """Return the entries in `materials` for all objects.
 
         Objects whose faces differ have an entry for each of their materials.
         """
@@ -239,7 +239,7 @@ class HeliosScene:
         return [*entries, {"objects": "*"}]
 
     def _reflectance(self, wavelength_nm: float, name: str) -> float | None:
-        """Return the reflectance of a named spectrum at a wavelength.
+        """Return the reflectance at a wavelength, according to a named spectrum.
 
         Returns None if the spectrum is missing.
         """
@@ -257,7 +257,7 @@ class HeliosScene:
         return None
 
     def unsupported_features(self) -> list[str]:
-        """Describe the unsupported features of the scene, after all parts have been read."""
+        """Describe the unsupported features of the scene, after all parts were read."""
         lines = []
         for tag, parts in self._moving.items():
             if len(parts) == 1:
@@ -274,7 +274,7 @@ class HeliosScene:
 
 @dataclass
 class _PartDraft:
-    """A <part> while its filters are being applied in their order."""
+    """A <part> to which filters are being applied in their order."""
 
     files: list[Path] = field(default_factory=list)
     up_axis: str | None = None
@@ -303,7 +303,7 @@ class _PartDraft:
             )
 
     def parts(self, assets: Assets) -> list[HeliosPart]:
-        """Return a part for each file.
+        """Create a part for each file.
 
         Raises LidarError if there are no files.
         """
@@ -329,7 +329,7 @@ class _PartDraft:
 def _entries(
     name: str, mesh: SceneMesh | SceneInstance, kinds: dict[str, dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Return the entries of `materials` for an object, given the fields of each material."""
+    """Return an object's entries in `materials`, given the fields for each material."""
     shape = mesh.mesh if isinstance(mesh, SceneInstance) else mesh
     objects = escape(name)
     if shape.materials is None:  # the part has at most one material
@@ -346,7 +346,7 @@ def _entries(
 
 
 def _files(text: dict[str, str], assets: Assets) -> list[Path]:
-    """Return the files of a loader, given by name or by a folder and a regular expression."""
+    """Return a loader's files, given by name or by a folder and a regular expression."""
     if "efilepath" not in text:
         return [assets.find_file(text.get("filepath", ""))]
     folder, _, names = text["efilepath"].rpartition("/")
@@ -367,7 +367,7 @@ def _files(text: dict[str, str], assets: Assets) -> list[Path]:
 
 
 def _points(path: Path, settings: dict[str, str]) -> tuple[Floats, float]:
-    """Return the points in a file and the cell size of its surfels, both in meters."""
+    """Return the points in a file, and the cell size for its surfels, both in meters."""
     separators = dict.fromkeys(map(ord, settings.get("separator") or " "), " ")
     lines = read_file(path).decode("utf-8", "replace").translate(separators).splitlines()
     if not any(line.partition("//")[0].strip() for line in lines):
@@ -395,7 +395,7 @@ def _text(path: Path) -> str:
 
 
 def _numbers(text: str, count: int) -> Floats:
-    """Parse `count` finite numbers separated by semicolons.
+    """Parse `count` finite numbers that are separated by semicolons.
 
     Raises LidarError if the text is invalid.
     """

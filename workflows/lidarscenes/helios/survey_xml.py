@@ -48,7 +48,7 @@ AHEAD = rotation_about((0, 0, 1), -90)
 
 @dataclass
 class ImportedSurvey:
-    """The path of a converted scenario, and the unsupported features of its survey."""
+    """The path of a converted scenario, and the survey features that it does not support."""
 
     path: Path
     unsupported: list[str]
@@ -118,7 +118,7 @@ def import_survey(
 
 
 class _Import:
-    """A survey whose XML files have been read and converted."""
+    """A survey, read from its XML files and converted."""
 
     def __init__(
         self, survey: Path, asset_folders: Sequence[Path], folder: Path, surfels: SurfelMaker
@@ -159,13 +159,13 @@ class _Import:
         )
 
     def _asset(self, kind: str) -> Element:
-        """Return the element of a kind, such as "scanner", that the survey refers to."""
+        """Return the element to which the survey refers by an attribute, such as "scanner"."""
         if not (reference := self._element.get(kind)):
             raise LidarError(f"its <survey> has no {kind}.")
         return self._assets.find_element(reference, kind, self._home).element
 
     def _read_legs(self) -> HeliosTrajectory:
-        """Read the legs and the platform, fill `_sensors`, and return the trajectory."""
+        """Read legs and platform, fill `_sensors`, and return the trajectory."""
         legs = read_legs(self._element, self._assets, self._home, self.scene.height)
         trajectory = None
         if self._element.get("platform") == "interpolated":
@@ -190,7 +190,7 @@ class _Import:
         return trajectory
 
     def _interpolated_mount(self) -> Element | None:
-        """Return the <scannerMount> of an interpolated platform or of its base platform."""
+        """Return the <scannerMount> of an interpolated platform, or else of its base platform."""
         mount = self._element.find("scannerMount")
         base = self._element.get("basePlatform")
         if mount is None and base:
@@ -199,7 +199,7 @@ class _Import:
         return mount
 
     def _moves(self, platform: Element) -> bool:
-        """Return whether a platform moves from leg to leg, and note its unsupported features."""
+        """Return whether the platform moves from leg to leg, and note what is not supported."""
         kind = platform.get("type", "").lower()
         if kind in ("groundvehicle", "multicopter"):
             self._notes.append(
@@ -214,7 +214,7 @@ class _Import:
         return kind in ("linearpath", "groundvehicle", "multicopter")
 
     def _devices(self, legs: Sequence[Leg]) -> dict[int, dict[str, Device]]:
-        """Return the devices of each active leg, by leg number and channel."""
+        """Return the devices for each active leg, by leg number and channel."""
         devices = {}
         for leg in legs:
             with prefixed(f"leg {leg.number}"):
@@ -231,7 +231,7 @@ class _Import:
         devices: dict[int, dict[str, Device]],
         trajectory: HeliosTrajectory,
     ) -> None:
-        """Move the trajectory to the position of the scanners, and fill `_sensors`."""
+        """Move the trajectory to the scanners' position, and fill `_sensors`."""
         mount_rotation = read_rotation(mount)
         mount_position = read_vector(mount)
         positions = {
@@ -252,7 +252,7 @@ class _Import:
                 self._sensors[name] = self._sensor(mounted, segment, mount_rotation)
 
     def _sensor(self, mounted: Device, segment: LegSegment, mount: Floats) -> dict[str, Any]:
-        """Return the `sensors` entry for a device during a segment.
+        """Return the `sensors` entry for a device during one segment.
 
         `mount` is the rotation (3, 3) of its mount.
         """
@@ -273,7 +273,7 @@ class _Import:
         }
 
     def _file_of(self, data: dict[str, Any]) -> str:
-        """Return the name of a sensor's data file, which identical sensors share."""
+        """Return the name of the data file for a sensor. Identical sensors share a file."""
         stem = re.sub(r"[^\w.-]+", "_", str(data["name"])).strip("._").lower() or "sensor"
         name = f"{stem}.yaml"
         number = 1
@@ -283,7 +283,7 @@ class _Import:
         return name
 
     def files(self, folder: Path) -> dict[str, str]:
-        """Return the text files for the folder by name."""
+        """Return the content of all text files for the folder, by name."""
         trajectory, files = self._trajectory.section_and_files()
         light, range_m = self._light()
         names = [
@@ -311,7 +311,7 @@ class _Import:
         return {**files, **sensors, SCENARIO_FILE: text}
 
     def _full_waveform(self) -> dict[str, str]:
-        """Return the FWFSettings of the scanner, overridden by those of the survey."""
+        """Return the FWFSettings of the scanner, as overridden by the survey."""
         elements = (self._first.child("FWFSettings"), self._element.find("FWFSettings"))
         settings: dict[str, str] = {}
         for element in elements:
@@ -320,7 +320,7 @@ class _Import:
         return settings
 
     def _light(self) -> tuple[dict[str, Any], dict[str, float]]:
-        """Return the sections that concern light, and the ranges that the survey sets."""
+        """Return the sections about light, and the range limits that the survey sets."""
         scanner = self._first
         detector = self._element.find("detectorSettings")
         detector_settings = {} if detector is None else detector.attrib
@@ -350,7 +350,7 @@ class _Import:
 def returns_section(
     settings: dict[str, str], max_returns: float, pulse_ns: float
 ) -> dict[str, Any]:
-    """Return the `returns` section for FWFSettings, maxNOR, and the pulse length."""
+    """Return the `returns` section, given the FWFSettings, maxNOR, and the pulse length."""
     quality = read_number(settings, "beamSampleQuality", 3.0)
     return {
         "mode": "first" if max_returns == 1 else "all",
@@ -360,10 +360,10 @@ def returns_section(
 
 
 def waveform(settings: dict[str, str], pulse_ns: float) -> dict[str, Any]:
-    """Return the waveform fields of `returns`, or none without waveform settings.
+    """Return the waveform fields for `returns`. There are none without waveform settings.
 
-    Times in HELIOS++ are range divided by the speed of light, which is half of the time that light
-    takes to a surface and back.
+    In HELIOS++, a time is the range divided by the speed of light. This is half of the time that
+    light takes to a surface and back.
     """
     if "binSize_ns" not in settings and "winSize_ns" not in settings:
         return {}
@@ -372,5 +372,5 @@ def waveform(settings: dict[str, str], pulse_ns: float) -> dict[str, Any]:
 
 
 def _dumped(data: dict[str, Any]) -> str:
-    """Return data as YAML."""
+    """Format data as YAML."""
     return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)

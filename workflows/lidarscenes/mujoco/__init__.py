@@ -1,1 +1,1 @@
-"""Read MuJoCo models (MJCF) as scenes, and their rangefinders as sensors."""
+"""Read MuJoCo models (MJCF) as scenes, and rangefinders as sensors."""

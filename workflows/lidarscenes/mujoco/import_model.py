@@ -1,4 +1,4 @@
-"""Convert MuJoCo models to scenarios, with rangefinders as sensors on a stationary platform.
+"""Convert MuJoCo models to scenarios. Rangefinders become sensors on a stationary platform.
 
 The rangefinders at all sites of a body are the beams of a sensor. The rangefinders of a camera are
 the beams of another sensor. The reader follows
@@ -37,7 +37,7 @@ _MAX_RATE_HZ = 1e6
 
 
 class _Group(NamedTuple):
-    """Rangefinders that become the beams of a sensor."""
+    """Rangefinders that become the beams of one sensor."""
 
     body: int  # body that carries the rangefinders
     camera: int | None  # camera of the beams; None for beams of sites
@@ -47,7 +47,7 @@ class _Group(NamedTuple):
 
 
 def import_model(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
-    """Write a model as a scenario, with a `scenario.yaml` file and a data file for each sensor.
+    """Write a model as a scenario, which is a `scenario.yaml` file and a data file for each sensor.
 
     Parameters
     ----------
@@ -98,7 +98,6 @@ def import_model(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
 
 
 def _options(path: Path, assets: Sequence[Path]) -> ReadOptions:
-    """Return options for reading a model without its images."""
     folders = (path.parent.resolve(), *(folder.resolve() for folder in assets))
     return ReadOptions(masks=False, colors=False, folders=folders, own=MujocoOptions())
 
@@ -119,7 +118,7 @@ def _loaded(path: Path, assets: Sequence[Path]) -> Any:
 
 
 def _groups(model: Any) -> dict[_Group, list[int]]:
-    """Group the rangefinders, and return the sites of each group."""
+    """Group the rangefinders, and return the sites in each group."""
     groups: dict[_Group, list[int]] = {}
     for sensor in np.flatnonzero(model.sensor_type == _RANGEFINDER).tolist():
         number = int(model.sensor_objid[sensor])
@@ -137,7 +136,7 @@ def _groups(model: Any) -> dict[_Group, list[int]]:
 
 
 def _rate_hz(model: Any, sensor: int) -> float:
-    """Return the measurement rate of a sensor, by default that of the simulation steps."""
+    """Return a sensor's measurement rate, which is the simulation rate by default."""
     intervals = getattr(model, "sensor_interval", None)  # since MuJoCo 4
     interval_s = 0.0 if intervals is None else float(np.atleast_1d(intervals[sensor])[0])
     interval_s = interval_s if interval_s > 0 else model.timestep_s
@@ -145,7 +144,7 @@ def _rate_hz(model: Any, sensor: int) -> float:
 
 
 def _name(model: Any, group: _Group) -> str:
-    """Return the name of a sensor, which is the name of its camera or its body."""
+    """Return the name of a sensor's camera or, without a camera, of its body."""
     if group.camera is not None:
         return printable(names_of(model, "cam")[group.camera])
     return printable(names_of(model, "body")[group.body])
@@ -188,7 +187,7 @@ def _lidar(model: Any, name: str, group: _Group, sites: list[int]) -> Lidar:
 
 
 def _beams(model: Any, group: _Group, sites: list[int]) -> tuple[Floats, Floats, Floats]:
-    """Return the frame of a sensor in the world, and its beam origins and directions.
+    """Return a sensor's frame in the world, and its beam origins and directions.
 
     For sites, the frame has the axes of the body, and its origin is the mean position of the sites.
     For a camera, the frame looks along x, with z pointing up in the image.
@@ -211,7 +210,7 @@ def _beams(model: Any, group: _Group, sites: list[int]) -> tuple[Floats, Floats,
 
 
 def _pixel_directions(model: Any, camera: int) -> Floats:
-    """Return the ray directions of a camera, row by row, with x forward and z up."""
+    """Return a camera's ray directions, row by row, with x forward and z up."""
     width, height = model.cam_resolution[camera].tolist()
     sensor_m = np.asarray(model.cam_sensorsize[camera], np.float64)
     row, column = np.divmod(np.arange(width * height), width)
@@ -230,12 +229,11 @@ def _pixel_directions(model: Any, camera: int) -> Floats:
 
 
 def _degrees(angles: Floats) -> list[float]:
-    """Return angles in degrees, rounded for a file."""
     return [rounded(angle) for angle in np.degrees(angles).tolist()]
 
 
 def _unusable(model: Any, camera: int | None) -> str:
-    """Return the reason why a camera cannot become a sensor, or an empty string."""
+    """Return why a camera cannot become a sensor, or an empty string if it can."""
     if camera is None:
         return ""
     projections = getattr(model, "cam_projection", None)
@@ -246,7 +244,7 @@ def _unusable(model: Any, camera: int | None) -> str:
 
 
 def _differences(model: Any, groups: dict[_Group, list[int]]) -> list[str]:
-    """Describe the differences from MuJoCo, one clause each."""
+    """Describe the differences from MuJoCo, with one clause each."""
     lines = [
         f"the rangefinder of {_name(model, group)!r} ({reason})"
         for group in groups

@@ -1,8 +1,8 @@
-"""Script that reads a MuJoCo model in the process that `model_file.py` starts.
+"""Script that `model_file.py` runs in a separate process to read a MuJoCo model.
 
-Invalid files can crash the process, and some models need unlimited memory. Here, this affects only
-this process. The script imports nothing from lidarpool. It writes one frame to standard output: a
-line of JSON, followed by the bytes of the arrays that the line lists.
+Invalid files can crash MuJoCo, and some models need unlimited memory, but this only affects the
+separate process. The script imports nothing from lidarpool. It writes one frame to standard output:
+a line of JSON, followed by the bytes of the arrays that the line lists.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ _OF_DATA = ("xpos", "xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat")
 
 
 class NoKeyframeError(Exception):
-    """Raised if the model lacks a keyframe.
+    """Raised if a model does not have the requested keyframe.
 
     The argument of the error is the list of the existing keyframes.
     """
 
 
 def main(path: str, request: dict[str, Any]) -> None:
-    """Read a file, and write a frame to standard output."""
+    """Read a file, and write one frame to the standard output."""
     output = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     warnings: list[str] = []
@@ -88,7 +88,7 @@ def main(path: str, request: dict[str, Any]) -> None:
 
 
 def _state(path: str, keyframe: str | None) -> tuple[Any, Any]:
-    """Return the model in a file, and its data at the reference pose or at a keyframe."""
+    """Load the model in a file, and its data at the reference pose or at a keyframe."""
     spec = mujoco.MjSpec.from_file(path)
     spec.memory = _ARENA_BYTES
     spec.nstack = -1  # old files have sizes that conflict with the memory

@@ -1,4 +1,4 @@
-"""Read MuJoCo models (MJCF) as scenes of the geoms that a lidar sees in the initial state.
+"""Read MuJoCo models (MJCF) as scenes, with the geoms that a lidar sees in the initial state.
 
 MuJoCo itself (Apache-2.0) reads the files in a separate process (see `model_child.py`). Geoms are
 converted to meshes as in `lidarsim.worlds.MujocoScanner`.
@@ -76,7 +76,7 @@ class MujocoOptions:
 
 
 def read_mjcf(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the geoms of a model in its initial state, with an object for each body.
+    """Read a model's geoms in their initial state, with one object for each body.
 
     Named geoms of the world body are separate objects.
     """
@@ -95,7 +95,7 @@ def read_mjcf(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace:
-    """Return the arrays of a model and of its initial state, by their MuJoCo names.
+    """Return the arrays of a model and its initial state, by their MuJoCo names.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace
 
 
 def body_object_names(model: Any, options: ReadOptions) -> dict[int, str]:
-    """Return the names of the scene objects that correspond to the bodies of a model.
+    """Return the name of the scene object for each body of a model.
 
     Bodies without an object, and the world body, are missing.
     """
@@ -152,7 +152,7 @@ def body_object_names(model: Any, options: ReadOptions) -> dict[int, str]:
 
 
 def _placed(model: Any, options: ReadOptions) -> list[PlacedNode]:
-    """Return the meshes of the bodies of a model, at their poses in the initial state."""
+    """Return the meshes of all bodies, placed at their poses in the initial state."""
     bodies, geoms = find_excluded(model, options.own.exclude)
     choice = _choice(model, options.own, bodies, geoms)
     named = _named_geoms_of_world(model)
@@ -180,7 +180,7 @@ def _placed(model: Any, options: ReadOptions) -> list[PlacedNode]:
 def _choice(
     model: Any, options: MujocoOptions, bodies: list[int], geoms: list[int]
 ) -> BodySelection:
-    """Return the visible parts of a model.
+    """Select the visible parts of a model.
 
     Raises MeshFileError if there are too many geoms.
     """
@@ -195,7 +195,7 @@ def _choice(
 
 
 def _sag_m(model: Any, geoms: Ints) -> float:
-    """Return the sag of round geoms in meters, which is larger if there are many of them."""
+    """Return the sag for round geoms in meters. It is larger if there are many of them."""
     kinds = np.column_stack([model.geom_type[geoms], model.geom_size[geoms]])
     shapes, counts = np.unique(kinds, axis=0, return_counts=True)
     sag_m = SAG_M
@@ -211,7 +211,7 @@ def _sag_m(model: Any, geoms: Ints) -> float:
 
 
 def _round_triangles(kind: int, size: Floats, sag_m: float) -> int:
-    """Return the number of triangles of a round geom, or 0 for other geoms."""
+    """Return a round geom's number of triangles, or 0 for other geoms."""
     match kind:
         case GeomType.SPHERE | GeomType.CAPSULE | GeomType.ELLIPSOID:
             radius = float(size.max() if kind == GeomType.ELLIPSOID else size[0])
@@ -222,7 +222,7 @@ def _round_triangles(kind: int, size: Floats, sag_m: float) -> int:
 
 
 def _named_geoms_of_world(model: Any) -> list[int]:
-    """Return the indices of the named geoms of the world body."""
+    """Return the indices of the world body's named geoms."""
     names = names_of(model, "geom")
     return [
         geom
@@ -232,12 +232,12 @@ def _named_geoms_of_world(model: Any) -> list[int]:
 
 
 def body_matrix(model: Any, body: int) -> Floats:
-    """Return the 4 x 4 matrix from the frame of a body to the world."""
+    """Return the 4 x 4 matrix that transforms from a body frame to the world."""
     return affine(model.xmat[body].reshape(3, 3), model.xpos[body])
 
 
 def _stripped(mesh: SceneMesh, options: ReadOptions) -> SceneMesh:
-    """Remove colors and materials that are not requested from a mesh."""
+    """Remove colors and materials from a mesh if they are not requested."""
     return replace(
         mesh,
         colors=mesh.colors if options.colors else None,
@@ -246,7 +246,7 @@ def _stripped(mesh: SceneMesh, options: ReadOptions) -> SceneMesh:
 
 
 def _notes(model: Any, options: ReadOptions) -> list[str]:
-    """Return notes on content that is not in the scene, as clauses that follow the file name."""
+    """Return notes on content that was not read, as clauses that can follow the file name."""
     notes = (
         [f"contains soft bodies, which were skipped: {soft}"]
         if (soft := describe_soft_bodies(model))

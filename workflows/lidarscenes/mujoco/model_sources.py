@@ -1,4 +1,4 @@
-"""Check the included models, meshes, and textures that a MuJoCo model refers to.
+"""Check the included models, meshes, and textures to which a MuJoCo model refers.
 
 MuJoCo opens these files itself. They are checked here first, so that a model reads data only from
 its own folder and from folders that the user allows.
@@ -33,7 +33,7 @@ _OTHER_ROOTS = {  # {root element of other XML files: advice}
 
 
 def check_sources(data: bytes, path: Path, options: ReadOptions, allowance: Allowance) -> None:
-    """Check that a file is a MuJoCo model, and that the files it refers to may be read.
+    """Check that a file is a MuJoCo model, and that all files to which it refers may be read.
 
     The sizes of all files are added to the allowance. Missing files are reported by MuJoCo later.
 
@@ -80,7 +80,7 @@ def _count(count: int) -> None:
 
 
 def _names_of(root: Element, tags: tuple[str, ...] = ()) -> Iterator[str]:
-    """Yield the names of the files that elements refer to, optionally only elements with `tags`."""
+    """Yield the file names to which elements refer, optionally only for elements with `tags`."""
     for element in root.iter():
         if not tags or element.tag in tags:
             for attribute, name in element.items():
@@ -89,7 +89,7 @@ def _names_of(root: Element, tags: tuple[str, ...] = ()) -> Iterator[str]:
 
 
 def _targets(name: str, folders: set[Path], options: ReadOptions) -> Iterator[Path]:
-    """Yield the existing files that a name may refer to in several folders.
+    """Yield the existing files to which a name may refer in the given folders.
 
     Raises MeshFileError if a file is in a folder that is not allowed.
     """
@@ -109,7 +109,7 @@ def _targets(name: str, folders: set[Path], options: ReadOptions) -> Iterator[Pa
 
 
 def _included_root(file: Path) -> Element:
-    """Return the root element of an included file.
+    """Parse an included file, and return its root element.
 
     Raises ValueError if it is not an MJCF file.
     """

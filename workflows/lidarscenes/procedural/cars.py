@@ -1,4 +1,4 @@
-"""Generate cars with recessed windows and four wheels from a few hundred triangles each."""
+"""Generate cars that have recessed windows and four wheels, from a few hundred triangles each."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FRAME = 0.12  # width of the frame as a fraction of the window
 
 @dataclass(frozen=True)
 class CarModel:
-    """The outline of a car that faces x, from front to back, in meters.
+    """The side outline of a car that faces x, from front to back, in meters.
 
     Each station is (x, half width, height of the beltline, height of the roof). Without a cabin,
     the two heights are nearly equal. Windows are beside and between the stations of the cabin.
@@ -84,12 +84,12 @@ def car(model: CarModel) -> SceneMesh:
 
 
 def all_cars() -> tuple[SceneMesh, ...]:
-    """Return a car of each of `MODELS`."""
+    """Return one car for each of `MODELS`."""
     return tuple(car(model) for model in MODELS)
 
 
 def _body(model: CarModel) -> tuple[Floats, Ints]:
-    """Return the vertices and faces of a car body.
+    """Return the vertices and faces of a car's body.
 
     The body consists of rings with eight corners each, connected by quadrilaterals.
     """
@@ -118,7 +118,7 @@ def _body(model: CarModel) -> tuple[Floats, Ints]:
 
 
 def _window(quad: Floats) -> list[Floats]:
-    """Return the quadrilaterals of a window's pane, recess, and frame."""
+    """Return the quadrilaterals that form a window's pane, recess, and frame."""
     middle = quad.mean(axis=0)
     normal = np.cross(quad[2] - quad[0], quad[3] - quad[1])
     hole = quad + _FRAME * (middle - quad)

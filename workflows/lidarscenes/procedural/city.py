@@ -1,4 +1,4 @@
-"""Generate a city of any size, with streets, houses, towers, trees, cars, and street lamps.
+"""Generate a city of any size with streets, houses, towers, trees, cars, and street lamps.
 
 Streets run along x and y, and two streets cross at (0, 0). The blocks between streets are divided
 into lots in two rows, back to back. Lots near the center have more towers. The objects of all
@@ -51,7 +51,7 @@ def city(
     trees: int = 0,
     cars: int = 0,
 ) -> Scene:
-    """Return a city with a given number of triangles.
+    """Return a city that has the given number of triangles.
 
     More triangles make the city larger, not finer. There is a crossing at (0, 0), where a sensor
     can be placed. The ground at z = 0 is an object, and so is the pavement of all blocks. Each
@@ -103,7 +103,7 @@ def city(
 def _furniture(
     scene: Scene, objects: AnyArray, trees: int, cars: int, seed: int
 ) -> list[SceneInstance]:
-    """Return detailed trees and cars, placed between the objects of a scene."""
+    """Return detailed trees and cars that fit between the objects of a scene."""
     pavement = objects[objects["owner"] == PAVEMENT]
     blocks = np.stack([pavement["place"][:, :2], pavement["scale"][:, :2]], axis=1)
     prefix = CLASSES[BUILDING] + "-"
@@ -121,7 +121,7 @@ def _furniture(
 
 
 def _select_objects(kinds: dict[str, list[Solid]], sizes: Ints, budget: int, seed: int) -> AnyArray:
-    """Return objects from the center outward, within a budget of triangles."""
+    """Return objects from the center outward until the triangle budget is used up."""
     rings = 1
     while True:
         objects = _CityBlocks(kinds, rings, seed).objects()
@@ -133,7 +133,7 @@ def _select_objects(kinds: dict[str, list[Solid]], sizes: Ints, budget: int, see
 
 
 def _ground(objects: AnyArray, triangles: int) -> Solid:
-    """Return flat ground below all objects, with at most the given number of triangles."""
+    """Return flat ground below all objects, with at most `triangles` triangles."""
     blocks = objects[objects["owner"] == PAVEMENT]
     reach = (np.abs(blocks["place"]) + blocks["scale"] / 2).max(axis=0) + _MARGIN_M
     rows = max(1, int(np.sqrt(triangles / 2)))
@@ -145,7 +145,7 @@ def _ground(objects: AnyArray, triangles: int) -> Solid:
 
 
 def _scene(solids: list[Solid], objects: AnyArray, ground: Solid) -> Scene:
-    """Combine the ground and copies of the solids into a scene."""
+    """Combine the ground and a copy of the solid for each object into a scene."""
     points = np.array([len(solid.vertices) for solid in solids])[objects["kind"]]
     sides = np.array([len(solid.faces) for solid in solids])[objects["kind"]]
     first_point = len(ground.vertices) + np.cumsum(points) - points
@@ -167,7 +167,7 @@ def _scene(solids: list[Solid], objects: AnyArray, ground: Solid) -> Scene:
 
 
 def _copies(solid: Solid, objects: AnyArray) -> Floats:
-    """Return the vertices of the copies of a solid, in meters. Shape (objects, v, 3)."""
+    """Return the vertices of each copy of a solid, in meters. Shape (objects, v, 3)."""
     vertices = solid.vertices * objects["scale"][:, None]
     cos = np.cos(objects["yaw"])[:, None]
     sin = np.sin(objects["yaw"])[:, None]
@@ -180,7 +180,7 @@ def _copies(solid: Solid, objects: AnyArray) -> Floats:
 
 
 def _names(objects: AnyArray) -> list[str]:
-    """Return the names of all objects except pavements, numbered from the center outward."""
+    """Name all objects except pavements, numbered from the center outward."""
     numbers = dict.fromkeys(CLASSES, 0)
     names = []
     for owner in objects["owner"].tolist():
@@ -191,7 +191,7 @@ def _names(objects: AnyArray) -> list[str]:
 
 
 class _Lots(NamedTuple):
-    """Lots in the blocks without parks, in two rows along x, back to back."""
+    """Lots in blocks without a park. They lie back to back in two rows along x."""
 
     block: Ints  # (n,) number of the block
     size: Floats  # (n, 2) meters
@@ -255,7 +255,7 @@ class _CityBlocks:
         self._park = park
 
     def objects(self) -> AnyArray:
-        """Return all objects by block, with the pavement followed by the others in random order."""
+        """Return the objects of each block in random order, except that pavements come first."""
         n = len(self._middle)
         slab = np.column_stack([self._size, np.ones(n)])
         objects = np.concatenate(
@@ -292,7 +292,7 @@ class _CityBlocks:
         *,
         z: float = _CURB_M,
     ) -> AnyArray:
-        """Return rows for objects of a class.
+        """Return table rows for objects that belong to the same class.
 
         `kind` is the number of the solid within its group.
         """
@@ -307,7 +307,7 @@ class _CityBlocks:
         return rows
 
     def _lots(self) -> list[AnyArray]:
-        """Return towers, houses, and the trees behind the houses."""
+        """Return towers, houses, and the trees behind houses."""
         lots = self._divide_blocks()
         tower = self._rng.random(len(lots.block)) < 0.9 * lots.centrality
         towers = self._towers(lots, np.flatnonzero(tower))
@@ -316,7 +316,7 @@ class _CityBlocks:
         return [towers, houses, self._yard_trees(lots, np.repeat(house_lots, 2))]
 
     def _divide_blocks(self) -> _Lots:
-        """Divide the blocks without parks into lots."""
+        """Divide the blocks that have no park into lots."""
         built = np.flatnonzero(~self._park)
         inner = self._size[built] - 2 * _PAVEMENT_M
         across = np.maximum(2, np.round(inner[:, 0] / _LOT_M)).astype(np.int64)
@@ -341,7 +341,7 @@ class _CityBlocks:
         )
 
     def _towers(self, lots: _Lots, lot_indices: Ints) -> AnyArray:
-        """Return towers on the lots with the given indices."""
+        """Return towers that stand on the lots with the given indices."""
         rng = self._rng
         n = len(lot_indices)
         height = np.clip(lots.centrality[lot_indices] * rng.uniform(0.2, 1.15, n), 0, 0.999)
@@ -368,7 +368,7 @@ class _CityBlocks:
         )
 
     def _houses(self, lots: _Lots, lot_indices: Ints) -> AnyArray:
-        """Return houses on the lots with the given indices."""
+        """Return houses that stand on the lots with the given indices."""
         rng = self._rng
         n = len(lot_indices)
         kind = rng.integers(self._count["house"], size=n)
@@ -387,7 +387,7 @@ class _CityBlocks:
         )
 
     def _yard_trees(self, lots: _Lots, lot_indices: Ints) -> AnyArray:
-        """Return trees behind houses on the lots with the given indices."""
+        """Return trees behind the houses on the lots with the given indices."""
         rng = self._rng
         n = len(lot_indices)
         depth = rng.uniform(0.72, 0.95, n) * lots.size[lot_indices, 1]
@@ -400,7 +400,7 @@ class _CityBlocks:
         return self._trees(lots.block[lot_indices], xy)
 
     def _park_trees(self) -> AnyArray:
-        """Return trees in the parks."""
+        """Return trees that stand in parks."""
         parks = np.flatnonzero(self._park)
         block = np.repeat(parks, (self._size[parks].prod(axis=1) / 50).astype(np.int64))
         room = self._size[block] / 2 - _PAVEMENT_M - 2
@@ -408,7 +408,7 @@ class _CityBlocks:
         return self._trees(block, xy)
 
     def _trees(self, block: Ints, xy: Floats) -> AnyArray:
-        """Return trees at positions in blocks."""
+        """Return trees at the given positions in blocks."""
         rng = self._rng
         n = len(block)
         kind = rng.integers(self._count["tree"], size=n)
@@ -426,7 +426,7 @@ class _CityBlocks:
     def _along_streets(
         self, owner: int, *, inward: float, spacing: float, chance: float
     ) -> AnyArray:
-        """Return objects of a class along all four edges of each block, with gaps."""
+        """Return objects of one class along all four edges of each block, with gaps."""
         rng = self._rng
         positions = self._street_positions(inward, spacing, chance)
         block = positions.block
@@ -445,7 +445,7 @@ class _CityBlocks:
         return self._rows(CAR, "car", kind=kind, block=block, xy=xy, yaw=yaw, scale=scale, z=0.0)
 
     def _street_positions(self, inward: float, spacing: float, chance: float) -> _StreetPositions:
-        """Return positions along all four edges of each block, each kept with a probability."""
+        """Return random positions along all four edges of each block."""
         n = len(self._middle)
         block = np.tile(np.arange(n), 4)
         yaw = np.repeat(np.array([-0.5, 0.0, 0.5, 1.0]) * np.pi, n)  # from the block to the street

@@ -1,4 +1,4 @@
-"""Place detailed trees and cars in a generated city."""
+"""Add detailed trees and cars to a generated city."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _ROOT_M = 0.1
 def street_trees(
     blocks: Floats, boxes: list[Floats], lamps: list[Floats], z: float, count: int, seed: int
 ) -> list[SceneInstance]:
-    """Place trees along streets, in yards, and in parks, with crowns that do not touch buildings.
+    """Place trees along streets, in yards, and in parks. Their crowns do not touch buildings.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def street_trees(
 
 
 class _TreeSites(NamedTuple):
-    """Positions for trees in a block."""
+    """Possible positions of trees in a block."""
 
     xy: Floats  # (n, 2) meters
     room: Floats  # (n,) distance to the nearest building, or the limit at streets
@@ -89,7 +89,7 @@ class _TreeSites(NamedTuple):
 def _tree_sites(
     block: Floats, boxes: Floats, lamps: Floats, min_room: float, rng: np.random.Generator
 ) -> _TreeSites:
-    """Return the positions in a block that have space for the smallest tree.
+    """Return those positions in a block that have enough space for the smallest tree.
 
     `block` (2, 2) contains the center and the size of the block, `boxes` (n, 2, 2) the corners of
     its buildings, and `lamps` (m, 2) the positions of its street lamps.
@@ -108,7 +108,7 @@ def _tree_sites(
 
 
 def parked_cars(blocks: Floats, count: int, seed: int) -> list[SceneInstance]:
-    """Place cars along the curbs of blocks, which are given by their centers and sizes.
+    """Place cars along the curbs of blocks, given each block's center and size.
 
     Raises
     ------
@@ -137,7 +137,7 @@ def parked_cars(blocks: Floats, count: int, seed: int) -> list[SceneInstance]:
 
 
 def _choose(weights: Floats, count: int, plural: str, rng: np.random.Generator) -> Ints:
-    """Choose `count` distinct rows at random, with probabilities proportional to weights.
+    """Choose `count` distinct rows at random, with probabilities proportional to the weights.
 
     Raises LidarError if there are fewer rows.
     """
@@ -153,7 +153,7 @@ def _choose(weights: Floats, count: int, plural: str, rng: np.random.Generator) 
 def _street_positions(
     size: Floats, spacing: float, inward: float, corner: float
 ) -> tuple[Floats, Floats]:
-    """Return positions along the edges of a block centered at the origin, and yaws.
+    """Return positions along the edges of a block centered at the origin, and a yaw for each.
 
     A car that faces the direction of its yaw has the block on its right.
     """
@@ -175,7 +175,7 @@ def _street_positions(
 
 
 def _yard_positions(size: Floats, rng: np.random.Generator) -> Floats:
-    """Return positions in a block centered at the origin, behind its street trees."""
+    """Return positions behind the street trees of a block centered at the origin."""
     inner = size - 2 * (_TREE_INWARD_M + _YARD_M / 2)
     n = (inner / _YARD_M).astype(np.int64)
     cells = np.stack(np.meshgrid(np.arange(n[0]), np.arange(n[1]), indexing="ij"), axis=-1)

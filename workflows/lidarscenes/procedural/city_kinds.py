@@ -1,4 +1,4 @@
-"""Build the kinds of objects in a city from closed shapes."""
+"""Build each kind of object in a city from closed shapes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lidarsim.scene.shapes import revolve
 
 
 class Solid(NamedTuple):
-    """Triangles of an object whose base is at z = 0, in local coordinates in meters.
+    """Triangles of an object that stands on z = 0, in local coordinates in meters.
 
     `vertices` are float64 (v, 3), and `faces` int64 (f, 3), counterclockwise as seen from outside.
     """
@@ -24,7 +24,7 @@ class Solid(NamedTuple):
     faces: Ints
 
     def translated(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Solid:
-        """Return a translated copy."""
+        """Return a copy that is moved by the given distances."""
         return Solid(self.vertices + np.array([x, y, z]), self.faces)
 
 
@@ -33,7 +33,7 @@ TOWER_FLOORS = (6, 9, 13, 18, 25)
 
 
 def all_kinds(seed: int = 0) -> dict[str, list[Solid]]:
-    """Return the solids of all kinds of objects, by group."""
+    """Return the solid for each kind of object, by group."""
     return {
         "pavement": [box(1, 1, 0.15)],
         "tower": _towers(),
@@ -45,7 +45,7 @@ def all_kinds(seed: int = 0) -> dict[str, list[Solid]]:
 
 
 def _towers() -> list[Solid]:
-    """Return square, stepped, round, and L-shaped office towers with `TOWER_FLOORS` floors."""
+    """Return square, stepped, round, and L-shaped office towers that have `TOWER_FLOORS` floors."""
     corner = np.array([[0, 0], [0, 8], [-9, 8], [-9, -8], [9, -8], [9, 0]], dtype=np.float64)
     return [
         tower
@@ -62,7 +62,7 @@ def _towers() -> list[Solid]:
 def _facade_profile(
     floors: int, base: float = 0.0, inset: float = 0.0
 ) -> list[tuple[float, float]]:
-    """Return the profile of a facade with recessed windows on each floor, and a parapet.
+    """Return the profile of a facade with a parapet and with recessed windows on each floor.
 
     The profile consists of (height, inset) pairs in meters.
     """
@@ -76,7 +76,7 @@ def _facade_profile(
 
 
 def _with_plant_room(tower: Solid, floors: int) -> Solid:
-    """Add plant rooms and a mast to the roof of a tower."""
+    """Add plant rooms and a mast to a tower's roof."""
     top = floors * FLOOR_M
     return join_solids([
         tower,
@@ -87,7 +87,7 @@ def _with_plant_room(tower: Solid, floors: int) -> Solid:
 
 
 def _stepped(floors: int) -> Solid:
-    """Return a tower in three parts, each narrower than the one below."""
+    """Return a tower of three parts, each of which is narrower than the one below."""
     counts = [floors - 2 * (floors // 3), floors // 3, floors // 3]
     parts = []
     base = 0.0
@@ -98,7 +98,7 @@ def _stepped(floors: int) -> Solid:
 
 
 def _houses() -> list[Solid]:
-    """Return houses with one to three floors and gabled or hipped roofs.
+    """Return houses that have one to three floors and gabled or hipped roofs.
 
     Each house exists with and without a wing.
     """
@@ -118,12 +118,12 @@ def _houses() -> list[Solid]:
 
 
 def _eaves(stories: int) -> float:
-    """Return the height of the eaves of a house in meters."""
+    """Return the eaves height of a house in meters."""
     return 0.4 + 2.8 * stories
 
 
 def _dwelling(width: float, depth: float, stories: int, hip: float) -> Solid:
-    """Return the walls and the roof of a house.
+    """Return a house's walls and roof.
 
     `hip` is the inset of both ends of the ridge.
     """
@@ -134,7 +134,7 @@ def _dwelling(width: float, depth: float, stories: int, hip: float) -> Solid:
 
 
 def _front(stories: int) -> list[Solid]:
-    """Return slightly protruding windows on the long sides, and a door with a step."""
+    """Return slightly protruding windows for the long sides, and a door with a step."""
     door = [
         box(1.1, 0.3, 2.1).translated(-1.2, -4.3, 0.3),
         box(1.8, 1.2, 0.3).translated(-1.2, -4.8, 0),
@@ -154,7 +154,7 @@ def _trees(seed: int) -> list[Solid]:
 
 
 def _broadleaf(rng: np.random.Generator, height_ratio: float) -> Solid:
-    """Return a deciduous tree whose crown has a given ratio of height to width."""
+    """Return a deciduous tree whose crown has the given ratio of height to width."""
     trunk = loft(regular_polygon(6, 0.22), [(0, -0.1), (0.3, 0), (3, 0.08)])
     angle = np.linspace(-np.pi / 2, np.pi / 2, 8)
     crown = revolve(
@@ -188,7 +188,7 @@ def _cars() -> list[Solid]:
 
 
 def _car(side: list[tuple[float, float]]) -> Solid:
-    """Return a car with the side outline given as (x, z) points in meters."""
+    """Return a car with the given side outline, as (x, z) points in meters."""
     body = lay_down(loft(side, [(-0.85, 0.08), (-0.75, 0), (0.75, 0), (0.85, 0.08)]))
     wheel = lay_down(loft(regular_polygon(8, 0.33), [(-0.12, 0), (0.12, 0)]))
     wheels = [wheel.translated(x, y, 0.31) for x in (-1.35, 1.35) for y in (-0.8, 0.8)]
@@ -196,7 +196,7 @@ def _car(side: list[tuple[float, float]]) -> Solid:
 
 
 def _lamp() -> Solid:
-    """Return a street lamp whose arm points along x."""
+    """Return a street lamp with an arm along x."""
     pole = loft(regular_polygon(6, 0.09), [(0, -0.06), (0.5, 0), (6.2, 0.04)])
     return join_solids(
         [
@@ -259,12 +259,12 @@ def regular_polygon(sides: int, radius: float) -> Floats:
 
 
 def box(width: float, depth: float, height: float) -> Solid:
-    """Return a box whose bottom face is in the plane z = 0."""
+    """Return a box whose bottom face lies at z = 0."""
     return loft(rectangle(width, depth), [(0, 0), (height, 0)])
 
 
 def gable(width: float, depth: float, eaves: float, rise: float, hip: float = 0.0) -> Solid:
-    """Return a pitched roof with eight triangles over a rectangle at the height `eaves`.
+    """Return a pitched roof of eight triangles over a rectangle at the height `eaves`.
 
     The ridge runs along x, `rise` above the eaves, and is shorter by `hip` at both ends.
     """
@@ -277,5 +277,5 @@ def gable(width: float, depth: float, eaves: float, rise: float, hip: float = 0.
 
 
 def lay_down(solid: Solid) -> Solid:
-    """Return a solid with the y and z axes swapped."""
+    """Return a solid in which the y and z axes are swapped."""
     return Solid(solid.vertices[:, [0, 2, 1]], solid.faces[:, ::-1])

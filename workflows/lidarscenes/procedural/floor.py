@@ -1,4 +1,4 @@
-"""Find the floor below the position of a sensor, and the ceiling above it."""
+"""Find the floor below a sensor position, and the ceiling above it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FURNITURE_M = 1.5  # minimum height of a ceiling above the floor
 
 
 def floor_and_ceiling(scene: Scene, x: float, y: float) -> tuple[float, float]:
-    """Return the heights of the floor and the ceiling at a position, in world coordinates.
+    """Return the world heights of the floor and the ceiling at the given x and y.
 
     The floor is the lowest triangle at the position if it faces up, as ground does, or the top of
     the lowest slab. Otherwise, it is the lowest point of the scene. The ceiling is the lowest
@@ -29,13 +29,13 @@ def floor_and_ceiling(scene: Scene, x: float, y: float) -> tuple[float, float]:
 
 
 def surface_heights(scene: Scene, x: float, y: float) -> Floats:
-    """Return the world heights at which a vertical line at x, y crosses triangles."""
+    """Return the world heights at which a vertical line at x and y crosses triangles."""
     heights, _ = _crossings(scene, np.array([x, y]) - scene.origin[:2])
     return heights + scene.origin[2]
 
 
 def triangles_in_box(scene: Scene, lower: ArrayLike, upper: ArrayLike) -> Indices:
-    """Return the indices of the triangles whose bounding boxes overlap a box.
+    """Return the indices of all triangles whose bounding boxes overlap the given box.
 
     The corners of the box are local coordinates of shape (3,), or (2,) for any height.
     """
@@ -68,7 +68,7 @@ def _crossings(scene: Scene, position: Floats) -> tuple[Floats, Bools]:
 
 
 def _areas(p: Floats, q: Floats, position: Floats) -> Floats:
-    """Return twice the signed areas of the triangles p, q, position in plan view.
+    """Return twice the signed area of each triangle (p, q, position) in plan view.
 
     Counterclockwise triangles have positive areas.
     """

@@ -1,4 +1,4 @@
-"""Color generated scenes by the classes of their objects."""
+"""Color generated scenes according to the classes of their objects."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _STEEP = 0.65  # maximum for rock
 
 
 def paint_scene(scene: Scene) -> Scene:
-    """Color a `city` or `terrain` scene according to the names of its objects."""
+    """Color a `city` or `terrain` scene based on the names of its objects."""
     numbered = [name.rpartition("-") for name in scene.names]
     kinds = [kind or name for kind, _, name in numbered]
     numbers = [int(number) if kind else 0 for kind, _, number in numbered]
@@ -51,7 +51,7 @@ def paint_scene(scene: Scene) -> Scene:
     faces = _face_geometry(scene)
 
     def paint(kind: str, mask: Bools, color: str) -> None:
-        """Paint the faces of a kind that are selected by a mask."""
+        """Paint those faces of a kind that a mask selects."""
         image[(face_kind == _NAMES.index(kind)) & mask] = _FIRST[color]
 
     paint("building", faces.up > _UP, "tiles")
@@ -69,14 +69,14 @@ def paint_scene(scene: Scene) -> Scene:
 
 
 class _FaceGeometry(NamedTuple):
-    """Slopes and heights of the faces in a scene."""
+    """Slope and height of each face in a scene."""
 
     up: Floats32  # (f,) z of the unit normal
     height: Floats32  # (f,) height of the lowest corner above the base of the object, in meters
 
 
 def _face_geometry(scene: Scene) -> _FaceGeometry:
-    """Compute the slopes and heights of faces in single precision."""
+    """Compute the slope and height of each face in single precision."""
     x, y, z = (axis[scene.faces].T for axis in scene.vertices.T.astype(np.float32))
     (ax, bx), (ay, by), (az, bz) = ((axis[1] - axis[0], axis[2] - axis[0]) for axis in (x, y, z))
     normal = ax * by - ay * bx
@@ -88,7 +88,7 @@ def _face_geometry(scene: Scene) -> _FaceGeometry:
 
 
 def _part_paint(faces: Ints32, number: int) -> Ints32:
-    """Return the paints of an instanced mesh, which is a tree with leaves or a car."""
+    """Return the palette index for each face of an instanced mesh, either a leafy tree or a car."""
     # Leaves do not share vertices with other triangles. Cars have no leaves.
     leaf = np.bincount(faces.ravel())[faces].max(axis=1) == 1
     if leaf.any():

@@ -1,4 +1,4 @@
-"""Generate trees with a trunk, branches, twigs, and leaves that are single triangles.
+"""Generate trees with trunks, branches, twigs, and leaves. Each leaf is a single triangle.
 
 Following Weber and Penn (1995), a stem carries branches, branches carry twigs, and twigs carry
 leaves, in the proportions of a species. A triangle is larger than a real leaf, so that a few of
@@ -28,7 +28,7 @@ _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
 @dataclass(frozen=True)
 class Species:
-    """The proportions of a tree.
+    """The proportions of a tree species.
 
     Heights within the crown are fractions from its lowest branch to its top.
     """
@@ -73,7 +73,7 @@ SPECIES = (
 
 
 def tree(species: Species, seed: int = 0, root_m: float = 0.1) -> SceneMesh:
-    """Return a tree with its base at the origin.
+    """Return a tree whose base is at the origin.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def tree(species: Species, seed: int = 0, root_m: float = 0.1) -> SceneMesh:
 
 
 def all_trees(seed: int, root_m: float) -> tuple[SceneMesh, ...]:
-    """Return a tree of each of `SPECIES`."""
+    """Return one tree for each of `SPECIES`."""
     return tuple(tree(species, seed, root_m) for species in SPECIES)
 
 
@@ -140,7 +140,7 @@ def place_instances(
 
 
 def _stem(species: Species, root_m: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return the points and radii of a stem from the root to the top, in meters."""
+    """Return the points and radii of a stem from root to top, in meters."""
     share = np.linspace(0, 1, _STEM_STEPS)
     sway = np.cumsum(rng.normal(0, 0.012 * species.height_m, (_STEM_STEPS, 2)), axis=0)
     sway = (sway - sway[0]) * share[:, None]
@@ -155,7 +155,7 @@ def _stem(species: Species, root_m: float, rng: np.random.Generator) -> tuple[Fl
 def _branches(
     species: Species, stem: Floats, radii: Floats, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Return the points and radii of branches, in meters."""
+    """Return the points and radii of all branches, in meters."""
     n = species.branches
     share, full_length = _branch_shares(species, rng)
     height = species.height_m * (species.bare + (0.97 - species.bare) * share)
@@ -180,7 +180,7 @@ def _branches(
 
 
 def _branch_shares(species: Species, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return the heights of branches as fractions of the crown, and their lengths.
+    """Return the branches' heights as fractions of the crown height, and their lengths.
 
     Branches are denser where they are long, so that they fill the crown evenly.
     """
@@ -193,7 +193,7 @@ def _branch_shares(species: Species, rng: np.random.Generator) -> tuple[Floats, 
 
 
 def _twigs(species: Species, branches: Floats, rng: np.random.Generator) -> Floats:
-    """Return the ends of twigs, which grow from the outer parts of branches. Shape (n, 2, 3)."""
+    """Return both ends of each twig on the outer parts of branches. Shape (n, 2, 3)."""
     n = len(branches)
     m = species.twigs
     share = np.sort(rng.uniform(0.2, 1, (n, m)), axis=1)
@@ -211,7 +211,7 @@ def _twigs(species: Species, branches: Floats, rng: np.random.Generator) -> Floa
 
 
 def _leaves(species: Species, twigs: Floats, rng: np.random.Generator) -> tuple[Floats, Ints]:
-    """Return the vertices and faces of separate leaves around twigs."""
+    """Return the vertices and faces of leaves around twigs. Leaves do not share vertices."""
     n = len(twigs)
     m = species.leaves
     length, width = species.leaf_m
@@ -228,7 +228,7 @@ def _leaves(species: Species, twigs: Floats, rng: np.random.Generator) -> tuple[
 
 
 def _tubes(paths: Floats, radii: Floats, sides: int) -> tuple[Floats, Ints]:
-    """Return the vertices and faces of open tubes along paths with the given radii."""
+    """Return the vertices and faces of open tubes along the given paths."""
     n, k = radii.shape
     tangents = _unit(np.gradient(paths, axis=1))
     # Use the same reference axis along a tube, so that the tube is not twisted.
@@ -252,5 +252,4 @@ def _tubes(paths: Floats, radii: Floats, sides: int) -> tuple[Floats, Ints]:
 
 
 def _unit(vectors: Floats) -> Floats:
-    """Scale vectors (..., 3) to unit length."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

@@ -52,7 +52,7 @@ _DIRECTIONS = 16
 
 
 def is_obstructed(scene: Scene, positions: ArrayLike) -> bool:
-    """Return True if a surface is within `CLEAR_M` of any of the local positions."""
+    """Return True if any of the local positions is within `CLEAR_M` of a surface."""
     points = np.asarray(positions, np.float64).reshape(-1, 3)
     nearby = triangles_in_box(scene, points.min(axis=0) - CLEAR_M, points.max(axis=0) + CLEAR_M)
     if not len(nearby):
@@ -64,7 +64,7 @@ def is_obstructed(scene: Scene, positions: ArrayLike) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Hits of rays in all directions from a list of positions."""
+    """Hits of rays that are cast in all directions from a list of positions."""
 
     directions: Floats  # (n, 3) unit vectors
     distance: Floats  # (n,) in meters, infinite without a hit
@@ -74,19 +74,19 @@ class Views:
 
     @property
     def hit(self) -> Bools:
-        """Mask of the rays that hit a surface at a distance of more than `HAND_M`."""
+        """Mask of the rays that hit a surface farther away than `HAND_M`."""
         return np.isfinite(self.distance) & (self.distance > HAND_M)
 
     @property
     def is_inside_body(self) -> bool:
-        """Whether the positions are surrounded by surfaces of which only the backs are visible."""
+        """Whether only the backs of surfaces are visible from the positions, in all directions."""
         enclosed = np.mean(np.isfinite(self.distance)) > _AROUND
         return bool(enclosed and self.hit.any() and np.mean(self.back[self.hit]) > 1 - 1 / RAYS)
 
 
 @dataclass(frozen=True, eq=False)
 class EnclosingBody:
-    """The object that surrounds a position."""
+    """An object that surrounds a position."""
 
     name: str
     bounds: Floats  # (2, 3) lower and upper corner, local coordinates in meters
@@ -94,7 +94,7 @@ class EnclosingBody:
 
 
 class PlacementChecker:
-    """Checks positions in a scene without actors by casting a few thousand rays."""
+    """Checks positions in a scene without actors, by casting a few thousand rays."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -103,13 +103,13 @@ class PlacementChecker:
         self._caster = RayCaster(scene.vertices, scene.faces, backend)
 
     def cast_around(self, positions: ArrayLike) -> Views:
-        """Cast rays in all directions from local positions."""
+        """Cast rays in all directions from the given local positions."""
         points = np.asarray(positions, np.float64).reshape(-1, 3)
         directions = sphere_directions(RAYS)
         return self.cast(np.repeat(points, RAYS, axis=0), np.tile(directions, (len(points), 1)))
 
     def cast_from_outside(self) -> Views:
-        """Cast rays at the scene from all directions."""
+        """Cast rays at the scene from outside, in all directions."""
         lower, upper = self._scene.bounds
         across = float(np.linalg.norm(upper - lower))
         toward = -sphere_directions(RAYS)
@@ -118,7 +118,7 @@ class PlacementChecker:
         return self.cast(lower + shares * (upper - lower) - 2 * across * toward, toward)
 
     def is_object(self, views: Views) -> bool:
-        """Return whether a scene is an object, given the views from sensor positions inside it.
+        """Return whether a scene is a single object, given the views from positions inside it.
 
         A scene is an object if almost no ray hits a surface, or if all its sides face outward and
         the positions are inside it, rather than on ground or in a room with a floor.
@@ -142,7 +142,7 @@ class PlacementChecker:
         return not self._is_room(views)
 
     def is_inside_body(self, position: ArrayLike) -> bool:
-        """Return whether a local position is inside a closed body that is not a room.
+        """Return whether a local position is inside a closed body other than a room.
 
         A body that stands on the ground may lack a bottom.
         """
@@ -157,7 +157,7 @@ class PlacementChecker:
         return bool(closed and not spans and np.mean(views.back[raised & views.hit]) > 1 - 1 / RAYS)
 
     def find_enclosing_body(self, position: ArrayLike) -> EnclosingBody:
-        """Return the object that is hit in most directions from a local position (3,).
+        """Return the object that most rays from a local position (3,) hit.
 
         At least one surface must be visible from the position.
         """
@@ -172,7 +172,7 @@ class PlacementChecker:
         return EnclosingBody(self._scene.names[owner], bounds, is_whole_scene=whole)
 
     def find_free_position(self, position: ArrayLike) -> Floats | None:
-        """Return the nearest free position (3,) around a local position, or None.
+        """Return the free position (3,) that is closest to a local position, or None.
 
         Candidates are at the same height and within the scene. At a free position, the ground or a
         floor is visible below, and no surface is close.
@@ -187,7 +187,7 @@ class PlacementChecker:
         return None
 
     def is_free(self, position: ArrayLike) -> bool:
-        """Return whether a local position (3,) has ground below and is not enclosed.
+        """Return whether a local position (3,) has ground below it and is not enclosed.
 
         No surface may be within `CLEAR_M`.
         """
@@ -220,7 +220,7 @@ class PlacementChecker:
         return bool(lower and np.mean(hits[up > _RAISED]) >= _WIDELY_COVERED)
 
     def _is_room(self, views: Views) -> bool:
-        """Return whether the positions are in a room, although all sides face outward."""
+        """Return whether positions are in a room, even though all sides face outward."""
         if not _has_floor(views):
             return False
         if np.mean(views.back) < 1 - _CLOSED:  # the walls have a thickness
@@ -231,7 +231,7 @@ class PlacementChecker:
         return bool(fits and np.mean(_is_level(views) | upright) >= _UPRIGHT)
 
     def cast(self, origins: Floats, directions: Floats) -> Views:
-        """Cast rays from local origins along unit directions."""
+        """Cast rays from the given local origins along unit directions."""
         hits = self._caster.cast(origins, directions)
         a, b, c = self._scene.vertices[self._scene.faces[hits.triangle]].transpose(1, 0, 2)
         normals = np.cross(b - a, c - a)
@@ -243,12 +243,12 @@ class PlacementChecker:
 
 
 def _is_level(views: Views) -> Bools:
-    """Return a mask of the rays that hit level surfaces."""
+    """Return a mask of the rays that hit a level surface."""
     return np.asarray(np.abs(views.normals[:, 2]) > 0.99)
 
 
 def _has_floor(views: Views) -> bool:
-    """Return whether steep downward rays hit level surfaces at about the same height."""
+    """Return whether steep downward rays hit level surfaces at similar heights."""
     steep = (views.directions[:, 2] < -0.7) & np.isfinite(views.distance)
     heights = views.heights[steep & _is_level(views)]
     floor = np.sum(np.abs(heights - np.median(heights)) < 0.3) if len(heights) else 0
@@ -256,7 +256,7 @@ def _has_floor(views: Views) -> bool:
 
 
 def is_open(scene: Scene) -> bool:
-    """Return whether the surfaces of a scene are open, as those of a terrain are.
+    """Return whether the surfaces in a scene are open, like those of a terrain.
 
     No rays are cast.
     """
@@ -264,9 +264,11 @@ def is_open(scene: Scene) -> bool:
 
 
 def _openness(scene: Scene) -> float:
-    """Return the length of the sum of area vectors divided by the sum of areas, from 0 to 1.
+    """Return how open the surfaces in a scene are, from 0 to 1.
 
-    Area vectors point along the normals. For a closed surface, they add up to zero.
+    This is the length of the sum of all area vectors, divided by the sum of their lengths.
+
+    Area vectors point along the normals. The area vectors of a closed surface add up to zero.
     """
     total = np.zeros(3)
     area = 0.0
@@ -279,7 +281,7 @@ def _openness(scene: Scene) -> float:
 
 
 def sphere_directions(count: int) -> Floats:
-    """Return unit vectors, evenly distributed over a sphere along a Fibonacci spiral."""
+    """Return unit vectors that are evenly distributed along a Fibonacci spiral on a sphere."""
     numbers: Any = np.arange(count) + 0.5
     z = 1 - 2 * numbers / count
     angle = np.pi * (1 + np.sqrt(5)) * numbers

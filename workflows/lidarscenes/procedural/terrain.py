@@ -39,7 +39,7 @@ def terrain(
     side_m: float = 1000.0,
     trees: int = 0,
 ) -> Scene:
-    """Return a square of fractal terrain with ridges and valleys at every scale.
+    """Return a square fractal terrain with ridges and valleys at every scale.
 
     The height is a sum of octaves of gradient noise (Perlin 1985), folded into ridges. Each octave
     is damped where the previous octaves are low, which makes low ground flatter. This is a
@@ -88,7 +88,7 @@ def terrain(
 
 
 def _woods(heights: Floats, side_m: float, count: int, seed: int) -> list[SceneInstance]:
-    """Return trees in woods, given the heights on a square grid."""
+    """Return trees that form woods, given the heights on a square grid."""
     if not count:
         return []
     rng = np.random.default_rng([seed, count])
@@ -119,7 +119,7 @@ def _woods(heights: Floats, side_m: float, count: int, seed: int) -> list[SceneI
 def _flattest_positions(
     heights: Floats, side_m: float, cells: int, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Return the flattest of several random positions in each cell, and its slope."""
+    """Return the flattest of several random positions in each cell, and the slope there."""
     number = np.stack(np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij"), axis=-1)
     inside = 0.5 + _MIDDLE * rng.uniform(-0.5, 0.5, (_TRIED, cells * cells, 2))
     shares = (number.reshape(-1, 2) + inside) / max(cells, 1)
@@ -130,7 +130,7 @@ def _flattest_positions(
 
 
 def _ground_at(heights: Floats, side_m: float, share: Floats) -> tuple[Floats, Floats]:
-    """Return the heights and slopes of the terrain at fractions of the sides."""
+    """Return the heights and slopes of the terrain at positions given as fractions of its sides."""
     size = np.array(heights.shape) - 1
     grid_position = share * size
     i, j = np.moveaxis(np.minimum(grid_position.astype(np.int64), size - 1), -1, 0)
@@ -146,7 +146,7 @@ def _ground_at(heights: Floats, side_m: float, share: Floats) -> tuple[Floats, F
 
 
 def grid_faces(column_count: int, row_count: int) -> Ints:
-    """Return two triangles for each cell of a grid. Shape (columns * rows, 2, 3).
+    """Return two triangles for each grid cell. Shape (columns * rows, 2, 3).
 
     The grid has (columns + 1) x (rows + 1) points.
     """
@@ -176,7 +176,7 @@ def _heights(x: Floats, y: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _noise(x: Floats, y: Floats, rng: np.random.Generator) -> Floats:
-    """Return gradient noise on a grid, with values of about -1 to 1. Shape (len(x), len(y)).
+    """Return gradient noise from about -1 to 1 on a grid. Shape (len(x), len(y)).
 
     The gradients are at integer coordinates.
     """

@@ -1,1 +1,1 @@
-"""Read OpenDRIVE roads with their reference lines, lanes, road marks, objects, and signals."""
+"""Read OpenDRIVE roads with reference lines, lanes, road marks, objects, and signals."""

@@ -1,4 +1,4 @@
-"""Place cross sections along roads so that triangles between them stay within a tolerance.
+"""Place cross sections along roads so that the triangles between them are within a tolerance.
 
 Everything that varies along a road is defined in pieces, and may step where a piece starts. At a
 step, a station has values from either before or after the step, and a surface has both stations.
@@ -35,7 +35,7 @@ _TWIST_SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)  # positions across a cell for measuri
 
 @dataclass(frozen=True, eq=False)
 class RoadStations:
-    """Stations on a road.
+    """Positions along a road.
 
     Attributes
     ----------
@@ -51,26 +51,26 @@ class RoadStations:
 
     @classmethod
     def at(cls, distances: Floats) -> RoadStations:
-        """Return stations at distances, with values from after any steps."""
+        """Create stations at the given distances, with values from after any steps."""
         return cls(distances, distances)
 
     def __len__(self) -> int:
         return len(self.s)
 
     def select(self, station_selection: AnyArray | slice) -> RoadStations:
-        """Return selected stations."""
+        """Return the selected stations."""
         return RoadStations(self.s[station_selection], self.pieces[station_selection])
 
 
 class SurfaceSamples(NamedTuple):
-    """The stations at which a surface is measured, and their intervals."""
+    """The stations at which a surface is measured, and the intervals that contain them."""
 
     intervals: Intervals
     stations: RoadStations
 
 
 class PlacedStations(NamedTuple):
-    """The stations at which a surface gets its vertices."""
+    """The stations at which a surface has its vertices."""
 
     stations: RoadStations
     steps: Ints  # (j,) stations before a step, where the next station has the same distance
@@ -78,7 +78,7 @@ class PlacedStations(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """Intervals of a road in which every polynomial has a single piece.
+    """Intervals of a road within which each polynomial has a single piece.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ class Intervals:
 
     @classmethod
     def between(cls, start: float, stop: float, breaks: Floats) -> Intervals:
-        """Return the intervals between two distances.
+        """Divide the road between two distances into intervals.
 
         `breaks` (b,) are the distances at which pieces start.
         """
@@ -120,7 +120,7 @@ class Intervals:
         return cls(ends, pieces)
 
     def with_lead(self, breaks: Floats) -> Intervals:
-        """Add a lead interval if pieces of the road start where the intervals start."""
+        """Add a lead interval if pieces of the road start at the first distance."""
         start = self.ends[0, 0]
         at_start = breaks[np.abs(breaks - start) <= GAP_M]
         if not len(at_start) or start <= GAP_M:
@@ -133,7 +133,7 @@ class Intervals:
         )
 
     def surface_samples(self, *, are_planes: bool) -> SurfaceSamples:
-        """Return the stations at which to measure the surface, possibly in shorter intervals.
+        """Return the stations at which to measure the surface. Long intervals are divided first.
 
         In planes, two samples per interval are enough to detect steps.
         """
@@ -143,7 +143,7 @@ class Intervals:
         return SurfaceSamples(intervals, intervals.samples(SAMPLES))
 
     def _cut(self) -> Intervals:
-        """Divide long intervals, so that samples capture curvatures that vary along the road."""
+        """Divide long intervals so that samples capture curvatures that vary along the road."""
         spans = self.ends[:, 1] - self.ends[:, 0]
         if spans.max() <= _MAX_SAMPLED_M:
             return self
@@ -178,9 +178,9 @@ class Intervals:
         return RoadStations(s.ravel(), pieces.ravel())
 
     def place(self, counts: Ints, steps: Bools) -> PlacedStations:
-        """Return stations that divide each interval into a number of parts.
+        """Divide each interval into the given number of parts, and return the stations.
 
-        `steps` (n,) marks intervals with a step of the surface at their stop.
+        `steps` (n,) marks intervals at whose stop the surface has a step.
         """
         has_stop = steps.copy()
         has_stop[-1] = True
@@ -204,7 +204,7 @@ class Intervals:
 
 
 class SampledSurface(NamedTuple):
-    """A surface along a road, measured at samples."""
+    """A surface along a road that is measured at samples."""
 
     intervals: Intervals
     points: Floats  # (c, n * m, 3) columns of points from right to left, at m samples each, meters
@@ -212,7 +212,7 @@ class SampledSurface(NamedTuple):
     height_m: float  # height tolerance in meters
 
     def is_step(self, sag_m: float) -> Bools:
-        """Return a mask of the intervals with a step of the surface at their stop."""
+        """Return a mask of the intervals after which the surface has a step."""
         count = len(self.intervals)
         if count < 2:
             return np.zeros(count, np.bool_)
@@ -230,7 +230,7 @@ class SampledSurface(NamedTuple):
         return len(self.points) > 0 and self.points.shape[1] == SAMPLES * len(self.intervals)
 
     def parts(self) -> Iterator[SampledSurface]:
-        """Yield the surface in parts with a few intervals each, which need less memory."""
+        """Yield the surface in parts of a few intervals each, which need less memory."""
         count = len(self.points)
         points = self.points.reshape(count, len(self.intervals), -1, 3)
         step = max(1, _GROUP_SIZE // points[:, 0].size)
@@ -247,7 +247,7 @@ class SampledSurface(NamedTuple):
 def place_stations(
     surfaces: Sequence[SampledSurface], sag_m: float, allowance: Allowance, bytes_per_point: int
 ) -> list[PlacedStations]:
-    """Place the stations of surfaces so that their triangles are within a tolerance.
+    """Place the stations of surfaces so that all triangles are within a tolerance.
 
     Parameters
     ----------
@@ -275,7 +275,7 @@ def place_stations(
 
 
 def _part_counts_in_groups(surfaces: Sequence[SampledSurface], sag_m: float) -> Iterator[Floats]:
-    """Yield the part counts of the measured surfaces, processing a few surfaces at a time."""
+    """Yield the part counts of each measured surface, processing a few surfaces at a time."""
     group: list[SampledSurface] = []
     size = 0
     for surface in surfaces:
@@ -295,7 +295,7 @@ def _part_counts_in_groups(surfaces: Sequence[SampledSurface], sag_m: float) -> 
 
 
 def part_counts(surfaces: Sequence[SampledSurface], sag_m: float) -> list[Floats]:
-    """Return the numbers of parts into which to divide the intervals of each surface.
+    """Determine into how many parts to divide each interval of each surface.
 
     The numbers are not rounded. Triangles between two cross sections deviate from the surface for
     two reasons. These are the bend along the road, which decreases with the square of the distance,
@@ -320,7 +320,7 @@ def part_counts(surfaces: Sequence[SampledSurface], sag_m: float) -> list[Floats
 
 
 class _Columns(NamedTuple):
-    """The columns of points of several surfaces in intervals, and the cells between them."""
+    """Columns of points for several surfaces, by interval, and the cells between the columns."""
 
     size: int  # number of intervals
     intervals: Ints  # (r,) interval of each column
@@ -329,7 +329,7 @@ class _Columns(NamedTuple):
 
     @classmethod
     def from_surfaces(cls, surfaces: Sequence[SampledSurface]) -> _Columns:
-        """Return the columns of surfaces."""
+        """Assign consecutive numbers to the columns and cells of all surfaces."""
         intervals = []
         right = []
         left = []
@@ -349,11 +349,11 @@ class _Columns(NamedTuple):
         return cls(count, *(np.concatenate(arrays) for arrays in (intervals, right, left)))
 
     def largest_of_columns(self, values: Floats, ends: Floats) -> Floats:
-        """Return the largest column value in each interval, as `_largest` does."""
+        """Return the largest column value in each interval. See `_largest`."""
         return self._largest(self.intervals, values, ends)
 
     def largest_of_cells(self, values: Floats, ends: Floats) -> Floats:
-        """Return the largest cell value in each interval, as `_largest` does."""
+        """Return the largest cell value in each interval. See `_largest`."""
         return self._largest(self.intervals[self.right], values, ends)
 
     def _largest(self, intervals: Ints, values: Floats, ends: Floats) -> Floats:
@@ -382,7 +382,7 @@ def has_extent(points: Floats, faces: Ints) -> Bools:
 
 
 def _bend_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> tuple[Floats, Floats]:
-    """Return the errors that bends cause in plan and in height, for undivided intervals."""
+    """Return the errors that bends would cause in plan and in height without division."""
     # Half of the second differences (r, 3), a quarter of the error of an undivided interval.
     bends = [(v[:, 2:] + v[:, :-2]) / 2 - v[:, 1:-1] for v in (x, y, z)]
     along = [v[:, 2:] - v[:, :-2] for v in (x, y, z)]
@@ -403,7 +403,7 @@ def _bend_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> tuple[Fl
 
 
 def _twist_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> Floats:
-    """Return the height errors that the twist of cells causes."""
+    """Return the height errors that twisted cells cause."""
     along = [v[:, 1:] - v[:, :-1] for v in (x, y, z)]
     across = [(v[:, 1:] + v[:, :-1]) / 2 for v in (x, y, z)]
     across = [v[columns.left] - v[columns.right] for v in across]
@@ -425,7 +425,7 @@ def _twist_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> Floats:
 
 
 def _beside(bends: list[Floats], along: list[Floats]) -> Floats:
-    """Return the components of vectors perpendicular to lines in plan."""
+    """Return the components of vectors that are perpendicular to lines in plan."""
     length = np.sqrt(along[0] * along[0] + along[1] * along[1])
     turned = np.abs(_cross(bends, along)) / np.maximum(length, 1e-30)
     # A line that does not move in plan, because the road turns about it, has no direction.
@@ -434,12 +434,12 @@ def _beside(bends: list[Floats], along: list[Floats]) -> Floats:
 
 
 def _cross(a: list[Floats], b: list[Floats]) -> Floats:
-    """Return the vertical components of cross products."""
+    """Return the vertical component of each cross product."""
     return np.asarray(a[0] * b[1] - a[1] * b[0])
 
 
 def _determinant(a: list[Floats], b: list[Floats], c: list[Floats]) -> Floats:
-    """Return the scalar triple products of vectors."""
+    """Return the scalar triple product of each three vectors."""
     return np.asarray(
         a[0] * (b[1] * c[2] - b[2] * c[1])
         + a[1] * (b[2] * c[0] - b[0] * c[2])
@@ -448,5 +448,5 @@ def _determinant(a: list[Floats], b: list[Floats], c: list[Floats]) -> Floats:
 
 
 def _is_wide(across: list[Floats]) -> Bools:
-    """Return a mask of the cells that are wide enough in plan to have a slope."""
+    """Return a mask of the cells that are wide enough in plan for a slope to be defined."""
     return np.asarray(across[0] * across[0] + across[1] * across[1] > _LEAST_WIDTH_M**2)

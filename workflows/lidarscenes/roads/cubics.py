@@ -1,4 +1,4 @@
-"""Evaluate piecewise cubic polynomials of a distance, such as OpenDRIVE elevations and widths."""
+"""Evaluate piecewise cubic polynomials of distance, such as OpenDRIVE elevations and widths."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .elements import read_number
 
 
 class Cubics:
-    """Cubic polynomials, each valid from its start to the start of the next.
+    """Cubic polynomials, each of which is valid until the next one starts.
 
     Before the first start, the value at the first start applies. Without any polynomial, the value
     is 0.
@@ -36,7 +36,7 @@ class Cubics:
 
     @classmethod
     def read(cls, elements: Iterable[Element], start: str = "s", origin: float = 0.0) -> Cubics:
-        """Read the polynomials in elements, whose starts are relative to an origin."""
+        """Read polynomials from elements, whose start distances are relative to an origin."""
         rows = [
             (origin + read_number(e, start, 0.0), *(read_number(e, name, 0.0) for name in "abcd"))
             for e in elements
@@ -47,7 +47,7 @@ class Cubics:
         return len(self.starts)
 
     def values(self, stations: RoadStations) -> Floats:
-        """Return the values at stations."""
+        """Return the values at the given stations."""
         if not len(self):
             return np.zeros_like(stations.s)
         if self.is_constant and len(self) == 1:
@@ -58,7 +58,7 @@ class Cubics:
         return np.asarray(((d * x + c) * x + b) * x + a)
 
     def slopes(self, stations: RoadStations) -> Floats:
-        """Return the first derivatives at stations."""
+        """Return the first derivatives at the given stations."""
         if self.is_constant:
             return np.zeros_like(stations.s)
         row_indices = self._row_indices(stations.pieces)
@@ -67,7 +67,7 @@ class Cubics:
         return np.asarray((3 * d * x + 2 * c) * x + b)
 
     def _row_indices(self, distances: Floats) -> Ints:
-        """Return the indices of the polynomials that are valid at distances."""
+        """Return the index of the polynomial that is valid at each distance."""
         return np.maximum(np.searchsorted(self.starts, distances, "right") - 1, 0)
 
 

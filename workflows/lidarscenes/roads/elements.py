@@ -1,4 +1,4 @@
-"""Read validated numbers from OpenDRIVE elements, and count elements that are not read."""
+"""Read validated numbers from OpenDRIVE elements, and count unread elements."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def read_number(element: Element, name: str, default: float | None = None) -> fl
 
 
 def read_non_negative(element: Element, name: str, default: float | None = None) -> float:
-    """Return an attribute as a number.
+    """Return an attribute as a number that is not negative.
 
     Raises MeshFileError if it is negative, or as `read_number` does.
     """
@@ -55,23 +55,23 @@ def read_non_negative(element: Element, name: str, default: float | None = None)
 
 
 class UnreadElements:
-    """Counts elements that are not read, by their tags."""
+    """Counts elements that are not read, by tag."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
 
     def add(self, tag: str, count: int = 1) -> None:
-        """Count elements with a tag, or other content that is described in words."""
+        """Count an unread element by its tag, or other content by a phrase that describes it."""
         self._counts[tag[:MAX_SHOWN]] += count
 
     def check(self, element: Element, known: Collection[str]) -> None:
-        """Count the children of an element whose tags are not known."""
+        """Count those children of an element whose tags are unknown."""
         for child in element:
             if child.tag not in known and child.tag not in _WITHOUT_GEOMETRY:
                 self.add(child.tag)
 
     def __str__(self) -> str:
-        """Return the counts and tags, for example "2 bridge, 3 objects without a size".
+        """Format the counts and tags, for example as "2 bridge, 3 objects without a size".
 
         The text is empty if everything was read.
         """
@@ -79,6 +79,6 @@ class UnreadElements:
 
 
 def _counted(count: int, tag: str) -> str:
-    """Return a count with a tag, or with words of which the first is pluralized."""
+    """Format a count with a tag, or with a phrase whose first word is pluralized."""
     noun, space, rest = tag.partition(" ")
     return f"{plural(count, noun)} {rest}" if space else f"{count} {tag}"

@@ -1,4 +1,4 @@
-"""Convert lanes to strips of triangles, with their borders, heights, and curbs.
+"""Convert lanes to strips of triangles with borders, heights, and curbs.
 
 `section_surfaces` measures the surface of each lane section at samples, and then places the
 stations of its triangles according to the measured curvatures.
@@ -76,16 +76,16 @@ class Lane:
 
     @property
     def cubics(self) -> tuple[Cubics, ...]:
-        """All polynomials of the lane."""
+        """All polynomials that describe the lane."""
         return self.widths, self.borders, self.inner_heights, self.outer_heights
 
     @property
     def has_heights(self) -> bool:
-        """Whether the lane has heights above or below the road."""
+        """Whether the lane has heights relative to the road."""
         return len(self.inner_heights) > 0
 
     def width(self, stations: RoadStations, inner_t: Floats, middle_t: Floats) -> Floats:
-        """Return the width in meters, which is negative where the file defines a negative width.
+        """Return the width in meters. It is negative where the file states a negative width.
 
         `inner_t` and `middle_t` (k,) are the t coordinates of the inner border and of the center
         lane.
@@ -96,7 +96,7 @@ class Lane:
 
 
 def _steps(elements: Sequence[Element], start: float, *names: str) -> Cubics:
-    """Return piecewise constant values of the first attribute that exists in each element."""
+    """Read a piecewise constant function from the first attribute that each element has."""
     if not elements:
         return NO_CUBICS
     rows = []
@@ -139,18 +139,18 @@ class LaneSection:
 
     @property
     def all_lanes(self) -> list[Lane]:
-        """Lanes on both sides."""
+        """Lanes on both sides of the road."""
         return [*self.lanes[1], *self.lanes[-1]]
 
     def borders(self, road: Road, stations: RoadStations) -> dict[int, Floats]:
-        """Return the t coordinates of the outer lane borders by lane number.
+        """Return the t coordinate of each lane's outer border, by lane number.
 
         Number 0 is the center lane.
         """
         return self._borders_and_widths(road, stations)[0]
 
     def intervals(self, road: Road, start: float, stop: float) -> Intervals:
-        """Return the intervals between two distances in which every polynomial has a single piece.
+        """Return the intervals between two distances, in which each polynomial has a single piece.
 
         Intervals also end where lane borders cross each other or a kink in the road's cross
         section.
@@ -164,14 +164,14 @@ class LaneSection:
         return intervals
 
     def samples(self, network: RoadNetwork, road: Road) -> SurfaceSamples:
-        """Return the stations at which to measure the surface of the section."""
+        """Return the stations at which to measure the section's surface."""
         intervals = self.intervals(road, self.start, self.stop).with_lead(road.breaks)
         are_planes = self.is_plain and road.is_plain and network.is_straight(road, intervals)
         return intervals.surface_samples(are_planes=are_planes)
 
     @cached_property
     def is_plain(self) -> bool:
-        """Whether lanes are planes where the road is straight."""
+        """Whether all lanes are planes where the road is straight."""
         return not any(
             cubics.bent or (lane.has_heights and not cubics.is_constant)
             for lane in self.all_lanes
@@ -181,7 +181,7 @@ class LaneSection:
     def _borders_and_widths(
         self, road: Road, stations: RoadStations
     ) -> tuple[dict[int, Floats], dict[int, Floats]]:
-        """Return the t coordinates of borders, and the widths in the file, by lane number.
+        """Return t coordinates of lane borders, and widths as in the file, by lane number.
 
         All arrays have shape (k,).
         """
@@ -200,7 +200,7 @@ class LaneSection:
         return borders, widths
 
     def _crossings(self, road: Road, intervals: Intervals) -> Floats:
-        """Return the distances at which widths become negative or borders cross kinks."""
+        """Return the distances at which a width becomes negative or a border crosses a kink."""
         kinks = road.kinks(self.start, self.stop) if road.curved_across else np.zeros(0)
         if not len(kinks) and all(
             lane.widths.is_constant and not len(lane.borders) for lane in self.all_lanes
@@ -208,7 +208,7 @@ class LaneSection:
             return kinks
 
         def values(stations: RoadStations) -> Floats:
-            """Return widths and borders. Shape (v, k)."""
+            """Return all widths, followed by all borders. Shape (v, k)."""
             borders, widths = self._borders_and_widths(road, stations)
             return np.stack([*widths.values(), *borders.values()])
 
@@ -230,7 +230,7 @@ class LaneSection:
         s = samples.s.reshape(-1, SAMPLES)
 
         def is_above_at(distances: Floats) -> Bools:
-            """Return whether each width or border is above its level at a distance."""
+            """Return whether each width or border is above its level at the given distance."""
             pair_indices = np.arange(len(pairs))
             return values(RoadStations.at(distances))[crossing[pairs], pair_indices] > levels[pairs]
 
@@ -238,7 +238,7 @@ class LaneSection:
 
 
 def _changes(is_above: Callable[[Floats], Bools], lower: Floats, upper: Floats) -> Floats:
-    """Return the distances between bounds at which a predicate changes, by bisection."""
+    """Find the distances at which a predicate changes between bounds, by bisection."""
     is_first = is_above(lower)
     for _ in range(_HALVINGS):
         middle = (lower + upper) / 2
@@ -249,7 +249,7 @@ def _changes(is_above: Callable[[Floats], Bools], lower: Floats, upper: Floats) 
 
 
 def lane_sections(road: Road, unread: UnreadElements) -> list[LaneSection]:
-    """Return the lane sections of a road that have a length."""
+    """Return all lane sections of a road except those of zero length."""
     elements = road.element.findall("lanes/laneSection")
     starts = [read_number(element, "s", 0.0) for element in elements]
     order = sorted(range(len(starts)), key=starts.__getitem__)
@@ -267,7 +267,7 @@ def section_surfaces(
     sag_m: float,
     allowance: Allowance,
 ) -> list[SectionSurface]:
-    """Return the surfaces of lane sections, whose triangles are within a tolerance.
+    """Create surfaces for lane sections, with triangles that are within a tolerance.
 
     The tolerance is `sag_m` in plan, and a tenth of that in height.
     """
@@ -275,7 +275,7 @@ def section_surfaces(
     def surfaces_at(
         section_indices: Sequence[int], placed: Sequence[PlacedStations]
     ) -> list[SectionSurface]:
-        """Return the surfaces of selected sections at stations."""
+        """Return the surfaces of the selected sections at the placed stations."""
         pairs = [sections[k] for k in section_indices]
         frames = network.frames([road for road, _ in pairs], [entry.stations for entry in placed])
         stops = np.cumsum([len(entry.stations) for entry in placed]).tolist()
@@ -321,7 +321,7 @@ def section_surfaces(
 
 
 class Strip(NamedTuple):
-    """The surface of a lane at the stations of its section, or a curb beside it."""
+    """The surface of a lane at the stations of its section, or of a curb beside the lane."""
 
     lane: Lane
     t: Floats  # (c, k) t coordinates of the point columns in meters
@@ -331,7 +331,7 @@ class Strip(NamedTuple):
 
     @property
     def faces(self) -> Ints:
-        """Triangles with normals that point up or, for a curb, away from the road. Shape (f, 3)."""
+        """Triangles whose normals point up or, for a curb, away from the road. Shape (f, 3)."""
         faces = grid_faces(*self.t.shape)
         if len(self.steps):
             # There is a wall where heights step, but not where only widths step.
@@ -357,7 +357,7 @@ def grid_faces(columns: int, stations: int) -> Ints:
 
 
 class SectionSurface:
-    """The surfaces of a lane section at stations.
+    """The surfaces of a lane section at given stations.
 
     Parameters
     ----------
@@ -409,7 +409,7 @@ class SectionSurface:
         return [*self._curbs()]
 
     def to_sampled(self, intervals: Intervals) -> SampledSurface:
-        """Return the sampled surface from which stations are placed.
+        """Return this surface in the form from which stations are placed.
 
         The stations of this surface must be the samples of `intervals`.
         """
@@ -427,7 +427,7 @@ class SectionSurface:
         return SampledSurface(intervals, self._points, is_cell, height_m)
 
     def select_stations(self, placed: PlacedStations) -> SectionSurface | None:
-        """Return the surface at a subset of the stations, or None if a station is missing."""
+        """Return the surface at selected stations, or None if one of them is missing."""
         station_indices = np.searchsorted(self.stations.pieces, placed.stations.pieces)
         station_indices = np.minimum(station_indices, len(self.stations) - 1)
         if (self.stations.pieces[station_indices] != placed.stations.pieces).any():
@@ -451,7 +451,7 @@ class SectionSurface:
         return surface
 
     def points(self, stations: Ints, t: Floats) -> Floats:
-        """Return points on cross sections, given stations and t coordinates."""
+        """Return the points of cross sections at the given stations and t coordinates."""
         frames = self.frames
         count = len(self._points)
         if count < _MIN_COLUMNS:
@@ -469,20 +469,20 @@ class SectionSurface:
 
     @cached_property
     def _t(self) -> Floats:
-        """The t coordinates of the points of all strips, from right to left."""
+        """The t coordinates of all strips' points, from right to left."""
         ordered = [strip.t if strip.lane.side > 0 else strip.t[::-1] for strip in self.strips]
         return np.concatenate(ordered or [np.zeros((0, len(self.stations)))])
 
     @cached_property
     def _points(self) -> Floats:
-        """The points of all strips, from right to left."""
+        """All strips' points, from right to left."""
         ordered = [
             strip.points if strip.lane.side > 0 else strip.points[::-1] for strip in self.strips
         ]
         return np.concatenate(ordered or [np.zeros((0, len(self.stations), 3))])
 
     def _lines_across(self) -> Floats:
-        """Return the ascending t coordinates at which strips need additional points."""
+        """Return ascending t coordinates at which the strips need additional points."""
         if not self._road.curved_across:
             return np.zeros(0)
         borders = np.stack([*self.borders.values()])
@@ -496,7 +496,7 @@ class SectionSurface:
         return lines
 
     def _strips(self, side: int) -> Iterator[Strip]:
-        """Yield the strips of the lanes on a side, from the center outward."""
+        """Yield the strips of all lanes on one side, from the center outward."""
         frames = self.frames
         inner_t = self.borders[0]
         middle = len(self.section.lanes[-1])
@@ -525,7 +525,7 @@ class SectionSurface:
             yield Strip(lane, t, base, self.steps)
 
     def _t_across(self, inner_t: Floats, outer_t: Floats) -> Floats:
-        """Return the t coordinates of the points of a lane, from the inside outward."""
+        """Return the t coordinates of a lane's points, from the inside outward."""
         lower = np.minimum(inner_t, outer_t)
         upper = np.maximum(inner_t, outer_t)
         lines = self._lines
@@ -536,7 +536,7 @@ class SectionSurface:
         return np.stack([inner_t, *(np.clip(line, lower, upper) for line in lines), outer_t])
 
     def _base(self, t: Floats) -> Floats:
-        """Return the points of a lane at t coordinates.
+        """Return the points of a lane at the given t coordinates.
 
         The heights of the lane itself are not included.
         """

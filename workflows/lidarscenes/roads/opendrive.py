@@ -1,4 +1,4 @@
-"""Read OpenDRIVE files (.xodr), following ASAM OpenDRIVE 1.4 to 1.8.
+"""Read OpenDRIVE files (.xodr) according to ASAM OpenDRIVE 1.4 to 1.8.
 
 libOpenDRIVE is not used, because it reads neither lane borders nor lateral shapes.
 """
@@ -48,7 +48,7 @@ Pieces = dict[str, list[Piece]]  # {name of an object: its triangles}
 
 @dataclass(frozen=True)
 class RoadOptions:
-    """Options for reading roads."""
+    """Options for reading OpenDRIVE roads."""
 
     sag_m: Annotated[
         float,
@@ -59,7 +59,7 @@ class RoadOptions:
 
 
 def read_xodr(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the roads in a file with their lanes, marks, objects, and signals."""
+    """Read the roads in a file with lanes, marks, objects, and signals."""
     # Comments before the XML declaration are common, although they are invalid.
     root = xml_root(data[max(data.find(b"<?xml"), 0) :])
     for element in root.iter():
@@ -101,7 +101,7 @@ class _RoadReader:
         self._sag_m = own.sag_m
 
     def meshes(self, network: RoadNetwork) -> list[SceneMesh]:
-        """Return the meshes of all objects."""
+        """Convert the roads, and return the meshes of all objects."""
         sections_of_roads = [lane_sections(road, self._unread) for road in network.roads]
         sections = [
             (road, section)
@@ -126,7 +126,7 @@ class _RoadReader:
         ]
 
     def _add_section(self, road: Road, surface: SectionSurface) -> None:
-        """Add the lanes and marks of a lane section."""
+        """Add a lane section's lanes and road marks."""
         for strip in (*surface.strips, *surface.curbs):
             lane = strip.lane
             material = CONCRETE if strip.is_curb else _material(lane)
@@ -141,7 +141,7 @@ class _RoadReader:
             self._add(f"road mark {road.name}", piece)
 
     def _add(self, name: str, piece: Piece) -> None:
-        """Add triangles to an object, with colors and materials if requested."""
+        """Add triangles to an object, including colors and materials if requested."""
         if not len(piece.faces):
             return
         colors = None
@@ -151,7 +151,7 @@ class _RoadReader:
         self._pieces[name].append(piece._replace(colors=colors, material=material))
 
     def _drop_degenerate(self) -> None:
-        """Remove triangles without an area, for example where a lane narrows to zero width."""
+        """Remove triangles without an area, for example where a lane's width becomes zero."""
         pieces = [piece for pieces in self._pieces.values() for piece in pieces]
         corners = [piece.vertices[piece.faces[:, k]] for k in range(3) for piece in pieces]
         if not corners:
@@ -178,7 +178,6 @@ class _RoadReader:
 
 
 def _material(lane: Lane) -> str:
-    """Return the material of a lane."""
     stated = lane.element.find("material")
     return lane_material(lane.type, None if stated is None else stated.get("surface"))
 
@@ -188,7 +187,7 @@ def _notes(
     meshes: Sequence[SceneMesh | SceneInstance],
     unread: UnreadElements,
 ) -> list[str]:
-    """Return notes on the coordinate system of a file, and on elements that are not read."""
+    """Return notes on the coordinate system of a file and on unread elements."""
     notes = []
     if header is not None:
         notes = _reference_notes(header, center_of(meshes))
@@ -199,7 +198,7 @@ def _notes(
 
 
 def _reference_notes(header: Element, middle: Floats) -> list[str]:
-    """Return notes on the coordinate system and the offset in a header.
+    """Return notes on the coordinate system and offset in a file header.
 
     `middle` (2,) is the center of the roads.
     """
@@ -235,7 +234,7 @@ def _reference_notes(header: Element, middle: Floats) -> list[str]:
 
 
 def _epsg(text: str) -> int | None:
-    """Return the EPSG code in a PROJ definition, or None.
+    """Return the EPSG code in a PROJ definition, or None if there is none.
 
     Explicit codes and UTM zones with WGS 84 are recognized.
     """

@@ -1,4 +1,4 @@
-"""Evaluate the lines, arcs, spirals, and cubics of road reference lines in plan.
+"""Evaluate the lines, arcs, spirals, and cubics that form road reference lines in plan.
 
 Lines, arcs, and spirals are curves whose curvature varies linearly (clothoids). They are
 integrated by five-point Gauss-Legendre quadrature over pieces that turn by at most half a radian,
@@ -37,7 +37,7 @@ _WEIGHTS = np.append(_WEIGHTS, _WEIGHTS[1::-1])
 
 
 class PlanPoints(NamedTuple):
-    """Points on reference lines in plan."""
+    """Points on reference lines in plan, and the headings there."""
 
     x: Floats  # (k,) in meters
     y: Floats  # (k,) in meters
@@ -46,7 +46,7 @@ class PlanPoints(NamedTuple):
 
 
 class _Clothoid(NamedTuple):
-    """A piece of a line, an arc, or a spiral."""
+    """A piece of a clothoid. Lines and arcs are special cases of clothoids."""
 
     start: float  # distance in the table, in meters
     x: float
@@ -57,7 +57,7 @@ class _Clothoid(NamedTuple):
 
 
 class _Cubic(NamedTuple):
-    """A poly3 or paramPoly3 geometry, sampled by arc length."""
+    """A poly3 or paramPoly3 geometry that is sampled by arc length."""
 
     start: float  # distance in the table, in meters
     x: float
@@ -71,7 +71,7 @@ class _Cubic(NamedTuple):
 
 
 class PlanTable:
-    """Table of the reference lines of all roads in a file, concatenated along a common distance.
+    """Table of all reference lines in a file, concatenated along a common distance.
 
     Roads are added with `add_road`. After `finish`, they can be evaluated together.
     """
@@ -87,7 +87,7 @@ class PlanTable:
         self._bend_table = np.zeros((0, 2))
 
     def add_road(self, geometries: Sequence[Element], offset: float, length: float) -> Floats:
-        """Add the geometries of a road that starts at `offset` in the table.
+        """Add a road's geometries to the table, starting at the distance `offset`.
 
         The result contains the starts of the geometries on the road. The last geometry ends with
         the road, which has a length of `length` meters.
@@ -116,12 +116,12 @@ class PlanTable:
         self._bend_table = bends[np.argsort(bends[:, 0], kind="stable")]
 
     def max_curvatures(self, starts: Floats, stops: Floats) -> Floats:
-        """Return the largest curvatures in 1/m in intervals that are each within a piece."""
+        """Return the largest curvature in 1/m in each interval. Each interval is within a piece."""
         row_indices = np.searchsorted(self._bend_table[:, 0], (starts + stops) / 2, "right") - 1
         return np.asarray(self._bend_table[np.maximum(row_indices, 0), 1])
 
     def points(self, distances: Floats, pieces: Floats) -> PlanPoints:
-        """Return points at distances in the table.
+        """Return the points at the given distances in the table.
 
         `pieces` (k,) are the distances that select the pieces on which the points are evaluated.
         """
@@ -136,7 +136,7 @@ class PlanTable:
         return points
 
     def _clothoid_points(self, distances: Floats, row_indices: Ints) -> PlanPoints:
-        """Return points on clothoids.
+        """Return the points on clothoids at the given distances in the table.
 
         The results are meaningless for rows that refer to cubics.
         """
@@ -159,7 +159,7 @@ class PlanTable:
         return PlanPoints(x, y, cosines, sines)
 
     def _add_geometry(self, geometry: Element, start: float, length: float) -> None:
-        """Add a geometry with a length that may differ from the length that the geometry states."""
+        """Add a geometry with the given length, which may differ from the stated length."""
         shape = next((child for child in geometry if child.tag in _SHAPES), None)
         if shape is None:
             tags = ", ".join(child.tag for child in geometry) or "nothing"
@@ -183,7 +183,7 @@ class PlanTable:
         )
 
     def _add_clothoid(self, clothoid: _Clothoid, length: float) -> None:
-        """Add a clothoid in pieces that turn by at most `_MAX_TURN`."""
+        """Add a clothoid, in pieces that turn by at most `_MAX_TURN`."""
         last = clothoid.curvature + clothoid.growth * length
         turn = max(abs(clothoid.curvature), abs(last)) * length
         self._allowance.take(int(min(turn / _MAX_TURN, 1e15)) * 500)
@@ -239,12 +239,12 @@ _SHAPES = ("line", "arc", "spiral", "poly3", "paramPoly3")
 
 
 def _origin(geometry: Element) -> tuple[float, float, float]:
-    """Return the x, y, and heading of the start of a geometry."""
+    """Return the x, y, and heading at which a geometry starts."""
     return read_number(geometry, "x"), read_number(geometry, "y"), read_number(geometry, "hdg")
 
 
 def _next_piece(piece: _Clothoid, step: float, curvature: float) -> _Clothoid:
-    """Return the piece of a clothoid that starts `step` meters later, given its curvature there."""
+    """Return the piece of a clothoid that starts `step` meters later with the given curvature."""
     table = np.array([piece])
     heading = piece.heading + (piece.curvature + piece.growth / 2 * step) * step
     steps = step * _NODES
@@ -255,7 +255,7 @@ def _next_piece(piece: _Clothoid, step: float, curvature: float) -> _Clothoid:
 
 
 def _cubic_points(cubic: _Cubic, distances: Floats) -> PlanPoints:
-    """Return points on a cubic at distances in the table."""
+    """Return the points on a cubic at the given distances in the table."""
     along = distances - cubic.start
     parameters = _parameters(cubic, along)
     u, v = (_value(coefficients, parameters) for coefficients in (cubic.u, cubic.v))
@@ -270,7 +270,7 @@ def _cubic_points(cubic: _Cubic, distances: Floats) -> PlanPoints:
 
 
 def _parameters(cubic: _Cubic, along: Floats) -> Floats:
-    """Return the parameters of a cubic at distances from its start.
+    """Return the parameters of a cubic at the given distances from its start.
 
     Beyond the end of the cubic, the parameters remain at the end.
     """
@@ -283,7 +283,7 @@ def _parameters(cubic: _Cubic, along: Floats) -> Floats:
 
 
 def _coefficients(shape: Element) -> tuple[Floats, Floats]:
-    """Return the coefficients of a cubic along the heading and to the left."""
+    """Return a cubic's coefficients along the heading, and to the left of it."""
     if shape.tag == "poly3":
         u = [0.0, 1.0, 0.0, 0.0]
         v = [read_number(shape, name, 0.0) for name in "abcd"]
@@ -294,7 +294,7 @@ def _coefficients(shape: Element) -> tuple[Floats, Floats]:
 
 
 def _curvatures(u: Floats, v: Floats, p: Floats) -> Floats:
-    """Return the unsigned curvatures of a cubic at parameters, in 1/m."""
+    """Return a cubic's unsigned curvatures at the given parameters, in 1/m."""
     du = _slope(u, p)
     dv = _slope(v, p)
     speeds = hypot(du, dv)
@@ -302,18 +302,15 @@ def _curvatures(u: Floats, v: Floats, p: Floats) -> Floats:
 
 
 def _value(coefficients: Floats, p: Floats) -> Floats:
-    """Return the values of a cubic at parameters."""
     a, b, c, d = coefficients
     return np.asarray(((d * p + c) * p + b) * p + a)
 
 
 def _slope(coefficients: Floats, p: Floats) -> Floats:
-    """Return the first derivatives of a cubic at parameters."""
     _, b, c, d = coefficients
     return np.asarray((3 * d * p + 2 * c) * p + b)
 
 
 def _bend(coefficients: Floats, p: Floats) -> Floats:
-    """Return the second derivatives of a cubic at parameters."""
     _, _, c, d = coefficients
     return np.asarray(2 * c + 6 * d * p)

@@ -38,7 +38,7 @@ _KNOWN = (
 
 
 class RoadFrames(NamedTuple):
-    """Coordinate frames of roads at stations.
+    """Coordinate frames of roads at given stations.
 
     The point at t and h is origin + t * side + h * up.
     """
@@ -50,12 +50,12 @@ class RoadFrames(NamedTuple):
     level_side: Floats  # (k, 3) horizontal unit vectors to the left
 
     def select(self, station_selection: slice | Ints) -> RoadFrames:
-        """Return the frames at selected stations."""
+        """Return the frames at the selected stations."""
         return RoadFrames(*(array[station_selection] for array in self))
 
 
 class Road:
-    """A road with its elements and its profiles along the reference line.
+    """A road with its elements, and with profiles along the reference line.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class Road:
             unread.check(profile, ("superelevation", "crossfall", "shape"))
 
     def add_to_table(self, table: PlanTable, offset: float) -> float:
-        """Add the reference line to a table at an offset, and return the offset of the next road.
+        """Add the reference line to a table at an offset, and return the next road's offset.
 
         Raises MeshFileError if the geometry is shorter than the road.
         """
@@ -118,25 +118,25 @@ class Road:
 
     @cached_property
     def shapes(self) -> LateralShapes | None:
-        """Lateral shapes of the road, or None."""
+        """Lateral shapes of the road, or None if it has none."""
         elements = self.element.findall("lateralProfile/shape")
         return LateralShapes(elements) if elements else None
 
     @property
     def curved_across(self) -> bool:
-        """Whether the cross sections of lanes are curved or have kinks."""
+        """Whether cross sections of lanes are curved or have kinks."""
         return self.shapes is not None or any(map(len, self.crossfalls.values()))
 
     @property
     def is_plain(self) -> bool:
-        """Whether the road is a plane where its reference line is straight."""
+        """Whether the road is a plane wherever its reference line is straight."""
         return not (
             self.curved_across or self.lane_offset.bent or not self.superelevation.is_constant
         )
 
     @cached_property
     def breaks(self) -> Floats:
-        """Distances in meters at which polynomials of the road change."""
+        """Distances in meters at which any of the road's polynomials changes."""
         profiles = (
             self.elevation, self.superelevation, self.lane_offset, *self.crossfalls.values()
         )  # fmt: skip
@@ -146,10 +146,10 @@ class Road:
         return np.concatenate(starts)
 
     def heights(self, stations: RoadStations, t: Floats, pieces: Floats | None = None) -> Floats:
-        """Return the heights of crossfall and shapes at t coordinates.
+        """Return the heights that crossfall and shapes add at the given t coordinates.
 
-        The heights are relative to the banked plane. `t` and `pieces` have shape (..., k), and
-        `pieces` are the t coordinates that select the pieces of the shapes, by default `t`.
+        The heights are relative to the banked plane. `t` and `pieces` have shape (..., k). `pieces`
+        contains the t coordinates that select the pieces of the shapes, which are `t` by default.
         """
         heights = np.zeros_like(t)
         for side, crossfall in self.crossfalls.items():
@@ -161,14 +161,14 @@ class Road:
         return heights
 
     def kinks(self, start: float, stop: float) -> Floats:
-        """Return the t coordinates of kinks in cross sections between two distances."""
+        """Return the t coordinates of kinks in the cross sections between two distances."""
         kinks = [np.zeros(1 if any(map(len, self.crossfalls.values())) else 0)]
         if self.shapes is not None:
             kinks.append(self.shapes.kinks(start, stop))
         return np.unique(np.concatenate(kinks))
 
     def points_across(self, start: float, stop: float, t: Floats, height_m: float) -> Floats:
-        """Return the ascending t coordinates at which cross sections need points.
+        """Return ascending t coordinates at which the cross sections need points.
 
         `t` (2,) are the lower and the upper limit. Straight lines between the points are within
         `height_m` of the cross sections between the distances `start` and `stop`.
@@ -191,7 +191,7 @@ class Road:
 
 
 class LateralShapes:
-    """Heights across a road, which are cubics of t at stations and linear between stations."""
+    """Heights across a road, given by cubics of t and interpolated linearly between stations."""
 
     def __init__(self, elements: Sequence[Element]) -> None:
         groups: dict[float, list[list[float]]] = {}
@@ -209,7 +209,7 @@ class LateralShapes:
         self._coefficients: Floats = np.moveaxis(table[..., 1:], -1, 0)  # (4, m, r)
 
     def heights(self, distances: Floats, t: Floats, pieces: Floats) -> Floats:
-        """Return the heights at distances and t coordinates.
+        """Return the heights at the given distances and t coordinates.
 
         `pieces` (..., k) are the t coordinates that select the cubics.
         """
@@ -244,7 +244,7 @@ class LateralShapes:
         return np.unique(starts[:, 1:][is_step & np.isfinite(starts[:, 1:])])
 
     def max_bends(self, start: float, stop: float, knots: Floats) -> Floats:
-        """Return the largest second derivatives in 1/m between ascending t coordinates."""
+        """Return the largest second derivative between successive t coordinates, in 1/m."""
         row_range = self._row_range(start, stop)
         t = (knots[1:] + knots[:-1]) / 2
         pieces = np.maximum((self._starts[row_range, :, None] <= t).sum(axis=1) - 1, 0)  # (m, j)
@@ -256,14 +256,14 @@ class LateralShapes:
         return np.where(is_before, 0.0, np.maximum(*ends)).max(axis=0)
 
     def _row_range(self, start: float, stop: float) -> slice:
-        """Return the range of stations that determine the heights between two distances."""
+        """Return the range of stations that determine heights between two distances."""
         first = int(np.searchsorted(self.stations, start, "right")) - 1
         last = int(np.searchsorted(self.stations, stop, "left")) + 1
         count = len(self.stations)
         return slice(min(max(first, 0), count - 1), min(max(last, 1), count))
 
     def _profiles(self, station_indices: Ints, t: Floats, pieces: Floats) -> Floats:
-        """Return the heights at t coordinates (..., k) for stations with given indices."""
+        """Return the heights at t coordinates (..., k) for the stations with the given indices."""
         cubics = np.maximum(
             (self._starts[station_indices] <= pieces[..., None]).sum(axis=-1) - 1, 0
         )
@@ -273,7 +273,7 @@ class LateralShapes:
 
 
 class RoadNetwork:
-    """The roads in a file, with their reference lines in a common table.
+    """All roads in a file, whose reference lines are in a common table.
 
     Parameters
     ----------
@@ -296,14 +296,14 @@ class RoadNetwork:
         self._table.finish()
 
     def is_straight(self, road: Road, intervals: Intervals) -> bool:
-        """Return True if a reference line is straight in plan and in height in all intervals."""
+        """Return True if a reference line is straight, in plan and in height, in all intervals."""
         if road.elevation.bent or not road.superelevation.is_constant:
             return False
         ends = road.offset + intervals.ends
         return not self._table.max_curvatures(ends[:, 0], ends[:, 1]).any()
 
     def frames(self, roads: Sequence[Road], stations: Sequence[RoadStations]) -> RoadFrames:
-        """Return the frames of roads at stations on each road, concatenated."""
+        """Return the coordinate frames at each road's stations, concatenated."""
         pairs = [*zip(roads, stations, strict=True)]
         if not pairs:
             return RoadFrames(*np.zeros((5, 0, 3)))
@@ -327,6 +327,6 @@ class RoadNetwork:
         return RoadFrames(origins, along, side, upright * cosines - level_side * sines, level_side)
 
     def point(self, road: Road, s: float, t: float, h: float = 0.0) -> Floats:
-        """Return the point at road coordinates s, t, and h."""
+        """Return the point with the road coordinates s, t, and h."""
         frames = self.frames([road], [RoadStations.at(np.array([s]))])
         return np.asarray(frames.origins[0] + t * frames.side[0] + h * frames.up[0])

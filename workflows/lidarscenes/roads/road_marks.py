@@ -1,4 +1,4 @@
-"""Convert road marks to quadrilaterals slightly above the triangles of the lanes."""
+"""Convert road marks to quadrilaterals slightly above the lane triangles."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _KNOWN = ("type", "explicit")
 
 
 class _Line(NamedTuple):
-    """A painted line of a road mark, as dashes along the road."""
+    """A painted line of a road mark, which consists of dashes along the road."""
 
     starts: Floats  # (d,) starts of the dashes in meters, ascending
     stops: Floats  # (d,) stops of the dashes in meters
@@ -46,7 +46,7 @@ class _Line(NamedTuple):
 
 
 class PaintedQuads(NamedTuple):
-    """The road marks with a certain color."""
+    """The road marks that have a certain color."""
 
     color: str
     points: Floats  # (v, 3) in meters
@@ -56,7 +56,7 @@ class PaintedQuads(NamedTuple):
 def painted_quads(
     surface: SectionSurface, allowance: Allowance, unread: UnreadElements
 ) -> list[PaintedQuads]:
-    """Return the road marks of a lane section by color."""
+    """Return the road marks of a lane section, grouped by color."""
     section = surface.section
     lanes = [*section.all_lanes, *([section.middle] if section.middle else [])]
     knots = [
@@ -80,7 +80,7 @@ def painted_quads(
 
 
 def _quads(right: Ints, count: int) -> Ints:
-    """Return triangles between cross sections and the following ones.
+    """Return the triangles between each given cross section and the next one.
 
     `right` contains the indices of the right points. The left points are `count` indices later.
     """
@@ -106,7 +106,7 @@ class _Knots(NamedTuple):
 
 
 def _knots_of(line: _Line, surface: SectionSurface, border: Floats) -> _Knots:
-    """Return the cross sections of a line, at the ends of dashes and at stations within dashes.
+    """Return a line's cross sections, at the ends of dashes and at the stations within dashes.
 
     Where the road steps, a line ends before the step and continues after it.
     """
@@ -131,7 +131,7 @@ def _knots_of(line: _Line, surface: SectionSurface, border: Floats) -> _Knots:
 
 
 def _dashed_knots(line: _Line, s: Floats, steps: Ints) -> tuple[Ints, Floats, Ints]:
-    """Return the stations, shares, and quadrilaterals of the cross sections of a dashed line.
+    """Return stations, fractions, and quadrilaterals for the cross sections of a dashed line.
 
     `s` (k,) are the distances of the section's stations in meters, and `steps` (j,) the stations
     before a step, where the next station has the same distance.
@@ -152,7 +152,7 @@ def _dashed_knots(line: _Line, s: Floats, steps: Ints) -> tuple[Ints, Floats, In
 
 
 def _positions(distances: Floats, s: Floats, stations: Ints) -> Floats:
-    """Express distances as fractional station indices."""
+    """Convert distances to fractional station indices."""
     stations = np.minimum(np.maximum(stations, 0), len(s) - 2)
     lengths = np.maximum(s[stations + 1] - s[stations], GAP_M)
     shares = (distances - s[stations]) / lengths
@@ -160,7 +160,7 @@ def _positions(distances: Floats, s: Floats, stations: Ints) -> Floats:
 
 
 def _points_of(surface: SectionSurface, knots: Sequence[_Knots]) -> Floats:
-    """Return the right and then the left edges of lines on the lanes. Shape (2q, 3)."""
+    """Return points on the right edges of all lines, and then on the left edges. Shape (2q, 3)."""
     station_indices = np.concatenate([entry.stations for entry in knots])
     shares = np.concatenate([entry.shares for entry in knots])
     first_t = np.concatenate([entry.first_t for entry in knots])
@@ -182,7 +182,7 @@ def _points_of(surface: SectionSurface, knots: Sequence[_Knots]) -> Floats:
 def _lines_of(
     lane: Lane, start: float, stop: float, allowance: Allowance, unread: UnreadElements
 ) -> Iterator[_Line]:
-    """Yield the painted lines of a lane between two distances on its road."""
+    """Yield a lane's painted lines between two distances along the road."""
     marks = lane.element.findall("roadMark")
     if all(mark.get("type", "none") in _UNPAINTED for mark in marks):
         return
@@ -200,7 +200,7 @@ def _lines_of(
 def _lines_of_mark(
     mark: Element, start: float, stop: float, side: int, allowance: Allowance
 ) -> list[_Line]:
-    """Return the lines of a road mark.
+    """Return the lines that form a road mark.
 
     The lines are defined explicitly, by the type of the mark, or by the name of the mark.
     """
@@ -237,7 +237,7 @@ def _lines_of_mark(
 
 
 def _explicit_line(line: Element, start: float, stop: float, width: float, color: str) -> _Line:
-    """Return a line that a road mark states explicitly."""
+    """Return a line that a road mark defines explicitly."""
     first = start + read_number(line, "sOffset", 0.0)
     last = min(first + read_non_negative(line, "length", 0.0), stop)
     starts = np.array([first] if last > first else [])
@@ -253,7 +253,7 @@ def _explicit_line(line: Element, start: float, stop: float, width: float, color
 def _typed_line(
     line: Element, start: float, stop: float, width: float, color: str, allowance: Allowance
 ) -> _Line:
-    """Return a line in the type of a road mark, which repeats a dash and a gap."""
+    """Return a line that the type of a road mark defines by a repeated dash and gap."""
     first = start + max(0.0, read_number(line, "sOffset", 0.0))
     dashes = _dashes(
         first,
@@ -273,7 +273,7 @@ def _typed_line(
 def _dashes(
     start: float, stop: float, length: float, space: float, allowance: Allowance
 ) -> tuple[Floats, Floats]:
-    """Return the starts and stops of dashes, or of a single dash without gaps."""
+    """Return the starts and stops of dashes. Without gaps, there is a single dash."""
     if not start < stop:
         return np.zeros(0), np.zeros(0)
     if space <= 0 or length <= 0:
@@ -286,6 +286,6 @@ def _dashes(
 
 
 def _color(element: Element, default: str) -> str:
-    """Return the color of a mark or line, which is white if its color is "standard"."""
+    """Return the color of a mark or line. The color "standard" means white."""
     color = element.get("color") or default
     return "white" if color == "standard" else color[:20]

@@ -119,12 +119,12 @@ CLASSES = {
 
 @cache
 def material_color(material: str) -> Bytes:
-    """Return the sRGB color of a material. Shape (1, 1, 3)."""
+    """Return the sRGB color for a material. Shape (1, 1, 3)."""
     return as_srgb(np.array(_LINEAR.get(material, _OTHER)).reshape(1, 1, 3))
 
 
 def lane_material(lane_type: str, surface: str | None) -> str:
-    """Return the material of a lane, given its type and the surface that it states."""
+    """Return the material of a lane, given its type and the surface stated in the file."""
     for word, material in _SURFACES.items():
         if surface and word in surface.lower():
             return material

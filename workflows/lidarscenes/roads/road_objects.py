@@ -1,4 +1,4 @@
-"""Convert road objects such as boxes, cylinders, outlines, copies, markings, and tunnels."""
+"""Convert road objects, such as boxes, cylinders, outlines, copies, markings, and tunnels."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _KNOWN = ("repeat", "outline", "outlines", "material", "parkingSpace", "markings
 
 
 class ObjectBuilder:
-    """Builds the objects in a file."""
+    """Builds the road objects in a file."""
 
     def __init__(
         self, network: RoadNetwork, sag_m: float, allowance: Allowance, unread: UnreadElements
@@ -67,7 +67,7 @@ class ObjectBuilder:
         self._rails = _rail_pieces(network, sag_m, allowance)
 
     def pieces(self, road: Road, sections: Sequence[LaneSection]) -> Iterator[tuple[str, Piece]]:
-        """Yield the names and triangles of the objects on a road."""
+        """Yield the name and triangles of each object on a road."""
         for group in road.element.iterfind("objects"):
             self._unread.check(group, _KNOWN_OBJECTS)
             for element in group.iterfind("object"):
@@ -79,7 +79,7 @@ class ObjectBuilder:
                     yield name, piece
 
     def _object(self, road: Road, element: Element) -> Iterator[tuple[str, Piece]]:
-        """Yield the names and triangles of an object and its copies."""
+        """Yield the names and triangles of an object and of its copies."""
         kind = _kind(element)
         name = f"{kind[:MAX_SHOWN]} {road.name}/{(element.get('id') or '')[:MAX_SHOWN]}"
         repeats = element.findall("repeat")
@@ -103,7 +103,7 @@ class ObjectBuilder:
     def _pieces_at(
         self, road: Road, element: Element, kind: str, placement: _Placement
     ) -> Iterator[Piece]:
-        """Yield the triangles of an object at a placement."""
+        """Yield the triangles of an object with the given placement."""
         material = object_material(kind)
         frame = _ObjectFrame.from_element(self._network, road, element, placement)
         outlines = [
@@ -134,7 +134,7 @@ class ObjectBuilder:
             self._unread.add("object without a size")
 
     def _copies(self, element: Element, repeat: Element) -> Iterator[_Placement]:
-        """Yield the placements of the copies of an object along a road."""
+        """Yield the placement of each copy of an object along a road."""
         base = _Placement.from_element(element)
         span = read_non_negative(repeat, "length", 0.0)
         distance = read_non_negative(repeat, "distance", 0.0)
@@ -151,7 +151,7 @@ class ObjectBuilder:
         placement: _Placement,
         outlines: Sequence[_Outline],
     ) -> Iterator[Piece]:
-        """Yield the painted edges of an object."""
+        """Yield the paint of markings along an object's sides or between its corners."""
         corners = {key: point for outline in outlines for key, point in outline.ids.items()}
         rectangle = transform_points(_rectangle(placement.size), frame.origin, frame.turn)
         sides = {
@@ -177,7 +177,7 @@ class ObjectBuilder:
                 yield painted_strips(starts + lift, stops + lift, width, paint)
 
     def _dashed(self, line: Floats, marking: Element) -> tuple[Floats, Floats]:
-        """Return the starts and stops of the dashes of a marking along a line."""
+        """Return where the dashes of a marking along a line start and stop."""
         dash = read_non_negative(marking, "lineLength", 0.0)
         space = read_non_negative(marking, "spaceLength", 0.0)
         starts = []
@@ -203,7 +203,7 @@ class ObjectBuilder:
     def _tunnel(
         self, road: Road, sections: Sequence[LaneSection], element: Element
     ) -> Iterator[Piece]:
-        """Yield the walls and the ceiling of a tunnel around all lanes of a road."""
+        """Yield the walls and ceiling of a tunnel that encloses all lanes of a road."""
         start = max(0.0, read_number(element, "s"))
         stop = min(road.length, start + read_non_negative(element, "length", 0.0))
         for section in sections:
@@ -216,7 +216,7 @@ class ObjectBuilder:
     def _tunnel_part(
         self, road: Road, section: LaneSection, start: float, stop: float
     ) -> Iterator[Piece]:
-        """Yield the walls and the ceiling of a tunnel in a part of a lane section."""
+        """Yield the walls and ceiling of a tunnel between two distances in a lane section."""
         intervals = section.intervals(road, start, stop)
         is_plain = section.is_plain and road.is_plain
         samples = intervals.surface_samples(
@@ -230,7 +230,7 @@ class ObjectBuilder:
             yield _sheet(rings[:, a], rings[:, b], placed.steps)
 
     def _tunnel_rings(self, road: Road, section: LaneSection, stations: RoadStations) -> Floats:
-        """Return the corners of a tunnel, clockwise from the lower left."""
+        """Return a tunnel's corners at each station, clockwise from the lower left."""
         borders = np.stack([*section.borders(road, stations).values()])
         left = borders.max(axis=0) + TUNNEL_MARGIN_M
         right = borders.min(axis=0) - TUNNEL_MARGIN_M
@@ -255,7 +255,7 @@ class _Rail(NamedTuple):
 
     @classmethod
     def from_element(cls, road: Road, element: Element, repeat: Element) -> _Rail | None:
-        """Return the rail of a <repeat>, or None without a size."""
+        """Return the rail for a <repeat>, or None if it has no size."""
         start = read_number(repeat, "s")
         stop = min(start + read_non_negative(repeat, "length", 0.0), road.length)
         base = _Placement.from_element(element)
@@ -276,7 +276,7 @@ class _Rail(NamedTuple):
         )
 
     def rings(self, stations: RoadStations, frames: RoadFrames) -> Floats:
-        """Return the cross sections, clockwise from the lower right. Shape (k, 4, 3)."""
+        """Return the rail's cross sections, clockwise from the lower right. Shape (k, 4, 3)."""
         share = (stations.s - self.start) / (self.stop - self.start)
         first = self.first
         last = self.last
@@ -298,7 +298,7 @@ class _Rail(NamedTuple):
 
 
 def _rail_pieces(network: RoadNetwork, sag_m: float, allowance: Allowance) -> dict[Element, Piece]:
-    """Return the rails in a file by their <repeat> elements."""
+    """Return all rails in a file, keyed by their <repeat> elements."""
     rails: dict[Element, _Rail] = {}
     for road in network.roads:
         for element in road.element.iterfind("objects/object"):
@@ -332,7 +332,7 @@ def _rail_pieces(network: RoadNetwork, sag_m: float, allowance: Allowance) -> di
 
 
 def _sampled(samples: SurfaceSamples, points: Floats, sag_m: float) -> SampledSurface:
-    """Return the surface between two lines of points at samples."""
+    """Return the surface between two lines of points that are given at the samples."""
     columns = np.moveaxis(points, 1, 0)
     is_cell = np.ones(1, np.bool_)
     return SampledSurface(samples.intervals, columns, is_cell, HEIGHT_SHARE * sag_m)
@@ -341,7 +341,7 @@ def _sampled(samples: SurfaceSamples, points: Floats, sag_m: float) -> SampledSu
 def _rings(
     network: RoadNetwork, rails: Collection[_Rail], stations: Sequence[RoadStations]
 ) -> Iterator[Floats]:
-    """Yield the cross sections of each rail at stations. Shape (k, 4, 3)."""
+    """Yield each rail's cross sections at its stations. Shape (k, 4, 3)."""
     frames = network.frames([rail.road for rail in rails], stations)
     stop = 0
     for rail, at in zip(rails, stations, strict=True):
@@ -351,7 +351,7 @@ def _rings(
 
 
 class _Placement(NamedTuple):
-    """The position and the size of an object or a copy."""
+    """The position and size of an object or of a copy."""
 
     # All values are in meters.
     s: float
@@ -378,16 +378,15 @@ class _Placement(NamedTuple):
 
     @property
     def size(self) -> tuple[float, float, float]:
-        """Length, width, and height in meters."""
         return self.length, self.width, self.height
 
     @property
     def wide(self) -> float:
-        """Width in meters, which is the diameter of a round object."""
+        """Width in meters. For a round object, this is its diameter."""
         return 2 * self.radius if self.radius > 0 else self.width
 
     def repeated(self, repeat: Element, share: float, s: float) -> _Placement:
-        """Return the placement of a copy at a fraction of the length of a <repeat>."""
+        """Return the placement of a copy at a given fraction of a <repeat>'s length."""
         values = {}
         for name, field in (
             ("t", "t"), ("zOffset", "z"), ("length", "length"), ("width", "width"),
@@ -402,7 +401,7 @@ class _Placement(NamedTuple):
 
 
 class _ObjectFrame(NamedTuple):
-    """The coordinate frame of an object."""
+    """The coordinate frame of a placed object."""
 
     origin: Floats  # (3,) in meters
     turn: Floats  # (3, 3)
@@ -412,7 +411,7 @@ class _ObjectFrame(NamedTuple):
     def from_element(
         cls, network: RoadNetwork, road: Road, element: Element, placement: _Placement
     ) -> _ObjectFrame:
-        """Return the frame of an object, which is upright regardless of the slope of the road."""
+        """Return the frame of an object, which is upright even if the road slopes."""
         frames = network.frames([road], [RoadStations.at(np.array([placement.s]))])
         origin = frames.origins + placement.t * frames.side + placement.z * frames.up
         heading = float(arctan2(frames.along[0, 1], frames.along[0, 0]))
@@ -437,7 +436,6 @@ class _Outline(NamedTuple):
     def from_element(
         cls, network: RoadNetwork, road: Road, element: Element, frame: _ObjectFrame
     ) -> _Outline:
-        """Read an <outline>."""
         points = []
         heights = []
         ids = {}
@@ -465,7 +463,6 @@ class _Outline(NamedTuple):
 
 
 def _kind(element: Element) -> str:
-    """Return the type of an object."""
     kind = element.get("type")
     return UNTYPED if kind in (None, "", "none", "-1") else kind
 
@@ -476,7 +473,7 @@ def _is_rail(element: Element, repeat: Element) -> bool:
 
 
 def _outlines(element: Element) -> list[Element]:
-    """Return the outlines of an object that have at least two corners."""
+    """Return those outlines of an object that have at least two corners."""
     outlines = [*element.iterfind("outline"), *element.iterfind("outlines/outline")]
     return [
         outline
@@ -486,7 +483,7 @@ def _outlines(element: Element) -> list[Element]:
 
 
 def _walls_and_roofs(outlines: Sequence[_Outline], material: str) -> Piece:
-    """Return walls and roofs over outlines.
+    """Return walls along outlines, and roofs over them.
 
     Inner outlines are holes in the first outer outline.
     """
@@ -513,7 +510,7 @@ def _flat_pieces(
     placement: _Placement,
     outlines: Sequence[_Outline],
 ) -> Iterator[Piece]:
-    """Yield the paint of an object without height, which is stripes or the whole area of a mark."""
+    """Yield the paint of a flat object, either stripes or the whole area of a mark."""
     lift = np.array([0, 0, LIFT_M])
     rings = [outline.corners for outline in outlines]
     rings = rings or [transform_points(_rectangle(placement.size), frame.origin, frame.turn)]
@@ -525,7 +522,7 @@ def _flat_pieces(
 
 
 def _rectangle(size: Sequence[float]) -> Floats:
-    """Return the counterclockwise corners of a rectangle, starting at the rear right."""
+    """Return a rectangle's counterclockwise corners, starting at the rear right."""
     half_length = size[0] / 2
     half_width = size[1] / 2
     return np.array(
@@ -539,7 +536,7 @@ def _rectangle(size: Sequence[float]) -> Floats:
 
 
 def _sheet(first: Floats, second: Floats, steps: Ints) -> Piece:
-    """Return the surface between two lines of points, with walls at steps."""
+    """Return the surface between two lines of points, including walls at steps."""
     count = len(first)
     points = np.concatenate([first, second])
     a = np.arange(count - 1)
@@ -555,11 +552,11 @@ def _sheet(first: Floats, second: Floats, steps: Ints) -> Piece:
 
 
 def _paint_of(element: Element) -> str:
-    """Return the paint of an object that is a road mark."""
+    """Return the paint material for an object that is a road mark."""
     stated = element.find("material")
     return f"{PAINT} {_paint_color(None if stated is None else stated.get('roadMarkColor'))}"
 
 
 def _paint_color(color: str | None) -> str:
-    """Return the color of paint, which is white if its color is "standard"."""
+    """Return a paint color. The color "standard" means white."""
     return "white" if color in (None, "", "standard") else color[:MAX_SHOWN]

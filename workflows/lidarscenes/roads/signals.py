@@ -1,4 +1,4 @@
-"""Convert road signals to plates for traffic signs and boxes for traffic lights, on poles."""
+"""Convert road signals to traffic sign plates and traffic light boxes on poles."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ _KNOWN = (
 
 
 class SignalBuilder(NamedTuple):
-    """Builds the signals in a file."""
+    """Builds the road signals in a file."""
 
     network: RoadNetwork
     unread: UnreadElements
 
     def pieces(self, road: Road, sections: Sequence[LaneSection]) -> Iterator[tuple[str, Piece]]:
-        """Yield the names and triangles of the signals on a road."""
+        """Yield the name and triangles of each signal on a road."""
         for group in road.element.iterfind("signals"):
             self.unread.check(group, _KNOWN_SIGNALS)
             for element in group.iterfind("signal"):
@@ -61,7 +61,7 @@ class SignalBuilder(NamedTuple):
     def _signal(
         self, road: Road, sections: Sequence[LaneSection], element: Element, *, is_light: bool
     ) -> Iterator[Piece]:
-        """Yield the pole and the plate or box of a signal."""
+        """Yield a signal's pole, and its plate or box."""
         default_width, default_height = LIGHT_M if is_light else (SIZE_M, SIZE_M)
         width = read_non_negative(element, "width", 0.0) or default_width
         height = read_non_negative(element, "height", 0.0) or default_height
@@ -95,7 +95,7 @@ class SignalBuilder(NamedTuple):
         yield solid._replace(faces=solid.faces[is_front], material=SIGN)
 
     def _frame(self, road: Road, element: Element) -> _SignalFrame:
-        """Return the frame of a signal, which faces the traffic for which it is valid."""
+        """Return the frame of a signal so that it faces the traffic for which it is valid."""
         placement = element.find("positionRoad")
         if placement is None:
             placement = element.find("physicalPosition/positionRoad")
@@ -113,26 +113,26 @@ class SignalBuilder(NamedTuple):
 
 
 class _SignalFrame(NamedTuple):
-    """The foot and the direction of a signal."""
+    """The foot and heading of a signal."""
 
     foot: Floats  # (3,) point on the plane of the road, in meters
     heading: float  # direction that the signal faces, in radians
 
 
 def _position(element: Element) -> Element | None:
-    """Return the inertial position element of a signal, or None."""
+    """Return a signal's <positionInertial> element, or None if it has none."""
     position = element.find("positionInertial")
     return element.find("physicalPosition/positionInertial") if position is None else position
 
 
 def _is_painted(element: Element) -> bool:
-    """Return True if a signal is paint on the road, such as a stop line."""
+    """Return True if a signal is painted on the road, such as a stop line."""
     country = element.get("country", "").lower()
     return element.get("type") in _PAINTED and country in _GERMAN
 
 
 def _hangs(road: Road, sections: Sequence[LaneSection], element: Element) -> bool:
-    """Return True if a signal is above lanes on which vehicles drive."""
+    """Return True if a signal hangs above lanes on which vehicles drive."""
     s = read_number(element, "s")
     t = read_number(element, "t")
     section = next((x for x in sections if x.start <= s <= x.stop), None)

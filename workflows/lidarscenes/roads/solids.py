@@ -26,7 +26,7 @@ _CORNERS = np.array([[x, y, z] for z in (0, 1) for y in (-0.5, 0.5) for x in (-0
 
 
 def rotation_matrix(heading: float, pitch: float = 0.0, roll: float = 0.0) -> Floats:
-    """Return a rotation about x by roll, then y by pitch, then z by heading.
+    """Return a rotation about x by the roll, then y by the pitch, and then z by the heading.
 
     Angles are in radians.
     """
@@ -40,7 +40,7 @@ def rotation_matrix(heading: float, pitch: float = 0.0, roll: float = 0.0) -> Fl
 
 
 def transform_points(points: Floats, origin: Floats, turn: Floats) -> Floats:
-    """Rotate points by a matrix, and translate them to an origin."""
+    """Rotate points by a matrix, and then move them by an origin."""
     return np.asarray(matvec(turn, points) + origin)
 
 
@@ -72,7 +72,7 @@ def cylinder(
 
 
 def prism(rings: Sequence[Floats], heights: Sequence[Floats], closed: bool, material: str) -> Piece:
-    """Return walls and a roof over outlines.
+    """Return walls along outlines, and a roof over them.
 
     The first outline is the outside, and the others are holes.
 
@@ -112,7 +112,7 @@ def prism(rings: Sequence[Floats], heights: Sequence[Floats], closed: bool, mate
 
 
 def extrude_sections(sections: Floats, material: str, *, capped: bool = True) -> Piece:
-    """Return the surface through cross sections, each of which is a ring of corners.
+    """Return the surface that connects cross sections, each of which is a ring of corners.
 
     The cross sections have shape (k, c, 3). The ends are closed if `capped` is set.
     """
@@ -144,7 +144,7 @@ def merge_pieces(pieces: Sequence[Piece]) -> Piece:
 
 
 def painted_strips(starts: Floats, stops: Floats, width: float, material: str) -> Piece:
-    """Return level strips with a given width, centered on lines between points."""
+    """Return level strips of the given width around the lines from `starts` to `stops`."""
     along = stops - starts
     size = np.maximum(norm(along), 1e-9)[:, None]
     left = np.stack([-along[:, 1], along[:, 0], np.zeros(len(along))], axis=1) / size * (width / 2)
@@ -156,7 +156,7 @@ def painted_strips(starts: Floats, stops: Floats, width: float, material: str) -
 
 
 def zebra_stripes(ring: Floats, stripe_m: float, material: str) -> Piece:
-    """Return alternate stripes across the longest side of a convex, level outline."""
+    """Return every other stripe across the longest side of a convex, level outline."""
     following = np.roll(ring, -1, axis=0)
     sides = following - ring
     longest = int(norm(sides).argmax())
@@ -180,7 +180,7 @@ def zebra_stripes(ring: Floats, stripe_m: float, material: str) -> Piece:
 
 
 def _clipped(ring: Floats, along: Floats, lower: float, upper: float) -> Floats:
-    """Return the part of a convex outline between two positions along a direction."""
+    """Return the part of a convex outline that lies between two positions along a direction."""
     corners = ring
     positions = along
     for sign, bound in ((1, lower), (-1, upper)):
@@ -203,7 +203,7 @@ def _clipped(ring: Floats, along: Floats, lower: float, upper: float) -> Floats:
 
 
 def _walls(numbers: Ints, following: Ints, upper: int) -> Ints:
-    """Return triangles of walls between consecutive corners and the corners above them."""
+    """Return triangles of walls that connect consecutive corners to the corners above them."""
     return np.concatenate(
         [
             np.stack([numbers, following, following + upper], axis=1),

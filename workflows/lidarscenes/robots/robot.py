@@ -1,4 +1,4 @@
-"""Define robots with links, the joints between links, and the poses of links over time."""
+"""Define robots by links and joints, and compute the poses of links over time."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """The connection of a link to its parent link.
+    """The connection between a link and its parent link.
 
     Attributes
     ----------
@@ -77,13 +77,13 @@ class Joint:
 
     @property
     def moves(self) -> bool:
-        """Whether the joint moves and therefore has a value."""
+        """Whether the joint can move and therefore has a value."""
         return self.kind in MOVING
 
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """Robot with links and joints, as read by `load_robot`.
+    """Robot that consists of links and joints, as read by `load_robot`.
 
     Joint values are angles in radians or displacements in meters. The methods accept `joints` as a
     table file with a header, or as a mapping of joint names to values. To describe a motion, add
@@ -114,7 +114,7 @@ class Robot:
 
     @property
     def summary(self) -> str:
-        """Text with the numbers of links and triangles, and with the movable joints."""
+        """Text that states the numbers of links and triangles, and lists the movable joints."""
         triangles = sum(len(mesh.faces) for mesh in self.meshes.values())
         moving = ", ".join(self.moving[:6]) + ", …" * (len(self.moving) > 6)
         return f"{plural(len(self.links), 'link')}, {plural(triangles, 'triangle')}; " + (
@@ -125,7 +125,7 @@ class Robot:
 
     @cached_property
     def _body_meshes(self) -> dict[frozenset[str], dict[str, SceneMesh]]:
-        """Results of `_bodies` by the omitted links."""
+        """Cached results of `_bodies`, keyed by the omitted links."""
         return {}
 
     @cached_property
@@ -142,9 +142,9 @@ class Robot:
         ignore: Sequence[str] = (),
         time_unit: TimeUnit | None = None,
     ) -> Trajectory:
-        """Return the trajectory of a link, given the trajectory of the root link.
+        """Return the trajectory of a link, given that of the root link.
 
-        `joints`, `ignore` and `time_unit` are as for `actors`.
+        `joints`, `ignore` and `time_unit` are the same as in `actors`.
 
         Raises
         ------
@@ -166,7 +166,7 @@ class Robot:
         time_unit: TimeUnit | None = None,
         tell: Callable[[str], None] = _log.warning,
     ) -> tuple[Actor, ...]:
-        """Return an actor for each rigid body, which is a group of links fixed to each other.
+        """Return an actor for each rigid body. The links of a body are fixed to each other.
 
         Parameters
         ----------
@@ -206,7 +206,7 @@ class Robot:
         )
 
     def _bodies(self, without: frozenset[str]) -> dict[str, SceneMesh]:
-        """Return the mesh of each moving link, joined with the links that are fixed to it.
+        """Return a mesh for each moving link, which includes the links that are fixed to it.
 
         A body is named after its first link with triangles. Meshes are joined only once, because
         actors that share arrays also share an acceleration structure.
@@ -236,7 +236,7 @@ class Robot:
     def _path(
         self, link: str, base: Trajectory, times_s: Floats, values: Mapping[str, Floats]
     ) -> Trajectory:
-        """Return the trajectory of a link.
+        """Compute the trajectory of a link from the values of all joints.
 
         Joints with constant values are treated as rigid.
         """
@@ -273,7 +273,7 @@ class Robot:
         time_unit: TimeUnit | None,
         tell: Callable[[str], None] = lambda line: None,
     ) -> tuple[Floats, dict[str, Floats]]:
-        """Return the times in seconds, and the values of all movable joints by name."""
+        """Return the times in seconds, and the values of each movable joint by name."""
         check_fits("time_unit", time_unit, TimeUnit | None)
         check_list("ignore", ignore)
         table: dict[str, Any] = {}
@@ -290,7 +290,7 @@ class Robot:
         return times, table
 
     def _check_table(self, times: Floats, table: Mapping[str, Floats]) -> None:
-        """Check the times and joint values in a table.
+        """Validate the times and joint values in a table.
 
         Raises LidarError if they are invalid.
         """
@@ -308,11 +308,10 @@ class Robot:
             raise LidarError("The values of time_s must be finite and strictly increasing.")
 
     def _moving_joints(self) -> dict[str, Joint]:
-        """Return the movable joints by name."""
         return {joint.name: joint for joint in self.joints.values() if joint.moves}
 
     def _add_missing(self, table: dict[str, Floats], count: int) -> None:
-        """Add the values of joints that are missing in a table, which are mimicked or at rest."""
+        """Add values to a table for missing joints, which mimic another joint or are at rest."""
         joints = self._moving_joints()
         for name in joints:
             chain = [joints[name]]
@@ -328,7 +327,7 @@ class Robot:
                 table[joint.name] = factor * table[mimicked] + offset
 
     def _report_limits(self, table: Mapping[str, Floats], tell: Callable[[str], None]) -> None:
-        """Report the joints whose values exceed their limits."""
+        """Report joints whose values exceed their limits."""
         for name, joint in self._moving_joints().items():
             lower, upper = joint.limits or (-np.inf, np.inf)
             min_value = table[name].min()
@@ -342,7 +341,7 @@ class Robot:
     def _read_values(
         self, path: Path, ignore: Sequence[str], time_unit: TimeUnit | None
     ) -> dict[str, Floats]:
-        """Read the joint values in a table file.
+        """Read joint values from a table file.
 
         Raises LidarError if the file is unusable.
         """
@@ -380,7 +379,7 @@ class Robot:
 
 @dataclass(frozen=True, eq=False)
 class Hinge:
-    """A joint with changing values in a chain of hinges."""
+    """A joint in a kinematic chain whose value changes over time."""
 
     before: Floats  # (4, 4) from the joint's frame to the frame beyond the previous hinge
     axis: Floats  # (3,) unit vector in the joint's frame
@@ -390,7 +389,7 @@ class Hinge:
 
 @dataclass(frozen=True, eq=False)
 class LinkPath:
-    """The trajectory of a link, given the trajectory of the robot's root and the joints in between.
+    """The trajectory of a link, computed from the root's trajectory and the joints in between.
 
     Joint values are interpolated linearly in time. Poses are then computed from these values, so
     they are exact at any time.
@@ -404,7 +403,7 @@ class LinkPath:
 
     @property
     def stations(self) -> int:
-        """Number of stations of the root's trajectory."""
+        """Number of stations in the root's trajectory."""
         return self.base.stations
 
     @property
@@ -414,23 +413,23 @@ class LinkPath:
 
     @property
     def duration_ns(self) -> float:
-        """Duration in nanoseconds for which the root has poses and the joints have values."""
+        """Duration in nanoseconds for which there are root poses and joint values."""
         if not self.hinges:
             return self.base.duration_ns
         return min(self.base.duration_ns, (float(self.times_s[-1]) - self.start_s) * 1e9)
 
     @property
     def presence_ns(self) -> tuple[float, float]:
-        """First and last nanosecond at which the robot is in the scene."""
+        """First and last nanosecond for which the robot is in the scene."""
         return presence_ns(self.base)
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
-        """Return the pose at a time since the start of a station, in nanoseconds."""
+        """Return the pose at a given time after the start of a station, in nanoseconds."""
         positions, rotations = self.poses(station, np.array([time_ns], np.float64))
         return Pose.from_rotation(positions[0], rotations[0])
 
     def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return positions and rotations at times of a station.
+        """Return the positions and rotations at the given times of a station.
 
         Times are in nanoseconds. Sums are evaluated in a fixed order, so the results do not depend
         on the number of times.
@@ -450,11 +449,11 @@ class LinkPath:
         return motion.positions.T, motion.rotations.transpose(2, 0, 1)
 
     def velocities(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return linear and angular velocities at times of a station.
+        """Return the linear and angular velocities at the given times of a station.
 
         Times are in nanoseconds. The velocities are in the scene frame, in m/s and rad/s, and
-        include the motion of all joints exactly. At a time of the joint values, they are those of
-        the following interval.
+        include the motion of all joints exactly. At the times of the joint values, where velocities
+        change, those of the following interval are returned.
 
         Raises
         ------
@@ -475,7 +474,7 @@ class LinkPath:
         return (motion.velocities * within).T, (motion.rates * within).T
 
     def _root_motion(self, station: int, times_ns: Floats, moving: bool) -> _LinkMotion:
-        """Return the motion of the root at times.
+        """Return the motion of the root link at the given times.
 
         Velocities are zero unless `moving` is set.
         """
@@ -508,7 +507,7 @@ class LinkPath:
         return moments_s
 
     def _slopes(self, hinge: Hinge, moments_s: Floats) -> Floats:
-        """Return the rates of change of a joint value at times, per second."""
+        """Return how fast a joint value changes at the given times, per second."""
         if len(self.times_s) < 2:
             return np.zeros(len(moments_s))
         slopes = np.diff(hinge.values) / np.diff(self.times_s)
@@ -518,7 +517,7 @@ class LinkPath:
 
 
 class _LinkMotion(NamedTuple):
-    """Poses and velocities of a robot frame at k times, in the scene frame."""
+    """Poses and velocities of a robot's frame at k times, in the scene frame."""
 
     positions: Floats  # (3, k) meters
     rotations: Floats  # (3, 3, k)
@@ -527,25 +526,25 @@ class _LinkMotion(NamedTuple):
     rates: Floats  # (3, k) angular velocities, rad/s
 
     def transformed(self, matrix: Floats) -> _LinkMotion:
-        """Return the motion of a frame with a constant pose in this frame."""
+        """Return the motion of another frame, which has a constant pose in this frame."""
         moved = _product(self.rotations, matrix[:3, :, None])
         return self._replace(positions=self.positions + moved[:, 3], rotations=moved[:, :3])
 
     def at_origin(self) -> _LinkMotion:
-        """Return the motion with velocities that refer to the origin of the frame."""
+        """Return the same motion, but with velocities at the origin of the frame."""
         levers = self.positions - self.anchors
         moved = self.velocities + np.cross(self.rates, levers, axis=0)
         return self._replace(anchors=self.positions, velocities=moved)
 
     def with_hinge_velocity(self, hinge: Hinge, slopes: Floats) -> _LinkMotion:
-        """Add the velocity of a hinge whose value changes at the rates `slopes`."""
+        """Add the velocity of a hinge, given how fast its value changes."""
         added = _product(self.rotations, hinge.axis[:, None, None] * slopes)[:, 0]
         if hinge.slides:
             return self._replace(velocities=self.velocities + added)
         return self._replace(rates=self.rates + added)
 
     def after_hinge(self, hinge: Hinge, value: Floats) -> _LinkMotion:
-        """Return the motion with the poses beyond a hinge with values."""
+        """Return the motion after a hinge, with the poses changed by the hinge's values."""
         if hinge.slides:
             slide = _product(self.rotations, hinge.axis[:, None, None] * value)[:, 0]
             return self._replace(positions=self.positions + slide)
@@ -557,7 +556,7 @@ class _LinkMotion(NamedTuple):
 
 
 def _product(left_matrices: Floats, right_matrices: Floats) -> Floats:
-    """Return the products of 3 x 3 matrices and 3 x m matrices.
+    """Multiply 3 x 3 matrices by 3 x m matrices.
 
     The shapes are (3, 3, k) and (3, m, k), where k may be 1.
     """

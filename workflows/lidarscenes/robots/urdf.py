@@ -1,4 +1,4 @@
-"""Read robots from URDF files, with the visual meshes of their links.
+"""Read robots from URDF files, including the visual meshes of links.
 
 The reader follows the specification at http://wiki.ros.org/urdf/XML and, where it is ambiguous,
 urdfdom 4. yourdfpy 0.0.60 is not used, because it evaluates one pose at a time, reads meshes with
@@ -55,7 +55,7 @@ def load_robot(
     assets: str | Path | None = None,
     tell: Callable[[str], None] = warn,
 ) -> Robot:
-    """Read a robot from a URDF file, with the visual meshes of its links.
+    """Read a robot from a URDF file, including the visual meshes of its links.
 
     Mesh files are read only from the robot's package, from other packages that the file names, and
     from `assets`. The robot's package is the closest folder with a package.xml, which is the folder
@@ -118,7 +118,7 @@ def load_robot(
 
 
 def _read_root(path: Path) -> tuple[Element, int]:
-    """Return the <robot> element of a URDF file, and the size of the file in bytes."""
+    """Return the <robot> element in a URDF file, and the file size in bytes."""
     try:
         data = read_input(path)
     except (OSError, ValueError) as error:
@@ -148,7 +148,7 @@ def _read_root(path: Path) -> tuple[Element, int]:
 
 
 def _joints(root: Element, links: Collection[str], tell: Callable[[str], None]) -> dict[str, Joint]:
-    """Return the joints of a robot by their child link."""
+    """Return a robot's joints, keyed by child link."""
     joints: dict[str, Joint] = {}
     for element in _named(root, "joint"):
         with prefixed(f"joint {_name(element)!r}"):
@@ -165,18 +165,18 @@ def _joints(root: Element, links: Collection[str], tell: Callable[[str], None]) 
 
 
 def _name(element: Element) -> str:
-    """Return the name of an element without unprintable characters."""
+    """Return an element's name without unprintable characters."""
     return printable(element.get("name", ""))
 
 
 def _material(visual: Element) -> FaceMaterials | None:
-    """Return the named material of a visual, or None."""
+    """Return the material that a visual names, or None if it has none."""
     material = visual.find("material")
     return None if material is None else FaceMaterials.from_name(material.get("name", ""))
 
 
 def _named(root: Element, kind: str) -> list[Element]:
-    """Return the elements with a tag.
+    """Return the elements with the given tag, which must have distinct names.
 
     Raises LidarError unless they all have different names.
     """
@@ -192,7 +192,7 @@ def _named(root: Element, kind: str) -> list[Element]:
 
 
 def _numbers(element: Element | None, name: str, count: int, default: str) -> Floats:
-    """Return `count` numbers in an attribute, or in `default` if it is missing."""
+    """Return `count` numbers from an attribute, or from `default` if it is missing."""
     text = default if element is None else element.get(name, default)
     try:
         values = np.array(text.split(), np.float64)
@@ -207,7 +207,7 @@ def _numbers(element: Element | None, name: str, count: int, default: str) -> Fl
 
 
 def _origin(element: Element) -> Floats:
-    """Return the 4 x 4 matrix of an <origin>.
+    """Return the 4 x 4 matrix that an <origin> describes.
 
     It rotates about the fixed x, y, and z axes, and then translates.
     """
@@ -217,7 +217,7 @@ def _origin(element: Element) -> Floats:
 
 
 def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
-    """Return a joint and its child link."""
+    """Read a joint, and return its child link and the joint."""
     kind = element.get("type", "")
     if kind not in (*MOVING, *HELD):
         raise LidarError(
@@ -261,7 +261,7 @@ def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
 
 
 def _in_order(links: list[str], joints: Mapping[str, Joint]) -> list[str]:
-    """Return the links, each after its parent.
+    """Sort the links so that each one follows its parent.
 
     Raises LidarError unless links and joints form a tree.
     """
@@ -281,7 +281,7 @@ def _in_order(links: list[str], joints: Mapping[str, Joint]) -> list[str]:
 
 
 def _check_mimics(joints: Mapping[str, Joint]) -> None:
-    """Check that mimicked joints move, and that no joint mimics itself."""
+    """Check that mimicked joints can move, and that no joint mimics itself."""
     moving = {joint.name: joint.mimic for joint in joints.values() if joint.moves}
     mimicked_joints = {name: [mimic[0]] for name, mimic in moving.items() if mimic is not None}
     for name, (mimicked,) in mimicked_joints.items():
@@ -320,7 +320,7 @@ class _LinkMeshes:
         self._package = next(filter(_is_package, self._folders_above), folder)
 
     def link_meshes(self, link: str, element: Element) -> Iterator[SceneMesh]:
-        """Yield the meshes of a link in the frame of the link."""
+        """Yield the meshes of a link in link coordinates."""
         visuals = element.findall("visual")
         if not visuals and element.find("collision/geometry") is not None:
             self._collide.append(link)
@@ -344,7 +344,7 @@ class _LinkMeshes:
                 yield mesh
 
     def report_skipped_links(self) -> None:
-        """Report the links that were skipped."""
+        """Report which links were skipped."""
         for links, reason in (
             (self._collide, "have collision shapes but no visual shapes"),
             (self._flat, "have shapes of size zero"),
@@ -354,7 +354,7 @@ class _LinkMeshes:
                 self.tell(f"{self.path} contains links that {reason} and were skipped: {names}.")
 
     def _color(self, visual: Element) -> Bytes | None:
-        """Return the color of a visual or of its material in the robot, or None."""
+        """Return the color of a visual, or of the robot's material that it names, or None."""
         material = visual.find("material")
         if not self.colors or material is None:
             return None
@@ -365,7 +365,7 @@ class _LinkMeshes:
         return as_bytes(_numbers(color, "rgba", 4, "1 1 1 1")[:3]).reshape(1, 1, 3)
 
     def _shape(self, shape: Element) -> tuple[Floats, list[SceneMesh]]:
-        """Return scale factors, which may be zero, and the meshes to be scaled."""
+        """Return scale factors, some of which may be zero, and the meshes to which they apply."""
         if shape.tag == "mesh":
             if len(factors := shape.get("scale", "").split()) == 4:  # some public files have four
                 shape.set("scale", " ".join(factors[:3]))
@@ -390,7 +390,7 @@ class _LinkMeshes:
         return np.ones(3), [capsule(radius, length, SIDES, "capsule")]
 
     def _sizes(self, sizes: Floats) -> Floats:
-        """Return the sizes of a shape.
+        """Check that the sizes of a shape are not negative, and return them.
 
         Raises LidarError if one is negative.
         """
@@ -399,7 +399,7 @@ class _LinkMeshes:
         return sizes
 
     def _meshes(self, name: str) -> list[SceneMesh]:
-        """Return the meshes in a file, in the axes of the file."""
+        """Return the meshes in a file without changing their axes."""
         path, package = self._find(name)
         if not is_inside(path, (package, *self.assets)):
             kind = "package" if _is_package(package) else "folder of the .urdf file"
@@ -454,7 +454,10 @@ class _LinkMeshes:
         )
 
     def _without_package(self, name: str, scheme: str, location: str) -> str:
-        """Return the error for a URI without a package name: package:///my_robot/leg.dae."""
+        """Return the error message for a URI without a package name.
+
+        An example is package:///my_robot/leg.dae.
+        """
         parts = [part for part in location.split("/") if part not in _NO_FOLDERS]
         start = f"its mesh {name[:200]!r} does not specify a package. Write"
         if len(parts) < 2:
@@ -476,7 +479,7 @@ def _is_package(folder: Path) -> bool:
 
 
 def _name_of(folder: Path) -> str:
-    """Return the name in the package.xml of a folder, or an empty string if it is unreadable."""
+    """Return the package name in a folder's package.xml, or an empty string if it is unreadable."""
     file = folder / "package.xml"
     try:
         return (xml_root(read_input(file)).findtext("name") or "").strip()

@@ -1,1 +1,1 @@
-"""Convert sensors from other programs to ray lists and scenarios."""
+"""Convert sensors of other programs to ray lists and scenarios."""

@@ -1,4 +1,4 @@
-"""Convert files with the rays of a sensor, such as ray lists and OmniLidar prims, to scenarios."""
+"""Convert files that describe a sensor's rays, such as ray lists and OmniLidar prims."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _RAYS_FILE = "rays.npz"
 
 
 def import_sensor(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
-    """Write a sensor file as a scenario, with a `scenario.yaml` file and a file with the rays.
+    """Write a sensor file as a scenario, which is a `scenario.yaml` file and a file with the rays.
 
     The scenario has the scene of `lidarpool demo`, but with this sensor.
 
@@ -66,7 +66,7 @@ def import_sensor(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]
 
 
 def _section(rays: RayList) -> dict[str, float | str]:
-    """Return the `sensor` section of a scenario, in which users can change the ranges."""
+    """Return a scenario's `sensor` section, in which users can change the ranges."""
     min_range_m, max_range_m = rays.range_m
     section: dict[str, float | str] = {"calibration": _RAYS_FILE}
     if min_range_m:
@@ -77,7 +77,7 @@ def _section(rays: RayList) -> dict[str, float | str]:
 
 
 def _read(path: Path) -> ImportedSensor:
-    """Read the sensor in a file.
+    """Read the sensor that a file describes.
 
     Raises LidarError if the file cannot be used.
     """

@@ -1,4 +1,4 @@
-"""Convert OmniLidar prims of Isaac Sim and Omniverse to rays.
+"""Convert OmniLidar prims from Isaac Sim and Omniverse to rays.
 
 `omnilidar_child.py` reads the files. The attributes are defined by the extension
 omni.sensors.nv.lidar, "Setting Lidar Attributes". Azimuths are counterclockwise from x, with x
@@ -76,7 +76,7 @@ class ImportedSensor(NamedTuple):
 
 
 def read_omnilidar(path: Path) -> ImportedSensor:
-    """Return the rays of the first OmniLidar prim in an OpenUSD file.
+    """Read the first OmniLidar prim in an OpenUSD file as rays.
 
     Raises
     ------
@@ -96,14 +96,14 @@ def read_omnilidar(path: Path) -> ImportedSensor:
 
 
 class _Prim(NamedTuple):
-    """The attributes of a prim."""
+    """The attributes of an OmniLidar prim."""
 
     paths: list[str]  # paths of all OmniLidar prims of the file
     values: dict[str, Any]  # {name: plain value}
     arrays: dict[str, AnyArray]
 
     def number(self, name: str, default: float) -> float:
-        """Return an attribute of the model as a number."""
+        """Return a model attribute as a number."""
         return float(self.values.get(CORE + name, default))
 
 
@@ -155,7 +155,7 @@ def _sensor(prim: _Prim) -> ImportedSensor:
 
 
 class _State(NamedTuple):
-    """The emitters that fire in a tick."""
+    """The emitters that fire in the same tick."""
 
     azimuths_deg: Floats  # (n,)
     elevations_deg: Floats  # (n,)
@@ -163,7 +163,7 @@ class _State(NamedTuple):
 
 
 class _Pattern(NamedTuple):
-    """The rays of one or several scans."""
+    """The rays of one or more scans."""
 
     azimuths_deg: Floats  # (n,)
     elevations_deg: Floats  # (n,)
@@ -198,7 +198,7 @@ def _states(prim: _Prim) -> list[_State]:
 
 
 def _solid_state(prim: _Prim, states: list[_State], rate_hz: float) -> _Pattern:
-    """Return the rays of a solid-state lidar, with a scan for each state."""
+    """Return the rays of a solid-state lidar, with one scan for each emitter state."""
     del prim
     starts_ns = np.rint(np.arange(len(states)) * (1e9 / rate_hz)).astype(np.int64)
     return _Pattern(
@@ -212,7 +212,7 @@ def _solid_state(prim: _Prim, states: list[_State], rate_hz: float) -> _Pattern:
 
 
 def _rotary(prim: _Prim, states: list[_State], rate_hz: float) -> _Pattern:
-    """Return the rays of a rotary lidar in a scan, restricted to its azimuth window.
+    """Return a rotary lidar's rays during one scan, restricted to its azimuth window.
 
     Raises ValueError if the tick rate is missing, or if no ray is within the window.
     """
@@ -241,7 +241,7 @@ def _rotary(prim: _Prim, states: list[_State], rate_hz: float) -> _Pattern:
 
 
 def _within_window(prim: _Prim, pattern: _Pattern) -> _Pattern:
-    """Return the rays within the azimuths from which a rotary lidar accepts returns.
+    """Return those rays at whose azimuths a rotary lidar accepts returns.
 
     If the end of the window is below its start, for example from 300 to 60 degrees, the window
     contains azimuth 0. Raises ValueError if no ray is within the window.
@@ -267,7 +267,7 @@ def _within_window(prim: _Prim, pattern: _Pattern) -> _Pattern:
 
 
 def _left_out(prim: _Prim, states: list[_State], kind: str) -> list[str]:
-    """Describe the differences from the other program, one clause each."""
+    """Describe the differences from the other program, with one clause each."""
     clauses = []
     if prim.paths[1:]:
         clauses.append(f"several OmniLidar prims (only {prim.paths[0]} is read)")
@@ -281,7 +281,7 @@ def _left_out(prim: _Prim, states: list[_State], kind: str) -> list[str]:
 
 
 def _unread(prim: _Prim, kind: str) -> Iterator[tuple[str, str]]:
-    """Yield the unsupported attributes that may change the points, with their values.
+    """Yield those unsupported attributes that may change the points, with their values.
 
     Attributes that are zero or have another value without an effect are skipped.
     """
@@ -301,5 +301,5 @@ def _unread(prim: _Prim, kind: str) -> Iterator[tuple[str, str]]:
 
 
 def _used_arrays(arrays: Mapping[str, AnyArray]) -> list[str]:
-    """Return the names of emitter state arrays that contain a nonzero value."""
+    """Return the names of the emitter state arrays that contain a nonzero value."""
     return [name for name, values in arrays.items() if name.startswith(_STATE) and values.any()]

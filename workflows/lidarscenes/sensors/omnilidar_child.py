@@ -1,6 +1,6 @@
-"""Script that reads an OmniLidar prim with usd-core in the process that `omnilidar.py` starts.
+"""Script that `omnilidar.py` runs in a separate process to read an OmniLidar prim with usd-core.
 
-Invalid files can crash usd-core, and here this affects only this process. The script imports
+Invalid files can crash usd-core, but this only affects the separate process. The script imports
 nothing from lidarpool. It writes one frame to standard output, which is a line of JSON with the
 attributes of the prim, followed by the bytes of the arrays that the line lists.
 """
@@ -24,7 +24,7 @@ _PREFIX = "omni:sensor:"
 
 
 def main(path: str) -> None:
-    """Read a file, and write a frame to standard output."""
+    """Read a file, and write one frame to the standard output."""
     output = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     frame: dict[str, Any]
@@ -54,7 +54,7 @@ def main(path: str) -> None:
 
 
 def _reason(error: Exception, path: str) -> str:
-    """Return the reason for an error without C++ names and folders."""
+    """Return the reason for an error, without C++ names and folders."""
     try:
         text = error.args[0].commentary if isinstance(error, Tf.ErrorException) else str(error)
     except UnicodeDecodeError:
@@ -63,7 +63,7 @@ def _reason(error: Exception, path: str) -> str:
 
 
 def _check_layers(stage: Usd.Stage, path: str) -> None:
-    """Raise ValueError if content comes from outside the folder of the file."""
+    """Raise ValueError if any content comes from outside the file's folder."""
     folder = Path(path).resolve().parent
     for layer in stage.GetUsedLayers():
         if layer.realPath and not Path(layer.realPath).resolve().is_relative_to(folder):
@@ -71,14 +71,14 @@ def _check_layers(stage: Usd.Stage, path: str) -> None:
 
 
 def _is_lidar(prim: Usd.Prim) -> bool:
-    """Return True for an OmniLidar prim with the attributes of the generic model."""
+    """Return True if a prim is an OmniLidar that has the attributes of the generic model."""
     applied = prim.GetMetadata("apiSchemas")
     names = applied.GetAddedOrExplicitItems() if applied else []
     return str(prim.GetTypeName()) == "OmniLidar" or _API in names
 
 
 def _attributes(prim: Usd.Prim) -> dict[str, Any]:
-    """Return the attributes of a sensor that have a value."""
+    """Return those attributes of a sensor that have a value."""
     attributes = {
         attribute.GetName(): attribute.Get()
         for attribute in prim.GetAttributes()
@@ -88,7 +88,6 @@ def _attributes(prim: Usd.Prim) -> dict[str, Any]:
 
 
 def _is_array(value: Any) -> bool:
-    """Return True for an array of numbers."""
     return not isinstance(value, str) and hasattr(value, "__len__")
 
 

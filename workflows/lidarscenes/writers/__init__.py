@@ -1,1 +1,1 @@
-"""Write scenes as mesh files, and imported lidars as scenarios."""
+"""Write scenes as mesh files, and lidars from other programs as scenarios."""

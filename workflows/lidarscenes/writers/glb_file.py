@@ -1,4 +1,4 @@
-"""Write scenes as .glb files, with a node for each object and materials for masks and colors.
+"""Write scenes as .glb files. Objects become nodes, and masks and colors become materials.
 
 trimesh is not used, because it writes only one material per mesh.
 """
@@ -30,7 +30,7 @@ _TYPES = {"f": 5126, "u": 5125}  # {kind of NumPy type: component type}
 
 
 def encode_glb(scene: Scene) -> bytes:
-    """Return a .glb file with all objects in a scene except the actors, in meters, Y-up.
+    """Return a .glb file that contains a scene's objects except actors, in meters, Y-up.
 
     The scene's origin is stored in the nodes in double precision, so that scenes far from the
     origin lose no precision.
@@ -52,7 +52,7 @@ def encode_glb(scene: Scene) -> bytes:
 
 
 class _Writer:
-    """The JSON content and the buffer of a file."""
+    """The JSON content and the binary buffer of a .glb file."""
 
     def __init__(self, origin: Floats, epsg: int | None) -> None:
         self._origin = origin
@@ -71,13 +71,13 @@ class _Writer:
         }
 
     def _put(self, kind: str, part: dict[str, Any]) -> int:
-        """Add an entry to an array of the JSON content, such as "nodes", and return its index."""
+        """Append an entry to a list in the JSON content, such as "nodes", and return its index."""
         parts = self._tree.setdefault(kind, [])
         parts.append(part)
         return len(parts) - 1
 
     def add(self, name: str, object_parts: list[SceneMesh | SceneInstance]) -> None:
-        """Add an object as a node whose parts share a matrix."""
+        """Add an object as a node, whose parts have the same matrix."""
         meshes = [part.mesh if isinstance(part, SceneInstance) else part for part in object_parts]
         key = tuple(id(mesh) for mesh in meshes)
         translated = self._origin.any() and not isinstance(object_parts[0], SceneInstance)
@@ -98,7 +98,7 @@ class _Writer:
         self._tree["scenes"][0]["nodes"].append(self._put("nodes", node))
 
     def _primitives(self, mesh: SceneMesh) -> list[dict[str, Any]]:
-        """Return the primitives of opaque triangles by image, followed by those of each mask."""
+        """Return primitives for the opaque triangles, followed by one primitive for each mask."""
         opaque = len(mesh.faces) - sum(len(cut.uv) for cut in mesh.cutouts)
         names: tuple[str, ...] = ("",)
         index = np.zeros(len(mesh.faces), np.int32)
@@ -111,7 +111,7 @@ class _Writer:
     def _opaque_primitives(
         self, mesh: SceneMesh, index: Ints32, names: tuple[str, ...]
     ) -> list[dict[str, Any]]:
-        """Return a primitive for each combination of image and material among the opaque triangles.
+        """Return a primitive for each combination of image and material of opaque triangles.
 
         `index` (n,) contains the indices of the triangles' materials in `names`.
         """
@@ -145,7 +145,7 @@ class _Writer:
     def _masked_primitives(
         self, mesh: SceneMesh, first: int, index: Ints32, names: tuple[str, ...]
     ) -> list[dict[str, Any]]:
-        """Return a primitive for each mask, whose triangles start at `first`."""
+        """Return a primitive for each mask. The masked triangles start at `first`."""
         colors = mesh.colors
         primitives = []
         for cut in mesh.cutouts:
@@ -163,7 +163,7 @@ class _Writer:
     def _corners(
         self, mesh: SceneMesh, face_indices: Indices, uv: AnyArray | None, tints: Bytes | None
     ) -> dict[str, int]:
-        """Return the attributes of triangles with separate corners."""
+        """Return the attributes for triangles that do not share corners."""
         corners = rotate(mesh.vertices[mesh.faces[face_indices]].reshape(-1, 3), UP_AXES["y"].T)
         attributes = {"POSITION": self._array(corners.astype("<f4"), "VEC3")}
         if uv is not None:
@@ -189,7 +189,7 @@ class _Writer:
         )
 
     def _view(self, data: bytes, **fields: Any) -> int:
-        """Add a buffer view of data, and return its index."""
+        """Add data as a buffer view, and return its index."""
         view = {"buffer": 0, "byteOffset": self._size, "byteLength": len(data), **fields}
         data += b"\0" * (-len(data) % 4)
         self._pieces.append(data)
@@ -197,10 +197,10 @@ class _Writer:
         return self._put("bufferViews", view)
 
     def _material(self, image: AnyArray | None, name: str) -> int:
-        """Return the index of a material, which is added on first use.
+        """Return the index of a material. The material is added on first use.
 
-        `image` is a mask, bool (h, w), an image, a single color, or None for a material with only a
-        name.
+        `image` is a mask (bool (h, w)), an image, or a single color. It is None for a material that
+        only has a name.
         """
         key = id(image), name
         if key not in self._materials:
@@ -223,7 +223,7 @@ class _Writer:
         return self._materials[key]
 
     def _texture(self, image: Image.Image) -> int:
-        """Add a texture with an image, and return its index."""
+        """Add an image as a texture, and return its index."""
         png = io.BytesIO()
         image.save(png, "png")
         view = self._view(png.getvalue())
@@ -233,7 +233,7 @@ class _Writer:
         return self._put("textures", {"source": source, "sampler": 0})
 
     def data(self) -> bytes:
-        """Return the content of the file.
+        """Return the file as bytes.
 
         Raises LidarError if it exceeds 4 GiB.
         """

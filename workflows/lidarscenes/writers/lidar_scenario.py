@@ -1,4 +1,4 @@
-"""Write lidars in worlds of other programs as scenarios, on a common stationary platform."""
+"""Write the lidars in another program's world as scenarios, on a common stationary platform."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _ZERO = 1e-9  # smaller numbers are rounding errors
 
 
 class Lidar(NamedTuple):
-    """A lidar in a world of another program.
+    """A lidar in the world of another program.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ def write_scenario(
     sections: Mapping[str, Any],
     unsupported: Sequence[str] = (),
 ) -> list[str]:
-    """Write a scenario with lidars to a folder, with a data file for each distinct lidar.
+    """Write a scenario with lidars to a folder. Each distinct lidar gets a data file.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def write_scenario(
 
 
 def _relative(entry: Mapping[str, Any], folder: Path) -> Any:
-    """Return an entry of `scene.files` with paths relative to a folder.
+    """Return a `scene.files` entry with paths relative to a folder.
 
     If the entry has only a file, its name is returned.
     """
@@ -129,7 +129,7 @@ def _relative(entry: Mapping[str, Any], folder: Path) -> Any:
 
 
 def _carrier(lidars: Sequence[Lidar], files: _Files) -> dict[str, Any]:
-    """Return the sections with sensors and poses.
+    """Return the scenario sections that define sensors and poses.
 
     If all lidars belong to the same model, the pose is that of the model. Otherwise, it is the
     origin.
@@ -156,7 +156,7 @@ def _carrier(lidars: Sequence[Lidar], files: _Files) -> dict[str, Any]:
 
 
 def _pose(matrix: Floats) -> dict[str, Any]:
-    """Return a 4 x 4 matrix as a pose in a scenario."""
+    """Convert a 4 x 4 matrix to a pose in a scenario."""
     pose = Pose.from_rotation(matrix[:3, 3], matrix[:3, :3])
     angles = {name: rounded(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")}
     return {
@@ -166,13 +166,13 @@ def _pose(matrix: Floats) -> dict[str, Any]:
 
 
 class _Files:
-    """The data files of lidars, which lidars with identical values share."""
+    """The data files of lidars. Lidars with identical values share a file."""
 
     def __init__(self) -> None:
         self._data: dict[str, dict[str, Any]] = {}  # {name: content}
 
     def name_of(self, lidar: Lidar) -> str:
-        """Return the name of a lidar's data file."""
+        """Return the name of the data file for a lidar, which is created if necessary."""
         for name, data in self._data.items():
             if {**data, "name": ""} == {**lidar.data, "name": ""}:
                 return name
@@ -186,15 +186,15 @@ class _Files:
         return name
 
     def texts(self) -> dict[str, str]:
-        """Return the text of the data files by name."""
+        """Return the content of each data file as text, by name."""
         return {name: _dumped(data) for name, data in self._data.items()}
 
 
 def _dumped(data: dict[str, Any]) -> str:
-    """Return data as YAML."""
+    """Format data as YAML."""
     return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
 
 
 def rounded(value: float) -> float:
-    """Round a number to 12 significant digits for a file, with tiny values set to zero."""
+    """Round a number to 12 significant digits for a file, and set tiny values to zero."""
     return float(f"{value:.12g}") if abs(value) > _ZERO else 0.0

@@ -25,7 +25,7 @@ SUFFIXES = (".ply", ".glb", ".obj")
 
 
 def write_scene(path: str | Path, scene: Scene) -> Path:
-    """Write a scene to a mesh file that `Scene.load` can read.
+    """Write a scene to a mesh file in a format that `Scene.load` can read.
 
     A .ply file stores one object without a name, while .glb and .obj store all objects with their
     names. Only .glb stores masks and colors. In .ply and .obj, triangles are opaque and gray. If a
@@ -51,7 +51,7 @@ def write_scene(path: str | Path, scene: Scene) -> Path:
 
 
 def check_target(path: Path) -> None:
-    """Check that a scene can be written to a path, before the scene is generated.
+    """Check that a scene can be written to a path. Call this before generating the scene.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def check_target(path: Path) -> None:
 
 
 def _encoded(suffix: str, scene: Scene) -> bytes:
-    """Return the content of a file with an extension in `SUFFIXES`."""
+    """Return a scene as the content of a file with the given extension in `SUFFIXES`."""
     if scene.has_voxels.any():
         name = scene.object_names[scene.has_voxels.argmax()]
         raise LidarError(
@@ -103,5 +103,5 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
 
 
 def _comments(scene: Scene) -> list[str]:
-    """Return the comments at the start of a file on units, axes, and the coordinate system."""
+    """Return the comments at the start of a file, on units, axes, and the coordinate system."""
     return [FORMAT_COMMENT, *([] if scene.epsg is None else [f"crs: EPSG:{scene.epsg}"])]
