@@ -7,7 +7,7 @@
 FROM debian:12-slim AS system
 RUN apt-get update \
     && apt-get install -y --no-install-recommends ca-certificates git make python3 python3-venv \
-        libegl1 libgl1 libgomp1 libusb-1.0-0 \
+        libegl1 libgl1 libgomp1 libidn2-0 libusb-1.0-0 \
     && rm -rf /var/lib/apt/lists/*
 
 FROM system AS cpu

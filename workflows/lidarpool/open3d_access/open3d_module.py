@@ -34,7 +34,8 @@ def load_open3d() -> Any:
             return _import_extension("open3d.pybind")
         except (ImportError, OSError) as error:
             advice = (
-                "On Debian and Ubuntu, run `apt-get install libegl1 libgl1 libgomp1 libusb-1.0-0`."
+                "On Debian and Ubuntu, run "
+                "`apt-get install libegl1 libgl1 libgomp1 libidn2-0 libusb-1.0-0`."
             )
             if isinstance(error, ModuleNotFoundError):
                 advice = (
