@@ -133,6 +133,7 @@ def test_dirt_shortens_the_range_of_detection():
     assert abs(count[1] / count[0] - 0.5) < 4.5 * 0.5 / np.sqrt(count[0])
 
 
+@pytest.mark.extended(keep=("none",))
 @pytest.mark.parametrize("waveform", ["none", "gaussian"])
 def test_dirt_is_before_all_light(waveform):
     """With sub-rays, rain and echoes: returns of the air are weaker, too."""

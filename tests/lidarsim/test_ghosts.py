@@ -179,7 +179,7 @@ def road(wet, down_deg, backend="numpy", **options):
     return cast(meshes, sensor, wet=wet, backend=backend, **options)
 
 
-@pytest.mark.slow(every=5)
+@pytest.mark.slow(every=13)
 @pytest.mark.parametrize("backend", CPU)
 @pytest.mark.parametrize("wet", [0.5, 1.0])
 @pytest.mark.parametrize("down_deg", [5, 20, 50])
