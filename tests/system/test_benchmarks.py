@@ -21,7 +21,7 @@ from distributed import Client
 from docs.pictures import adapting as adapting_picture
 from docs.pictures import sensors as sensor_pictures
 from docs.pictures.effects import __main__ as pictures
-from tests.clusters import import_jobqueue, thread_cluster
+from tests.clusters import thread_cluster
 from tests.cuda_on_host import played_cuda, source_backend  # noqa: F401 - fixtures
 
 import lidarpool.run.cluster.cluster
@@ -77,18 +77,6 @@ def test_beside_dask(tmp_path, capsys):
     assert rows.keys() == small | wide | short
     assert all(row["wall_us"] > 0 and row["wall_ratio"] > 0 for row in rows.values())
     assert capsys.readouterr().out.count("beside Dask") == 10
-
-
-def test_adapting(tmp_path, capsys):
-    import_jobqueue()
-    from benchmarks import adapting
-
-    path = tmp_path / "figures.json"
-    figures = adapting.main(["--tasks", "300", "--waves", "2", "--json", str(path)])
-    assert json.loads(path.read_text()) == figures
-    assert (figures["tasks"], figures["misplaced"], figures["taken_back"]) == (300, 0, 0)
-    assert figures["workers_joined"] == figures["workers_left"] >= 3
-    assert "0 of 300 tasks misplaced" in capsys.readouterr().out
 
 
 def test_the_picture_of_jobs(tmp_path):
