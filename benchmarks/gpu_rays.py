@@ -12,9 +12,8 @@ from raybeam import Instance, Mesh, Opacity, Pattern, PoseMotion, RayCaster
 from raybeam.scan import HitGroups, Scan, check_scan
 
 from .gpu_clock import Session, Split, milliseconds, wall_milliseconds
-from .gpu_scenes import Float, beam_directions, city, revolution, track
+from .gpu_scenes import Float, beam_directions, city, revolution, track, tree, tree_transforms
 from .gpu_scenes import Mesh as Faces
-from .instances import tree, tree_transforms
 
 Rows = Iterator[tuple[str, dict[str, Any]]]
 MIDDLE = np.array([10.0, 10.0, 2.0])  # a crossing of the city

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from benchmarks import gpu, gpu_points, gpu_rays, instances
+from benchmarks import gpu, gpu_points, gpu_rays
 from tests.cuda_on_host import (  # noqa: F401 - fixtures
     played_cuda,
     source_backend,
@@ -15,16 +15,6 @@ from tests.cuda_on_host import (  # noqa: F401 - fixtures
 )
 
 from raybeam import available_backends
-
-
-@pytest.mark.slow
-def test_forests_of_instances_hit_as_one_mesh_does(capsys):
-    if reason := available_backends()["tiles"]:
-        pytest.skip(f"tiles: {reason}")
-    assert instances.main(["--quick"]) == 0
-    _, many, few, flat = (line.split("|") for line in capsys.readouterr().out.splitlines())
-    assert "10,002" in many[3]
-    assert few[-2] == flat[-2] != " 0 % "
 
 
 def test_the_devices_benchmark_says_so_without_a_device(capsys):
