@@ -1,18 +1,17 @@
-"""Rays that escape from closed meshes, backend by backend: `python -m benchmarks.leaks`.
+"""Rays that escape from closed meshes, for each backend.
 
-All are aimed from inside at edges and corners, where a test that rounds each triangle for itself
-lets some through. The numpy and cuda backends are built so that none does.
+    python -m benchmarks.leaks [--rays N] [--triangles N]
+
+All rays are aimed from inside at edges and corners, where rays escape if each triangle is rounded
+on its own. The exit code is 1 if a ray escapes from an exact backend.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from lidarscenes.procedural.terrain import terrain
 from lidarsim.scene.shapes import revolve, seed_objects
 from raybeam import RayCaster, available_backends
 
+from .harness import argument_parser, write_results
 from .seams import escaped
 
 _PART = 250_000
@@ -90,14 +90,13 @@ def count_escaped(mesh: Closed, backend: str, count: int) -> dict[str, float]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run from the command line; return 1 if a ray escapes from an exact backend."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--rays", type=int, default=10_000_000, help="for each backend, in all")
+    parser = argument_parser(__doc__)
+    parser.add_argument("--rays", type=int, default=10_000_000, help="rays of each backend")
     parser.add_argument("--triangles", type=int, default=2_000_000, help="of the terrain box")
-    parser.add_argument("--json", type=Path, help="write the results here")
-    chosen = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     backends = [name for name, reason in available_backends().items() if not reason]
-    meshes = list(closed_meshes(chosen.triangles))
-    share = -(-chosen.rays // len(meshes))
+    meshes = list(closed_meshes(options.triangles))
+    share = -(-options.rays // len(meshes))
     results: dict[str, dict[str, dict[str, float]]] = {name: {} for name in backends}
     for mesh in meshes:
         for name in backends:
@@ -110,8 +109,7 @@ def main(arguments: list[str] | None = None) -> int:
     for name in backends:
         rays, leaks = (sum(v[key] for v in results[name].values()) for key in ("rays", "escaped"))
         print(f"{name}: {leaks:,.0f} of {rays:,.0f} escaped, {leaks / rays:.2g}")
-    if chosen.json:
-        chosen.json.write_text(json.dumps(results, indent=1) + "\n")
+    write_results(options.json, results)
     exact = [entry for name in backends if name != "tiles" for entry in results[name].values()]
     return int(any(entry["escaped"] for entry in exact))
 

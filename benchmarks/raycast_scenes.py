@@ -1,4 +1,4 @@
-"""What benchmarks/raycast.py casts: scenes, and a lidar's rays in them."""
+"""Scenes, and a lidar's rays in them, for benchmarks/raycast.py and benchmarks/trees.py."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""The peers' side of benchmarks/sensors.py, in their Python: needs NumPy and the one that is named.
+"""Casters of other packages for benchmarks/sensors.py and scanner.py; requires only NumPy and them.
 
-It builds its tree, says "ready" and its version, then casts once for each line that comes in.
+The process builds its tree, prints "ready" and its version, and then casts once for each line on
+standard input.
 """
 
 from __future__ import annotations

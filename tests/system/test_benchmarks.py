@@ -109,7 +109,7 @@ def test_dataplane(tmp_path, capsys):
 
 
 def test_effects(capsys):
-    toy = ["--rounds", "1", "--triangles", "2000"]
+    toy = ["--repeat", "1", "--triangles", "2000"]
     assert effects.main(["--only", "rain", "spray", *toy]).keys() == {"rain", "spray"}
     assert capsys.readouterr().out.startswith("rain ")
 
