@@ -1,7 +1,8 @@
-"""Twins of public recordings, beside sweeps that were held out.
+"""Scenes reconstructed from public recordings, compared with held-out sweeps.
 
-`python -m benchmarks.reality FOLDER [NAME …] [--json FILE]` reads the recordings that FOLDER holds,
-each in the folder of its repository:
+    python -m benchmarks.reality FOLDER [NAME ...]
+
+FOLDER contains the recordings, each in the folder of its repository:
 
 | name | repository | sensor |
 |---|---|---|
@@ -20,8 +21,6 @@ The recordings are not part of lidarpool, and none states a license: fetch them 
 
 from __future__ import annotations
 
-import argparse
-import json
 import resource
 import time
 from collections.abc import Callable
@@ -50,6 +49,8 @@ from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
+
+from .harness import argument_parser, write_results
 
 _COMPARED_SWEEPS = 24
 _BLOCK_SWEEPS = 20
@@ -335,12 +336,11 @@ def _line(row: dict[str, Any]) -> str:
 
 
 def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
-    """Measure, print and return the rows of the recordings that are there."""
-    parser = argparse.ArgumentParser(prog="benchmarks.reality", description=__doc__)
+    """Measure, print and return the rows of the recordings in a folder."""
+    parser = argument_parser(__doc__)
     parser.add_argument("folder", type=Path, help="folder with the folders of the repositories")
-    parser.add_argument("names", nargs="*", help=f"of {', '.join(SOURCES)}; all by default")
+    parser.add_argument("names", nargs="*", help=f"of {', '.join(SOURCES)} (default: all)")
     parser.add_argument("--rules", default="easy,hard", help="easy, hard, or both")
-    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args(arguments)
     rows = []
     for name in options.names or SOURCES:
@@ -349,8 +349,7 @@ def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
             print(f"{name}: {root} is not there, and is left out")
             continue
         rows += measure(name, options.folder, tuple(options.rules.split(",")))
-    if options.json:
-        options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    write_results(options.json, rows)
     return rows
 
 

@@ -17,6 +17,7 @@ from benchmarks import (
     scale,
     submitting,
 )
+from benchmarks.harness import read_results
 from distributed import Client
 from docs.pictures import adapting as adapting_picture
 from docs.pictures import sensors as sensor_pictures
@@ -32,7 +33,7 @@ pytestmark = pytest.mark.slow
 def test_scale(tmp_path, capsys):
     path = tmp_path / "figures.json"
     figures = scale.main(["--workers", "4", "--tasks", "80", "--json", str(path)])
-    assert json.loads(path.read_text())["growth"] == figures["growth"]
+    assert read_results(path)["growth"] == figures["growth"]
     assert set(figures["growth"]) == set(scale.WAYS)
     for cluster in figures["workers"].values():
         assert cluster["misplaced"] == 0
@@ -44,7 +45,7 @@ def test_scale_of_receipts_and_jobs(tmp_path, capsys):
     path = tmp_path / "figures.json"
     sizes = ["--workers", "3", "--scans", "40", "--jobs", "10", "--shards", "2"]
     rows = scale.main([*sizes, "--receipts", "0.05", "--json", str(path)])
-    assert json.loads(path.read_text()) == rows
+    assert read_results(path) == rows
     assert all(row["driver_ms"] > 0 and row["a_second"] > 0 for row in rows.values())
     assert 0 < rows["2 x 3 workers, batches of 0.05 s"]["busy"] <= 1
     names = ("driver", "scheduler", "collectors", "casting")
@@ -61,9 +62,9 @@ def test_scale_of_receipts_and_jobs(tmp_path, capsys):
 @pytest.mark.parametrize("kind", ["declared", "divided"])
 def test_submitting(tmp_path, capsys, kind):
     path = tmp_path / "figures.json"
-    options = ["--tasks", "40", "--pairs", "1", "--delay", "0.01", "--kind", kind]
+    options = ["--tasks", "40", "--repeat", "1", "--delay", "0.01", "--kind", kind]
     figures = submitting.main([*options, "--json", str(path)])
-    assert json.loads(path.read_text()) == figures
+    assert read_results(path) == figures
     assert figures["Partition.submit sending"] > 0
     assert "ratio: " in capsys.readouterr().out
 
@@ -71,7 +72,7 @@ def test_submitting(tmp_path, capsys, kind):
 def test_beside_dask(tmp_path, capsys):
     path = tmp_path / "figures.json"
     rows = beside_dask.main(["--quick", "--json", str(path)])
-    assert json.loads(path.read_text()) == rows
+    assert read_results(path) == rows
     small, wide = {"submit", "map", "map_items", "pipe"}, {"wide_submit", "wide_map"}
     short = {"quiet_map", "quiet_map_slow", "busy_map", "busy_map_slow"}
     assert rows.keys() == small | wide | short
@@ -96,7 +97,7 @@ def test_bytes_of_batches(capsys):
 def test_dataplane(tmp_path, capsys):
     path = tmp_path / "rounds.json"
     figures = dataplane.main(["--quick", "--folder", str(tmp_path), "--json", str(path)])
-    (measured_round,) = json.loads(path.read_text())
+    (measured_round,) = read_results(path)
     assert measured_round == figures
     points = dataplane.QUICK.scans * dataplane.QUICK.rays_per_scan
     assert figures["points"] == points, "of replayed columns"
@@ -122,7 +123,7 @@ def test_a_picture_of_an_effect(tmp_path):
 
 
 def test_formats(capsys):
-    formats.main(2000)
+    formats.main(["--points", "2000"])
     assert len(capsys.readouterr().out.splitlines()) == 1 + len(formats.SCRIPTS)
 
 
