@@ -19,6 +19,9 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import json
+import os
+import subprocess
 import tempfile
 from collections.abc import Callable
 from functools import partial
@@ -41,7 +44,6 @@ from .harness import (
     write_results,
 )
 from .raycast import open3d_scene
-from .sensors import Peer
 
 Float = NDArray[np.float64]
 CASES = ("velodyne/vlp16", "ouster/os1-128", "robots")
@@ -118,6 +120,43 @@ class LidarpoolScans:
         """Make the cloud of a sensor at 20 m/s; return its number of points."""
         positions = poses[0, :3, 3] + np.array([[0, 0, 0], [4, 0, 0]])
         return len(self.scanner.sweep(Track([0, 0.2], positions)))
+
+
+class Peer:
+    """Process of a Python with a package, which casts a job of arrays on request."""
+
+    def __init__(self, name: str, python: str, job: Path, clock: str) -> None:
+        script = Path(__file__).with_name("scanner_peers.py")
+        # -P: the folder of the script, which has a module `mujoco` too, is not searched.
+        self._process = subprocess.Popen(
+            [python, "-P", str(script), name, str(job), clock],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+        )
+        self._line()
+
+    def _line(self) -> str:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:  # what it prints besides is none of ours
+            if line.startswith(("ready", "{")):
+                return line.strip()
+        raise RuntimeError(f"The peer ended with {self._process.wait()}")
+
+    def cast(self) -> tuple[float, int]:
+        """Return the time of a revolution, seconds, and the number of hits."""
+        assert self._process.stdin is not None
+        self._process.stdin.write("cast\n")
+        self._process.stdin.flush()
+        answer = json.loads(self._line())
+        return answer["seconds"], answer["hits"]
+
+    def close(self) -> None:
+        """End the process."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait()
 
 
 class Open3D:

@@ -1,6 +1,6 @@
 """One revolution of sensor models in motion, compared with a grid of rays from a fixed pose.
 
-    python -m benchmarks.sensors [--model NAME] [--backend NAME] [--peers PYTHON]
+    python -m benchmarks.sensors [--model NAME] [--backend NAME]
 
 A VLP-16, an OS1-128 and an HDL-64E scan a city on one thread:
 
@@ -10,22 +10,14 @@ A VLP-16, an OS1-128 and an HDL-64E scan a city on one thread:
 - turning: moving, while the vehicle turns by 30 degrees per second;
 - noise, ten actors, 19 sub-rays: moving, with one addition.
 
-Times are listed for casting alone, and for casting and making the columns of a cloud. With
-`--peers`, MuJoCo's `mj_multiRay`, called once for each firing with precomputed rays, and Helios'
-spinning scanner (pyhelios3d) on the same path run in a separate Python environment.
+Times are listed for casting alone, and for casting and making the columns of a cloud.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import os
-import subprocess
-import tempfile
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,7 +31,6 @@ from raybeam import available_backends
 
 from .harness import (
     argument_parser,
-    has_modules,
     median_ratio,
     run_rounds,
     time_call,
@@ -47,7 +38,7 @@ from .harness import (
 )
 
 MODELS = ("velodyne/vlp16", "ouster/os1-128", "velodyne/hdl64e-s3")
-PEERS = ("mujoco", "pyhelios3d")
+STAGES = ("cast", "with columns")
 LINE = ((-10.0, -1.8, 2.0), (10.0, -1.8, 2.0))  # along the street, in a second
 CASES = ("grid", "still", "moving", "turning", "noise", "ten actors", "19 sub-rays")
 
@@ -122,84 +113,15 @@ def make_columns(batches: list[BatchPoints]) -> int:
     return sum(len(returns) for returns in batches)
 
 
-class Peer:
-    """Process of a Python with a package, which casts a job of arrays on request."""
-
-    def __init__(self, name: str, python: str, job: Path, clock: str) -> None:
-        script = Path(__file__).with_name("sensors_peers.py")
-        # -P: the folder of the script, which has a module `mujoco` too, is not searched.
-        self._process = subprocess.Popen(
-            [python, "-P", str(script), name, str(job), clock],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-        )
-        self.version = self._line().removeprefix("ready ")
-
-    def _line(self) -> str:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:  # what it prints besides is none of ours
-            if line.startswith(("ready ", "{")):
-                return line.strip()
-        raise RuntimeError(f"The peer ended with {self._process.wait()}")
-
-    def cast(self) -> tuple[float, int]:
-        """Return the time of a revolution, seconds, and the number of hits."""
-        assert self._process.stdin is not None
-        self._process.stdin.write("cast\n")
-        self._process.stdin.flush()
-        answer = json.loads(self._line())
-        return answer["seconds"], answer["hits"]
-
-    def close(self) -> None:
-        """End the process."""
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait()
-
-
-def write_job(survey: Survey, scene: Scene, path: Path) -> None:
-    """Write mesh and rays of a moving sensor, level and facing along x, for the peers."""
-    sensor = survey.sensor
-    firings = np.arange(*sensor.firings(0))
-    times = sensor.begins_ns(firings)
-    positions, _ = survey.path.poses(0, times)
-    offsets = sensor.origins(firings)  # one call has one origin: the middle of the beams'
-    seconds = (times[-1] - times[0]) / (len(times) - 1) * len(times) / 1e9
-    np.savez(
-        path,
-        vertices=scene.vertices,
-        faces=scene.faces,
-        origins=positions if offsets is None else positions + offsets.mean(axis=1),
-        directions=sensor.directions(firings).reshape(-1, 3),
-        elevations=sensor.beams.elevation,
-        way=survey.path.poses(0, np.array([0.0, 1e9 * seconds]))[0],
-        seconds=seconds,
-        turned=seconds * 10,  # turns, at 10 a second
-    )
-
-
-def measure(
-    name: str, backend: str, scene: Scene, options: argparse.Namespace, peers: Sequence[str]
-) -> dict[str, Any]:
-    """Time all cases of a model on a backend, and the peers."""
+def measure(name: str, backend: str, scene: Scene, options: argparse.Namespace) -> dict[str, Any]:
+    """Time all cases of a model on a backend."""
     crowded = traffic(scene)
     rigs = {
         case: Rig(crowded if case == "ten actors" else scene, survey, backend, threads=1)
         for case, survey in surveys(name, 0.02 if options.quick else 1.0).items()
     }
-    calls: dict[str, Callable[[int], tuple[list[float], int]]] = {
-        case: partial(_time_rig, rig, options.clock) for case, rig in rigs.items()
-    }
-    with tempfile.TemporaryDirectory() as folder:
-        job = Path(folder) / "job.npz"
-        write_job(rigs["moving"].survey, scene, job)
-        processes = {peer: Peer(peer, options.peers, job, options.clock) for peer in peers}
-        calls |= {peer: partial(_time_peer, process) for peer, process in processes.items()}
-        results = run_rounds(calls, options.repeat)
-        for process in processes.values():
-            process.close()
+    calls = {case: partial(_time_rig, rig, options.clock) for case, rig in rigs.items()}
+    results = run_rounds(calls, options.repeat)
     survey = rigs["moving"].survey
     return {
         "model": name,
@@ -209,7 +131,6 @@ def measure(
         "firings": survey.ray_count // survey.sensor.channels,
         "hits": {case: rounds[-1][1] / survey.ray_count for case, rounds in results.items()},
         "seconds": {case: [times for times, _ in rounds] for case, rounds in results.items()},
-        "peers": {peer: process.version for peer, process in processes.items()},
     }
 
 
@@ -218,11 +139,6 @@ def _time_rig(rig: Rig, clock: str, _: int) -> tuple[list[float], int]:
     cast_s, batches = time_call(lambda: list(rig.cast(0, rig.survey.scan_count)), clock)
     columns_s, count = time_call(lambda: make_columns(batches), clock)
     return [cast_s, cast_s + columns_s], count
-
-
-def _time_peer(peer: Peer, _: int) -> tuple[list[float], int]:
-    seconds, count = peer.cast()
-    return [seconds], count
 
 
 def show(row: dict[str, Any]) -> None:
@@ -234,10 +150,9 @@ def show(row: dict[str, Any]) -> None:
     seconds = {case: np.array(times).T for case, times in row["seconds"].items()}
     for case, times in seconds.items():
         base = "grid" if case in CASES[:4] else "moving"
-        names = ("cast", "with columns")  # peers only cast
         words = [
             f"{stage} {1e3 * np.median(own):9.2f} ms {median_ratio(own, other):6.3f} x {base}"
-            for stage, own, other in zip(names, times, seconds[base], strict=False)
+            for stage, own, other in zip(STAGES, times, seconds[base], strict=True)
         ]
         points = f"points {100 * row['hits'][case]:.1f} % of rays"
         print("; ".join([f"  {case:<12} {words[0]}", *words[1:], points]))
@@ -250,23 +165,16 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--model", action="append", help="only this model; can be repeated")
     parser.add_argument("--backend", action="append", help="only this backend; can be repeated")
     parser.add_argument("--triangles", type=int, default=100_000)
-    parser.add_argument("--peers", default="", metavar="PYTHON", help="Python that has the peers")
     options = parser.parse_args(arguments)
     if options.quick:
         options.repeat = 2
         options.triangles = 2_000
-    if not options.peers:
-        print(f"{' and '.join(PEERS)} are left out, because --peers is not given")
-    elif not has_modules(options.peers, "mujoco", "pyhelios"):
-        parser.error(f"{options.peers} lacks peers: pip install {' '.join(PEERS)}")
     scene = city(options.triangles)
     results = []
-    peers = PEERS if options.peers else ()
     for backend in options.backend or backends:
         for name in options.model or MODELS:
-            results.append(measure(name, backend, scene, options, peers))
+            results.append(measure(name, backend, scene, options))
             show(results[-1])
-        peers = ()  # with the first backend only
     write_results(options.json, results)
     return 0
 

@@ -1,6 +1,5 @@
 """The benchmarks at toy size, so that they cannot rot; no figure is judged here."""
 
-import json
 import re
 from contextlib import contextmanager
 
@@ -19,7 +18,6 @@ from benchmarks import (
 )
 from benchmarks.harness import read_results
 from distributed import Client
-from docs.pictures import adapting as adapting_picture
 from docs.pictures import sensors as sensor_pictures
 from docs.pictures.effects import __main__ as pictures
 from tests.clusters import thread_cluster
@@ -80,15 +78,6 @@ def test_beside_dask(tmp_path, capsys):
     assert capsys.readouterr().out.count("beside Dask") == 10
 
 
-def test_the_picture_of_jobs(tmp_path):
-    one = {"waiting": 1, "running": 2, "slots": 2, "busy": 1, "tasks": 9}
-    samples = [{"t": t, "GPU": one, "IO": one} for t in (0.0, 50.0, 90.0)]
-    (tmp_path / "samples.json").write_text(json.dumps(samples))
-    picture = tmp_path / "jobs.png"
-    adapting_picture.main([str(picture), "--samples", str(tmp_path / "samples.json")])
-    assert picture.stat().st_size > 10_000
-
-
 def test_bytes_of_batches(capsys):
     control.count_batches(5)
     assert "a further batch of one scan adds" in capsys.readouterr().out
@@ -140,7 +129,7 @@ def test_a_survey_on_a_device(played_cuda, tmp_path, monkeypatch):  # noqa: F811
     path = tmp_path / "gpu.json"
     options = ["--quick", "--in-process", "--only", "run", "--json", str(path)]
     assert gpu.main([*options, "--folder", str(tmp_path)]) == 0
-    rows = json.loads(path.read_text())["sections"]["run"]
+    rows = read_results(path)["run"]
     points = {name: rows[name]["points"] for name in ("all points", "every fifth point")}
     assert points["every fifth point"] == pytest.approx(points["all points"] / 5, rel=0.01)
     assert all(rows[name]["grays_s"] > 0 for name in points)
