@@ -7,7 +7,6 @@ page. Workers of this machine stand for machines with GPUs.
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from pathlib import Path
 from threading import Thread
 
 from distributed import Client, LocalCluster
+from docs.pictures.options import file_parser
 
 from poolpart import Partition, Pipe, PipeFailed, Pool, n_workers, rest
 
@@ -101,15 +101,13 @@ def draw(url: str, picture: Path) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Draw the picture, and return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("picture", type=Path, help="a .png file")
-    chosen = parser.parse_args(arguments)
+    options = file_parser(__doc__, ".png").parse_args(arguments)
     with (
         LocalCluster(**CLUSTER) as cluster,
         Client(cluster) as client,
         page_at_work(client) as url,
     ):
-        draw(url, chosen.picture)
+        draw(url, options.file)
     return 0
 
 

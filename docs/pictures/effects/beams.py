@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from statistics import NormalDist
 from typing import Any
 
 import numpy as np
+from docs.pictures.effects._receiver import wall
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
-from lidarpool import Beams, Returns, Scene, SceneMesh, Sensor, Spin, Survey
+from lidarpool import Beams, Returns, Scene, Sensor, Spin, Survey
 from lidarsim.sensor.disc import Beam
 from lidarsim.simulator.rig import Rig
 from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLORS
 from raybeam import pattern_rays
 
-DRAWS = "effect-beams.png"
 OVAL = (3.0, 1.5)  # mrad, as Velodyne's manual of the VLP-16 has it
 EXIT_M = 0.0125
 SENSOR = Sensor(Beams(np.zeros(1)), Spin(1, 360))
@@ -32,12 +31,6 @@ def with_effect(survey: Survey) -> Survey:
         subrays=19, divergence_mrad=OVAL, beam_profile="gaussian", exit_diameter_m=EXIT_M
     )
     return replace(survey, returns=beam)
-
-
-def wall(name: str, x: float, y: tuple[float, float] = (-50.0, 50.0)) -> SceneMesh:
-    """Make a rectangle across the x axis."""
-    corners = [[x, y[0], -50], [x, y[1], -50], [x, y[1], 50], [x, y[0], 50.0]]
-    return SceneMesh(name, np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def footprint(returns: Returns, distance: float) -> NDArray[np.float64]:
@@ -63,7 +56,7 @@ def share(returns: Returns, edge_m: float) -> float:
     return float(bright[batch.object == 0].sum() / bright.sum())  # type: ignore[union-attr]
 
 
-def picture(path: Path) -> None:
+def picture() -> Figure:
     """Plot beam footprints, the share of light at an edge, and the beam width against range."""
     figure = Figure((13.5, 4.5), dpi=100, layout="constrained")
     prints, edges, widths = figure.subplots(1, 3, width_ratios=[0.8, 1, 1])
@@ -140,4 +133,4 @@ def picture(path: Path) -> None:
     for axes in (prints, edges, widths):
         axes.tick_params(labelsize=8, colors=MUTED)
         axes.spines[:].set_color(LINE)
-    figure.savefig(path)
+    return figure

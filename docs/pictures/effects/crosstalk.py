@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 from lidarpool import Material, Mounted, Noise, Pose, Returns, SceneMesh, Survey
 from lidarsim.sensor.optics import Mode
 
-DRAWS = "effect-crosstalk.png"
 NOISE = Noise(detection_range_m=100, crosstalk=True)
 REVOLUTIONS = 10
 FIRINGS = 20_000
@@ -57,7 +55,7 @@ def cast_pair(
     return {name: values[of_receiver] for name, values in columns.items()}
 
 
-def picture(path: Path) -> None:
+def picture() -> Figure:
     """Plot the pulses that a sensor receives from another, with the closed form of their number."""
     figure = Figure((9, 3.9), layout="constrained", dpi=110)
     above, counts = figure.subplots(1, 2, width_ratios=[1.25, 1])
@@ -95,4 +93,4 @@ def picture(path: Path) -> None:
     counts.legend(frameon=False, fontsize=8)
     counts.set_title("A and B at one place", fontsize=10)
     counts.grid(alpha=0.25)
-    figure.savefig(path)
+    return figure

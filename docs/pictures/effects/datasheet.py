@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from docs.pictures.effects._receiver import BLUE, GRAY, RED, cast_scan, fixed_beams, wall
@@ -12,7 +11,6 @@ from matplotlib.figure import Figure
 from lidarpool import Material, Survey
 from lidarsim.sensor.models import read_model
 
-DRAWS = "effect-datasheet.png"
 SHOWN = {
     "ouster/os0-64": "#7b3f99",
     "livox/mid360": "#2e8b57",
@@ -29,7 +27,7 @@ def with_effect(survey: Survey) -> Survey:
     return replace(survey, noise=sheet.noise, returns=sheet.returns)
 
 
-def picture(path: Path) -> None:
+def picture() -> Figure:
     """Plot simulated detection rates and range precision with the values stated in data sheets."""
     figure = Figure((9, 3.7), layout="constrained", dpi=110)
     shares, sigmas = figure.subplots(1, 2)
@@ -77,4 +75,4 @@ def picture(path: Path) -> None:
     for axes in (shares, sigmas):
         axes.minorticks_off()
         axes.grid(alpha=0.25)
-    figure.savefig(path)
+    return figure

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-from docs.pictures.effects._air import save
 from docs.pictures.effects._receiver import BLUE, GRAY, RED, wall
 from docs.pictures.effects._street import survey_without
 from matplotlib.figure import Figure
@@ -15,7 +13,6 @@ from lidarpool import Fault, Scene, Sensor, Survey, Track
 from lidarscenes.procedural.city import city
 from lidarsim.simulator.rig import Rig
 
-DRAWS = "effect-faults.png"
 DIRT = Fault("dirt", azimuth_deg=(60, 130), elevation_deg=(-25, 5), transmission=0.3)
 DEAD = Fault("dead_channels", channels=[20, 21, 40])
 LOST = Fault("dropped_packets", share=0.1, packet=16)
@@ -50,7 +47,7 @@ def approach(*faults: Fault) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def picture(path: Path) -> None:
+def picture() -> Figure:
     """Plot the effect of faults on range images, and on ranges over time."""
     figure = Figure((11, 5.2), layout="constrained", dpi=100)
     images, charts = figure.subfigures(1, 2, width_ratios=[1.7, 1])
@@ -90,4 +87,4 @@ def picture(path: Path) -> None:
     axes.set_title(f"a vehicle at {SPEED_M_S:g} m/s", fontsize=9)
     axes.legend(frameon=False, fontsize=8, markerscale=4)
     axes.grid(alpha=0.25)
-    save(figure, path)
+    return figure

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from docs.pictures.effects._receiver import BLUE, GRAY, RED, cast_scan, cloud
@@ -13,7 +12,6 @@ from lidarpool import Beams, Material, Noise, Returns, Scene, SceneMesh, Sensor,
 from lidarsim.media.materials import fresnel
 from lidarsim.scene.actors import box
 
-DRAWS = "effect-ghosts.png"
 PAINT = 0.04
 DIRT = 0.1
 
@@ -33,7 +31,7 @@ def upright(name: str, start: tuple[float, float], stop: tuple[float, float]) ->
     return SceneMesh(name, np.array([*lower, *upper]), np.array([[0, 1, 3], [0, 3, 2]]))
 
 
-def picture(path: Path) -> None:
+def picture() -> Figure:
     """Plot ghosts of a shop window from above, and energies against the angle of incidence."""
     figure = Figure((12, 4.4), layout="constrained", dpi=100)
     above, right = figure.subplots(1, 2, width_ratios=[1.5, 1])
@@ -119,4 +117,4 @@ def picture(path: Path) -> None:
     right.set_title("dirty glass; dots simulated, lines closed form", fontsize=10)
     right.legend(fontsize=8, frameon=False)
     right.grid(alpha=0.25)
-    figure.savefig(path)
+    return figure

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-from docs.pictures.effects._air import save
 from docs.pictures.effects._receiver import BLUE, GRAY, RED, wall
 from matplotlib.figure import Figure
 
 from lidarpool import Noise, Scene, Sensor, Survey, load_sensor
 from lidarsim.simulator.rig import Rig
 
-DRAWS = "effect-lasting-errors.png"
 NOISE = Noise(
     0.005, channel_bias_m=0.015, warm_up_m=0.03, warm_up_s=600, ripple_deg=0.05, ripple_cycles=2
 )
@@ -43,7 +40,7 @@ def errors(sensor: Sensor, noise: Noise, **options: object) -> dict[str, np.ndar
     }
 
 
-def picture(path: Path) -> None:
+def picture() -> Figure:
     """Plot errors by channel, time and azimuth, together with their closed forms."""
     figure = Figure((11, 3.6), layout="constrained", dpi=100)
     by_channel, by_time, by_azimuth = figure.subplots(1, 3)
@@ -77,7 +74,7 @@ def picture(path: Path) -> None:
     for axes in (by_channel, by_time, by_azimuth):
         axes.grid(alpha=0.25)
         axes.legend(framealpha=0.9, fontsize=8, loc="upper right")
-    save(figure, path)
+    return figure
 
 
 def ripple(cycles: int) -> tuple[np.ndarray, np.ndarray]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from docs.pictures.effects._receiver import BLUE, GRAY, RED, cast_scan, fixed_beams, wall
@@ -17,7 +16,6 @@ from lidarsim.sensor.optics import LIGHT_M_NS
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 
-DRAWS = "effect-saturation.png"
 NOISE = Noise(detection_range_m=100, saturation=100)  # full by a white wall 31.6 m away
 PULSE_NS = 5.0
 MATERIALS = {
@@ -64,7 +62,7 @@ def _separable_distance(name: str, plate_m: float) -> tuple[float, float]:
     return columns["intensity"][0] / NOISE.full, upper_m
 
 
-def picture(path: Path) -> None:
+def picture() -> Figure:
     """Plot clipped pulses, pulse widths and range errors, and the distance of separable walls."""
     figure = Figure((11, 3.7), layout="constrained", dpi=110)
     pulse, widths, apart = figure.subplots(1, 3)
@@ -127,4 +125,4 @@ def picture(path: Path) -> None:
         axes.set_xlabel("signal / saturation")
     for axes in (pulse, widths, apart):
         axes.grid(alpha=0.25)
-    figure.savefig(path)
+    return figure
