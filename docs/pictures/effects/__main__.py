@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 
 from docs.pictures.effects._catalog import load_effects
 from docs.pictures.options import IMAGES, folder_parser
-from PIL import Image
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Draw the pictures."""
     options = folder_parser(__doc__, IMAGES).parse_args(arguments)
     for name, effect in load_effects(options.only).items():
-        png = io.BytesIO()
-        effect.picture().savefig(png, format="png")
-        image = Image.open(png).convert("RGB").quantize(256)  # a palette makes files smaller
-        image.save(options.folder / f"effect-{name.replace('_', '-')}.png", optimize=True)
+        path = options.folder / f"effect-{name.replace('_', '-')}.png"
+        effect.picture().savefig(path, pil_kwargs={"optimize": True})
 
 
 if __name__ == "__main__":
