@@ -1,52 +1,59 @@
-"""Cost of poolpart beside plain Dask, in pairs: `python -m benchmarks.beside_dask`.
+"""Cost of poolpart, compared with plain Dask, in pairs.
 
-Each row does the same work on two equal clusters, one with a resource of Dask and one divided by
-poolpart, in turn. The schedulers are processes of their own.
+    python -m benchmarks.beside_dask
 
-- `submit`: `Partition.submit` beside `Client.submit(resources=)`;
-- `map`: `Partition.map(chunk=1)` beside `Client.map(resources=)` and `gather`; `map_items` the
+Each row does the same work on two equal clusters, in turns: one uses a resource of Dask, and one is
+divided by poolpart. The schedulers are separate processes.
+
+- `submit`: `Partition.submit` and `Client.submit(resources=)`;
+- `map`: `Partition.map(chunk=1)`, and `Client.map(resources=)` with `gather`; `map_items` is the
   same without `chunk`, so that several items share a task;
-- `busy_map`: 300 tasks that sleep 50 ms, on two slots, while other processes keep all cores busy;
-  `busy_map_slow` the same for a client that sleeps 20 ms after each result, and `quiet_map` and
-  `quiet_map_slow` without the other processes;
-- `pipe`: round trips of an item through a task, by two `Pipe`s beside two `Queue`s;
-- `wide_submit` and `wide_map`: 20,000 tasks over 200 workers, which are threads of one process.
+- `busy_map`: 300 tasks that sleep 50 ms, on two slots, while other processes keep all cores busy.
+  In `busy_map_slow`, the client sleeps 20 ms after each result. `quiet_map` and `quiet_map_slow`
+  are the same without the other processes;
+- `pipe`: round trips of an item through a task, by two `Pipe`s and by two `Queue`s;
+- `wide_submit` and `wide_map`: 20,000 tasks on 200 workers, which are threads of one process.
 
-Processor time is that of driver and scheduler. The ratio of a row is the median of its pairs, ours
-to Dask's. `--quick` takes small sizes: it shows that all runs, and its ratios mean nothing.
-
-To compare with another version of poolpart, put its folder first on `PYTHONPATH`.
+CPU time is the sum for driver and scheduler. The ratio of a row is the median over its pairs of our
+cost divided by Dask's. To compare with another version of poolpart, put its folder first on
+`PYTHONPATH`.
 """
 
 from __future__ import annotations
 
-import argparse
 import gc
-import json
 import os
-import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import psutil
 from distributed import Client, Queue, wait
 
-from benchmarks.many_workers import process, run_scheduler, run_workers
-from benchmarks.submitting import NAME, SLOTS, WORKERS, cluster_of
 from poolpart import Partition, Pipe, Pool, n_workers
+
+from .harness import (
+    argument_parser,
+    cpu_seconds,
+    median_ratio,
+    run_rounds,
+    time_call,
+    write_results,
+)
+from .many_workers import process, run_scheduler, run_workers
+from .submitting import NAME, SLOTS, WORKERS, cluster_of
 
 RESOURCES = {NAME: 1}
 
 
 class Cost(NamedTuple):
-    """Processor time of driver and scheduler, and elapsed time; seconds."""
+    """CPU time of driver and scheduler, and elapsed time; seconds."""
 
-    processor: float
+    cpu: float
     wall: float
 
 
@@ -183,90 +190,73 @@ def cost_of(work: Callable[[int], object], count: int, scheduler: psutil.Process
     """Return what some work costs."""
     gc.collect()
     processes = psutil.Process(), scheduler
-    before = sum(map(_seconds_of, processes))
-    started = time.perf_counter()
-    work(count)
-    wall = time.perf_counter() - started
-    return Cost(sum(map(_seconds_of, processes)) - before, wall)
-
-
-def _seconds_of(of_process: psutil.Process) -> float:
-    times = of_process.cpu_times()
-    return float(times.user + times.system)
+    before = sum(map(cpu_seconds, processes))
+    wall, _ = time_call(lambda: work(count), "wall")
+    return Cost(sum(map(cpu_seconds, processes)) - before, wall)
 
 
 def compare(work: Work, clusters: Clusters, count: int, pairs: int) -> dict[str, float]:
     """Return the median costs of each side in microseconds per item, and the median ratios."""
     work.ours(min(count, 50))  # both have done everything once
     work.theirs(min(count, 50))
-    ours: list[Cost] = []
-    theirs: list[Cost] = []
-    for number in range(pairs):
-        sides = [
-            (ours, work.ours, clusters.scheduler),
-            (theirs, work.theirs, clusters.plain_scheduler),
-        ]
-        for costs, function, scheduler in sides[:: 1 if number % 2 else -1]:
-            costs.append(cost_of(function, count, scheduler))
-    figures: dict[str, float] = {}
-    for field in Cost._fields:
-        ours_s, theirs_s = ([getattr(cost, field) for cost in costs] for costs in (ours, theirs))
-        figures[f"{field}_us"] = 1e6 * statistics.median(ours_s) / count
-        figures[f"{field}_us_dask"] = 1e6 * statistics.median(theirs_s) / count
-        ratios = [mine / max(1e-9, dask) for mine, dask in zip(ours_s, theirs_s, strict=True)]
-        figures[f"{field}_ratio"] = statistics.median(ratios)
-    return figures
+    calls = {
+        "ours": lambda _: cost_of(work.ours, count, clusters.scheduler),
+        "theirs": lambda _: cost_of(work.theirs, count, clusters.plain_scheduler),
+    }
+    costs = run_rounds(calls, pairs, warm_up=0)
+    results: dict[str, float] = {}
+    for index, field in enumerate(Cost._fields):
+        ours_s, theirs_s = ([cost[index] for cost in costs[side]] for side in calls)
+        results[f"{field}_us"] = 1e6 * float(np.median(ours_s)) / count
+        results[f"{field}_us_dask"] = 1e6 * float(np.median(theirs_s)) / count
+        results[f"{field}_ratio"] = median_ratio(ours_s, theirs_s)
+    return results
 
 
 def main(arguments: list[str] | None = None) -> dict[str, dict[str, float]]:
-    """Measure, print and return the figures of each row."""
-    parser = argparse.ArgumentParser(prog="benchmarks.beside_dask", description=__doc__)
-    parser.add_argument("--pairs", type=int, default=9)
-    parser.add_argument("--tasks", type=int, default=4_000, help="of submit and map, in each half")
+    """Measure, print and return the results of each row."""
+    parser = argument_parser(__doc__, repeat=9, quick=True)
+    parser.add_argument("--tasks", type=int, default=4_000, help="of submit and map")
     parser.add_argument("--trips", type=int, default=1_000, help="round trips of an item")
-    parser.add_argument("--short-tasks", type=int, default=300, help="of 50 ms, in each half")
-    parser.add_argument("--short-pairs", type=int, default=5)
+    parser.add_argument("--short-tasks", type=int, default=300, help="tasks of 50 ms")
+    parser.add_argument("--short-repeat", type=int, default=5, help="rounds of these tasks")
     parser.add_argument("--busy", type=int, default=os.cpu_count(), help="processes beside them")
     parser.add_argument("--workers", type=int, default=200, help="of the wide clusters")
     parser.add_argument("--wide-tasks", type=int, default=20_000)
-    parser.add_argument("--wide-pairs", type=int, default=3)
-    parser.add_argument("--quick", action="store_true", help="sizes that show that all runs")
-    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--wide-repeat", type=int, default=3)
     options = parser.parse_args(arguments)
     if options.quick:
-        options.pairs = options.wide_pairs = 1
+        options.repeat = options.wide_repeat = options.short_repeat = options.busy = 1
         options.tasks = options.wide_tasks = 100
-        options.short_pairs = options.busy = 1
         options.short_tasks = 10
         options.trips = 20
         options.workers = 4
     rows: dict[str, dict[str, float]] = {}
 
     def row(name: str, work: Work, clusters: Clusters, count: int, pairs: int) -> None:
-        rows[name] = figures = compare(work, clusters, count, pairs)
+        rows[name] = values = compare(work, clusters, count, pairs)
         print(
-            f"{name:<14} processor {figures['processor_us']:7.0f} µs, beside Dask "
-            f"{figures['processor_us_dask']:7.0f} ({figures['processor_ratio']:.3f}); elapsed "
-            f"{figures['wall_us']:7.0f} µs, beside {figures['wall_us_dask']:7.0f} "
-            f"({figures['wall_ratio']:.3f})",
+            f"{name:<14} CPU {values['cpu_us']:7.0f} µs, beside Dask "
+            f"{values['cpu_us_dask']:7.0f} ({values['cpu_ratio']:.3f}); elapsed "
+            f"{values['wall_us']:7.0f} µs, beside {values['wall_us_dask']:7.0f} "
+            f"({values['wall_ratio']:.3f})",
             flush=True,
         )
 
     with small_clusters() as clusters:
-        row("submit", submit_work(clusters), clusters, options.tasks, options.pairs)
-        row("map", map_work(clusters, 1), clusters, options.tasks, options.pairs)
-        row("map_items", map_work(clusters, None), clusters, options.tasks, options.pairs)
-        row("pipe", pipe_work(clusters), clusters, options.trips, options.pairs)
+        row("submit", submit_work(clusters), clusters, options.tasks, options.repeat)
+        row("map", map_work(clusters, 1), clusters, options.tasks, options.repeat)
+        row("map_items", map_work(clusters, None), clusters, options.tasks, options.repeat)
+        row("pipe", pipe_work(clusters), clusters, options.trips, options.repeat)
         for load, busy in ("quiet", 0), ("busy", options.busy):
             for name, client_sleeps_s in (f"{load}_map", 0.0), (f"{load}_map_slow", 0.02):
                 work = short_map_work(clusters, client_sleeps_s)
                 with busy_cores(busy):
-                    row(name, work, clusters, options.short_tasks, options.short_pairs)
+                    row(name, work, clusters, options.short_tasks, options.short_repeat)
     with wide_clusters(options.workers) as clusters:
-        row("wide_submit", submit_work(clusters), clusters, options.wide_tasks, options.wide_pairs)
-        row("wide_map", map_work(clusters, 1), clusters, options.wide_tasks, options.wide_pairs)
-    if options.json:
-        options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        row("wide_submit", submit_work(clusters), clusters, options.wide_tasks, options.wide_repeat)
+        row("wide_map", map_work(clusters, 1), clusters, options.wide_tasks, options.wide_repeat)
+    write_results(options.json, rows)
     return rows
 
 

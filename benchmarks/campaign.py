@@ -1,15 +1,16 @@
-"""What a campaign costs beside its rays: `python -m benchmarks.campaign`.
+"""Time and memory per job of a campaign, in addition to ray casting.
 
-Jobs of 20 scans, one turn of a sensor with 64 channels, on a local cluster that has started before.
-The cost of a job beside its rays is the wall time less the casting time of all tasks, shared by the
-workers that cast. `--toy` makes the jobs so small that only their number counts, and `--picture`
-draws the memory of the driver, which has the scheduler in its process, and of LIDAR's worker.
+    python -m benchmarks.campaign [--jobs N] [--toy] [--picture FILE]
+
+Each job has 20 scans, which are one revolution of a sensor with 64 channels. The jobs run on a
+local cluster that is already running. The cost of a job is the wall time, minus the casting time
+of all tasks divided by the number of casting workers. `--toy` makes the jobs very small, and
+`--picture` draws the memory of the driver, whose process contains the scheduler, and of the LIDAR
+worker.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import tempfile
 import time
@@ -23,6 +24,8 @@ from lidarpool import Campaign
 from lidarpool.run.cluster.connection import local_client
 from lidarpool.run.pipeline.stage_names import GPU
 from lidarpool.run.progress import Progress
+
+from .harness import argument_parser, write_results
 
 MIB = 1 << 20
 EVERY_S = 1.0  # between samples
@@ -128,23 +131,21 @@ def draw(samples: Samples, path: Path) -> None:
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    """Run from the command line; return the figures."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    """Run from the command line; return the results."""
+    parser = argument_parser(__doc__)
     parser.add_argument("--jobs", type=int, default=1000)
     parser.add_argument("--toy", action="store_true", help="jobs of 1,000 rays")
-    parser.add_argument("--picture", type=Path, help="draw the memory here")
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    chosen = parser.parse_args(arguments)
-    rays, layers = (100, 10) if chosen.toy else (1024, 64)
+    parser.add_argument("--picture", type=Path, help="draw the memory usage to this file")
+    options = parser.parse_args(arguments)
+    rays, layers = (100, 10) if options.toy else (1024, 64)
     with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
-        figures, samples = measure(chosen.jobs, rays, layers, Path(folder))
-    for name, value in figures.items():
+        results, samples = measure(options.jobs, rays, layers, Path(folder))
+    for name, value in results.items():
         print(f"{name:<30} {value:,.1f}" if isinstance(value, float) else f"{name:<30} {value:,}")
-    if chosen.picture:
-        draw(samples, chosen.picture)
-    if chosen.json:
-        chosen.json.write_text(json.dumps(figures, indent=1) + "\n")
-    return figures
+    if options.picture:
+        draw(samples, options.picture)
+    write_results(options.json, results)
+    return results
 
 
 if __name__ == "__main__":

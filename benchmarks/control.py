@@ -1,16 +1,15 @@
-"""The control road: what passes scheduler and driver.
+"""Bytes that the scheduler and the driver exchange with other processes.
 
-Bytes: a survey on a cluster of this machine, whose scheduler is in the driver's process, so that
-all that either sends or receives passes here and is counted by kind of message. It is run with
-every fifth point kept and with all of them: what grows with points would show. And it is run in
-batches of one scan: what comes with each batch.
+    python -m benchmarks.control [--scans N]
 
-Run: ``python -m benchmarks.control [--scans 20000]``
+A survey runs on a local cluster whose scheduler is in the process of the driver, so that all of
+their messages can be counted here by kind. The survey runs with every fifth point and with all
+points, which shows what grows with the number of points. It also runs in batches of one scan,
+which shows the cost of a batch.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,6 +22,8 @@ import numpy as np
 
 import lidarpool.run.pipeline.policies
 from lidarpool import Scene, Sensor, Survey, simulate
+
+from .harness import argument_parser, write_results
 
 # Messages that come with time and with workers, not with work.
 UPKEEP = {"heartbeat", "setup", "transfers"}
@@ -63,9 +64,8 @@ def _kind(message: Any) -> str:
     return op
 
 
-_local_address: ContextVar[str] = ContextVar(
-    "_here", default=""
-)  # address at this end of a connection
+# Address at this end of a connection.
+_local_address: ContextVar[str] = ContextVar("_local_address", default="")
 
 
 @contextmanager
@@ -111,8 +111,8 @@ def small_survey(scans: int, keep_every: int) -> Survey:
     return Survey(sensor, poses, steps=90, keep_every=keep_every)
 
 
-def count_bytes(scans: int) -> None:
-    """Print the scheduler's bytes per additional scan, and with five times as many points."""
+def count_bytes(scans: int) -> dict[str, float]:
+    """Print and return the scheduler's bytes per additional scan and per scan with all points."""
     sides = {
         "every 5th point": (scans, 5),
         "all points": (scans, 1),
@@ -135,11 +135,14 @@ def count_bytes(scans: int) -> None:
     points = work["all points"]
     for kind, count in (doubled - base).most_common(5):
         print(f"    {kind:24} {count / scans:6.1f} bytes a further scan")
-    added = (sum(doubled.values()) - sum(base.values())) / scans
-    print(
-        f"a further scan adds {added:.0f} bytes; five times the points add "
-        f"{(sum(points.values()) - sum(base.values())) / scans:.0f} bytes a scan"
+    scan_bytes, point_bytes = (
+        (sum(counts.values()) - sum(base.values())) / scans for counts in (doubled, points)
     )
+    print(
+        f"a further scan adds {scan_bytes:.0f} bytes; five times the points add "
+        f"{point_bytes:.0f} bytes a scan"
+    )
+    return {"bytes_a_scan": scan_bytes, "bytes_a_scan_of_points": point_bytes}
 
 
 def single_scans() -> Any:
@@ -147,8 +150,8 @@ def single_scans() -> Any:
     return patch.object(lidarpool.run.pipeline.policies, "scans_per_batch", lambda *_: 1)
 
 
-def count_batches(batches: int) -> None:
-    """Print the bytes per additional batch of one scan, at the scheduler and at the driver."""
+def count_batches(batches: int) -> dict[str, float]:
+    """Print and return the bytes per additional batch, at the scheduler and at the driver."""
     bytes_by_batches = {}
     for count in (batches, 3 * batches):
         with count_traffic() as counted, single_scans():
@@ -161,15 +164,19 @@ def count_batches(batches: int) -> None:
         f"a further batch of one scan adds {scheduler:,.0f} bytes at the scheduler and "
         f"{driver:,.0f} at the driver"
     )
+    return {"scheduler_bytes": scheduler, "driver_bytes": driver}
 
 
-def main() -> None:
-    """Count bytes of scans and of batches."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def main(arguments: list[str] | None = None) -> None:
+    """Count the bytes of scans and of batches."""
+    parser = argument_parser(__doc__)
     parser.add_argument("--scans", type=int, default=20_000)
-    options = parser.parse_args()
-    count_bytes(options.scans)
-    count_batches(min(360, options.scans))
+    options = parser.parse_args(arguments)
+    results = {
+        "scans": count_bytes(options.scans),
+        "batches": count_batches(min(360, options.scans)),
+    }
+    write_results(options.json, results)
 
 
 if __name__ == "__main__":

@@ -1,20 +1,20 @@
-"""From casting to the cloud, without casting: `python -m benchmarks.dataplane [--points 16e6]`.
+"""The path of points from casting to the cloud, without casting, compared with plain writing.
 
-The real pipeline on a cluster that is started as by every run, in processes of this machine: the
-casting workers return columns that are in their memory already, and all else is the product's own,
-up to cloud.ply and report.json. In each round the bytes of the parts and of the cloud are also
-written plainly, file by file as large and flushed as often as the run's, twice after the run;
-copied in memory once; and packed and written by one thread, as a collector does.
+    python -m benchmarks.dataplane [--points 16e6] [--folder FOLDER]
 
-The first run, which is small, imports what each process needs, and is not measured. Processor times
-are of whole processes; the scheduler is in the driver's. Bytes are what system calls read and wrote
-in files, and what casting workers sent to collectors. --folder /dev/shm keeps all files in memory.
+A local cluster runs the real pipeline up to cloud.ply and report.json, but the casting workers
+return columns that are already in their memory. In each round, the bytes of the parts and of the
+cloud are also written plainly, in files of the same sizes that are flushed as often, twice after
+the run. One thread also packs parts, and packs and writes parts, as a collector does.
+
+A small run that is not measured imports what the processes need. CPU times are of whole processes;
+the scheduler is in the process of the driver. Bytes are those that system calls read from and wrote
+to files, and those that casting workers sent to collectors. `--folder /dev/shm` keeps all files in
+memory.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import shutil
 import statistics
@@ -54,11 +54,12 @@ from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from poolpart.workers import worker_identities
 
+from .harness import argument_parser, cpu_seconds, write_results
+
 HALL = Scene.from_meshes([box("Hall", (160, 120, 30))])  # all rays hit
-_PIECE_BYTES = 1 << 25  # written at a time to the cloud, and copied at a time
+_PIECE_BYTES = 1 << 25  # written at a time to the cloud
 _BESIDE = {
     "plain": "writing the same bytes",
-    "copy": "copying them in memory once",
     "pack": "a thread packs parts",
     "pack_and_write": "a thread packs and writes parts",
 }
@@ -73,7 +74,6 @@ class Sizes:
     rays_per_scan: int = 131_072
     collectors: int = 2
     casting: int = 1
-    rounds: int = 3
 
     @property
     def scans(self) -> int:
@@ -81,7 +81,7 @@ class Sizes:
         return max(2, round(self.points / self.rays_per_scan))
 
 
-QUICK = Sizes(points=16_000, rays_per_scan=1_024, rounds=1)
+QUICK = Sizes(points=16_000, rays_per_scan=1_024)
 
 
 def still_survey(sizes: Sizes, scans: int) -> Survey:
@@ -172,10 +172,9 @@ class Usage:
     @classmethod
     def of(cls, processes: Sequence[psutil.Process]) -> Usage:
         """Read the usage of processes."""
-        times = [process.cpu_times() for process in processes]
         counters = [process.io_counters() for process in processes]
         return cls(
-            sum(t.user + t.system for t in times),
+            sum(map(cpu_seconds, processes)),
             sum(c.read_chars for c in counters),
             sum(c.write_chars for c in counters),
             sum(_peak_bytes(process.pid) for process in processes) / 1e6,
@@ -315,13 +314,6 @@ def write_plainly(folder: Path, sizes: Sequence[int]) -> Spent:
     return spent
 
 
-def copy_plainly(total_bytes: int) -> Spent:
-    """Copy bytes within memory; return the time."""
-    source = np.ones(min(_PIECE_BYTES, total_bytes), np.uint8)
-    target = np.ones_like(source)
-    return spent_in(lambda: np.copyto(target, source), -(-total_bytes // len(source)))
-
-
 def pack_alone(part: PartColumns, folder: Path, points: int) -> dict[str, float]:
     """Pack parts, and pack and write parts, in this thread; return rates and processor times."""
     storage = Storage.at(folder)
@@ -344,20 +336,17 @@ def pack_alone(part: PartColumns, folder: Path, points: int) -> dict[str, float]
 def measure_round(
     cluster: Cluster, sizes: Sizes, part: PartColumns, folder: Path
 ) -> dict[str, Any]:
-    """Return the figures of a run and of plain writing before and after, and of copying."""
+    """Return the figures of a run and of plain writing before and after it."""
     figures, file_sizes = measure_run(cluster, sizes, folder / "result")
     points = figures["points"]
     after = write_plainly(folder / "after", file_sizes)
     (folder / "result" / CLOUD).unlink()
     again = write_plainly(folder / "again", file_sizes)
-    copied = copy_plainly(sum(file_sizes))
     plain_s = (after.wall_s + again.wall_s) / 2
     figures["plain_mpoints_s"] = points / plain_s / 1e6
     figures["plain_ns"] = 1e9 * (after.cpu_s + again.cpu_s) / 2 / points
     figures["to_plain"] = plain_s / figures["wall_s"]
     figures["file_bytes"] = sum(file_sizes) / points
-    figures["copy_mpoints_s"] = points / copied.wall_s / 1e6
-    figures["copy_ns"] = 1e9 * copied.cpu_s / points
     return {**figures, **pack_alone(part, folder / "alone", points)}
 
 
@@ -371,11 +360,11 @@ def medians(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def report(figures: dict[str, Any], sizes: Sizes) -> None:
+def report(figures: dict[str, Any], sizes: Sizes, repeat: int) -> None:
     """Print the medians of all rounds."""
     print(
         f"{figures['points']:,.0f} points, {sizes.casting} casting and {sizes.collectors} "
-        f"collectors, medians of {sizes.rounds}"
+        f"collectors, medians of {repeat}"
     )
     print(
         f"survey: {figures['mpoints_s']:.2f} million points/s from start to end, "
@@ -397,30 +386,29 @@ def report(figures: dict[str, Any], sizes: Sizes) -> None:
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    """Measure, print and return the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    """Measure, print and return the medians of all rounds."""
+    parser = argument_parser(__doc__, repeat=3, quick=True)
     parser.add_argument("--points", type=lambda text: int(float(text)), default=Sizes.points)
     parser.add_argument("--collectors", type=int, default=Sizes.collectors)
     parser.add_argument("--casting", type=int, default=Sizes.casting, help="casting workers")
-    parser.add_argument("--rounds", type=int, default=Sizes.rounds)
-    parser.add_argument("--folder", type=Path, help="where files are written: a disk or /dev/shm")
-    parser.add_argument("--quick", action="store_true", help="toy size")
-    parser.add_argument("--json", type=Path, help="also write the figures of all rounds")
+    parser.add_argument("--folder", type=Path, help="folder for files, on a disk or in /dev/shm")
     options = parser.parse_args(arguments)
-    names = ("points", "collectors", "casting", "rounds")
-    sizes = QUICK if options.quick else Sizes(**{name: getattr(options, name) for name in names})
+    sizes = Sizes(options.points, collectors=options.collectors, casting=options.casting)
+    repeat = options.repeat
+    if options.quick:
+        sizes = QUICK
+        repeat = 1
     rig = Rig(HALL, still_survey(sizes, 1), "auto")
     part = repeated(replace(columns_of(list(rig.cast(0, 1))), **_of_scans()), 7)
     with replaying_cluster(sizes) as cluster:
         rows = []
-        for _ in range(sizes.rounds):
+        for _ in range(repeat):
             with tempfile.TemporaryDirectory(dir=options.folder) as folder:
                 rows.append(measure_round(cluster, sizes, part, Path(folder)))
-    figures = medians(rows)
-    report(figures, sizes)
-    if options.json:
-        options.json.write_text(json.dumps(rows, indent=1) + "\n")
-    return figures
+    results = medians(rows)
+    report(results, sizes, repeat)
+    write_results(options.json, rows)
+    return results
 
 
 def _of_scans() -> dict[str, Any]:

@@ -1,17 +1,16 @@
-"""Exports as decoders and devkits of others read them.
+"""Exported files, as third-party decoders and devkits read them.
 
-    python -m benchmarks.decoders [--python PYTHON …] [--only PROGRAM …] [--quick]
+    python -m benchmarks.decoders [--python PYTHON ...] [--only PROGRAM ...]
 
-Sensors of Velodyne and Ouster stand in a city, and their packets are written; a car with two lidars
-drives past actors, and the drive is written in six formats. Each program reads its files in a
-process of its own. What it has read is compared with the cloud of the survey, and with the closed
-form of the actors' trajectories. A program is taken from the first Python that has it: the one that
-runs this, then those of `--python`, since some programs demand packages that lidarpool does not.
+The packets of static Velodyne and Ouster sensors in a city are written, and a drive with two lidars
+past actors is written in six formats. Each program reads its files in its own process. The results
+are compared with the cloud of the survey and with the exact trajectories of the actors. A program
+runs in the first Python environment that has it: the current one, then those of `--python`, because
+some programs require packages that conflict with lidarpool.
 """
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 import tempfile
@@ -36,6 +35,7 @@ from .decoders_compare import (
     compare_velodyne,
 )
 from .decoders_surveys import Drive, drive_of, packets_of
+from .harness import argument_parser, print_row, write_results
 
 TRIANGLES = 100_000  # of the city
 SWEEPS = 20  # of the drive
@@ -154,19 +154,19 @@ def drive_rows(program: str, python: str, folder: Path, drive: Drive) -> tuple[s
 
 def main(arguments: list[str] | None = None) -> int:
     """Run from the command line; return 1 if a program is missing."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser = argument_parser(__doc__, quick=True)
     parser.add_argument("--python", action="append", default=[], help="a Python with programs")
     parser.add_argument("--only", nargs="+", choices=PROGRAMS, default=[*PROGRAMS])
-    parser.add_argument("--quick", action="store_true", help="toy sizes")
-    chosen = parser.parse_args(arguments)
-    scene = city(TOY_TRIANGLES if chosen.quick else TRIANGLES)
-    drive = drive_of(scene, TOY_SWEEPS if chosen.quick else SWEEPS)
-    revolutions = TOY_REVOLUTIONS if chosen.quick else REVOLUTIONS
+    options = parser.parse_args(arguments)
+    scene = city(TOY_TRIANGLES if options.quick else TRIANGLES)
+    drive = drive_of(scene, TOY_SWEEPS if options.quick else SWEEPS)
+    revolutions = TOY_REVOLUTIONS if options.quick else REVOLUTIONS
     missing = []
-    print("| program | file | compared | number | greatest difference |")
+    results = {}
+    print_row("program", "file", "compared", "number", "greatest difference")
     print("|---|---|---|--:|---|")
-    for program in chosen.only:
-        python = python_of(program, [sys.executable, *chosen.python])
+    for program in options.only:
+        python = python_of(program, [sys.executable, *options.python])
         if python is None:
             missing.append(program)
             continue
@@ -175,16 +175,17 @@ def main(arguments: list[str] | None = None) -> int:
                 version, rows = packet_rows(program, python, Path(name), scene, revolutions)
             else:
                 version, rows = drive_rows(program, python, Path(name), drive)
+        results[f"{program} {version}"] = [row._asdict() for row in rows]
         for row in rows:
             words = "; ".join(f"{name} {value}" for name, value in row.differences.items())
-            cells = (f"{program} {version}", row.file, row.things, f"{row.count:,}", words)
-            print("|", " | ".join(cells), "|", flush=True)
+            print_row(f"{program} {version}", row.file, row.things, f"{row.count:,}", words)
     for program in missing:
         print(
             f"{program} was left out: pip install {' '.join(packages_of(program))}, or give "
             "--python with the Python of an environment that has it",
             file=sys.stderr,
         )
+    write_results(options.json, results)
     return 1 if missing else 0
 
 

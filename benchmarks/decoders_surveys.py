@@ -13,14 +13,13 @@ import numpy as np
 from lidarpool import Material, Mounted, Pose, Scene, Survey, Track, load_sensor
 from lidarpool.clouds.writing import ExportSpec, with_format_columns
 from lidarsim.columns.cloud import Cloud
-from lidarsim.columns.table import SCAN
 from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.scene.actors import Actor, box, join_meshes
 from lidarsim.scene.files.meshfile import load_objects
 from lidarsim.scene.scene_mesh import SceneMesh
-from lidarsim.simulator.points.batch_columns import columns_of
-from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
+
+from .odometry import cloud_of
 
 START = datetime(2026, 11, 27, 12, 0, tzinfo=UTC)  # of the drive
 _STEPS_PER_REVOLUTION = 36
@@ -68,19 +67,15 @@ class Drive:
     scene: Scene
     movers: tuple[Mover, ...] = ()
 
-    @cached_property
+    @property
     def sweeps(self) -> Sweeps:
         """Sweeps of the survey."""
-        return Sweeps.from_survey(self.survey, self.scene)
+        return self.cloud.sweeps()
 
     @cached_property
     def cloud(self) -> Cloud:
         """Points of the survey, cast in this process."""
-        survey = self.survey
-        part = columns_of(list(Rig(self.scene, survey, "auto").cast(0, survey.scan_count)))
-        names = (SCAN, *survey.stored_columns[3:])
-        cloud = part.cloud(names, survey.precision_m, self.scene.origin)
-        return replace(cloud, sweeps=lambda: self.sweeps)
+        return cloud_of(self.survey, self.scene)
 
     @cached_property
     def points(self) -> list[Cloud]:

@@ -1,14 +1,13 @@
-"""How often the intervals of `lidarpool fit` hold the figures that a recording was made with.
+"""How often the confidence intervals of `lidarpool fit` contain the true values.
 
-python -m benchmarks.fit_coverage [--trials 200]
-python -m benchmarks.fit_coverage --places [--trials 40] [--cache FOLDER]
+    python -m benchmarks.fit_coverage [--trials 200]
+    python -m benchmarks.fit_coverage --places [--trials 40] [--cache FOLDER]
 
-With `--places`, the sensor stands in turn in a room, a street of a city, a hall and a forest.
+With `--places`, the sensor stands in a room, a street of a city, a hall and a forest in turn.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,8 @@ from lidarscenes.procedural.city import city
 from lidarscenes.procedural.plants import all_trees, place_instances
 from lidarsim.columns.sweep import Sweep
 from lidarsim.scene.scene_mesh import SceneMesh
+
+from .harness import argument_parser, print_row, write_results
 
 SWEEPS = 12
 COLUMNS = 360
@@ -197,20 +198,20 @@ def trial(
     return truth, fitted
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--trials", type=int)
-    parser.add_argument("--places", action="store_true")
+def main(arguments: list[str] | None = None) -> None:
+    parser = argument_parser(__doc__)
+    parser.add_argument("--trials", type=int, help="number of recordings (default: 200 or 40)")
+    parser.add_argument("--places", action="store_true", help="simulate different places")
     parser.add_argument("--cache", type=Path, help="folder that keeps simulated recordings")
-    arguments = parser.parse_args()
-    place_names = PLACES if arguments.places else ("",)
-    trials = arguments.trials or (40 if arguments.places else 200)
+    options = parser.parse_args(arguments)
+    place_names = PLACES if options.places else ("",)
+    trials = options.trials or (40 if options.places else 200)
     # {(place, figure): (held, relative error, relative half-width) of each trial}
     rows: dict[tuple[str, str], list[tuple[bool, float, float]]] = defaultdict(list)
     missing: dict[tuple[str, str], int] = defaultdict(int)
     for number in range(trials):
         place_name = place_names[number % len(place_names)]
-        truth, fitted = trial(number, arguments.cache, place_name)
+        truth, fitted = trial(number, options.cache, place_name)
         if isinstance(fitted, str):
             print(f"{place_name} {number}: {fitted}")
             fitted = {}
@@ -224,16 +225,29 @@ def main() -> None:
                 held = estimate["low"] <= true <= estimate["high"]
                 half = (estimate["high"] - estimate["low"]) / 2 / abs(true)
                 rows[key].append((held, estimate["value"] / true - 1, half))
-    print("| place | figure | trials | not determined | held | median error | median half-width |")
+    results = {}
+    print_row("place", "figure", "trials", "not determined", "held", "error", "half-width")
     print("|---|---|--:|--:|--:|--:|--:|")
     for place_name, name in sorted({*rows, *missing}):
-        held, error, half = np.reshape(rows[place_name, name] or [(0, np.nan, np.nan)], (-1, 3)).T
-        print(
-            f"| {place_name} | `{name}` "
-            f"| {len(rows[place_name, name])} | {missing[place_name, name]} "
-            f"| {100 * held.mean():.1f} % | {100 * np.median(error):+.2f} % "
-            f"| {100 * np.median(np.abs(half)):.1f} % |"
+        trials_held = rows[place_name, name]
+        held, error, half = np.reshape(trials_held or [(0, np.nan, np.nan)], (-1, 3)).T
+        results[f"{place_name} {name}"] = {
+            "trials": len(trials_held),
+            "not_determined": missing[place_name, name],
+            "held": held.mean(),
+            "median_error": np.median(error),
+            "median_half_width": np.median(np.abs(half)),
+        }
+        print_row(
+            place_name,
+            f"`{name}`",
+            len(trials_held),
+            missing[place_name, name],
+            f"{100 * held.mean():.1f} %",
+            f"{100 * np.median(error):+.2f} %",
+            f"{100 * np.median(np.abs(half)):.1f} %",
         )
+    write_results(options.json, results)
 
 
 if __name__ == "__main__":

@@ -1,16 +1,15 @@
-"""How fast clouds are exported: each format beside a short script with the same library.
+"""Points per second of each export, compared with a minimal script that uses the same library.
 
-    python -m benchmarks.formats [POINTS]
+    python -m benchmarks.formats [--points 1e7]
 
-Prints millions of points a second of processor time, and the most memory in MB without pages of
-the mapped cloud. The scripts write neither poses nor labels, and read the whole cloud at once.
+The table lists millions of points per second of CPU time, and the peak memory in MB without the
+pages of the mapped cloud. The scripts write neither poses nor labels, and read the whole cloud at
+once.
 """
 
-import argparse
 import multiprocessing
 import tempfile
 import threading
-import time
 from pathlib import Path
 
 import laspy
@@ -27,6 +26,8 @@ from lidarpool.clouds.writing import ExportSpec
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import layout
 from lidarsim.sweeps.sweeps import Sweeps
+
+from .harness import argument_parser, time_call, write_results
 
 COLUMNS = (
     "time",
@@ -145,32 +146,35 @@ def measure_call(write, *arguments):
             samples_kb.append(int(status.split("RssAnon:")[1].split()[0]))
 
     threading.Thread(target=watch).start()
-    begin = time.process_time()
-    write(*arguments)
+    seconds, _ = time_call(lambda: write(*arguments))
     finished.set()
-    return time.process_time() - begin, max(samples_kb) / 1000
+    return seconds, max(samples_kb) / 1000
 
 
-def main(points=10_000_000):
+def main(arguments=None):
     """Print the table."""
+    parser = argument_parser(__doc__)
+    parser.add_argument("--points", type=float, default=1e7, help="points of the cloud")
+    options = parser.parse_args(arguments)
+    points = int(options.points)
+    results = {}
     processes = multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1)
     with processes, tempfile.TemporaryDirectory() as folder_name:
         folder = Path(folder_name)
         processes.apply(write_inputs, (folder, points))
         print(f"{'format':10}{'Mpt/s':>8}{'script':>8}{'ratio':>7}{'MB':>8}{'script':>8}")
         for name in SCRIPTS:
-            (export_s, export_mb), (script_s, script_mb) = (
+            (export_s, export_mb), (script_s, script_mb) = results[name] = [
                 processes.apply(
                     measure_call, (write, name, folder, folder / f"{write.__name__}.{name}")
                 )
                 for write in (export, write_by_library)
-            )
+            ]
             rates = f"{points / export_s / 1e6:8.2f}{points / script_s / 1e6:8.2f}"
             ratio = export_s / script_s
             print(f"{name:10}{rates}{ratio:7.2f}{export_mb:8.0f}{script_mb:8.0f}", flush=True)
+    write_results(options.json, results)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("points", type=float, nargs="?", default=1e7, help="points of the cloud")
-    main(int(parser.parse_args().points))
+    main()

@@ -1,23 +1,22 @@
-"""All that a CUDA device does for lidarpool, measured by one command: `python -m benchmarks.gpu`.
+"""All operations on a CUDA device.
 
-From the repository's root, with NumPy and CuPy, the parts of the project on the path:
+    python -m benchmarks.gpu [--quick] [--only SECTION ...] --json gpu.json
 
-    PYTHONPATH=kernels:scheduler:workflows python -m benchmarks.gpu --json gpu.json
+Run it in the root of the repository with `PYTHONPATH=kernels:scheduler:workflows`. Ray casting
+requires NumPy and CuPy. Points also require lidarpool's dependencies, except Open3D, trimesh and
+Matplotlib, and the comparison requires warp-lang. Sections whose packages are missing are skipped
+and listed. Each section runs in its own process with a time limit, so that a failure does not
+affect the other sections. The JSON file is written after each section. Finally, the table of
+docs/performance.md is printed. Times are medians.
 
-Points need lidarpool's dependencies besides, but not Open3D, trimesh or Matplotlib; peers need
-warp-lang and mujoco-lidar. What cannot be imported is left out and named. Each section is a process
-of its own, with a limit of time: one that fails, even by ending the process, leaves the others. The
-file is written after each. At the end comes the table of docs/performance.md. Times are medians.
-
-`--first-device` is for a device on which nothing has run yet: it runs the tests and NVIDIA's tools
-besides, in an order of rising risk, and writes a page of Markdown beside the file.
+Use `--first-device` on a device on which nothing has run yet. It also runs the tests and NVIDIA's
+tools, in order of increasing risk, and writes a Markdown page next to the JSON file.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib
-import json
 import os
 import signal
 import subprocess
@@ -34,6 +33,7 @@ from raybeam import available_backends
 from raybeam.registry import choose_backend
 
 from .gpu_clock import QUICK, Session, Sizes, clocks
+from .harness import argument_parser, read_results, write_results
 
 # {section: (its module, seconds at most)}, in an order of rising risk; its function has its name.
 # A section has that long on a device with nothing compiled yet.
@@ -55,7 +55,6 @@ SECTIONS = {
     "instances": ("gpu_rays", 25),
     "durable": ("gpu_points", 30),
     "sharing": ("gpu_points", 35),
-    "mujoco": ("gpu_warp", 10),
 }
 _FIRST_ONLY = ("tests", "sanitizer", "scanner", "counters")
 MEASURED = [name for name in SECTIONS if name not in _FIRST_ONLY]  # 400 s
@@ -81,8 +80,6 @@ ROWS = (
     ("one revolution in sensor order, same cities, Gray/s", 2, _casts("one revolution")),
     ("16 revolutions in random order, same cities, Gray/s", 2, _casts("shuffled")),
     ("random directions from random origins, same cities, Gray/s", 2, _casts("scattered")),
-    ("brute force, city of 10⁴, 10⁵, 10⁶ triangles, Mray/s", 2,
-     [f"kernels/{city}, brute force/mrays_s" for city in _CITIES]),
     ("hits copied to the host, 16 bytes each, city of 10⁴, 10⁵, 10⁶ triangles, Gray/s", 2,
      [f"kernels/{city}, coherent/grays_s/to_host" for city in _CITIES]),
     ("time to build a caster of 10⁴, 10⁵, 10⁶, 10⁷ triangles, s", 1,
@@ -100,9 +97,6 @@ ROWS = (
     ("raybeam rate ÷ fastest Warp rate: city of 10⁵ triangles in sensor order, in "
      "random order; city of 10⁶ triangles in sensor order, in random order", 2,
      [f"to Warp/{city}/{order}" for city in _CITIES[1:] for order in ("coherent", "shuffled")]),
-    ("MuJoCo-LiDAR with Warp; raybeam; from poses to distances on the host, city of "
-     "10⁵ triangles, Gray/s", 2,
-     ("mujoco/MuJoCo-LiDAR/grays_s", "mujoco/raybeam/grays_s")),
     ("points with columns in host memory: all points, every fifth point, ten actors, "
      "million points/s", 0,
      [f"columns/{name}/mpoints_s" for name in ("plain", "every fifth point", "ten actors")]),
@@ -272,25 +266,23 @@ def apart(name: str, options: list[str], seconds: float) -> dict[str, Any]:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
-        rows = json.loads(path.read_text())["sections"].get(name, {}) if path.exists() else {}
+        rows = read_results(path).get(name, {}) if path.exists() else {}
         rows["seconds"] = round(time.monotonic() - start, 1)
         return {**rows, "error": error} if error else rows
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run from the command line; return 1 for failures or wrong results, 2 without a device."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="toy sizes: whether it works")
+    parser = argument_parser(__doc__, quick=True)
     parser.add_argument(
         "--first-device",
         action="store_true",
-        help="tests and NVIDIA's tools as well, on a device on which nothing has run yet",
+        help="also run tests and NVIDIA's tools, for a device on which nothing has run yet",
     )
-    parser.add_argument("--only", nargs="+", choices=SECTIONS, help="these sections")
-    parser.add_argument("--seconds", type=float, help="for all sections")
-    parser.add_argument("--folder", default=".", help="on the disk for parts")
-    parser.add_argument("--json", type=Path, help="write the results here")
-    parser.add_argument("--in-process", action="store_true", help="all sections in this process")
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, help="run only these sections")
+    parser.add_argument("--seconds", type=float, help="time limit of all sections")
+    parser.add_argument("--folder", default=".", help="folder for parts, on a disk")
+    parser.add_argument("--in-process", action="store_true", help="run sections in this process")
     chosen = parser.parse_args(arguments)
     if chosen.first_device and chosen.json is None:
         chosen.json = Path("first-device.json")
@@ -315,11 +307,9 @@ def run_sections(names: list[str], chosen: argparse.Namespace) -> dict[str, Any]
 
     def store(name: str, rows: dict[str, Any]) -> None:
         results[name] = rows
-        if chosen.json:
-            report = {"command": sys.argv[1:], "sections": results}
-            write(chosen.json, json.dumps(report, indent=1, default=float) + "\n")
-            if chosen.first_device:
-                write(chosen.json.with_suffix(".md"), page(results))
+        write_results(chosen.json, results)
+        if chosen.first_device:
+            chosen.json.with_suffix(".md").write_text(page(results), "utf-8")
 
     for name in names:
         remaining_s = end - time.monotonic()
@@ -331,13 +321,6 @@ def run_sections(names: list[str], chosen: argparse.Namespace) -> dict[str, Any]
         else:
             store(name, apart(name, options, min(SECTIONS[name][1], remaining_s)))
     return results
-
-
-def write(path: Path, text: str) -> None:
-    """Write a file under another name first, so that it is complete at all times."""
-    unfinished = path.with_name(f"{path.name}.new")
-    unfinished.write_text(text, "utf-8")
-    unfinished.replace(path)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from .gpu_clock import Session, Sizes
 from .gpu_rays import MIDDLE, Rows, forest, name_of
 from .gpu_scenes import Float, ball, city, flat_ground, joined, revolution, six_objects, soup
 from .gpu_scenes import Mesh as Faces
+from .seams import count_escaped
 
 _SOUPS = ("random", "sliver", "huge", "tiny")  # kinds of unconnected triangles
 _FAR_M = 5e5  # coordinates of a map projection
@@ -136,15 +137,7 @@ def leaks(session: Session) -> Rows:
     vertices = vertices[: faces.max() + 1] + 5e5
     caster = RayCaster(vertices, faces, backend="cuda")
     inside = np.array([-20, -20, 1.5]) + 5e5
-    rng = np.random.default_rng(2)
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    escaped = cast_count = 0
-    while cast_count < session.sizes.leaks:
-        count = min(1 << 20, session.sizes.leaks - cast_count)
-        edge_vertices = vertices[edges[rng.integers(len(edges), size=count)]]
-        part = np.clip(rng.uniform(-0.5, 1.5, (count, 1)), 0, 1)  # half of them at corners
-        origins = inside + 0.1 * rng.uniform(-1, 1, (count, 3))
-        directions = edge_vertices[:, 0] * (1 - part) + edge_vertices[:, 1] * part - origins
-        escaped += count - int(caster.cast(origins, directions).hit.sum())
-        cast_count += count
-    yield "edges and corners", {"rays": cast_count, "escaped": escaped}
+    yield (
+        "edges and corners",
+        count_escaped(caster, (vertices, faces), inside, 0.1, session.sizes.leaks),
+    )

@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
@@ -22,11 +21,6 @@ _LEAST = 3
 _MOST = 50
 _BATCH_MS = 50  # of the device: short launches are repeated, until its clock has settled
 _CLOCKS = ("clocks.sm", "clocks.mem", "temperature.gpu", "power.draw", "pcie.link.gen.current")
-# What sections of the benchmark are left out without.
-_PACKAGES = (
-    "pytest", "numba", "pydantic", "trimesh", "distributed", "open3d-cpu", "warp-lang",
-    "cuda-pathfinder", "nvidia-cuda-nvrtc",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -175,7 +169,6 @@ def device(session: Session) -> Iterator[tuple[str, dict[str, Any]]]:
             "date": time.strftime("%Y-%m-%d"),
         },
     )
-    yield "versions", {name: _version(name) for name in _PACKAGES}
     array = cupy.zeros(count, np.uint8)
     plain = np.zeros(count, np.uint8)
     source = pinned(cupy, count)
@@ -199,13 +192,6 @@ def device(session: Session) -> Iterator[tuple[str, dict[str, Any]]]:
             "device, read and write": 2 * count / copied / 1e6,
         },
     )
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "not installed"
 
 
 def clocks() -> dict[str, str]:

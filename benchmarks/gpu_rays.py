@@ -12,40 +12,12 @@ from raybeam import Instance, Mesh, Opacity, Pattern, PoseMotion, RayCaster
 from raybeam.scan import HitGroups, Scan, check_scan
 
 from .gpu_clock import Session, Split, milliseconds, wall_milliseconds
-from .gpu_scenes import Float, beam_directions, city, revolution, track
+from .gpu_scenes import Float, beam_directions, city, revolution, track, tree, tree_transforms
 from .gpu_scenes import Mesh as Faces
-from .instances import tree, tree_transforms
 
 Rows = Iterator[tuple[str, dict[str, Any]]]
 MIDDLE = np.array([10.0, 10.0, 2.0])  # a crossing of the city
-_BLOCK = 128
 STAGES = ("rays", "cast", "pack", "to_device", "to_host")
-
-# Moeller and Trumbore in float against all triangles, without a tree: what needs no thought.
-_BRUTE_FORCE = """
-#define KERNEL extern "C" __global__ void
-KERNEL brute_force(
-    const float4* triangles, int triangle_count, float ox, float oy, float oz,
-    const double* directions, int count, float* distance)
-{
-    const int i = blockIdx.x * blockDim.x + threadIdx.x;
-    if (i >= count) return;
-    const float dx = directions[3 * i], dy = directions[3 * i + 1], dz = directions[3 * i + 2];
-    float best = 1e30f;
-    for (int k = 0; k < triangle_count; ++k) {
-        const float4 v = triangles[3 * k], e = triangles[3 * k + 1], g = triangles[3 * k + 2];
-        const float px = dy * g.z - dz * g.y, py = dz * g.x - dx * g.z, pz = dx * g.y - dy * g.x;
-        const float inverse = 1.0f / (e.x * px + e.y * py + e.z * pz);
-        const float tx = ox - v.x, ty = oy - v.y, tz = oz - v.z;
-        const float b = (tx * px + ty * py + tz * pz) * inverse;
-        const float qx = ty * e.z - tz * e.y, qy = tz * e.x - tx * e.z, qz = tx * e.y - ty * e.x;
-        const float c = (dx * qx + dy * qy + dz * qz) * inverse;
-        const float t = (g.x * qx + g.y * qy + g.z * qz) * inverse;
-        if (b >= 0.0f && c >= 0.0f && b + c <= 1.0f && t >= 0.0f && t < best) best = t;
-    }
-    distance[i] = best;
-}
-"""
 
 
 def name_of(triangles: int) -> str:
@@ -129,7 +101,7 @@ def other_scans(session: Session, directions: Float) -> dict[str, Scan]:
 
 
 def kernels(session: Session) -> Rows:
-    """Yield rates of rays in cities, in order, shuffled and scattered, and of brute force."""
+    """Yield rates of rays in cities, in order, shuffled and scattered."""
     directions = revolution(session.sizes.rays)
     scans = other_scans(session, directions)
     for count in (session.sizes.smallest, *session.sizes.cities):
@@ -139,29 +111,6 @@ def kernels(session: Session) -> Rows:
         yield f"{name}, coherent", rates(session, caster, revolutions(session, directions))
         for kind, scan in scans.items():
             yield f"{name}, {kind}", rates(session, caster, scan, ["cast"])
-        yield f"{name}, brute force", brute_force(session, caster, directions)
-
-
-def brute_force(session: Session, caster: RayCaster, directions: Float) -> dict[str, float]:
-    """Time a subset of the rays against all triangles, without a tree."""
-    cupy = session.cupy
-    engine = caster.engine
-    triangles = engine._meshes[1]  # type: ignore[attr-defined]
-    n = int(np.clip(4e10 / caster.face_count, 1024, len(directions)))
-    part = cupy.asarray(np.ascontiguousarray(directions[:n]))
-    kernel = cupy.RawModule(code=_BRUTE_FORCE, options=()).get_function("brute_force")
-    origin = [np.float32(x) for x in engine._scene.frame.to_local(MIDDLE[None])[0]]
-    distances = cupy.empty(len(part), np.float32)
-    arguments = (
-        triangles,
-        np.int32(caster.face_count),
-        *origin,
-        part,
-        np.int32(len(part)),
-        distances,
-    )
-    took = milliseconds(session, lambda: kernel((-(-len(part) // _BLOCK),), (_BLOCK,), arguments))
-    return {"rays": len(part), "mrays_s": len(part) / took["ms"] / 1e3, **took}
 
 
 def moving(session: Session) -> Rows:

@@ -110,6 +110,33 @@ def flat_ground(side: int, pitch: float) -> Mesh:
     return vertices, grid_faces(side + 1, side + 1)
 
 
+def tree(leaves: int) -> Mesh:
+    """Make a crown of triangles around a point 6 m above the ground."""
+    rng = np.random.default_rng(1)
+    middle = rng.normal(size=(leaves, 1, 3)) * [1.5, 1.5, 2] + [0, 0, 6]
+    corners = middle + 0.04 * rng.normal(size=(leaves, 3, 3))
+    return corners.reshape(-1, 3), np.arange(3 * leaves).reshape(-1, 3)
+
+
+def tree_transforms(trees: int) -> Float:
+    """Make transforms (trees, 3, 4): a square grid, with random yaw and scale of each tree."""
+    rng = np.random.default_rng(2)
+    pitch = 8.0
+    side = int(np.ceil(np.sqrt(trees)))
+    angle = rng.uniform(0, 2 * np.pi, trees)
+    size = rng.uniform(0.8, 1.2, trees)
+    number = np.arange(trees)
+    transforms = np.zeros((trees, 3, 4))
+    transforms[:, 0, 0] = transforms[:, 1, 1] = size * np.cos(angle)
+    transforms[:, 1, 0] = size * np.sin(angle)
+    transforms[:, 0, 1] = -transforms[:, 1, 0]
+    transforms[:, 2, 2] = size
+    transforms[:, 0, 3] = pitch * (number % side)
+    transforms[:, 1, 3] = pitch * (number // side)
+    transforms[:, :2, 3] -= pitch * (side - 1) / 2
+    return transforms
+
+
 def revolution(rays: int, layers: int = 128) -> Float:
     """Return unit directions of a lidar's revolution; the field of view is 60 degrees."""
     azimuth = 2 * np.pi * np.arange(max(1, rays // layers))[:, None] / max(1, rays // layers)

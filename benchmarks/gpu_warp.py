@@ -1,4 +1,4 @@
-"""Sections of the device's benchmark: the same rays cast by NVIDIA Warp, and by MuJoCo-LiDAR."""
+"""Section of the device's benchmark: the same rays cast by NVIDIA Warp."""
 
 from __future__ import annotations
 
@@ -9,13 +9,10 @@ from typing import Any
 import numpy as np
 import warp
 
-from raybeam import RayCaster
-
-from .gpu_clock import Session, wall_milliseconds
-from .gpu_rays import MIDDLE, Rows, name_of, revolutions
+from .gpu_clock import Session
+from .gpu_rays import MIDDLE, Rows, name_of
 from .gpu_scenes import Float, city, revolution
 from .raycast_warp import first_hits
-from .sensors_peers import mujoco_lidar_caster
 
 # (constructor, most triangles for which it is tried): the one on the CPU takes minutes at 1e7.
 _BUILDERS = (("lbvh", None), ("cubql", None), ("sah", 2_000_000))
@@ -47,26 +44,6 @@ def peers(session: Session, device: str = "cuda:0") -> Rows:
                 for name, rays in directions.items():
                     row[name] = _cast(mesh, rays, device, session.sizes.seconds / 3)
                 yield f"{name_of(count)}, {builder}, leaves of {size}", row
-
-
-def mujoco(session: Session, device: str = "cuda:0") -> Rows:
-    """Yield rates of MuJoCo-LiDAR's Warp backend and of raybeam, from poses to host distances."""
-    vertices, faces = city(session.sizes.cities[0])
-    once = revolution(session.sizes.rays)
-    scan = revolutions(session, once)
-    origins = scan.poses.positions
-    rays = np.tile(once, (session.sizes.poses, 1))
-    job = {"vertices": vertices, "faces": faces, "origins": origins, "directions": rays}
-    mujoco_cast = mujoco_lidar_caster(job, "warp", device)
-    caster = RayCaster(vertices, faces, backend="cuda")
-    casts = {
-        "MuJoCo-LiDAR": mujoco_cast,
-        "raybeam": lambda: int(caster.engine.scan(scan).hit_counts.sum()),
-    }
-    for name, cast in casts.items():
-        hits = cast()
-        took = wall_milliseconds(session, cast)
-        yield name, {"hits": hits / len(rays), "grays_s": len(rays) / took["ms"] / 1e6, **took}
 
 
 def _cast(mesh: Any, directions: Float, device: str, seconds: float) -> dict[str, float]:

@@ -1,18 +1,17 @@
-"""Rays that escape from closed meshes, backend by backend: `python -m benchmarks.leaks`.
+"""Rays that escape from closed meshes, for each backend.
 
-All are aimed from inside at edges and corners, where a test that rounds each triangle for itself
-lets some through. The numpy and cuda backends are built so that none does.
+    python -m benchmarks.leaks [--rays N] [--triangles N]
+
+All rays are aimed from inside at edges and corners, where rays escape if each triangle is rounded
+on its own. The exit code is 1 if a ray escapes from an exact backend.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +20,8 @@ from lidarscenes.procedural.terrain import terrain
 from lidarsim.scene.shapes import revolve, seed_objects
 from raybeam import RayCaster, available_backends
 
-from .seams import escaped
-
-_PART = 250_000
+from .harness import argument_parser, write_results
+from .seams import count_escaped
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,34 +72,23 @@ def terrain_box(triangles: int) -> Closed:
     return Closed("terrain box", np.concatenate([points, lid]), all_faces, inside, 10.0)
 
 
-def count_escaped(mesh: Closed, backend: str, count: int) -> dict[str, float]:
-    """Cast `count` rays from inside a closed mesh; return rays, escaped rays and seconds."""
-    start = time.perf_counter()
-    caster = RayCaster(mesh.vertices, mesh.faces, backend)
-    rng = np.random.default_rng(0)
-    cast = leaks = 0
-    while cast < count:
-        half = -(-min(_PART, count - cast) // 2)
-        arrays = mesh.vertices, mesh.faces
-        leaks += escaped(caster, arrays, mesh.inside, mesh.room, half, rng)
-        cast += 2 * half
-    return {"rays": cast, "escaped": leaks, "seconds": time.perf_counter() - start}
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run from the command line; return 1 if a ray escapes from an exact backend."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--rays", type=int, default=10_000_000, help="for each backend, in all")
+    parser = argument_parser(__doc__)
+    parser.add_argument("--rays", type=int, default=10_000_000, help="rays of each backend")
     parser.add_argument("--triangles", type=int, default=2_000_000, help="of the terrain box")
-    parser.add_argument("--json", type=Path, help="write the results here")
-    chosen = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     backends = [name for name, reason in available_backends().items() if not reason]
-    meshes = list(closed_meshes(chosen.triangles))
-    share = -(-chosen.rays // len(meshes))
+    meshes = list(closed_meshes(options.triangles))
+    share = -(-options.rays // len(meshes))
     results: dict[str, dict[str, dict[str, float]]] = {name: {} for name in backends}
     for mesh in meshes:
         for name in backends:
-            row = count_escaped(mesh, name, share)
+            start = time.perf_counter()
+            caster = RayCaster(mesh.vertices, mesh.faces, name)
+            arrays = mesh.vertices, mesh.faces
+            row = count_escaped(caster, arrays, mesh.inside, mesh.room, share)
+            row["seconds"] = time.perf_counter() - start
             results[name][mesh.name] = row
             print(
                 f"{mesh.name:<12} {name:<7} {row['escaped']:>7,} of {row['rays']:,} escaped  "
@@ -110,8 +97,7 @@ def main(arguments: list[str] | None = None) -> int:
     for name in backends:
         rays, leaks = (sum(v[key] for v in results[name].values()) for key in ("rays", "escaped"))
         print(f"{name}: {leaks:,.0f} of {rays:,.0f} escaped, {leaks / rays:.2g}")
-    if chosen.json:
-        chosen.json.write_text(json.dumps(results, indent=1) + "\n")
+    write_results(options.json, results)
     exact = [entry for name in backends if name != "tiles" for entry in results[name].values()]
     return int(any(entry["escaped"] for entry in exact))
 

@@ -1,9 +1,12 @@
-"""Live packets, beside their schedule: `python -m benchmarks.live [--minutes 10] [--json FILE]`.
+"""Delay and loss of live packets.
 
-An OS1-64 with 20 cars that move, and a VLP-16 with 100, each alone, with 7 sub-rays, rain and noise
-of ranges, in a city of 100,000 triangles, to a receiver on the loopback interface. The receiver, a
-process of its own, counts the packets and how late they arrive after their stamps; the process that
-sends says how late it was after the schedule, which starts when the first sweeps are cast.
+    python -m benchmarks.live [--minutes 10]
+
+An OS1-64 among 20 moving cars and a VLP-16 among 100 moving cars send packets, one at a time, with
+7 sub-rays, rain and range noise in a city of 100,000 triangles. A receiver on the loopback
+interface runs in its own process. It counts the packets and measures how late they arrive after
+their timestamps. The sender measures its delay after the schedule, which starts when the first
+sweeps are cast.
 """
 
 from __future__ import annotations
@@ -14,7 +17,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,7 @@ from lidarscenes.procedural.city import city
 from lidarsim.scene.actors import box
 
 from . import live_receiver
+from .harness import argument_parser, write_results
 
 POSITION = (0.0, 0.0, 1.9)
 # Sensor, maker, cars and port by name.
@@ -52,20 +55,14 @@ def cars(count: int, seconds: float, seed: int = 7) -> list[Actor]:
 
 
 def measure(
-    sensor: str,
-    maker: str,
-    actors: int,
-    port: int,
-    *,
-    seconds: float,
-    triangles: int,
-    rate: float = 1.0,
+    sensor: str, maker: str, actors: int, port: int, options: argparse.Namespace
 ) -> dict[str, Any]:
-    """Play a sensor for some seconds; return what was sent and received, and how late."""
+    """Play a sensor; return the numbers of packets and their delays."""
+    seconds = 60 * options.minutes
     lidar = load_sensor(sensor)
     packets = Packets(lidar)
     scanner = Scanner(
-        city(triangles).with_actors(cars(actors, seconds)),
+        city(options.triangles).with_actors(cars(actors, seconds)),
         lidar,
         columns=packets.columns,
         returns=Returns(subrays=7),
@@ -73,10 +70,10 @@ def measure(
         rain_mm_h=10.0,
         threads=1,  # sweeps are cast beside each other
     )
-    first, *others = packets.encoder.ports.values()
-    ports = [port, *(port + other - first for other in others)]
+    usual = list(packets.encoder.ports.values())
+    ports = [port + number - usual[0] for number in usual]
     with subprocess.Popen(
-        [sys.executable, str(live_receiver.__file__), maker, str(rate), *map(str, ports)],
+        [sys.executable, str(live_receiver.__file__), maker, str(options.rate), *map(str, ports)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     ) as receiver:
@@ -89,7 +86,7 @@ def measure(
             POSITION,
             to=f"127.0.0.1:{port}",
             duration_s=seconds,
-            rate=rate,
+            rate=options.rate,
             ready=print,
             note=notes.append,
         )
@@ -113,38 +110,27 @@ def measure(
 
 
 def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
-    """Print the histograms of lateness."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    """Print the histograms of delays."""
+    parser = argument_parser(__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--only", choices=[*CASES], nargs="*", default=[*CASES])
     parser.add_argument("--triangles", type=int, default=100_000, help="of the city")
-    parser.add_argument("--rate", type=float, default=1.0, help="0.1: ten times as slow")
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--rate", type=float, default=1.0, help="speed; 0.1 is ten times as slow")
     options = parser.parse_args(arguments)
-    figures = {}
+    results = {}
     for name in options.only:
-        sensor, maker, actors, port = CASES[name]
-        figures[name] = row = measure(
-            sensor,
-            maker,
-            actors,
-            port,
-            seconds=60 * options.minutes,
-            triangles=options.triangles,
-            rate=options.rate,
-        )
+        results[name] = row = measure(*CASES[name], options)
         print(
             f"{name}: {row['sent']['sent']:,} packets sent in {row['seconds']:g} s, {row['lost']} "
             f"lost; {row['later_than_5_ms']:.3%} sent and {row['arrived_later_than_5_ms']:.3%} "
             f"arrived later than 5 ms, the latest sent after {row['sent']['latest_ms']:.1f} ms"
         )
-        print(f"  {row['cpu_ms_a_sweep']:.0f} ms of processor time a sweep")
+        print(f"  {row['cpu_ms_a_sweep']:.0f} ms of CPU time per sweep")
         print("  sent", row["sent"]["lateness"])
         for note in row["notes"]:
             print(f"  note: {note}")
-    if options.json:
-        options.json.write_text(json.dumps(figures, indent=1))
-    return figures
+    write_results(options.json, results)
+    return results
 
 
 if __name__ == "__main__":

@@ -1,24 +1,21 @@
-"""Sweeps a second of processor time: by lidarpool, and by the own loader of each format.
+"""Sweeps per second of `lidarpool.sweeps`, compared with the loader of each format.
 
     python -m benchmarks.loaders [FORMAT ...]
 
-Both open the same data set anew in each round, in one process, and read all sweeps in order; files
-are in memory. `lidarpool.sweeps` gives points, all columns that the format holds and the pose of
-each sweep, and boxes where the other gives them. The others give, for each sweep,
+Both open the same data set again in each round, in one process, and read all sweeps in order. Files
+are cached in memory. `lidarpool.sweeps` provides points, all columns of the format and the pose of
+each sweep, and boxes if the other loader provides them. For each sweep, the other loaders provide
 
-- webdataset all of a sample: points, columns, pose and boxes as arrays, `json` parsed;
-- pykitti points with intensities and poses; beside it, NumPy reads labels as semantic-kitti-api
-  does, and parts classes from objects;
-- nuscenes-devkit points with intensities (the channel is cut off) and the boxes of actors;
-- pyarrow all columns with positions, in the axes of the world.
+- webdataset: the whole sample, which is points, columns, pose and boxes as arrays, and parsed JSON;
+- pykitti: points with intensities and poses; NumPy reads labels as semantic-kitti-api does, and
+  separates classes from objects;
+- nuscenes-devkit: points with intensities, without the channel, and the boxes of actors;
+- pyarrow: all columns with positions in world coordinates.
 
-The ratio is the median of the ratios of all rounds. Formats whose package is not installed are left
-out.
+Formats whose package is not installed are skipped.
 """
 
-import argparse
 import tempfile
-import time
 from functools import partial
 from importlib.util import find_spec
 from itertools import pairwise
@@ -27,16 +24,12 @@ from pathlib import Path
 import numpy as np
 
 import lidarpool as lp
-from lidarpool.datasets.dataset import DataSet
-from lidarpool.datasets.job_table import JobRow, write_table
-from lidarsim.io.storage import Storage
-from lidarsim.scene.actors import Actor, box
-from lidarsim.sweeps.sweeps import Sweeps
+
+from .harness import argument_parser, median_ratio, run_rounds, time_call, write_results
 
 POINTS = 30_000
 REVOLUTIONS = 20
 JOBS = 6
-ROUNDS = 15
 
 
 def webdataset(folder):
@@ -86,17 +79,30 @@ WITH_BOXES = webdataset, nuscenes
 PEERS = {webdataset: "webdataset", kitti: "pykitti", nuscenes: "nuscenes", parquet: "pyarrow"}
 
 
+def write_data_set(folder, name, cloud, sweeps):
+    """Write a data set of jobs with the same sweeps, like a campaign."""
+    from lidarpool.datasets.dataset import DataSet  # other versions may not have these modules
+    from lidarpool.datasets.job_table import JobRow, write_table
+    from lidarsim.io.storage import Storage
+
+    data = DataSet(Storage.at(folder), name)
+    jobs = [data.write_job(JobRow(n, f"{n:04}"), cloud, sweeps) for n in range(JOBS)]
+    write_table(data.storage, [], lambda: jobs)
+    data.finish(jobs)
+
+
 def write(folder, name):
     """Write a data set of sweeps past a car."""
+    from lidarsim.sweeps.sweeps import Sweeps
+
     track = lp.Track([0, 60], [[0, 0, 1], [60, 5, 1]])
     scans = REVOLUTIONS * 36
-    car = Actor(box("Car 1", (4, 2, 1.5)), lp.Track([0, 60], [[5, 5, 0], [9, 5, 0]]))
+    car = lp.Actor(lp.box("Car 1", (4, 2, 1.5)), lp.Track([0, 60], [[5, 5, 0], [9, 5, 0]]))
     scene = lp.Scene.seed().with_actors((car,))
     survey = lp.Survey(lp.Sensor.grid(360, 4), trajectory=track, steps=scans)
     sweeps = Sweeps.from_survey(survey, scene)
     rng = np.random.default_rng(1)
     count = REVOLUTIONS * POINTS
-    data = DataSet(Storage.at(folder), name)
     rows = np.arange(count)
     columns = {"scan": np.arange(count) * scans // count}
     columns |= {"ray": rows % 40, "channel": rows % 4, "class": rng.integers(0, 30, count)}
@@ -104,35 +110,41 @@ def write(folder, name):
     columns |= {"intensity": rng.random(count, np.float32), "time": columns["scan"] * 1000}
     columns["reflectivity"] = rng.integers(0, 256, count).astype(np.uint8)
     cloud = lp.Cloud(np.round(rng.uniform(-60, 60, (count, 3)), 3), columns)
-    jobs = [data.write_job(JobRow(n, f"{n:04}"), cloud, sweeps) for n in range(JOBS)]
-    write_table(data.storage, [], lambda: jobs)
-    data.finish(jobs)
+    write_data_set(folder, name, cloud, sweeps)
 
 
-def main(*names):
+def main(arguments=None):
+    """Print a row for each format."""
+    parser = argument_parser(__doc__, repeat=15)
+    known = [peer.__name__ for peer in PEERS]
+    parser.add_argument("formats", metavar="FORMAT", nargs="*", help=f"of {', '.join(known)}")
+    options = parser.parse_args(arguments)
+    if unknown := {*options.formats} - {*known}:
+        parser.error(f"Unknown format {', '.join(unknown)}")
+    results = {}
     for peer, package in PEERS.items():
-        if (names and peer.__name__ not in names) or find_spec(package) is None:
+        name = peer.__name__
+        if (options.formats and name not in options.formats) or find_spec(package) is None:
             continue
         with tempfile.TemporaryDirectory() as folder:
-            write(data_folder := Path(folder), peer.__name__)
-            reads = partial(lidarpool, data_folder, peer in WITH_BOXES), partial(peer, data_folder)
-            rates = np.empty((ROUNDS, 2))
-            for index in np.ndindex(rates.shape):  # in turns: a busy machine slows down both
-                begin = time.process_time()
-                count = sum(1 for _ in reads[index[1]]())
-                rates[index] = count / (time.process_time() - begin)
-        lidarpool_rate, peer_rate = rates.max(axis=0)
-        ratio = np.median(rates[:, 0] / rates[:, 1])
-        print(
-            f"{peer.__name__:>10} {lidarpool_rate:6.0f}/s "
-            f"{package:>11} {peer_rate:6.0f}/s {ratio:6.2f}"
-        )
+            write(data_folder := Path(folder), name)
+            reads = {
+                "lidarpool": partial(lidarpool, data_folder, peer in WITH_BOXES),
+                package: partial(peer, data_folder),
+            }
+            calls = {key: lambda _, read=read: sweep_rate(read) for key, read in reads.items()}
+            rates = results[name] = run_rounds(calls, options.repeat, warm_up=0)
+        ratio = median_ratio(rates["lidarpool"], rates[package])
+        words = " ".join(f"{key:>11} {max(values):6.0f}/s" for key, values in rates.items())
+        print(f"{name:>10} {words} {ratio:6.2f}")
+    write_results(options.json, results)
+
+
+def sweep_rate(read):
+    """Return the number of sweeps that are read per second of CPU time."""
+    seconds, count = time_call(lambda: sum(1 for _ in read()))
+    return count / seconds
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("formats", metavar="FORMAT", nargs="*", help="by default all formats")
-    chosen = parser.parse_args().formats
-    if unknown := {*chosen} - {peer.__name__ for peer in PEERS}:
-        parser.error(f"no loader of {', '.join(unknown)}")
-    main(*chosen)
+    main()

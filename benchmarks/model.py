@@ -1,17 +1,17 @@
-"""A small model of a run, for clusters that nobody here has: `python -m benchmarks.model`.
+"""Throughput of clusters that were not available for measurements, modeled from results of `scale`.
 
-Tasks go round, as many as the driver has under way: it offers one, the scheduler sends it, the
-next free GPU worker casts its batches, a collector stores them, scheduler and driver take the
-receipts. Each of them does one thing at a time. What they take, for a task and for each receipt in
-it, is read with `benchmarks.scale`; `--read` compares the model with other runs of it, whose
-processes share `--cores`, and `--picture` draws how busy the GPUs of one scheduler are.
+    python -m benchmarks.model --driver MS MS --scheduler MS MS --collectors MS MS --casting MS MS
+
+A fixed number of tasks is in flight: the driver offers a task, the scheduler sends it, the next
+free GPU worker casts its batches, a collector stores them, and scheduler and driver receive the
+receipts. Each process does one thing at a time. Their CPU times, per task and per receipt in it,
+come from `benchmarks.scale`. `--read` compares the model with other results of that benchmark,
+whose processes share `--cores`, and `--picture` draws how busy the GPUs of one scheduler are.
 """
 
 from __future__ import annotations
 
-import argparse
 import heapq
-import json
 from collections import Counter
 from dataclasses import dataclass
 from itertools import count, product
@@ -19,8 +19,10 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from benchmarks.scale import GPUS_EACH
 from lidarpool.run.pipeline.policies import batches_per_task, max_weight_in_flight
+
+from .harness import argument_parser, read_results, write_results
+from .scale import GPUS_EACH
 
 GPUS = (10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 HEARTBEATS = 0.07  # share of the scheduler's core; Dask has 200 a second at most
@@ -165,38 +167,37 @@ def draw(costs: Costs, read: dict[str, dict[str, float]], path: Path) -> None:
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
     """Run from the command line; return rates, limits and shards by case."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser = argument_parser(__doc__)
     for name in dict.fromkeys(STEPS):
-        words = "ms of it for a task, and for each receipt in it"
-        parser.add_argument(f"--{name}", type=float, nargs=2, required=True, help=words)
-    words = "µs of the scheduler for a worker"
-    parser.add_argument("--member", type=float, default=3.5, help=words)
-    parser.add_argument("--read", type=Path, nargs="*", default=[], help="--json of the scale")
-    parser.add_argument("--cores", type=int, help="of the machine of those")
-    parser.add_argument("--picture", type=Path, help="draw the busy share here")
-    chosen = parser.parse_args(arguments)
-    per_step = {name: tuple(ms / 1e3 for ms in getattr(chosen, name)) for name in STEPS}
-    costs = Costs(per_step, chosen.member / 1e6)
-    rows = [row for file in chosen.read for row in json.loads(file.read_text()).items()]
+        words = "its CPU time per task, and per receipt in the task"
+        parser.add_argument(
+            f"--{name}", type=float, nargs=2, required=True, metavar="MS", help=words
+        )
+    parser.add_argument("--member", type=float, default=3.5, help="µs of the scheduler per worker")
+    parser.add_argument("--read", type=Path, nargs="*", default=[], help="JSON files of `scale`")
+    parser.add_argument("--cores", type=int, help="cores of the machine that wrote these files")
+    parser.add_argument("--picture", type=Path, help="draw the busy share to this file")
+    options = parser.parse_args(arguments)
+    per_step = {name: tuple(ms / 1e3 for ms in getattr(options, name)) for name in STEPS}
+    costs = Costs(per_step, options.member / 1e6)
+    rows = [row for file in options.read for row in read_results(file).items()]
     read = {name: row for name, row in rows if "busy" in row}
     for name, row in read.items():
         gpus = int(row["gpus"])
         shards = int(row["shards"])
-        rate = batches_a_second(gpus, row["seconds"], costs, chosen.cores, shards)
+        rate = batches_a_second(gpus, row["seconds"], costs, options.cores, shards)
         print(f"{name}: {row['a_second']:.0f} a second, by the model {rate:.0f}")
-    figures = {}
-    for gpus in (200, 1_000, 10_000):
-        for seconds in SECONDS:
-            rate = batches_a_second(gpus, seconds, costs)
-            by = limit(gpus, seconds, costs)
-            shards = schedulers(gpus, seconds, costs)
-            figures[f"{gpus} GPUs, batches of {seconds:g} s"] = rate, by, shards
-            print(
-                f"{gpus:6,} GPUs, {seconds:3g} s: {rate:7.1f} batches/s, {by}; {shards} schedulers"
-            )
-    if chosen.picture:
-        draw(costs, read, chosen.picture)
-    return figures
+    results = {}
+    for gpus, seconds in product((200, 1_000, 10_000), SECONDS):
+        rate = batches_a_second(gpus, seconds, costs)
+        by = limit(gpus, seconds, costs)
+        shards = schedulers(gpus, seconds, costs)
+        results[f"{gpus} GPUs, batches of {seconds:g} s"] = rate, by, shards
+        print(f"{gpus:6,} GPUs, {seconds:3g} s: {rate:7.1f} batches/s, {by}; {shards} schedulers")
+    if options.picture:
+        draw(costs, read, options.picture)
+    write_results(options.json, results)
+    return results
 
 
 if __name__ == "__main__":

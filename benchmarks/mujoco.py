@@ -1,17 +1,19 @@
-"""Lidars in worlds of MuJoCo, beside MuJoCo's own rays: `python -m benchmarks.mujoco`.
+"""Lidars in MuJoCo worlds, compared with MuJoCo's own ray casting.
 
-Rooms with 20, 100 and 400 moving bodies are scanned by a VLP-16 and an OS1-64; then the lidars of
-256 quadrupeds on a terrain, 16 x 360 rays each, in one call. All bodies move before each scan. One
-thread, processor time: the least of several rounds, because other programs may share the cores,
-and the median over the rounds of how many times as fast as MuJoCo's rays.
+    python -m benchmarks.mujoco
+
+A VLP-16 and an OS1-64 scan rooms with 20, 100 and 400 moving bodies. Then the lidars of 256
+quadrupeds on a terrain scan with 16 x 360 rays each, in a single call. All bodies move before each
+scan. Times are CPU time of one thread: the minimum over the rounds, because other programs may use
+the cores, and the median ratio of MuJoCo's time to the time.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
-import time
 from collections.abc import Callable
+from functools import partial
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +21,8 @@ import numpy as np
 from lidarpool import MujocoScanner, Sensor, load_sensor
 from lidarsim.numerics.arrays import Floats
 
-_ROUNDS = 21
+from .harness import argument_parser, median_ratio, print_row, run_rounds, time_call, write_results
+
 MAX_M = 120.0  # range of MuJoCo's rays
 _GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)
 _ROUND_SHAPES = ("box", "cylinder", "capsule", "sphere")
@@ -89,21 +92,6 @@ def build(name: str, xml: str, sites: list[str]) -> World:
     return World(name, model, data, sites)
 
 
-def milliseconds(functions: list[Callable[[], object]], rounds: int) -> Floats:
-    """Return the processor times of calls by this thread, milliseconds: (rounds, functions).
-
-    The functions take turns, so that those of a round are measured while other programs are as
-    busy.
-    """
-    times = np.empty((rounds, len(functions)))
-    for row in times:
-        for column, function in enumerate(functions):
-            start = time.thread_time()
-            function()
-            row[column] = 1e3 * (time.thread_time() - start)
-    return times
-
-
 def cast_by_mujoco(world: World, directions: Floats) -> None:
     """Cast rays (sites, n, 3), in the frame of the world, by MuJoCo."""
     import mujoco
@@ -120,8 +108,8 @@ def cast_by_mujoco(world: World, directions: Floats) -> None:
         )  # fmt: skip
 
 
-def measure(world: World, sensor: Sensor, rounds: int) -> list[str]:
-    """Return a row of the table: times of MuJoCo's rays, `ranges`, `sweep` and `step`."""
+def measure(world: World, sensor: Sensor, repeat: int) -> dict[str, Any]:
+    """Return the times of MuJoCo's rays, `ranges`, `sweep` and `step` in a world."""
     rng = np.random.default_rng(1)
     data = world.data
     is_single = len(world.sites) == 1
@@ -151,41 +139,60 @@ def measure(world: World, sensor: Sensor, rounds: int) -> list[str]:
     numbers = [world.model.site(name).id for name in world.sites]
     turned = [directions @ data.site_xmat[number].reshape(3, 3).T for number in numbers]
     in_world = np.array(turned)
-    calls: list[Callable[[], None]] = [lambda: cast_by_mujoco(world, in_world), ranges]
+    calls: dict[str, Callable[[], None]] = {
+        "mj_multiRay": lambda: cast_by_mujoco(world, in_world),
+        "ranges": ranges,
+    }
     if is_single:
-        calls += [sweep, step]
+        calls |= {"sweep": sweep, "step": step}
         step()
-    times = milliseconds(calls, rounds)
-    least = times.min(axis=0)
-    ratios = np.median(times[:, :1] / times, axis=0)
-    rays = f"{len(directions) * len(world.sites):,}"
-    cells = [f"{t:.1f} ({ratio:.1f})" for t, ratio in zip(least, ratios, strict=True)]
-    return [world.name, rays, f"{least[0]:.1f}", *cells[1:]]
+
+    def cpu_s(name: str, _: int) -> float:
+        seconds, _result = time_call(calls[name])
+        return seconds
+
+    seconds = run_rounds({name: partial(cpu_s, name) for name in calls}, repeat)
+    return {
+        "world": world.name,
+        "rays": len(directions) * len(world.sites),
+        "seconds": seconds,
+    }
+
+
+def show(row: dict[str, Any]) -> None:
+    """Print a row of the table."""
+    seconds = row["seconds"]
+    mujoco_s = seconds["mj_multiRay"]
+    cells = [f"{1e3 * min(mujoco_s):.1f}"]
+    for name in ("ranges", "sweep", "step"):
+        own = seconds.get(name)
+        cells.append(f"{1e3 * min(own):.1f} ({median_ratio(mujoco_s, own):.1f})" if own else "–")
+    print_row(row["world"], f"{row['rays']:,}", *cells)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run from the command line; return 2 without MuJoCo."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="toy sizes")
-    chosen = parser.parse_args(arguments)
-    try:
-        import mujoco as _  # noqa: F401
-    except ImportError:
+    parser = argument_parser(__doc__, repeat=21, quick=True)
+    options = parser.parse_args(arguments)
+    if find_spec("mujoco") is None:
         print("Nothing was measured: pip install mujoco", file=sys.stderr)
         return 2
-    rounds = 1 if chosen.quick else _ROUNDS
-    robots, cells = (4, 16) if chosen.quick else (256, 257)
-    print("| bodies | rays | mj_multiRay, ms | ranges (times as fast) | sweep | step |")
+    repeat = 1 if options.quick else options.repeat
+    robots, cells = (4, 16) if options.quick else (256, 257)
+    print_row("bodies", "rays", "mj_multiRay, ms", "ranges (times as fast)", "sweep", "step")
     print("|---|--:|--:|--:|--:|--:|")
-    for bodies in (5,) if chosen.quick else (20, 100, 400):
+    rows = []
+    for bodies in (5,) if options.quick else (20, 100, 400):
         for model in ("velodyne/vlp16", "ouster/os1-64"):
             world = build(f"{bodies}, {model}", room(bodies), ["lidar"])
-            print("|", " | ".join(measure(world, load_sensor(model), rounds)), "|", flush=True)
+            rows.append(measure(world, load_sensor(model), repeat))
+            show(rows[-1])
     sensor = Sensor.grid(360, 16, step_deg=360, max_range_m=30)
     sites = [f"lidar{k}" for k in range(robots)]
     world = build(f"{robots} quadrupeds", herd(robots, cells), sites)
-    row = measure(world, sensor, 1)
-    print("|", " | ".join([*row, "–", "–"]), "|")
+    rows.append(measure(world, sensor, 1))
+    show(rows[-1])
+    write_results(options.json, rows)
     return 0
 
 

@@ -1,18 +1,18 @@
-"""Plays a bag of a drive through KISS-ICP, with its deskewing on and off.
+"""Positions that KISS-ICP estimates from a bag, with and without deskewing.
 
-python -m benchmarks.odometry [--quick] [--sweeps 64] [--model ouster/os1-64]
+    python -m benchmarks.odometry [--sweeps 64] [--model ouster/os1-64]
 
-A car drives along a street of the generated city and turns left. A bag holds each point in the
-sensor's axes at its firing, as drivers publish it; KISS-ICP (Vizzo et al., 2023) estimates the
-motion and moves the points of a sweep to its end. The table has the distances of these points from
-their true positions. With deskewing they are small only if the bag's points are not compensated.
+A car drives along a street of the generated city and turns left. A bag contains each point in the
+sensor frame at its firing, as drivers publish it. KISS-ICP (Vizzo et al., 2023) estimates the
+motion and moves the points of a sweep to its end. The table lists the distances of these points
+from their true positions. With deskewing, they are small only if the points in the bag are not
+compensated.
 
-It needs KISS-ICP (pip install kiss-icp) and the extra ros of lidarpool.
+Requires KISS-ICP (`pip install kiss-icp`) and the extra `ros` of lidarpool.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 from dataclasses import replace
@@ -29,6 +29,8 @@ from lidarsim.columns.table import SCAN
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
+
+from .harness import argument_parser, print_row, write_results
 
 SPEED_MPS = 6.0
 RADIUS_M = 9.0
@@ -82,7 +84,7 @@ def survey_of(model: str, sweeps: int) -> Survey:
 
 def cloud_of(survey: Survey, scene: Scene) -> Cloud:
     """Cast a survey in this process; return its cloud."""
-    rig = Rig(scene, survey, "tiles")
+    rig = Rig(scene, survey, "auto")
     part = columns_of(list(rig.cast(0, survey.scan_count)))
     cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
     sweeps = Sweeps.from_survey(survey, scene)
@@ -133,8 +135,7 @@ def measured(model: str, sweeps: int, triangles: int) -> dict[bool, Distances]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a toy size, for tests")
+    parser = argument_parser(__doc__, quick=True)
     parser.add_argument("--sweeps", type=int, default=64)
     parser.add_argument("--model", default="ouster/os1-64")
     options = parser.parse_args(arguments)
@@ -145,11 +146,12 @@ def main(arguments: list[str] | None = None) -> int:
         options.sweeps = 14
         options.model = "velodyne/vlp16"
     results = measured(options.model, options.sweeps, 20_000 if options.quick else 200_000)
-    print("| deskewing | median, m | 95 %, m |")
+    print_row("deskewing", "median, m", "95 %, m")
     print("|---|--:|--:|")
     for deskew, errors in results.items():
         words = "on" if deskew else "off"
-        print(f"| {words} | {errors.median:.4f} | {errors.percentile_95:.4f} |")
+        print_row(words, f"{errors.median:.4f}", f"{errors.percentile_95:.4f}")
+    write_results(options.json, {str(deskew): errors for deskew, errors in results.items()})
     return 0
 
 

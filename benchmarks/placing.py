@@ -1,21 +1,22 @@
-"""Cost and balance of placing tasks as a cluster grows: `python -m benchmarks.placing`.
+"""Time to place a task and balance of the workers, as a cluster grows.
 
-A real scheduler with simulated workers, which answer nothing: tasks are placed and ended by the
-scheduler's own transitions. Half of the workers belong to an exclusive partition. Of each cluster:
+    python -m benchmarks.placing [--workers N ...]
 
-- microseconds to place a task of the partition, and a task of others, with the rule of poolpart and
-  without it, both behind the same fence;
-- when tasks of random durations end on average, as a multiple of what Dask itself reaches, and the
-  longest queue of a worker.
+A real scheduler has simulated workers, which never respond: tasks are placed and ended by the
+scheduler's own transitions. Half of the workers belong to an exclusive partition. For each
+cluster size, the benchmark lists
+
+- the microseconds to place a task of the partition, and any other task, with the rule of poolpart
+  and without it, both behind the same fence;
+- the mean end of tasks with random durations, relative to the mean end with Dask's own choice, and
+  the longest queue of a worker.
 """
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import heapq
 import itertools
-import json
 import logging
 import random
 import time
@@ -30,7 +31,10 @@ from poolpart.choosing import NAME as CHOICE
 from poolpart.features import enable_features
 from poolpart.fence import raise_fence
 
+from .harness import argument_parser, write_results
+
 PARTITION = "A"
+KEYS = ("us", "end", "longest")  # of the results
 _numbers = itertools.count()
 
 
@@ -207,32 +211,27 @@ async def measure(number: int, rounds: int, tasks_per_worker: int) -> dict[str, 
     return figures
 
 
-def main() -> None:
-    """Print a row for each size of cluster."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def main(arguments: list[str] | None = None) -> None:
+    """Print a row for each cluster size."""
+    parser = argument_parser(__doc__)
     parser.add_argument("--workers", type=int, nargs="+", default=[40, 4000])
     parser.add_argument("--tasks", type=int, default=400, help="tasks that are placed at a time")
     parser.add_argument("--per-worker", type=int, default=2, help="tasks of random durations")
-    parser.add_argument("--json", type=argparse.FileType("w"))
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     logging.getLogger("distributed").setLevel(logging.ERROR)
     results = []
     for number in options.workers:
-        figures = asyncio.run(measure(number, options.tasks, options.per_worker))
-        results.append(figures)
+        values = asyncio.run(measure(number, options.tasks, options.per_worker))
+        results.append(values)
         for name in ("partition", "others"):
-            cost, dask_cost = (figures[f"{name}_{label}_us"] for label in ("poolpart", "dask"))
-            end, dask_end = (figures[f"{name}_{label}_end"] for label in ("poolpart", "dask"))
-            queue, dask_queue = (
-                figures[f"{name}_{label}_longest"] for label in ("poolpart", "dask")
-            )
+            cost, end, queue = (values[f"{name}_poolpart_{key}"] for key in KEYS)
+            dask_cost, dask_end, dask_queue = (values[f"{name}_dask_{key}"] for key in KEYS)
             print(
                 f"{number:>6} workers, tasks of {name:<9}: {cost:7.0f} µs, Dask {dask_cost:7.0f};"
                 f" mean end {end / dask_end:.3f} of Dask's,"
                 f" longest queue {queue} and {dask_queue}"
             )
-    if options.json:
-        json.dump(results, options.json, indent=1)
+    write_results(options.json, results)
 
 
 if __name__ == "__main__":

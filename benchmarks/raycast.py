@@ -1,206 +1,232 @@
-"""Ray casting, side by side with what one would use instead: `python -m benchmarks.raycast`.
+"""Rays per second of each backend, compared with Open3D and trimesh.
 
-All engines that are installed cast the same rays in one process, in turns (A B C, A B C, ...),
-so that whatever else the machine does befalls all of them. Rates are medians over the rounds,
-with the least and the greatest; ratios are medians of the ratios within each round. On a machine
-that others use, `--clock cpu` counts the processor's time instead of the wall's.
+    python -m benchmarks.raycast [--large] [--scene NAME] [--mesh FILE] [--threads N]
+
+All engines cast the same rays in one process, in turns. Rates are medians over the rounds, with
+the minimum and the maximum. Ratios are medians of the ratios within a round. On a machine that
+other programs use, `--clock cpu` measures CPU time.
 """
 
 from __future__ import annotations
 
 import argparse
-import datetime
-import importlib.metadata
-import json
-import os
-import platform
-import sys
-import time
 from collections.abc import Callable
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .raycast_engines import Cast, Engine
-from .raycast_peers import ENGINES
-from .raycast_scenes import Job, jobs
+from raybeam import Pattern, RayCaster, available_backends
 
-CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
-_CALLS_S = 0.15  # an engine's turn takes about that long at least
-_VERSIONS = (
-    "numpy",
-    "open3d-cpu",
-    "open3d",
-    "trimesh",
-    "numba",
-    "warp-lang",
-    "cupy-cuda13x",
-)
+from .harness import argument_parser, run_rounds, time_call, write_results
+from .raycast_scenes import Float, Job, jobs
+
+Cast = Callable[[], int]  # casts all rays of a job, and returns the number of hits
+
+_CALLS_S = 0.15  # minimum duration of an engine's turn
+_CHUNK = 1 << 17  # rays that Open3D casts at a time
 
 
-def time_call(cast: Cast, repeats: int, clock: Callable[[], float]) -> tuple[float, int]:
-    """Return the mean time of a call, seconds, and the number of hits."""
-    start = clock()
-    for _ in range(repeats):
-        hits = cast()
-    return (clock() - start) / repeats, hits
+def prepare_raybeam(backend: str, job: Job, threads: int) -> Cast:
+    """Return a function that makes the rays of all poses, casts them and gathers hits."""
+    caster = RayCaster(job.vertices, job.faces, backend, threads=threads)
+    pattern = Pattern(job.directions)
+    return lambda: sum(len(caster.scan(pattern, origin, job.rotation)) for origin in job.origins)
+
+
+def prepare_open3d(job: Job, threads: int) -> Cast:
+    """Return a function that casts precomputed rays, without gathering hits."""
+    import open3d
+
+    scene = open3d_scene(job.vertices, job.faces, threads)
+    rays = np.concatenate([_rays(job, origin) for origin in job.origins])
+    chunks = [
+        open3d.core.Tensor.from_numpy(rays[start : start + _CHUNK])
+        for start in range(0, len(rays), _CHUNK)
+    ]
+    answers = (scene.cast_rays(chunk)["t_hit"].numpy() for chunk in chunks)
+    hits = sum(int(np.isfinite(answer).sum()) for answer in answers)
+
+    def cast() -> int:
+        for chunk in chunks:
+            scene.cast_rays(chunk, nthreads=threads)
+        return hits
+
+    return cast
+
+
+def prepare_open3d_numpy(job: Job, threads: int) -> Cast:
+    """Return a function that makes rays, casts them and gathers hits, as a script would."""
+    import open3d
+
+    scene = open3d_scene(job.vertices, job.faces, threads)
+
+    def count_hits(origin: Float) -> int:
+        rays = _rays(job, origin)
+        answer = scene.cast_rays(open3d.core.Tensor.from_numpy(rays), nthreads=threads)
+        t = answer["t_hit"].numpy()
+        triangle = answer["primitive_ids"].numpy()
+        hit = np.isfinite(t)
+        points = origin + t[hit, None] * rays[hit, 3:]
+        return len(points) if len(triangle[hit]) == len(points) else -1
+
+    return lambda: sum(count_hits(origin) for origin in job.origins)
+
+
+def prepare_trimesh(job: Job, threads: int) -> Cast:
+    """Return a function that finds triangles by trimesh's fastest query, without distances."""
+    import trimesh
+    from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+    scene = RayMeshIntersector(trimesh.Trimesh(job.vertices, job.faces, process=False))
+
+    def count_hits(origin: Float) -> int:
+        directions = job.directions @ job.rotation.T
+        origins = np.tile(origin, (len(directions), 1))
+        return int((scene.intersects_first(origins, directions) >= 0).sum())
+
+    return lambda: sum(count_hits(origin) for origin in job.origins)
+
+
+def open3d_scene(vertices: Float, faces: NDArray[Any], threads: int) -> Any:
+    """Return an Open3D scene of a mesh."""
+    import open3d
+
+    scene = open3d.t.geometry.RaycastingScene(nthreads=threads)
+    tensor = open3d.core.Tensor
+    scene.add_triangles(tensor(vertices.astype(np.float32)), tensor(faces.astype(np.uint32)))
+    return scene
+
+
+def _rays(job: Job, origin: Float) -> NDArray[np.float32]:
+    """Return the rays (n, 6) of an origin."""
+    directions = job.directions @ job.rotation.T
+    origins = np.tile(origin, (len(directions), 1))
+    return np.hstack([origins, directions]).astype(np.float32)
+
+
+def available_engines() -> dict[str, Callable[[Job, int], Cast]]:
+    """Return functions that prepare an engine for a job, by name; print what is missing."""
+    missing = dict(available_backends())
+    engines: dict[str, Callable[[Job, int], Cast]] = {
+        backend: partial(prepare_raybeam, backend) for backend in missing
+    }
+    peers = {
+        "Open3D, bare": ("open3d", prepare_open3d),
+        "Open3D + NumPy": ("open3d", prepare_open3d_numpy),
+        "trimesh + embreex": ("embreex", prepare_trimesh),
+    }
+    for name, (module, prepare) in peers.items():
+        engines[name] = prepare
+        missing[name] = "" if find_spec(module) else f"pip install {module}"
+    for name, reason in missing.items():
+        if reason:
+            print(f"{name} is left out: {reason}")
+    return {name: prepare for name, prepare in engines.items() if not missing[name]}
 
 
 def measure(
-    job: Job, engines: list[Engine], rounds: int, calls_s: float, clock: Callable[[], float]
+    job: Job,
+    engines: dict[str, Callable[[Job, int], Cast]],
+    options: argparse.Namespace,
 ) -> dict[str, Any]:
     """Measure the rates of all engines on a job."""
-    ready: list[tuple[Engine, Cast, int]] = []
     builds = {}
-    for engine in engines:
-        start = clock()
-        cast = engine.prepare(job)
-        builds[engine.name] = clock() - start
-        time_call(cast, 1, clock)
-        call_s, _ = time_call(cast, 1, clock)
-        ready.append((engine, cast, max(1, int(calls_s / max(call_s, 1e-6)))))
-    rates: dict[str, list[float]] = {engine.name: [] for engine in engines}
     hits = {}
-    for round_number in range(rounds):
-        # Whoever is first finds the caches as the last one left them: not always the same two.
-        shift = round_number % len(ready)
-        for engine, cast, repeats in ready[shift:] + ready[:shift]:
-            seconds, hit_count = time_call(cast, repeats, clock)
-            rates[engine.name].append(engine.rays(job) / max(seconds, 1e-9) / 1e6)
-            hits[engine.name] = hit_count / engine.rays(job)
+    calls = {}
+    for name, prepare in engines.items():
+        builds[name], cast = time_call(partial(prepare, job, options.threads), options.clock)
+        cast()  # compiles, and builds trees
+        seconds, hits[name] = time_call(cast, options.clock)
+        repeats = 1 if options.quick else max(1, int(_CALLS_S / max(seconds, 1e-6)))
+        calls[name] = partial(_rate, job, cast, repeats, options.clock)
+    rates = run_rounds(calls, options.repeat, warm_up=0)
     return {
         "scene": job.name,
         "triangles": len(job.faces),
         "order": job.order,
         "rays": job.rays,
         "engines": {
-            engine.name: {
-                "ours": engine.is_raybeam,
-                "peer": engine.peer,
-                "mrays_s": rates[engine.name],
-                "hit_share": hits[engine.name],
-                "build_s": builds[engine.name],
+            name: {
+                "mrays_s": rates[name],
+                "hit_share": hits[name] / job.rays,
+                "build_s": builds[name],
             }
-            for engine in engines
+            for name in engines
         },
     }
 
 
-def best_peer(row: dict[str, Any]) -> str | None:
-    """Return the name of the peer with the highest median rate, or None without peers."""
-    peers = {k: np.median(v["mrays_s"]) for k, v in row["engines"].items() if v["peer"]}
-    return max(peers, key=lambda name: peers[name]) if peers else None
-
-
-def ratio(row: dict[str, Any], engine: str, base: str) -> float:
-    """Return the median over the rounds of the rate of an engine over the rate of `base`."""
-    rates = [np.array(row["engines"][name]["mrays_s"]) for name in (engine, base)]
-    return float(np.median(rates[0] / rates[1]))
+def _rate(job: Job, cast: Cast, repeats: int, clock: str, _: int) -> float:
+    """Return the rate of several casts in Mray/s."""
+    seconds, _ = time_call(lambda: [cast() for _ in range(repeats)], clock)
+    return job.rays * repeats / max(seconds, 1e-9) / 1e6
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print the ray-casting rates of all engines for a job."""
+    """Print the rates of all engines on a job, and their ratios to the fastest peer."""
     print(f"\n{row['scene']}, {row['triangles']:,} triangles, {row['rays']:,} {row['order']} rays")
-    peer = best_peer(row)
-    for name, entry in row["engines"].items():
+    engines = row["engines"]
+    medians = {name: float(np.median(entry["mrays_s"])) for name, entry in engines.items()}
+    peers = [name for name in engines if name not in available_backends()]
+    best = max(peers, key=medians.__getitem__, default=None)
+    for name, entry in engines.items():
         rates = entry["mrays_s"]
         line = (
-            f"  {name:<20} {np.median(rates):12.5g} Mray/s  ({min(rates):.4g} to {max(rates):.4g})"
-            f"  hits {100 * entry['hit_share']:5.1f} %  prepared in {entry['build_s']:.2f} s"
+            f"  {name:<18} {medians[name]:10.4g} Mray/s  ({min(rates):.4g} to {max(rates):.4g})"
+            f"  hits {100 * entry['hit_share']:5.1f} %  built in {entry['build_s']:.2f} s"
         )
-        if entry["ours"] and peer:
-            line += f"  {ratio(row, name, peer):.3g} x {peer}"
+        if best and name not in peers:
+            ratio = np.median(np.divide(rates, engines[best]["mrays_s"]))
+            line += f"  {ratio:.3g} x {best}"
         print(line)
-    for text in findings(row):
-        print(f"  {text}")
-
-
-def findings(row: dict[str, Any]) -> list[str]:
-    """Return sentences about the ratios that have targets."""
-    engines = row["engines"]
-    sentences = []
-    if "Open3D, bare" in engines and "tiles" in engines:
-        sentences.append(f"tiles take {ratio(row, 'tiles', 'Open3D, bare'):.2f} x bare Open3D")
-    if "brute force, NumPy" in engines and "numpy" in engines:
-        sentences.append(f"numpy is {ratio(row, 'numpy', 'brute force, NumPy'):,.0f} x brute force")
-    return sentences
-
-
-def environment(threads: int, clock: str) -> dict[str, Any]:
-    """Return the machine, versions and settings of a measurement."""
-    versions = {}
-    for name in _VERSIONS:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return {
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "machine": platform.machine(),
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "load": os.getloadavg() if hasattr(os, "getloadavg") else None,
-        "threads": threads,
-        "clock": clock,
-        "python": platform.python_version(),
-        "versions": versions,
-    }
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((x.partition(":")[2].strip() for x in lines if x.startswith("model name")), "")
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run from the command line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="toy scenes, few rays, two rounds")
+    parser = argument_parser(__doc__, repeat=7, quick=True, clock="wall")
     parser.add_argument(
-        "--large", action="store_true", help="a city of 10 million triangles too: 13 GB, minutes"
+        "--large", action="store_true", help="also cast in a city of 10 million triangles (13 GB)"
     )
-    parser.add_argument("--scene", action="append", help="only this one; may be given again")
-    parser.add_argument("--mesh", action="append", type=Path, default=[], help="a mesh file more")
-    parser.add_argument("--rays", type=int, default=1 << 17, help="rays of a scan")
-    parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--threads", type=int, default=1, help="CPU threads of those that can")
-    parser.add_argument("--clock", choices=CLOCKS, default="wall")
-    parser.add_argument("--without", action="append", default=[], help="leave this engine out")
-    parser.add_argument("--json", type=Path, help="write the results here")
-    chosen = parser.parse_args(arguments)
-    quick = chosen.quick
-    makers = jobs(2_000 if quick else chosen.rays, chosen.mesh, quick, chosen.large)
-    unknown = set(chosen.scene or ()) - set(makers)
-    if unknown:
-        parser.error(f"there is no scene {', '.join(unknown)}: {', '.join(makers)}")
-    engines = []
-    for engine in (
-        engine_class(chosen.threads)
-        for engine_class in ENGINES
-        if engine_class.name not in chosen.without
-    ):
-        reason = engine.missing()
-        if reason:
-            print(f"{engine.name} is left out: {reason}")
-        else:
-            engines.append(engine)
+    add_scene_options(parser)
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads (default: 1)")
+    options = parser.parse_args(arguments)
+    if options.quick:
+        options.repeat = 2
+    makers = chosen_jobs(parser, options, options.large)
+    engines = available_engines()
     results = []
-    for name, make in makers.items():
-        if not chosen.scene or name in chosen.scene:
-            job = make()
-            for order in (job, job.shuffled()):
-                rounds, calls_s = (2, 0.0) if quick else (chosen.rounds, _CALLS_S)
-                results.append(measure(order, engines, rounds, calls_s, CLOCKS[chosen.clock]))
-                show(results[-1])
-    if chosen.json:
-        report = {"environment": environment(chosen.threads, chosen.clock), "jobs": results}
-        chosen.json.write_text(json.dumps(report, indent=1) + "\n")
+    for make in makers:
+        job = make()
+        for order in (job, job.shuffled()):
+            results.append(measure(order, engines, options))
+            show(results[-1])
+    write_results(options.json, results)
     return 0
 
 
+def add_scene_options(parser: argparse.ArgumentParser) -> None:
+    """Add options that choose scenes, for `chosen_jobs`."""
+    parser.add_argument("--scene", action="append", help="only this scene; can be repeated")
+    parser.add_argument(
+        "--mesh", action="append", type=Path, default=[], help="an additional mesh file"
+    )
+    parser.add_argument("--rays", type=int, default=1 << 17, help="rays of a scan")
+
+
+def chosen_jobs(
+    parser: argparse.ArgumentParser, options: argparse.Namespace, large: bool = False
+) -> list[Callable[[], Job]]:
+    """Return functions that make the jobs of the chosen scenes."""
+    rays = 2_000 if options.quick else options.rays
+    makers = jobs(rays, options.mesh, options.quick, large)
+    if unknown := {*(options.scene or ())} - {*makers}:
+        parser.error(f"unknown scene {', '.join(unknown)}. The scenes are {', '.join(makers)}.")
+    return [make for name, make in makers.items() if not options.scene or name in options.scene]
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

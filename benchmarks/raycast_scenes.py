@@ -1,4 +1,4 @@
-"""What benchmarks/raycast.py casts: scenes, and a lidar's rays in them."""
+"""Scenes, and a lidar's rays in them, for benchmarks/raycast.py and benchmarks/trees.py."""
 
 from __future__ import annotations
 
@@ -78,6 +78,11 @@ def _job(name: str, scene: Scene, origins: Float, sensor: Sensor) -> Job:
     )
 
 
+def _named(kind: str, triangles: int) -> str:
+    """Return the name of a scene, such as city 1e5."""
+    return f"{kind} {triangles:.0e}".replace("e+0", "e")
+
+
 def _lidar(rays: int) -> Sensor:
     """Make a sensor of 128 rings and 45 degrees, with about `rays` rays per revolution."""
     return Sensor.grid(rays_per_revolution=max(36, rays // 128), layers=128, vertical_fov_deg=45)
@@ -96,9 +101,7 @@ def survey_job(rays: int) -> Job:
 
 def city_job(triangles: int, rays: int) -> Job:
     """Make a city, with the sensor on the central crossing."""
-    return _job(
-        f"city {triangles:.0e}".replace("e+0", "e"), city(triangles), [0, 0, 2], _lidar(rays)
-    )
+    return _job(_named("city", triangles), city(triangles), [0, 0, 2], _lidar(rays))
 
 
 def positions_job(triangles: int, rays: int, *, inside: bool) -> Job:
@@ -113,8 +116,7 @@ def positions_job(triangles: int, rays: int, *, inside: bool) -> Job:
     directions = sensor.directions(np.arange(36)).reshape(-1, 3)
     share = np.array([caster.cast(position, directions).hit.mean() for position in positions])
     chosen = positions[(share > 0.97) == inside][:4]
-    name = f"{'inside' if inside else 'street'} {triangles:.0e}".replace("e+0", "e")
-    return _job(name, scene, chosen, sensor)
+    return _job(_named("inside" if inside else "street", triangles), scene, chosen, sensor)
 
 
 def terrain_job(triangles: int, rays: int) -> Job:
@@ -122,9 +124,7 @@ def terrain_job(triangles: int, rays: int) -> Job:
     scene = terrain(triangles)
     down = RayCaster(scene.vertices, scene.faces, "numpy").cast([0.1, 0.2, 1e4], [[0, 0, -1]])
     height = 1e4 - float(down.distance[0]) + 30
-    return _job(
-        f"terrain {triangles:.0e}".replace("e+0", "e"), scene, [0.1, 0.2, height], _lidar(rays)
-    )
+    return _job(_named("terrain", triangles), scene, [0.1, 0.2, height], _lidar(rays))
 
 
 def mesh_job(path: Path, rays: int) -> Job:
@@ -138,33 +138,20 @@ def mesh_job(path: Path, rays: int) -> Job:
 def jobs(
     rays: int, meshes: list[Path], quick: bool, large: bool = False
 ) -> dict[str, Callable[[], Job]]:
-    """Return functions that make jobs, by the name that --scene takes.
+    """Return functions that make jobs, by the name of their scene in `--scene`.
 
-    Parameters
-    ----------
-    rays
-        Rays of a scan.
-    meshes
-        Mesh files more.
-    quick
-        Toy sizes.
-    large
-        The city of ten million triangles as well: with all engines it takes 13 GB and minutes.
+    With `large`, they include a city of ten million triangles, which needs 13 GB and minutes.
     """
     cities = [2_000] if quick else [100_000, 1_000_000]
     if large:
         cities.append(10_000_000)
     hills = 2_000 if quick else 2_000_000
-    makers: dict[str, Callable[[], Job]] = {"survey": lambda: survey_job(rays)}
+    streets = max(cities[0], 20_000)  # smaller cities have no rooms
+    makers: dict[str, Callable[[], Job]] = {"survey": partial(survey_job, rays)}
     for triangles in cities:
-        name = f"city-{triangles:.0e}".replace("e+0", "e")
-        makers[name] = lambda triangles=triangles: city_job(triangles, rays)  # type: ignore[misc]
-    for where_positions in ("street", "inside"):
-        city_triangles = max(cities[0], 20_000)  # smaller ones have no rooms
-        makers[where_positions] = partial(
-            positions_job, city_triangles, rays, inside=where_positions == "inside"
-        )
-    makers[f"terrain-{hills:.0e}".replace("e+0", "e")] = lambda: terrain_job(hills, rays)
-    for path in meshes:
-        makers[path.stem] = lambda path=path: mesh_job(path, rays)  # type: ignore[misc]
-    return makers
+        name = _named("city", triangles).replace(" ", "-")
+        makers[name] = partial(city_job, triangles, rays)
+    makers["street"] = partial(positions_job, streets, rays, inside=False)
+    makers["inside"] = partial(positions_job, streets, rays, inside=True)
+    makers[_named("terrain", hills).replace(" ", "-")] = partial(terrain_job, hills, rays)
+    return makers | {path.stem: partial(mesh_job, path, rays) for path in meshes}

@@ -1,4 +1,4 @@
-"""The kernel that benchmarks/raycast.py runs with NVIDIA Warp; needs warp-lang."""
+"""The ray query of NVIDIA Warp that benchmarks/gpu_warp.py measures; requires warp-lang."""
 
 import warp as wp
 

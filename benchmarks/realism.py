@@ -1,19 +1,18 @@
-"""What is real, beside what is bare: `python -m benchmarks.realism [--rounds N] [--json]`.
+"""One sweep with actors, sub-rays, weather and noise, compared with the same sweep without them.
 
-One sweep of an OS1-64 in a city of 100,000 triangles, one thread: bare, with cars that move (boxes,
-and meshes of 1,000 triangles), with 20 people of 2,320 triangles, rigid and walking, from a sensor
-that moves too, with sub-rays, with noise, with errors that last, with lost returns, with
-saturation, in rain, fog and snow, with ghosts, on wet ground, with spray; cars, sub-rays, noise and
-rain together (`real`), and all of it; and as turns of a survey, with all kinds of faults and
-without. Each figure is the median of the rounds, and a multiple of the bare sweep's.
+    python -m benchmarks.realism [--rows NAME ...] [--sensor MODEL]
+
+The sensor is an OS1-64 in a city of 100,000 triangles, on one thread. Rows have moving cars (boxes,
+and meshes of 1,000 triangles), 20 people of 2,320 triangles, rigid and walking, a moving sensor,
+sub-rays, noise, systematic errors, lost returns, saturation, rain, fog, snow, ghosts, wet ground or
+spray. `real` combines cars, sub-rays, noise and rain, and `all` everything. `whole survey` and
+`faults` are revolutions of a survey. Values are medians of CPU times.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +38,7 @@ from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from raybeam import available_backends
 
-from .raycast import environment
+from .harness import argument_parser, run_rounds, time_call, write_results
 
 POSITION = (0.0, 0.0, 1.9)
 SPEED_M_S = 20.0
@@ -182,53 +181,46 @@ def revolution_caster(scene: Scene, survey: Survey, backend: str) -> Any:
     return cast_revolution
 
 
-def measure(rows: dict[str, Any], rounds: int) -> dict[str, dict[str, float]]:
-    """Time all rows, in a random order each round; the first round warms up."""
-    seconds: dict[str, list[float]] = {row: [] for row in rows}
-    points = {}
-    for number in range(rounds + 1):
-        for row in np.random.default_rng(number).permutation(list(rows)).tolist():
-            start = time.process_time()
-            points[row] = len(rows[row](number % 5))
-            if number:
-                seconds[row].append(time.process_time() - start)
-    bare = float(np.median(seconds["bare"]))
+def measure(rows: dict[str, Any], repeat: int) -> dict[str, dict[str, float]]:
+    """Time all rows."""
+
+    def sweep(row: str, number: int) -> tuple[float, int]:
+        seconds, points = time_call(lambda: rows[row](number % 5))
+        return seconds, len(points)
+
+    sweeps = run_rounds({row: partial(sweep, row) for row in rows}, repeat)
+    medians = {row: float(np.median([s for s, _ in sweeps[row]])) for row in rows}
     return {
         row: {
-            "ms": 1e3 * float(np.median(spent)),
-            "times": float(np.median(spent)) / bare,
-            "points": points[row],
+            "ms": 1e3 * seconds,
+            "times": seconds / medians["bare"],
+            "points": sweeps[row][-1][1],
         }
-        for row, spent in seconds.items()
+        for row, seconds in medians.items()
     }
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the benchmark, and return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=9)
+def main(arguments: list[str] | None = None) -> dict[str, dict[str, float]]:
+    """Print the time of each row."""
+    parser = argument_parser(__doc__, repeat=9)
     parser.add_argument("--triangles", type=int, default=100_000)
     parser.add_argument("--cars", type=int, nargs="+", default=COUNTS)
     parser.add_argument("--sensor", default="ouster/os1-64")
-    parser.add_argument("--rows", nargs="*", help="those to measure, beside the bare one")
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--rows", nargs="*", help="rows to measure, in addition to `bare`")
     options = parser.parse_args(arguments)
     backend = next(name for name in ("tiles", "numpy") if not available_backends()[name])
-    scene = city(options.triangles)
-    rows = cases(scene, backend, tuple(options.cars), options.sensor)
+    rows = cases(city(options.triangles), backend, tuple(options.cars), options.sensor)
     if options.rows is not None:
         rows = {row: rows[row] for row in ["bare", *options.rows]}
-    figures_by_row = measure(rows, options.rounds)
-    if options.json:
-        print(json.dumps({**environment(1, "cpu"), "backend": backend, "rows": figures_by_row}))
-        return 0
-    for row, figures in figures_by_row.items():
+    results = measure(rows, options.repeat)
+    for row, values in results.items():
         print(
-            f"{row:20} {figures['ms']:8.2f} ms {figures['times']:6.2f} x bare "
-            f"{figures['points']:10,} points"
+            f"{row:20} {values['ms']:8.2f} ms {values['times']:6.2f} x bare "
+            f"{values['points']:10,} points"
         )
-    return 0
+    write_results(options.json, results)
+    return results
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

@@ -1,7 +1,8 @@
-"""Twins of public recordings, beside sweeps that were held out.
+"""Scenes reconstructed from public recordings, compared with held-out sweeps.
 
-`python -m benchmarks.reality FOLDER [NAME …] [--json FILE]` reads the recordings that FOLDER holds,
-each in the folder of its repository:
+    python -m benchmarks.reality FOLDER [NAME ...]
+
+FOLDER contains the recordings, each in the folder of its repository:
 
 | name | repository | sensor |
 |---|---|---|
@@ -20,11 +21,9 @@ The recordings are not part of lidarpool, and none states a license: fetch them 
 
 from __future__ import annotations
 
-import argparse
-import json
 import resource
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,30 +32,28 @@ import numpy as np
 from PIL import Image
 
 from lidarpool.clouds.recording import Recording
-from lidarpool.reconstruction.alignment import AlignedSweeps, align, first_alignment
+from lidarpool.reconstruction.alignment import AlignedSweeps, first_alignment
 from lidarpool.reconstruction.building import DEFAULT_VOXEL_M
 from lidarpool.reconstruction.free_space import find_stationary_points
-from lidarpool.reconstruction.held_out import HeldOutRays, simulate_held_out
+from lidarpool.reconstruction.held_out import HeldOutRays
 from lidarpool.reconstruction.lost_pulses import SensorCoverage
 from lidarpool.reconstruction.odometry import RecordedPoses, find_poses
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
-from lidarpool.reconstruction.reflectances import Reflectances
 from lidarpool.reconstruction.submap_tasks import (
     BuildTask,
     align_submap,
-    build_map_with_reflectances,
     compare_held_out_sweeps,
 )
 from lidarpool.reconstruction.submaps import merge_alignments, split_into_submaps
-from lidarpool.reconstruction.surface_map import SurfaceMap
 from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 
+from .harness import argument_parser, write_results
+
 _COMPARED_SWEEPS = 24
 _BLOCK_SWEEPS = 20
-_HALF_SWEEPS = 80  # of a `HalfMap`
 _STATIC_VOXEL_M = 0.4
 _STATIC_SWEEPS = 10  # between sweeps that have points at the same surface_map: a second
 _RESAMPLES = 400  # of sweeps, for intervals
@@ -137,41 +134,6 @@ def mapped_sweeps(count: int, rule: str) -> Ints:
     block = numbers // _BLOCK_SWEEPS
     held_out = (block % 2 == 1) & ((block + 1) * _BLOCK_SWEEPS < count)
     return numbers[~held_out]
-
-
-class HalfMap(NamedTuple):
-    """Surface map of every second sweep of a recording, with which the others are compared."""
-
-    sweeps: AlignedSweeps
-    mapped: list[int]  # numbers of the sweeps from which the map is built
-    compared: list[int]  # numbers of some of the others
-    surface_map: SurfaceMap
-    reflectances: Reflectances | None
-    standing: dict[int, Bools]  # {number of any sweep: mask of its points that stand}
-
-    @classmethod
-    def of_recording(
-        cls, recording: Recording, compared_sweeps: int, coverage: SensorCoverage | None = None
-    ) -> HalfMap:
-        """Build the map of the last sweeps of a recording."""
-        recorded = RecordedSweeps.from_recording(part_of(recording, slice(-_HALF_SWEEPS, None)))
-        mapped = mapped_sweeps(recorded.count, "easy").tolist()
-        first = first_alignment(recorded, find_poses(recorded, None))
-        alignment = align(recorded, first, np.arange(recorded.count), mapped)
-        sweeps = AlignedSweeps(
-            recorded, alignment, coverage or SensorCoverage.from_sweeps(recorded)
-        )
-        held_out = np.arange(1, recorded.count - 1, 2)  # a mapped sweep follows each
-        compared = held_out[even_indices(len(held_out), compared_sweeps)].tolist()
-        surface_map, reflectances = build_map_with_reflectances(sweeps, mapped, DEFAULT_VOXEL_M)
-        standing = find_stationary_points(sweeps, range(recorded.count))
-        return cls(sweeps, mapped, compared, surface_map, reflectances, standing)
-
-    def rays(self, numbers: Sequence[int], reflectances: Reflectances | None) -> HeldOutRays:
-        """Cast the rays of held-out sweeps in the map."""
-        return simulate_held_out(
-            self.sweeps, self.surface_map, reflectances, self.standing, numbers
-        )
 
 
 def static_points(sweeps: AlignedSweeps, numbers: Ints) -> dict[int, Bools]:
@@ -374,12 +336,11 @@ def _line(row: dict[str, Any]) -> str:
 
 
 def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
-    """Measure, print and return the rows of the recordings that are there."""
-    parser = argparse.ArgumentParser(prog="benchmarks.reality", description=__doc__)
+    """Measure, print and return the rows of the recordings in a folder."""
+    parser = argument_parser(__doc__)
     parser.add_argument("folder", type=Path, help="folder with the folders of the repositories")
-    parser.add_argument("names", nargs="*", help=f"of {', '.join(SOURCES)}; all by default")
+    parser.add_argument("names", nargs="*", help=f"of {', '.join(SOURCES)} (default: all)")
     parser.add_argument("--rules", default="easy,hard", help="easy, hard, or both")
-    parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args(arguments)
     rows = []
     for name in options.names or SOURCES:
@@ -388,8 +349,7 @@ def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
             print(f"{name}: {root} is not there, and is left out")
             continue
         rows += measure(name, options.folder, tuple(options.rules.split(",")))
-    if options.json:
-        options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    write_results(options.json, rows)
     return rows
 
 

@@ -1,13 +1,12 @@
-"""How fast recorded points are read, compared with another version of lidarpool.
+"""Time to read recordings and views, compared with another checkout of lidarpool.
 
-    python -m benchmarks.recordings [--against CHECKOUT] [--pairs N] [--folder FOLDER]
+    python -m benchmarks.recordings [--against CHECKOUT] [--folder FOLDER]
 
 The inputs are written once: an airborne survey (.las), the drive of a rotating sensor (.mcap), a
 sequence in KITTI format, and a data set of a campaign. Each measurement runs in a new process,
-which first performs the action on a small input, so that imports and compilation are not counted.
-Short actions are then repeated, and the fastest repetition counts. The processes of both checkouts
-alternate; the ratio is the median of the ratios of all pairs, less than 1 if this checkout is
-faster. Seconds are processor time.
+which first performs the action on a small input, so that imports and compilation are not measured.
+Short actions are then repeated, and the minimum counts. The processes of both checkouts run in
+turns. The ratio is less than 1 if this checkout is faster. Times are CPU time.
 """
 
 import argparse
@@ -16,7 +15,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -25,10 +23,13 @@ import numpy as np
 
 import lidarpool as lp
 
+from .harness import argument_parser, median_ratio, run_rounds, time_call, write_results
+from .loaders import write_data_set
+
 ROOT = Path(__file__).resolve().parent.parent
 SURVEY_POINTS, SCENE_POINTS = 16_000_000, 2_000_000
 FIRINGS, CHANNELS, SCANS = 640, 32, 32  # firings and scans per revolution
-DRIVE_SWEEPS, JOBS, JOB_SWEEPS = 500, 6, 50
+DRIVE_SWEEPS, JOB_SWEEPS = 500, 50
 KITTI_SWEEPS, KITTI_POINTS = 100, 100_000  # points per sweep
 SMALL = 0.02  # share of the points, or sweeps, in the inputs that are read before the measurement
 LEAST_S = 2  # actions are repeated for so long in each process
@@ -102,19 +103,6 @@ def write_kitti(folder, sweep_count):
     (folder / "calib.txt").write_text("Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n", encoding="ascii")
 
 
-def write_data_set(folder, sweep_count):
-    """Write the data set of a campaign with `keep: kitti`."""
-    from lidarpool.datasets.dataset import DataSet
-    from lidarpool.datasets.job_table import JobRow, write_table
-    from lidarsim.io.storage import Storage
-
-    cloud, sweeps = make_drive(sweep_count)
-    data = DataSet(Storage.at(folder), "kitti")
-    jobs = [data.write_job(JobRow(number, f"{number:04}"), cloud, sweeps) for number in range(JOBS)]
-    write_table(data.storage, [], lambda: jobs)
-    data.finish(jobs)
-
-
 def write_inputs(folder, share=1.0):
     """Write all inputs with a share of the points or sweeps, unless they exist."""
     from lidarpool.clouds.writing import ExportSpec
@@ -128,7 +116,7 @@ def write_inputs(folder, share=1.0):
     write_survey(staged / "scene.las", int(share * SCENE_POINTS))
     ExportSpec("mcap").write(staged / "drive.mcap", *make_drive(int(share * DRIVE_SWEEPS)))
     write_kitti(staged / "kitti", int(share * KITTI_SWEEPS))
-    write_data_set(staged / "dataset", int(share * JOB_SWEEPS))
+    write_data_set(staged / "dataset", "kitti", *make_drive(int(share * JOB_SWEEPS)))
     staged.rename(folder)
 
 
@@ -190,21 +178,21 @@ ACTIONS = {  # {name: (function that returns the number of points it has read, i
 }
 
 
-def measure(name, folder):
+def measure(name, folder, size):
     """Print the fewest seconds of an action in this process, and the number of points, as JSON."""
     (action, file), seconds = ACTIONS[name], []
     action(folder / "small" / file)
     while sum(seconds) < LEAST_S:
-        begin = time.process_time()
-        count = action(folder / "full" / file)
-        seconds.append(time.process_time() - begin)
+        took, count = time_call(lambda: action(folder / size / file))
+        seconds.append(took)
     print(json.dumps([min(seconds), count]))
 
 
-def measure_in_process(checkout, name, folder):
+def measure_in_process(checkout, name, folder, size):
     """Return the seconds of an action in a new process, and the number of points."""
     paths = os.pathsep.join(f"{checkout}/{part}" for part in ("kernels", "scheduler", "workflows"))
     command = [sys.executable, "-m", __spec__.name, "--measure", name, "--folder", str(folder)]
+    command += ["--quick"] if size == "small" else []
     # By default, glibc decides from earlier allocations whether large arrays reuse memory, which
     # changes the time to read a bag threefold.
     reuse = {"MALLOC_MMAP_THRESHOLD_": str(1 << 30), "MALLOC_TRIM_THRESHOLD_": str(1 << 34)}
@@ -212,39 +200,52 @@ def measure_in_process(checkout, name, folder):
     return json.loads(subprocess.check_output(command, cwd=ROOT, env=environment))
 
 
-def main(checkouts, pairs, folder):
+def compare(name, checkouts, pairs, folder, size):
+    """Return the seconds of an action by checkout, and the number of points; print a row."""
+    calls = {
+        str(checkout): lambda _, checkout=checkout: measure_in_process(checkout, name, folder, size)
+        for checkout in checkouts
+    }
+    results = run_rounds(calls, pairs)  # the first round fills the file cache
+    counts = {count for rounds in results.values() for _, count in rounds}
+    if len(counts) > 1:
+        raise SystemExit(f"{name}: the versions read different numbers of points: {counts}.")
+    seconds = {checkout: [s for s, _ in rounds] for checkout, rounds in results.items()}
+    cells = [np.median(values) for values in seconds.values()]
+    if len(cells) > 1:
+        cells.append(median_ratio(*seconds.values()))
+    print(f"{name:18}{counts.pop():12,}" + "".join(f"{cell:9.3f}" for cell in cells), flush=True)
+    return seconds
+
+
+def main(arguments=None):
     """Print the table."""
-    write_inputs(folder / "full")
+    parser = argument_parser(__doc__, repeat=5, quick=True)
+    parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="another checkout")
+    parser.add_argument("--folder", type=Path, default=ROOT / "build" / "recordings")
+    parser.add_argument("--only", nargs="+", choices=ACTIONS, default=[*ACTIONS])
+    parser.add_argument("--measure", choices=ACTIONS, help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    if options.against and not (options.against / "workflows" / "lidarpool").is_dir():
+        parser.error(f"{options.against} is not a checkout of lidarpool")
+    size = "small" if options.quick else "full"
+    if options.measure:
+        measure(options.measure, options.folder, size)
+        return
+    folder = options.folder.resolve()
     write_inputs(folder / "small", SMALL)
-    titles = "".join(f"{title:>9}" for title in ("s", "other s", "ratio")[: 2 * len(checkouts) - 1])
-    print(f"{'action':18}{'points':>12}{titles}")
-    for name in ACTIONS:
-        if "torch" in name and find_spec("torch") is None:
-            continue
-        seconds, counts = np.empty((pairs + 1, len(checkouts))), set()
-        for index in np.ndindex(seconds.shape):
-            column = index[1] if index[0] % 2 else -1 - index[1]  # each is first in turn
-            seconds[index[0], column], count = measure_in_process(checkouts[column], name, folder)
-            counts.add(count)
-        if len(counts) > 1:
-            raise SystemExit(f"{name}: the versions read different numbers of points: {counts}.")
-        seconds = seconds[1:]  # the first round has warmed the file cache
-        ratio = np.median(seconds[:, 0] / seconds[:, -1])
-        cells = [*np.median(seconds, axis=0), ratio][: 2 * len(checkouts) - 1]
-        print(f"{name:18}{count:12,}" + "".join(f"{cell:9.3f}" for cell in cells), flush=True)
+    if not options.quick:
+        write_inputs(folder / "full")
+    checkouts = [ROOT] if options.against is None else [ROOT, options.against.resolve()]
+    titles = ("s", "other s", "ratio")[: 2 * len(checkouts) - 1]
+    print(f"{'action':18}{'points':>12}" + "".join(f"{title:>9}" for title in titles))
+    results = {
+        name: compare(name, checkouts, options.repeat, folder, size)
+        for name in options.only
+        if "torch" not in name or find_spec("torch")
+    }
+    write_results(options.json, results)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="another checkout")
-    parser.add_argument("--pairs", type=int, default=5, help="measurements of each action")
-    parser.add_argument("--folder", type=Path, default=ROOT / "build" / "recordings")
-    parser.add_argument("--measure", choices=ACTIONS, help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.against and not (options.against / "workflows" / "lidarpool").is_dir():
-        parser.error(f"{options.against} is not a checkout of lidarpool")
-    if options.measure:
-        measure(options.measure, options.folder)
-    else:
-        checkouts = [ROOT] if options.against is None else [ROOT, options.against.resolve()]
-        main(checkouts, options.pairs, options.folder.resolve())
+    main()

@@ -1,28 +1,28 @@
-"""What a task, a receipt and a job cost as the cluster grows: `python -m benchmarks.scale`.
+"""CPU time of the driver, the scheduler and the collectors for each task, receipt and job.
 
-Scheduler, driver and workers are three processes, so that what each takes can be told apart:
-all the workers are threads of one process, and the tasks do nothing. The workers are divided
-into four partitions.
+    python -m benchmarks.scale [--workers N ...]
+    python -m benchmarks.scale --receipts SECONDS [--workers N ...] [--shards N]
+    python -m benchmarks.scale --jobs N
 
-- `submit`: one task a message; `client_map`: Dask's own map, all in one; `map`: results one by
-  one, a bounded number of tasks under way. `map_small` puts several items into a task, as
-  `Partition.map` does by itself, and its figures are for an item: at least two tasks for each
-  slot are needed, so that they grow with the cluster.
-- The scheduler's time is CPU time, less what it takes in as long a time with nothing to do
-  (heartbeats), which is given by itself; the driver's is CPU time of its process.
-- Growth is that of driver and scheduler together, from the smallest cluster to the largest.
+Scheduler, driver and workers are separate processes. All workers are threads of one process, are
+divided into four partitions, and run tasks that do nothing:
 
-`--receipts SECONDS` has surveys cast by so many GPU workers whose batches, of one scan with four
-rays, take so long: casting ends with a sleep, all else is the product's own. The figures are a
-receipt's, and how busy the workers are in a minute; `--shards N` has so many of these clusters run
-at a time. `--jobs N` runs the tiny jobs of `benchmarks.campaign`. Both count from a fifth of the
-work on: what a run takes to start and to finish is no part of them.
+- `submit` sends one task in each message, `client_map` is Dask's own map, and `map` returns results
+  one by one with a limited number of tasks in flight. `map_small` puts several items into a task,
+  and its values are per item. At least two tasks for each slot are needed, so its cost grows with
+  the cluster.
+- The CPU time of the scheduler excludes heartbeats, which are measured separately.
+- Growth is the growth of driver and scheduler together, from the smallest to the largest cluster.
+
+With `--receipts`, surveys are cast by GPU workers whose batches, of one scan with four rays, take
+so many seconds: casting ends with a sleep, and the rest of the pipeline is real. The values are
+per receipt, with the share of a minute in which the workers are busy. `--shards N` runs N of these
+clusters at a time. `--jobs N` runs the tiny jobs of `benchmarks.campaign`. Both measure from a
+fifth of the work on, to exclude the start and the end of a run.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import multiprocessing
 import tempfile
@@ -38,13 +38,15 @@ import psutil
 from distributed import Client, get_worker
 
 import lidarpool.run.pipeline.rigs
-from benchmarks.campaign import BASE, CAMPAIGN
-from benchmarks.control import single_scans
-from benchmarks.many_workers import process, run_scheduler, run_workers
 from lidarpool import Campaign, Scene, Sensor, Survey, simulate
 from lidarpool.run.progress import Progress
 from lidarsim.scene.actors import box
 from poolpart import Partition, Pool
+
+from .campaign import BASE, CAMPAIGN
+from .control import single_scans
+from .harness import argument_parser, cpu_seconds, write_results
+from .many_workers import process, run_scheduler, run_workers
 
 NAMES = ("A", "B", "C", "D")
 
@@ -113,11 +115,6 @@ WAYS = {
 }
 
 
-def processor_s(process: psutil.Process) -> float:
-    times = process.cpu_times()
-    return float(times.user + times.system)
-
-
 def measure(workers: int, tasks: int) -> dict[str, Any]:
     """Return the figures of a cluster of `workers` workers."""
     with (
@@ -127,9 +124,9 @@ def measure(workers: int, tasks: int) -> dict[str, Any]:
     ):
         parts, seconds = divide(client)
         members = {part.name: {worker.name for worker in part.workers} for part in parts}
-        cpu_before = processor_s(scheduler)
+        cpu_before = cpu_seconds(scheduler)
         time.sleep(2)
-        idle = (processor_s(scheduler) - cpu_before) / 2
+        idle = (cpu_seconds(scheduler) - cpu_before) / 2
         figures: dict[str, Any] = {
             "seconds_to_partition": round(seconds, 3),
             "scheduler_idle_percent": round(100 * idle, 1),
@@ -140,11 +137,11 @@ def measure(workers: int, tasks: int) -> dict[str, Any]:
         for method, (run, share) in WAYS.items():
             start = time.perf_counter()
             driver = time.process_time()
-            cpu_before = processor_s(scheduler)
+            cpu_before = cpu_seconds(scheduler)
             names = {part.name: run(part, math.ceil(share * tasks / len(parts))) for part in parts}
             wall = time.perf_counter() - start
             task_count = sum(map(len, names.values()))
-            busy = processor_s(scheduler) - cpu_before - idle * wall
+            busy = cpu_seconds(scheduler) - cpu_before - idle * wall
             figures[method] = {
                 "tasks_per_second": round(task_count / wall, 1),
                 "driver_ms": round(1e3 * (time.process_time() - driver) / task_count, 4),
@@ -183,7 +180,7 @@ class CostSamples:
 
     def _cpu_s(self) -> dict[str, float]:
         return {
-            name: sum(map(processor_s, processes)) for name, processes in self._processes.items()
+            name: sum(map(cpu_seconds, processes)) for name, processes in self._processes.items()
         }
 
     def __call__(self, progress: Progress) -> None:
@@ -288,16 +285,14 @@ def growth(smallest: dict[str, float], largest: dict[str, float]) -> float | Non
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argument_parser(__doc__)
     parser.add_argument("--workers", type=int, nargs="+", default=[10, 50, 200])
-    parser.add_argument("--tasks", type=int, default=20_000, help="of each way to submit them")
-    parser.add_argument("--receipts", type=float, help="seconds that a batch of one scan takes")
-    parser.add_argument("--scans", type=int, default=3_000, help="of a survey for --receipts")
-    parser.add_argument("--shards", type=int, default=1, help="clusters at a time, for --receipts")
+    parser.add_argument("--tasks", type=int, default=20_000, help="tasks of each way to submit")
+    parser.add_argument("--receipts", type=float, help="seconds to cast a batch of one scan")
+    parser.add_argument("--scans", type=int, default=3_000, help="with --receipts, of a survey")
+    parser.add_argument("--shards", type=int, default=1, help="with --receipts, clusters at a time")
     parser.add_argument("--jobs", type=int, help="number of tiny jobs")
-    parser.add_argument("--json", type=Path, help="also write the figures to this file")
     options = parser.parse_args(arguments)
-
     rows: dict[str, Any] = {}
     if options.receipts is not None:
         for count in options.workers:
@@ -305,25 +300,25 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
             rows[title] = measure_shards(options.shards, count, options.receipts, options.scans)
     if options.jobs:
         rows[f"{options.jobs} tiny jobs"] = measure_jobs(options.jobs)
-    for title, figures in rows.items():
-        print(f"{title}: {', '.join(f'{name} {value:g}' for name, value in figures.items())}")
-    if options.json and rows:
-        options.json.write_text(json.dumps(rows, indent=1) + "\n")
-    return rows or measure_tasks(options)
+    for title, values in rows.items():
+        print(f"{title}: {', '.join(f'{name} {value:g}' for name, value in values.items())}")
+    results = rows or measure_tasks(options.workers, options.tasks)
+    write_results(options.json, results)
+    return results
 
 
-def measure_tasks(options: argparse.Namespace) -> dict[str, Any]:
+def measure_tasks(worker_counts: list[int], tasks: int) -> dict[str, Any]:
     """Measure the cost of tasks that do nothing, in clusters of growing size."""
     clusters = {}
-    for count in options.workers:
-        clusters[count] = figures = measure(count, options.tasks)
+    for count in worker_counts:
+        clusters[count] = values = measure(count, tasks)
         print(
-            f"{count} workers: {figures['seconds_to_partition']} s to partition, "
-            f"{figures['misplaced']} of {figures['tasks']} misplaced, scheduler idle at "
-            f"{figures['scheduler_idle_percent']}% of a core"
+            f"{count} workers: {values['seconds_to_partition']} s to partition, "
+            f"{values['misplaced']} of {values['tasks']} misplaced, scheduler idle at "
+            f"{values['scheduler_idle_percent']}% of a core"
         )
         for method in WAYS:
-            a_second, driver, scheduler = figures[method].values()
+            a_second, driver, scheduler = values[method].values()
             print(
                 f"  {method:<11} {a_second:9.1f} a second, driver {driver:.3f} ms, "
                 f"scheduler {scheduler:.3f} ms"
@@ -331,10 +326,7 @@ def measure_tasks(options: argparse.Namespace) -> dict[str, Any]:
     extremes = clusters[min(clusters)], clusters[max(clusters)]
     grown = {method: growth(extremes[0][method], extremes[1][method]) for method in WAYS}
     print(f"growth from {min(clusters)} to {max(clusters)} workers: {grown}")
-    results = {"tasks": options.tasks, "workers": clusters, "growth": grown}
-    if options.json:
-        options.json.write_text(json.dumps(results, indent=1) + "\n")
-    return results
+    return {"tasks": tasks, "workers": clusters, "growth": grown}
 
 
 if __name__ == "__main__":

@@ -1,16 +1,18 @@
-"""A scan in a loop, beside the cast alone: `python -m benchmarks.scanner [--peers PYTHON]`.
+"""Sweeps of a `Scanner` in a loop, compared with ray casting alone, Open3D and MuJoCo.
 
-A VLP-16, an OS1-128, and 1,000 robots with 64 rays each, in a city, with one thread, in shuffled
-order:
+    python -m benchmarks.scanner [--case NAME] [--peers PYTHON]
 
-- cast: `RayCaster.scan` of raybeam with the same rays, made before; it ends with hits;
-- ranges, noise: `Scanner.ranges`, float32 images of ranges, and so with noise of 2 cm;
+A VLP-16, an OS1-128, and 1,000 robots with 64 rays each scan a city on one thread. Each round uses
+different poses, as in a loop:
+
+- cast: `RayCaster.scan` of raybeam with the same precomputed rays, which returns hits;
+- ranges, noise: `Scanner.ranges`, float32 range images, without and with range noise of 2 cm;
 - sweep, moving: `Scanner.sweep`, a cloud with its columns, from a pose and from a trajectory;
-- open3d: Open3D's RaycastingScene and NumPy, from poses to float32 images, as one would write it.
+- open3d: Open3D's RaycastingScene and NumPy, from poses to float32 images, as in a user's script.
 
-The poses of each round are others, as in a loop. MuJoCo's ``mj_multiRay`` and the CPU and Warp
-backends of MuJoCo-LiDAR (Warp on the processor) stand in a Python of their own. They are called
-once for each pose, with directions that were turned before.
+With `--peers`, MuJoCo's `mj_multiRay` and the CPU and Warp backends of MuJoCo-LiDAR (Warp on the
+CPU) run in a separate Python environment, which needs mujoco-lidar and warp-lang. They are called
+once for each pose, with directions that were rotated before.
 """
 
 from __future__ import annotations
@@ -18,10 +20,11 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
+import os
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,13 +35,19 @@ from lidarpool import Noise, Scanner, Scene, Sensor, Track, load_sensor
 from lidarscenes.procedural.city import city
 from raybeam import Pattern, RayCaster, available_backends
 
-from .raycast import CLOCKS, environment
-from .sensors import Peer
+from .harness import (
+    argument_parser,
+    has_modules,
+    median_ratio,
+    run_rounds,
+    time_call,
+    write_results,
+)
+from .raycast import open3d_scene
 
 Float = NDArray[np.float64]
 CASES = ("velodyne/vlp16", "ouster/os1-128", "robots")
 PEERS = ("mujoco", "mujoco-lidar cpu", "mujoco-lidar warp")
-BAR = 1.3  # of the time of ranges to that of the cast
 HEIGHT_M = 1.8
 
 
@@ -64,13 +73,7 @@ def poses_of(count: int, number: int) -> Float:
 
 
 class LidarpoolScans:
-    """Cast alone, and scanners, with the same rays.
-
-    Parameters
-    ----------
-    scene, sensor, backend
-        What is scanned, by what and how.
-    """
+    """Ray casting alone, and scanners, with the same rays."""
 
     def __init__(self, scene: Scene, sensor: Sensor, backend: str) -> None:
         self.sensor = sensor
@@ -119,6 +122,43 @@ class LidarpoolScans:
         return len(self.scanner.sweep(Track([0, 0.2], positions)))
 
 
+class Peer:
+    """Process of a Python with a package, which casts a job of arrays on request."""
+
+    def __init__(self, name: str, python: str, job: Path, clock: str) -> None:
+        script = Path(__file__).with_name("scanner_peers.py")
+        # -P: the folder of the script, which has a module `mujoco` too, is not searched.
+        self._process = subprocess.Popen(
+            [python, "-P", str(script), name, str(job), clock],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+        )
+        self._line()
+
+    def _line(self) -> str:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:  # what it prints besides is none of ours
+            if line.startswith(("ready", "{")):
+                return line.strip()
+        raise RuntimeError(f"The peer ended with {self._process.wait()}")
+
+    def cast(self) -> tuple[float, int]:
+        """Return the time of a revolution, seconds, and the number of hits."""
+        assert self._process.stdin is not None
+        self._process.stdin.write("cast\n")
+        self._process.stdin.flush()
+        answer = json.loads(self._line())
+        return answer["seconds"], answer["hits"]
+
+    def close(self) -> None:
+        """End the process."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait()
+
+
 class Open3D:
     """Open3D scene whose rays are computed with NumPy."""
 
@@ -127,11 +167,7 @@ class Open3D:
 
         self.core = open3d.core
         self.scans = scans
-        self.scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-        self.scene.add_triangles(
-            self.core.Tensor(scene.vertices.astype(np.float32)),
-            self.core.Tensor(scene.faces.astype(np.uint32)),
-        )
+        self.scene = open3d_scene(scene.vertices, scene.faces, 1)
         self.rays = np.array(scans.pattern.directions, np.float32)
         origins = scans.pattern.origins
         self.origins = None if origins is None else np.array(origins, np.float32)
@@ -153,13 +189,10 @@ class Open3D:
         return range_m
 
 
-def measure(
-    case: str, backend: str, scene: Scene, robots: int, rounds: int, clock: str, python: str
-) -> dict[str, Any]:
+def measure(case: str, scene: Scene, options: argparse.Namespace) -> dict[str, Any]:
     """Time all methods of a case."""
-    clock_s = CLOCKS[clock]
-    count = robots if case == "robots" else 1
-    scans = LidarpoolScans(scene, sensor_of(case), backend)
+    count = options.robots if case == "robots" else 1
+    scans = LidarpoolScans(scene, sensor_of(case), options.backend)
     methods: dict[str, Callable[[Float], Any]] = {
         "cast": scans.cast,
         "ranges": scans.ranges,
@@ -170,44 +203,31 @@ def measure(
     if importlib.util.find_spec("open3d"):
         methods["open3d"] = Open3D(scene, scans).ranges
     rays = len(scans.pattern) * count
-    seconds: dict[str, list[float]] = {method: [] for method in methods}
-    hits: dict[str, float] = {}
-    for number in range(rounds + 1):
+
+    def scan(method: str, number: int) -> tuple[float, float]:
         poses = poses_of(count, number)
-        # Each finds caches and memory as the last one left them: not always the same one.
-        for method in np.random.default_rng(number).permutation(list(methods)).tolist():
-            start = clock_s()
-            answer = methods[method](poses)
-            spent = clock_s() - start
-            if number:  # the first round warms up
-                seconds[method].append(spent)
-            hit = answer if isinstance(answer, int) else np.isfinite(answer).sum()
-            hits[method] = float(hit / rays)
-    if python:
-        for peer in PEERS:
-            answer = _time_peer(peer, python, scans, scene, poses, rounds, clock)
-            seconds[peer], hits[peer] = answer
+        seconds, answer = time_call(partial(methods[method], poses), options.clock)
+        hits = answer if isinstance(answer, int) else np.isfinite(answer).sum()
+        return seconds, float(hits / rays)
+
+    results = run_rounds({method: partial(scan, method) for method in methods}, options.repeat)
+    for peer in PEERS if options.peers else ():
+        results[peer] = _time_peer(peer, scans, scene, poses_of(count, options.repeat), options)
     return {
         "case": case,
-        "backend": backend,
+        "backend": options.backend,
         "triangles": len(scene.faces),
         "rays": rays,
         "poses": count,
-        "hits": hits,
-        "seconds": seconds,
+        "hits": {method: scans[-1][1] for method, scans in results.items()},
+        "seconds": {method: [s for s, _ in scans] for method, scans in results.items()},
     }
 
 
 def _time_peer(
-    name: str,
-    python: str,
-    scans: LidarpoolScans,
-    scene: Scene,
-    poses: Float,
-    rounds: int,
-    clock: str,
-) -> tuple[list[float], float]:
-    """Time a peer with the poses of the last round; return its times and share of hits."""
+    name: str, scans: LidarpoolScans, scene: Scene, poses: Float, options: argparse.Namespace
+) -> list[tuple[float, float]]:
+    """Return the time and the share of hits of each cast of a peer."""
     rays = np.concatenate([scans.directions @ pose[:3, :3].T for pose in poses])
     with tempfile.TemporaryDirectory() as folder:
         job = Path(folder) / "job.npz"
@@ -219,16 +239,10 @@ def _time_peer(
             directions=rays,
             far=min(scans.sensor.max_range_m, 1e10),
         )
-        peer = Peer(name, python, job, clock)
-        casts = [peer.cast() for _ in range(rounds + 1)][1:]
+        peer = Peer(name, options.peers, job, options.clock)
+        casts = run_rounds({name: lambda _: peer.cast()}, options.repeat)[name]
         peer.close()
-    return [spent for spent, _ in casts], casts[-1][1] / len(rays)
-
-
-def ratio(row: dict[str, Any], method: str, base: str = "cast") -> float:
-    """Return the median over the rounds of a method's time over the time of `base`."""
-    pairs = zip(row["seconds"][method], row["seconds"][base], strict=True)
-    return float(np.median([max(a, 1e-9) / max(b, 1e-9) for a, b in pairs]))
+    return [(seconds, hits / len(rays)) for seconds, hits in casts]
 
 
 def show(row: dict[str, Any]) -> None:
@@ -238,55 +252,39 @@ def show(row: dict[str, Any]) -> None:
         f"{row['triangles']:,} triangles"
     )
     for method, seconds in row["seconds"].items():
+        ratio = median_ratio(seconds, row["seconds"]["cast"])
         print(
-            f"  {method:<17} {1e3 * np.median(seconds):9.2f} ms  {ratio(row, method):6.2f} x cast; "
+            f"  {method:<17} {1e3 * np.median(seconds):9.2f} ms  {ratio:6.2f} x cast; "
             f"hits {100 * row['hits'][method]:.1f} % of rays"
         )
-    ranges_ratio = ratio(row, "ranges")
-    verdict = "kept" if ranges_ratio <= BAR else "missed"
-    print(f"  the bar of {BAR} x the cast is {verdict}: {ranges_ratio:.2f}")
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run from the command line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="toy sizes, two rounds")
-    parser.add_argument("--case", action="append", choices=CASES, help="only this one")
-    parser.add_argument("--backend", choices=available_backends(), help="else the first there is")
+    parser = argument_parser(__doc__, repeat=21, quick=True, clock="wall")
+    backends = [name for name, reason in available_backends().items() if not reason]
+    parser.add_argument("--case", action="append", choices=CASES, help="only this case")
+    parser.add_argument("--backend", choices=backends, default=backends[0])
     parser.add_argument("--triangles", type=int, default=100_000)
     parser.add_argument("--robots", type=int, default=1000)
-    parser.add_argument("--rounds", type=int, default=21)
-    parser.add_argument("--clock", choices=CLOCKS, default="wall")
-    parser.add_argument(
-        "--peers", default="", metavar="PYTHON", help="that has mujoco-lidar and warp-lang"
-    )
-    parser.add_argument("--json", type=Path, help="write the results here")
-    chosen = parser.parse_args(arguments)
-    if chosen.quick:
-        chosen.triangles = 10_000
-        chosen.robots = 20
-        chosen.rounds = 2
-    if not chosen.peers:
-        print("mujoco-lidar: not installed; --peers names a Python that has it")
-    elif subprocess.run(
-        [chosen.peers, "-c", "import mujoco_lidar, warp"], capture_output=True
-    ).returncode:
-        parser.error(f"{chosen.peers} lacks peers: pip install mujoco-lidar mujoco warp-lang")
-    backends = {name: why for name, why in available_backends().items() if not why}
-    backend = chosen.backend or next(iter(backends))
-    scene = city(chosen.triangles)
+    parser.add_argument("--peers", default="", metavar="PYTHON", help="Python that has the peers")
+    options = parser.parse_args(arguments)
+    if options.quick:
+        options.triangles = 10_000
+        options.robots = 20
+        options.repeat = 2
+    if not options.peers:
+        print("mujoco-lidar is left out, because --peers is not given")
+    elif not has_modules(options.peers, "mujoco_lidar", "warp"):
+        parser.error(f"{options.peers} lacks peers: pip install mujoco-lidar mujoco warp-lang")
+    scene = city(options.triangles)
     results = []
-    for case in chosen.case or CASES:
-        robots = chosen.robots
-        rounds = chosen.rounds
-        row = measure(case, backend, scene, robots, rounds, chosen.clock, chosen.peers)
-        results.append(row)
-        show(row)
-    if chosen.json:
-        report = {"environment": environment(1, chosen.clock), "cases": results}
-        chosen.json.write_text(json.dumps(report, indent=1) + "\n")
+    for case in options.case or CASES:
+        results.append(measure(case, scene, options))
+        show(results[-1])
+    write_results(options.json, results)
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

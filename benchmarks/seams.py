@@ -9,6 +9,7 @@ from raybeam import RayCaster
 
 Float = NDArray[np.float64]
 Index = NDArray[np.integer]
+_PART = 1 << 18  # rays that are cast at a time
 
 
 def seam_rays(
@@ -32,23 +33,24 @@ def escaped(
 ) -> int:
     """Count escaping rays: `count` rays from a point and `count` rays from points around it.
 
-    Parameters
-    ----------
-    caster
-        Over the mesh.
-    mesh
-        Vertices and faces, closed.
-    inside
-        (3,): a point inside it.
-    room
-        How far it may be moved along each axis.
-    count
-        Rays of each half.
-    rng
-        Where the rays come from.
+    `inside` is a point (3,) inside the closed mesh, and `room` the distance by which it may be
+    moved along each axis.
     """
     leaks = 0
     for origins in (inside, inside + room * rng.uniform(-1, 1, (count, 3))):
         directions = seam_rays(*mesh, origins, count, rng)
         leaks += count - int(caster.cast(origins, directions).hit.sum())
     return leaks
+
+
+def count_escaped(
+    caster: RayCaster, mesh: tuple[Float, Index], inside: Float, room: float, count: int
+) -> dict[str, int]:
+    """Count escaping rays among about `count` rays, part by part."""
+    rng = np.random.default_rng(0)
+    cast = leaks = 0
+    while cast < count:
+        half = -(-min(_PART, count - cast) // 2)
+        leaks += escaped(caster, mesh, inside, room, half, rng)
+        cast += 2 * half
+    return {"rays": cast, "escaped": leaks}

@@ -1,10 +1,12 @@
-"""Cost of `Partition.submit` beside Dask's own `submit`: `python -m benchmarks.submitting`.
+"""CPU time of `Partition.submit`, compared with `Client.submit`, also with a slow scheduler.
 
-Two equal clusters of worker processes, each with its scheduler in a process of its own. The same
-tasks go to one cluster by `client.submit(resources=)`, and to the other by `Partition.submit`, in
-blocks that alternate. Processor time is that of driver plus scheduler. With `--delay 2`, the
-scheduler answers requests 2 s late, as a busy scheduler does; messages that nobody waits for are
-not delayed.
+    python -m benchmarks.submitting [--tasks N] [--delay SECONDS] [--kind KIND]
+
+Two equal clusters of worker processes have their schedulers in separate processes. The same tasks
+are sent to one cluster by `client.submit(resources=)` and to the other by `Partition.submit`, in
+alternating blocks. CPU time is the sum for driver and scheduler. With `--delay 2`, the scheduler
+responds to requests 2 s late, like a busy scheduler; messages that nobody waits for are not
+delayed.
 """
 
 from __future__ import annotations
@@ -12,9 +14,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import gc
-import json
-import pathlib
-import statistics
 import subprocess
 import sys
 import time
@@ -22,13 +21,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
+import numpy as np
 import psutil
 from distributed import Client, Future, LocalCluster, wait
 
+from lidarsim.numerics.arrays import Floats
 from poolpart import Partition, Pool, n_workers
 
+from .harness import argument_parser, cpu_seconds, run_rounds, write_results
+
 NAME = "A"
-BLOCKS = 10  # of each half of a pair
+BLOCKS = 10  # alternating blocks of a pair
 WORKERS = 2
 SLOTS = 2
 
@@ -51,21 +54,16 @@ class Side:
     def run(self, tasks: int) -> Cost:
         """Submit tasks, and wait for their ends."""
         gc.collect()
-        before = [_seconds_of(process) for process in self._processes]
+        before = [cpu_seconds(process) for process in self._processes]
         started = time.perf_counter()
         futures = [self._submit(str(number)) for number in range(tasks)]
         sending = time.perf_counter() - started
         wait(futures)
         driver, scheduler = (
-            _seconds_of(process) - seconds
+            cpu_seconds(process) - seconds
             for process, seconds in zip(self._processes, before, strict=True)
         )
         return Cost(driver, scheduler, sending)
-
-
-def _seconds_of(process: psutil.Process) -> float:
-    times = process.cpu_times()
-    return float(times.user + times.system)
 
 
 def serve(declared: bool) -> None:
@@ -106,8 +104,8 @@ def answer_late(delay_s: float, dask_scheduler: Any = None) -> None:
     dask_scheduler.handlers["run_function"] = late
 
 
-def measure(kind: str, tasks: int, pairs: int, delay_s: float) -> list[dict[str, Cost]]:
-    """Return the costs of each pair, by way of submitting."""
+def measure(kind: str, tasks: int, pairs: int, delay_s: float) -> dict[str, Floats]:
+    """Return the costs (fields, pairs) of each way to submit tasks."""
     with cluster_of("declared") as (plain, plain_pid), cluster_of(kind) as (client, pid):
         part = Partition(NAME, client)
         if kind == "divided":
@@ -125,48 +123,39 @@ def measure(kind: str, tasks: int, pairs: int, delay_s: float) -> list[dict[str,
         }
         for side in sides.values():  # both have done everything once
             side.run(100)
-        return [_pair(sides, tasks) for _ in range(pairs)]
-
-
-def _pair(sides: dict[str, Side], tasks: int) -> dict[str, Cost]:
-    blocks: dict[str, list[Cost]] = {way: [] for way in sides}
-    size = max(1, tasks // BLOCKS)
-    for number in range(BLOCKS):
-        for way in list(sides)[:: 1 if number % 2 else -1]:
-            blocks[way].append(sides[way].run(size))
-    return {way: Cost(*map(sum, zip(*costs, strict=True))) for way, costs in blocks.items()}
+        calls = {way: lambda _, side=side: side.run(tasks // BLOCKS) for way, side in sides.items()}
+        blocks = run_rounds(calls, pairs * BLOCKS, warm_up=0)
+    return {
+        way: np.reshape(costs, (pairs, BLOCKS, -1)).sum(axis=1).T for way, costs in blocks.items()
+    }
 
 
 def main(arguments: list[str] | None = None) -> dict[str, float]:
     """Measure, print and return the medians of all pairs."""
-    parser = argparse.ArgumentParser(prog="benchmarks.submitting", description=__doc__)
+    parser = argument_parser(__doc__, repeat=9)
     parser.add_argument("--tasks", type=int, default=10_000)
-    parser.add_argument("--pairs", type=int, default=9)
     parser.add_argument("--delay", type=float, default=0.0, help="of the scheduler, seconds")
     parser.add_argument("--kind", choices=["declared", "divided"], default="divided")
-    parser.add_argument("--json", help="file for the figures")
     parser.add_argument("--serve", choices=["declared", "divided"], help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.serve:
         serve(options.serve == "declared")
         return {}
-    pairs = measure(options.kind, options.tasks, options.pairs, options.delay)
-    figures: dict[str, float] = {}
-    for way in pairs[0]:
-        costs = [pair[way] for pair in pairs]
-        for name in Cost._fields:
-            seconds = statistics.median(getattr(cost, name) for cost in costs)
-            figures[f"{way} {name}"] = 1e6 * seconds / options.tasks
-    sums = [{way: cost.driver + cost.scheduler for way, cost in pair.items()} for pair in pairs]
-    ratios = [total["Partition.submit"] / total["Client.submit"] for total in sums]
-    figures["ratio"] = statistics.median(ratios)
-    for name, figure in figures.items():
-        print(f"{name}: {figure:.3f}" if name == "ratio" else f"{name}: {figure:.0f} µs a task")
-    print("ratios of the pairs:", " ".join(f"{ratio:.3f}" for ratio in sorted(ratios)))
-    if options.json:
-        with pathlib.Path(options.json).open("w", encoding="utf-8") as file:
-            json.dump(figures, file, indent=1)
-    return figures
+    costs = measure(options.kind, options.tasks, options.repeat, options.delay)
+    results = {
+        f"{way} {name}": 1e6 * float(np.median(seconds)) / options.tasks
+        for way, rows in costs.items()
+        for name, seconds in zip(Cost._fields, rows, strict=True)
+    }
+    for name, value in results.items():
+        print(f"{name}: {value:.0f} µs a task")
+    totals = {way: rows[:2].sum(axis=0) for way, rows in costs.items()}  # driver and scheduler
+    ratios = totals["Partition.submit"] / totals["Client.submit"]
+    results["ratio"] = float(np.median(ratios))
+    words = " ".join(f"{ratio:.3f}" for ratio in sorted(ratios))
+    print(f"ratio: {results['ratio']:.3f}, of the pairs: {words}")
+    write_results(options.json, results)
+    return results
 
 
 if __name__ == "__main__":

@@ -1,25 +1,24 @@
-"""A whole survey beside the script that an expert would write: time, bytes, and the same points.
+"""A complete survey, compared with an expert's single-process script.
 
-The script runs in one process: Open3D casts on all cores, NumPy thins and rounds, Open3D writes
-the PLY. Ours is the command with ``--cloud-only`` on a cluster that it starts itself, with all the
-guarantees of a run. Both are processes of their own, measured from start to end, in turns.
+    python -m benchmarks.survey [--rays 1e8] [--pictures]
 
-Run: ``python -m benchmarks.survey [--rays 1e8] [--rounds 3] [--pictures]``
+The script runs in one process: Open3D casts rays on all cores, NumPy thins and rounds the points,
+and Open3D writes the PLY file. lidarpool runs as a command with `--cloud-only` on a cluster that it
+starts itself. Both are complete processes and run in turns. Their clouds are compared.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import resource
-import statistics
+import os
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
+
+from .harness import argument_parser, median_ratio, run_rounds, write_results
 
 RAYS_PER_TURN = 1800
 LAYERS = 64
@@ -113,58 +112,50 @@ def scenario(rays: int, folder: Path) -> Path:
 
 
 def time_side(side: str, rays: int, folder: Path) -> tuple[float, float]:
-    """Return wall and processor seconds of the process of a side, including its children."""
+    """Return and print the wall and CPU time of the process of a side and its children, seconds."""
     out_folder = folder / side
     out_folder.mkdir(exist_ok=True)
     python = [sys.executable, "-m"]
+    run = [*python, "lidarpool", "run", str(folder / "survey.yaml"), "-q", "--out", str(out_folder)]
     command = {
         "script": [*python, "benchmarks.survey", "--script", str(out_folder), "--rays", str(rays)],
-        "ours": [*python, "lidarpool", "run", str(folder / "survey.yaml"), "-q", "--cloud-only"],
-        "pictures": [*python, "lidarpool", "run", str(folder / "survey.yaml"), "-q"],
+        "lidarpool": [*run, "--cloud-only"],
+        "pictures": run,
     }[side]
-    if side != "script":
-        command += ["--out", str(out_folder)]
-    usage_before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    began = time.perf_counter()
+    before = os.times()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    wall = time.perf_counter() - began
-    usage_after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu = (
-        usage_after.ru_utime + usage_after.ru_stime - usage_before.ru_utime - usage_before.ru_stime
-    )
+    after = os.times()
+    wall = after.elapsed - before.elapsed
+    cpu = sum(after[2:4]) - sum(before[2:4])  # of children
+    print(f"{side:9} {wall:7.2f} s wall {cpu:7.2f} s CPU", flush=True)
     return wall, cpu
 
 
-def main() -> None:
-    """Run the benchmark, or the script's side alone."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def main(arguments: list[str] | None = None) -> None:
+    """Run the benchmark, or only the script."""
+    parser = argument_parser(__doc__, repeat=3)
     parser.add_argument("--rays", type=lambda text: int(float(text)), default=100_000_000)
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--pictures", action="store_true", help="also with pictures and report")
-    parser.add_argument("--script", type=Path, metavar="FOLDER", help="only do the script's side")
-    options = parser.parse_args()
+    parser.add_argument("--pictures", action="store_true", help="also run with pictures and report")
+    parser.add_argument("--script", type=Path, metavar="FOLDER", help="only run the script")
+    options = parser.parse_args(arguments)
     if options.script:
         script(options.rays, options.script)
         return
-    sides = ["script", "ours", *(["pictures"] if options.pictures else [])]
+    sides = ["script", "lidarpool", *(["pictures"] if options.pictures else [])]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         scenario(options.rays, folder)
-        times: dict[str, list[tuple[float, float]]] = {side: [] for side in sides}
-        for _ in range(options.rounds):
-            for side, side_times in times.items():
-                side_times.append(time_side(side, options.rays, folder))
-                wall, cpu = side_times[-1]
-                print(f"{side:8} {wall:7.2f} s wall {cpu:7.2f} s processor", flush=True)
+        calls = {side: lambda _, side=side: time_side(side, options.rays, folder) for side in sides}
+        results = run_rounds(calls, options.repeat, warm_up=0)
         compare(folder)
-    for index, quantity in enumerate(("wall time", "processor time")):
-        pairs = zip(times["ours"], times["script"], strict=True)
-        ratio = statistics.median(a[index] / b[index] for a, b in pairs)
-        print(f"{quantity}: ours {ratio:.2f} x the script's, median of {options.rounds}")
+    seconds = {side: np.transpose(times) for side, times in results.items()}  # wall, CPU
+    for index, quantity in enumerate(("wall time", "CPU time")):
+        ratio = median_ratio(seconds["lidarpool"][index], seconds["script"][index])
+        print(f"{quantity}: lidarpool {ratio:.2f} x the script's, median of {options.repeat}")
     if options.pictures:
-        pairs = zip(times["pictures"], times["ours"], strict=True)
-        pictures_s = statistics.median(a[0] - b[0] for a, b in pairs)
-        print(f"pictures and report: {pictures_s:.1f} s more")
+        added_s = np.median(seconds["pictures"][0] - seconds["lidarpool"][0])
+        print(f"pictures and report: {added_s:.1f} s more")
+    write_results(options.json, results)
 
 
 def compare(folder: Path) -> None:
@@ -172,7 +163,7 @@ def compare(folder: Path) -> None:
     from lidarpool import read_cloud
 
     script_cloud, our_cloud = (
-        read_cloud(folder / side / "cloud.ply") for side in ("script", "ours")
+        read_cloud(folder / side / "cloud.ply") for side in ("script", "lidarpool")
     )
     equal_rows = len(script_cloud) == len(our_cloud) and np.logical_and.reduce(
         [script_cloud[name] == our_cloud[name] for name in ("scan", "channel", "object")]

@@ -1,19 +1,18 @@
-"""What a better tree would gain: `python -m benchmarks.trees`.
+"""Tests per ray in our bounding volume hierarchies, compared with better ones.
 
-Casts each scene's rays through three trees with one and the same walk, that of intersect.cu,
-compiled for the CPU: ours; one that is clustered up to its root (ploc.py without the sweep); and
-one by a full sweep with the surface area heuristic from the root to the last triangle, which is
-at least as good as what Embree builds. Leaves, width and walk are equal, so what differs are the
-boxes. Prints nodes (of four boxes), triangles and decisions in double precision, each a ray.
-Needs g++.
+    python -m benchmarks.trees [--scene NAME] [--mesh FILE]
+
+Three trees are traversed by the same code, intersect.cu compiled for the CPU: ours; a tree that is
+clustered up to its root (ploc.py without the sweep); and a tree from a full sweep with the surface
+area heuristic, which is at least as good as what Embree builds. Leaves and width are equal. The
+table lists nodes (of four boxes), triangle tests and decisions in double precision per ray.
+Requires g++.
 """
 
 from __future__ import annotations
 
-import argparse
 import ctypes
 import importlib.resources
-import json
 import shutil
 import subprocess
 import sys
@@ -30,7 +29,9 @@ from raybeam.cuda_tables import MeshTables, build_instance_tables, build_mesh_ta
 from raybeam.instances import single_mesh_scene
 from raybeam.mesh import LocalMesh, local_mesh
 
-from .raycast_scenes import Job, jobs
+from .harness import argument_parser, print_row, write_results
+from .raycast import add_scene_options, chosen_jobs
+from .raycast_scenes import Job
 
 # Clusters that are left to the sweep: as it comes, only one, all boxes.
 TREES: dict[str, tuple[int, int] | None] = {
@@ -47,7 +48,8 @@ def compile_kernels(folder: Path) -> ctypes.CDLL:
     library = folder / "intersect.so"
     files = importlib.resources.files("raybeam")
     with importlib.resources.as_file(files / "intersect.cu") as kernels:
-        flags = [flag for flag in cuda_backend.flags(_STACK, False, False) if flag != "-fmad=false"]
+        options = cuda_backend.compiler_options(_STACK, False, False)
+        flags = [option for option in options if option != "-fmad=false"]
         command = [
             "g++",
             "-O2",
@@ -150,36 +152,26 @@ def show(row: dict[str, Any]) -> None:
     cells += [" / ".join(f"{row[name][kind]:.2f}" for name in TREES) for kind in KINDS]
     cells.append(f"{row['ours']['nodes'] / row['sweep']['nodes']:.2f}")
     cells.append(" / ".join(f"{row[name]['build_s']:.2f}" for name in TREES))
-    print("| " + " | ".join(cells) + " |", flush=True)
+    print_row(*cells)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run from the command line; return 2 without a compiler."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="toy scenes, few rays")
-    parser.add_argument("--scene", action="append", help="only this one; may be given again")
-    parser.add_argument("--mesh", action="append", type=Path, default=[], help="a mesh file more")
-    parser.add_argument("--rays", type=int, default=1 << 17, help="rays of a scan")
-    parser.add_argument("--json", type=Path, help="write the results here")
-    chosen = parser.parse_args(arguments)
+    parser = argument_parser(__doc__, quick=True)
+    add_scene_options(parser)
+    options = parser.parse_args(arguments)
     if shutil.which("g++") is None:
-        print("Nothing was counted: g++ is not here to compile the kernels.", file=sys.stderr)
+        print("Nothing was counted, because g++ is not installed.", file=sys.stderr)
         return 2
-    makers = jobs(2_000 if chosen.quick else chosen.rays, chosen.mesh, chosen.quick)
-    unknown = set(chosen.scene or ()) - set(makers)
-    if unknown:
-        parser.error(f"there is no scene {', '.join(unknown)}: {', '.join(makers)}")
     rows = []
     print(f"of each: {' / '.join(TREES)}")
-    print("| scene | triangles | nodes | triangle tests | decisions | nodes, ratio | seconds |")
+    print_row("scene", "triangles", "nodes", "triangle tests", "decisions", "ratio", "seconds")
     with tempfile.TemporaryDirectory() as folder:
         library = compile_kernels(Path(folder))
-        for name, make in makers.items():
-            if not chosen.scene or name in chosen.scene:
-                rows.append(measure(library, make()))
-                show(rows[-1])
-    if chosen.json:
-        chosen.json.write_text(json.dumps(rows, indent=1) + "\n")
+        for make in chosen_jobs(parser, options):
+            rows.append(measure(library, make()))
+            show(rows[-1])
+    write_results(options.json, rows)
     return 0
 
 

@@ -1,14 +1,14 @@
-"""A film of a realistic simulation in real time: `python -m docs.pictures.film OUT.webp`.
+"""A film of sweeps with many effects, in the sensor's own time.
 
-One core casts sweeps of an OS1-64 among moving cars, with sub-rays, noise and rain (`real` of
-`benchmarks.realism`). Another core draws one frame for each sweep. The module prints the scan time
-of the sensor and the time that making the film took.
+    python -m docs.pictures.film OUT.webp
+
+Sweeps of an OS1-64 among moving cars, with sub-rays, noise and rain (`real` of
+`benchmarks.realism`), are cast on one core while another core draws them. The program prints the
+duration of the scan and the time that the film took.
 """
 
 from __future__ import annotations
 
-import argparse
-import io
 import time
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from benchmarks.realism import REVOLUTION_S, cases
+from docs.pictures.options import file_parser
 from PIL import Image
 
 from lidarscenes.procedural.city import city
@@ -33,7 +34,7 @@ RAISED = 12.0  # meters above the ground with the last color
 
 
 def cast(sweeps: int, triangles: int, connection: Connection) -> None:
-    """Cast one sweep to compile the code, and then send the points of `sweeps` sweeps."""
+    """Cast a sweep to compile, then send the points of `sweeps` sweeps."""
     sweep = cases(city(triangles), "tiles", (100,), "ouster/os1-64")["real"]
     connection.send(len(sweep(0)))
     connection.recv()
@@ -42,7 +43,7 @@ def cast(sweeps: int, triangles: int, connection: Connection) -> None:
 
 
 def frame(camera: Camera, points: Any) -> Image.Image:
-    """Draw the points of a sweep, colored by height."""
+    """Draw the points of a sweep, by height."""
     pixels, distance = camera.project(points)
     inside = np.flatnonzero(((pixels >= 0) & (pixels < camera.size)).all(axis=1))
     rows = inside[np.argsort(-distance[inside])]
@@ -54,17 +55,30 @@ def frame(camera: Camera, points: Any) -> Image.Image:
     return Image.fromarray(np.round(255 * image[..., :3]).astype(np.uint8))
 
 
+def aim(eye: Any, target: Any, focal: float, size: tuple[int, int]) -> Camera:
+    """Return a level camera that looks at a target."""
+    ahead = normalize((target - eye)[None])
+    right = normalize(np.cross(ahead, [0.0, 0.0, 1.0]))
+    axes = np.concatenate([right, np.cross(right, ahead), ahead])
+    return Camera(eye, axes, focal, np.array(size) / 2, size)
+
+
+def save(frames: list[Image.Image], path: Path, period_s: float, **options: Any) -> None:
+    """Write a film, with options of Pillow for WebP."""
+    duration = round(1e3 * period_s)
+    later = frames[1:]
+    frames[0].save(
+        path, "webp", save_all=True, append_images=later, duration=duration, loop=0, **options
+    )
+
+
 def main(arguments: list[str] | None = None) -> int:
-    """Make the film and return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("film", type=Path, help="a .webp file")
+    """Make the film, and return the exit status."""
+    parser = file_parser(__doc__, ".webp")
     parser.add_argument("--sweeps", type=int, default=100)
     parser.add_argument("--triangles", type=int, default=100_000)
     options = parser.parse_args(arguments)
-    ahead = normalize((TARGET - EYE)[None])
-    right = normalize(np.cross(ahead, [0.0, 0.0, 1.0]))
-    axes = np.concatenate([right, np.cross(right, ahead), ahead])
-    camera = Camera(EYE, axes, 600.0, np.array(SIZE) / 2, SIZE)
+    camera = aim(EYE, TARGET, 600.0, SIZE)
     context = get_context("spawn")
     parent_end, child_end = context.Pipe()
     caster = context.Process(
@@ -80,17 +94,12 @@ def main(arguments: list[str] | None = None) -> int:
         frames.append(frame(camera, points.astype(np.float64)))
     cast_s = time.perf_counter() - start
     caster.join()
-    options_of_webp = {"save_all": True, "duration": round(1e3 * REVOLUTION_S), "loop": 0}
-    frames[0].save(
-        memory := io.BytesIO(), "webp", append_images=frames[1:], method=0, **options_of_webp
-    )
-    options.film.write_bytes(memory.getvalue())
+    save(frames, options.file, REVOLUTION_S, method=0)
     took = time.perf_counter() - start
     print(
-        f"{options.sweeps * REVOLUTION_S:.1f} s of scanning: cast and drawn in {cast_s:.1f} s,",
-        end=" ",
+        f"{options.sweeps * REVOLUTION_S:.1f} s of scanning: cast and drawn in {cast_s:.1f} s, "
+        f"written after {took:.1f} s"
     )
-    print(f"written after {took:.1f} s")
     return 0
 
 

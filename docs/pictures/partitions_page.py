@@ -1,13 +1,12 @@
-"""A screenshot of the partitions page while two partitions work.
+"""The page of partitions, as a browser shows it while two partitions work.
 
-`python -m docs.pictures.partitions_page docs/images/partitions-page.png` divides a cluster on this
-machine and sends items from an IO task through a pipe to GPU tasks. Chromium then draws the page.
-Workers on this machine stand in for machines with GPUs.
+`python -m docs.pictures.partitions_page docs/images/partitions-page.png` divides a cluster of this
+machine, sends items from a task of IO through a pipe to tasks of GPU, and has Chromium draw the
+page. Workers of this machine stand for machines with GPUs.
 """
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from pathlib import Path
 from threading import Thread
 
 from distributed import Client, LocalCluster
+from docs.pictures.options import file_parser
 
 from poolpart import Partition, Pipe, PipeFailed, Pool, n_workers, rest
 
@@ -36,26 +36,26 @@ DONE = 6  # tasks of GPU before the picture is taken
 
 
 def load(pipe: Pipe, count: int) -> None:
-    """Put numbers into a pipe, waiting while the pipe is full."""
+    """Put numbers into a pipe, which waits while the pipe is full."""
     for number in range(count):
         pipe.put(number)
 
 
 def shrink(number: int) -> int:
-    """Stand in for a GPU task."""
+    """Stand for a task on a GPU."""
     time.sleep(ITEM_S)
     return number
 
 
 def index(number: int) -> int:
-    """Stand in for a task of the remaining workers."""
+    """Stand for a task of the remaining workers."""
     time.sleep(4 * ITEM_S)
     return number
 
 
 @contextmanager
 def page_at_work(client: Client) -> Iterator[str]:
-    """Divide a cluster, give its partitions work, and yield the URL of the page."""
+    """Divide a cluster, give the partitions work, and yield the address of the page."""
     pool = Pool.from_client(client)
     rules = {"GPU": n_workers(2), "IO": n_workers(1), "OTHER": rest()}
     gpu, io, other = pool.divide(rules).values()
@@ -74,16 +74,13 @@ def page_at_work(client: Client) -> Iterator[str]:
 
 
 def _until_it_fails(gpu: Partition, pipe: Pipe) -> None:
-    """Run a task for each item of a pipe until the pipe fails."""
+    """Run a task for each item of a pipe."""
     with suppress(PipeFailed):
         gpu.for_each(pipe, shrink)
 
 
 def draw(url: str, picture: Path) -> None:
-    """Draw a page with a browser and save it as a PNG.
-
-    Raises RuntimeError if there is no browser or if it fails.
-    """
+    """Have a browser draw a page into a PNG; RuntimeError without a browser, or if it fails."""
     program = next(filter(None, map(shutil.which, BROWSERS)), None)
     if program is None:
         raise RuntimeError(f"The picture needs a browser, one of {', '.join(BROWSERS)}.")
@@ -103,16 +100,14 @@ def draw(url: str, picture: Path) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Draw the screenshot and return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("picture", type=Path, help="a .png file")
-    chosen = parser.parse_args(arguments)
+    """Draw the picture, and return the exit status."""
+    options = file_parser(__doc__, ".png").parse_args(arguments)
     with (
         LocalCluster(**CLUSTER) as cluster,
         Client(cluster) as client,
         page_at_work(client) as url,
     ):
-        draw(url, chosen.picture)
+        draw(url, options.file)
     return 0
 
 

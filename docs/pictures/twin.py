@@ -1,34 +1,24 @@
-"""A film of a recorded drive and of the same drive with another sensor in a digital twin.
+"""A film of a reconstruction: a recorded drive, and the same drive with another sensor in its twin.
 
 `python -m docs.pictures.twin OUT.webp` drives an OS1-64 through the generated city among moving
-cars, and reconstructs the scene from its sweeps. The left half shows the recorded sweeps. The right
-half shows sweeps of a Pandar128 in the twin, where nothing moves. The module prints statistics of
-the twin.
+cars, and reconstructs the place from its sweeps. The left side shows the recorded sweeps, and the
+right side sweeps of a Pandar128 in the twin, where nothing moves. The metrics of the twin are
+printed.
 """
 
 from __future__ import annotations
 
-import argparse
-import io
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
-from benchmarks.odometry import SWEEP_S, left_turn
-from docs.pictures.film import frame
+from benchmarks.odometry import SWEEP_S, cloud_of, left_turn
+from docs.pictures.film import aim, frame, save
+from docs.pictures.options import file_parser
 from PIL import Image, ImageDraw
 
 from lidarpool import Actor, Mounted, Pose, Scanner, Survey, Track, load_sensor, twin
 from lidarpool.reconstruction.building import Twin
 from lidarscenes.procedural.city import city
 from lidarsim.columns.cloud import Cloud
-from lidarsim.columns.table import SCAN
 from lidarsim.scene.actors import box
-from lidarsim.simulator.points.batch_columns import columns_of
-from lidarsim.simulator.rig import Rig
-from lidarsim.sweeps.sweeps import Sweeps
-from lidarview.render.camera import Camera
-from lidarview.render.surface import normalize
 
 SIZE = (560, 420)  # of each half
 EYE = np.array([-46.0, -34.0, 34.0])
@@ -46,7 +36,7 @@ CAPTIONS = ("recorded: OS1-64", "in the twin: Pandar128")
 
 
 def drive(sweeps: int) -> Cloud:
-    """Record a drive through the city among moving cars as a cloud in memory."""
+    """Record a drive through the city, amid cars that move: a cloud in memory."""
     end_s = (sweeps + 1) * SWEEP_S
     actors = [
         Actor(box(f"car {number}", (4.4, 1.8, 1.5)), Track([0, end_s], [(*start, 0), (*stop, 0)]))
@@ -60,23 +50,12 @@ def drive(sweeps: int) -> Cloud:
         columns=["time", "intensity"],
         precision_m=1e-4,
     )
-    part = columns_of(list(Rig(scene, survey, "auto").cast(0, survey.scan_count)))
-    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
-    sweeps_of_survey = Sweeps.from_survey(survey, scene)
-    return replace(cloud, sweeps=lambda: sweeps_of_survey)
-
-
-def camera() -> Camera:
-    """Return the camera that both halves share."""
-    ahead = normalize((TARGET - EYE)[None])
-    right = normalize(np.cross(ahead, [0.0, 0.0, 1.0]))
-    axes = np.concatenate([right, np.cross(right, ahead), ahead])
-    return Camera(EYE, axes, 470.0, np.array(SIZE) / 2, SIZE)
+    return cloud_of(survey, scene)
 
 
 def frames(cloud: Cloud, place: Twin, sweeps: int) -> list[Image.Image]:
-    """Draw the recorded sweeps beside sweeps of another sensor in the twin."""
-    view = camera()
+    """Draw the sweeps of the recording beside sweeps of another sensor in the twin."""
+    view = aim(EYE, TARGET, 470.0, SIZE)
     scanner = Scanner(place.scene, load_sensor("hesai/pandar128"))
     images = []
     for number in range(sweeps):
@@ -94,26 +73,15 @@ def frames(cloud: Cloud, place: Twin, sweeps: int) -> list[Image.Image]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Make the film and return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("film", type=Path, help="a .webp file")
+    """Make the film, and return the exit status."""
+    parser = file_parser(__doc__, ".webp")
     parser.add_argument("--sweeps", type=int, default=40)
     options = parser.parse_args(arguments)
     cloud = drive(options.sweeps)
     place = twin(cloud)
     print(repr(place))
     images = frames(cloud, place, options.sweeps)
-    images[0].save(
-        memory := io.BytesIO(),
-        "webp",
-        save_all=True,
-        append_images=images[1:],
-        duration=round(1e3 * SWEEP_S),
-        loop=0,
-        quality=35,
-        method=4,
-    )
-    options.film.write_bytes(memory.getvalue())
+    save(images, options.file, SWEEP_S, quality=35, method=4)
     return 0
 
 

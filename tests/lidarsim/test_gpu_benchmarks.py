@@ -1,13 +1,13 @@
 """Benchmarks at toy size: the rates mean nothing, that they run and agree does."""
 
-import json
 import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from benchmarks import gpu, gpu_points, gpu_rays, instances
+from benchmarks import gpu, gpu_points, gpu_rays
+from benchmarks.harness import read_results
 from tests.cuda_on_host import (  # noqa: F401 - fixtures
     played_cuda,
     source_backend,
@@ -15,16 +15,6 @@ from tests.cuda_on_host import (  # noqa: F401 - fixtures
 )
 
 from raybeam import available_backends
-
-
-@pytest.mark.slow
-def test_forests_of_instances_hit_as_one_mesh_does(capsys):
-    if reason := available_backends()["tiles"]:
-        pytest.skip(f"tiles: {reason}")
-    assert instances.main(["--quick"]) == 0
-    _, many, few, flat = (line.split("|") for line in capsys.readouterr().out.splitlines())
-    assert "10,002" in many[3]
-    assert few[-2] == flat[-2] != " 0 % "
 
 
 def test_the_devices_benchmark_says_so_without_a_device(capsys):
@@ -37,7 +27,7 @@ def test_the_devices_benchmark_says_so_without_a_device(capsys):
 def results_of(tmp_path, *options):
     path = tmp_path / "gpu.json"
     code = gpu.main(["--quick", "--json", str(path), "--folder", str(tmp_path), *options])
-    return code, json.loads(path.read_text())["sections"]
+    return code, read_results(path)
 
 
 @pytest.mark.slow
@@ -45,7 +35,7 @@ def test_all_that_the_device_is_measured_at(played_cuda, tmp_path, capsys, monke
     monkeypatch.setattr(gpu_points, "START", "fork")
     patient = {name: (module, 600) for name, (module, _) in gpu.SECTIONS.items()}
     monkeypatch.setattr(gpu, "SECTIONS", patient)
-    names = [name for name in gpu.MEASURED if name not in ("run", "peers", "mujoco")]
+    names = [name for name in gpu.MEASURED if name not in ("run", "peers")]
     code, found = results_of(tmp_path, "--in-process", "--only", *names)
     said = capsys.readouterr()
     assert code == 0, said
@@ -190,7 +180,7 @@ def test_a_device_on_which_nothing_has_run(source_backend, tmp_path, monkeypatch
         [*command, *options, "--only", *sections], cwd=root, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    results = json.loads((tmp_path / "first.json").read_text())["sections"]
+    results = read_results(tmp_path / "first.json")
     assert list(results) == sections
     assert results["compiling"]["instances, masked"]["cast_table"]["registers"] == 0
     assert results["tests"]["tests/raybeam/test_device.py"] == {"passed": 10}

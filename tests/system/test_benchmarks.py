@@ -1,6 +1,5 @@
 """The benchmarks at toy size, so that they cannot rot; no figure is judged here."""
 
-import json
 import re
 from contextlib import contextmanager
 
@@ -17,11 +16,11 @@ from benchmarks import (
     scale,
     submitting,
 )
+from benchmarks.harness import read_results
 from distributed import Client
-from docs.pictures import adapting as adapting_picture
 from docs.pictures import sensors as sensor_pictures
 from docs.pictures.effects import __main__ as pictures
-from tests.clusters import import_jobqueue, thread_cluster
+from tests.clusters import thread_cluster
 from tests.cuda_on_host import played_cuda, source_backend  # noqa: F401 - fixtures
 
 import lidarpool.run.cluster.cluster
@@ -32,7 +31,7 @@ pytestmark = pytest.mark.slow
 def test_scale(tmp_path, capsys):
     path = tmp_path / "figures.json"
     figures = scale.main(["--workers", "4", "--tasks", "80", "--json", str(path)])
-    assert json.loads(path.read_text())["growth"] == figures["growth"]
+    assert read_results(path)["growth"] == figures["growth"]
     assert set(figures["growth"]) == set(scale.WAYS)
     for cluster in figures["workers"].values():
         assert cluster["misplaced"] == 0
@@ -44,7 +43,7 @@ def test_scale_of_receipts_and_jobs(tmp_path, capsys):
     path = tmp_path / "figures.json"
     sizes = ["--workers", "3", "--scans", "40", "--jobs", "10", "--shards", "2"]
     rows = scale.main([*sizes, "--receipts", "0.05", "--json", str(path)])
-    assert json.loads(path.read_text()) == rows
+    assert read_results(path) == rows
     assert all(row["driver_ms"] > 0 and row["a_second"] > 0 for row in rows.values())
     assert 0 < rows["2 x 3 workers, batches of 0.05 s"]["busy"] <= 1
     names = ("driver", "scheduler", "collectors", "casting")
@@ -61,9 +60,9 @@ def test_scale_of_receipts_and_jobs(tmp_path, capsys):
 @pytest.mark.parametrize("kind", ["declared", "divided"])
 def test_submitting(tmp_path, capsys, kind):
     path = tmp_path / "figures.json"
-    options = ["--tasks", "40", "--pairs", "1", "--delay", "0.01", "--kind", kind]
+    options = ["--tasks", "40", "--repeat", "1", "--delay", "0.01", "--kind", kind]
     figures = submitting.main([*options, "--json", str(path)])
-    assert json.loads(path.read_text()) == figures
+    assert read_results(path) == figures
     assert figures["Partition.submit sending"] > 0
     assert "ratio: " in capsys.readouterr().out
 
@@ -71,33 +70,12 @@ def test_submitting(tmp_path, capsys, kind):
 def test_beside_dask(tmp_path, capsys):
     path = tmp_path / "figures.json"
     rows = beside_dask.main(["--quick", "--json", str(path)])
-    assert json.loads(path.read_text()) == rows
+    assert read_results(path) == rows
     small, wide = {"submit", "map", "map_items", "pipe"}, {"wide_submit", "wide_map"}
     short = {"quiet_map", "quiet_map_slow", "busy_map", "busy_map_slow"}
     assert rows.keys() == small | wide | short
     assert all(row["wall_us"] > 0 and row["wall_ratio"] > 0 for row in rows.values())
     assert capsys.readouterr().out.count("beside Dask") == 10
-
-
-def test_adapting(tmp_path, capsys):
-    import_jobqueue()
-    from benchmarks import adapting
-
-    path = tmp_path / "figures.json"
-    figures = adapting.main(["--tasks", "300", "--waves", "2", "--json", str(path)])
-    assert json.loads(path.read_text()) == figures
-    assert (figures["tasks"], figures["misplaced"], figures["taken_back"]) == (300, 0, 0)
-    assert figures["workers_joined"] == figures["workers_left"] >= 3
-    assert "0 of 300 tasks misplaced" in capsys.readouterr().out
-
-
-def test_the_picture_of_jobs(tmp_path):
-    one = {"waiting": 1, "running": 2, "slots": 2, "busy": 1, "tasks": 9}
-    samples = [{"t": t, "GPU": one, "IO": one} for t in (0.0, 50.0, 90.0)]
-    (tmp_path / "samples.json").write_text(json.dumps(samples))
-    picture = tmp_path / "jobs.png"
-    adapting_picture.main([str(picture), "--samples", str(tmp_path / "samples.json")])
-    assert picture.stat().st_size > 10_000
 
 
 def test_bytes_of_batches(capsys):
@@ -108,7 +86,7 @@ def test_bytes_of_batches(capsys):
 def test_dataplane(tmp_path, capsys):
     path = tmp_path / "rounds.json"
     figures = dataplane.main(["--quick", "--folder", str(tmp_path), "--json", str(path)])
-    (measured_round,) = json.loads(path.read_text())
+    (measured_round,) = read_results(path)
     assert measured_round == figures
     points = dataplane.QUICK.scans * dataplane.QUICK.rays_per_scan
     assert figures["points"] == points, "of replayed columns"
@@ -121,7 +99,7 @@ def test_dataplane(tmp_path, capsys):
 
 
 def test_effects(capsys):
-    toy = ["--rounds", "1", "--triangles", "2000"]
+    toy = ["--repeat", "1", "--triangles", "2000"]
     assert effects.main(["--only", "rain", "spray", *toy]).keys() == {"rain", "spray"}
     assert capsys.readouterr().out.startswith("rain ")
 
@@ -134,7 +112,7 @@ def test_a_picture_of_an_effect(tmp_path):
 
 
 def test_formats(capsys):
-    formats.main(2000)
+    formats.main(["--points", "2000"])
     assert len(capsys.readouterr().out.splitlines()) == 1 + len(formats.SCRIPTS)
 
 
@@ -151,7 +129,7 @@ def test_a_survey_on_a_device(played_cuda, tmp_path, monkeypatch):  # noqa: F811
     path = tmp_path / "gpu.json"
     options = ["--quick", "--in-process", "--only", "run", "--json", str(path)]
     assert gpu.main([*options, "--folder", str(tmp_path)]) == 0
-    rows = json.loads(path.read_text())["sections"]["run"]
+    rows = read_results(path)["run"]
     points = {name: rows[name]["points"] for name in ("all points", "every fifth point")}
     assert points["every fifth point"] == pytest.approx(points["all points"] / 5, rel=0.01)
     assert all(rows[name]["grays_s"] > 0 for name in points)

@@ -47,14 +47,19 @@ def spinning_beam(firings: int, rate_hz: float = 10.0, clockwise: bool = False) 
 
 
 def cloud(scene: Scene, survey: Survey) -> dict[str, NDArray[Any]]:
-    """Return the causes and positions of all points of a survey."""
+    """Return the causes, positions, ranges and intensities of all points of a survey."""
     batches = list(Rig(scene, survey).cast(0, survey.scan_count))
     causes = [
         np.zeros(len(b)) if b.pulse_returns.cause is None else b.pulse_returns.cause
         for b in batches
     ]
     positions = np.concatenate([b.positions for b in batches])
-    return {"cause": np.concatenate(causes), **dict(zip("xyz", positions.T, strict=True))}
+    return {
+        "cause": np.concatenate(causes),
+        "range": np.concatenate([b.pulse_returns.distance for b in batches]),
+        "intensity": np.concatenate([b.intensity for b in batches]),
+        **dict(zip("xyz", positions.T, strict=True)),
+    }
 
 
 def points(meshes: list[SceneMesh], survey: Survey) -> dict[str, NDArray[Any]]:

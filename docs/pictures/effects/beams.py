@@ -1,25 +1,24 @@
-"""Gaussian and oval beams: footprints, light on an edge, and beam width against range."""
+"""Gaussian and oval beams: footprints, light on an edge, and width against range."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from statistics import NormalDist
 from typing import Any
 
 import numpy as np
+from docs.pictures.effects._receiver import wall
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
-from lidarpool import Beams, Returns, Scene, SceneMesh, Sensor, Spin, Survey
+from lidarpool import Beams, Returns, Scene, Sensor, Spin, Survey
 from lidarsim.sensor.disc import Beam
 from lidarsim.simulator.rig import Rig
 from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLORS
 from raybeam import pattern_rays
 
-DRAWS = "effect-beams.png"
 OVAL = (3.0, 1.5)  # mrad, as Velodyne's manual of the VLP-16 has it
 EXIT_M = 0.0125
 SENSOR = Sensor(Beams(np.zeros(1)), Spin(1, 360))
@@ -34,16 +33,8 @@ def with_effect(survey: Survey) -> Survey:
     return replace(survey, returns=beam)
 
 
-def wall(name: str, x: float, y: tuple[float, float] = (-50.0, 50.0)) -> SceneMesh:
-    corners = [[x, y[0], -50], [x, y[1], -50], [x, y[1], 50], [x, y[0], 50.0]]
-    return SceneMesh(name, np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
-
-
 def footprint(returns: Returns, distance: float) -> NDArray[np.float64]:
-    """Return the positions at which the sub-rays of a beam hit a wall.
-
-    The shape is (k, 2), with meters across and up.
-    """
+    """Return where the sub-rays of a beam hit a wall: (k, 2), meters across and up."""
     scene = Scene.from_meshes([wall("Wall", distance)])
     rig = Rig(scene, Survey(SENSOR, poses=[(0, 0, 0)], steps=1, returns=returns), "numpy")
     beams = rig.pulse_casters[0].emitter.subrays_of(rig.pattern(0, 0, 1))
@@ -54,10 +45,7 @@ def footprint(returns: Returns, distance: float) -> NDArray[np.float64]:
 
 
 def share(returns: Returns, edge_m: float) -> float:
-    """Return the fraction of a pulse's light that hits a wall with an edge.
-
-    The wall is at 50 m, in front of another wall at 60 m.
-    """
+    """Return the share of a pulse's light on a wall at 50 m with an edge, before a wall at 60 m."""
     meshes = [wall("Near", 50, (-50, edge_m)), wall("Far", 60)]
     survey = Survey(
         SENSOR, poses=[(0, 0, 0)], steps=1, returns=returns, columns=["reflectance", "range"]
@@ -68,8 +56,8 @@ def share(returns: Returns, edge_m: float) -> float:
     return float(bright[batch.object == 0].sum() / bright.sum())  # type: ignore[union-attr]
 
 
-def picture(path: Path) -> None:
-    """Plot beam footprints, the fraction of light at an edge, and beam width against range."""
+def picture() -> Figure:
+    """Plot beam footprints, the share of light at an edge, and the beam width against range."""
     figure = Figure((13.5, 4.5), dpi=100, layout="constrained")
     prints, edges, widths = figure.subplots(1, 3, width_ratios=[0.8, 1, 1])
     kinds = (
@@ -145,4 +133,4 @@ def picture(path: Path) -> None:
     for axes in (prints, edges, widths):
         axes.tick_params(labelsize=8, colors=MUTED)
         axes.spines[:].set_color(LINE)
-    figure.savefig(path)
+    return figure

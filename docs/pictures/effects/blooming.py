@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from statistics import NormalDist
 
 import numpy as np
@@ -12,7 +11,6 @@ from matplotlib.figure import Figure
 
 from lidarpool import Beams, Material, Noise, Sensor, Spin, Survey
 
-DRAWS = "effect-blooming.png"
 NOISE = Noise(detection_range_m=100, stray_light=2e-5)
 SIGNS = [Material("S*", reflectance=1.0, retro=True), Material("*", reflectance=0.3)]
 STEP_DEG = 0.1
@@ -25,8 +23,8 @@ def with_effect(survey: Survey) -> Survey:
     return replace(survey, noise=NOISE, materials=materials)
 
 
-def picture(path: Path) -> None:
-    """Plot a sign with and without stray light, and the fraction of rays that receive it."""
+def picture() -> Figure:
+    """Plot a sign with and without stray light, and the share of rays that receive stray light."""
     across = np.arange(-4, 4.01, STEP_DEG)
     up = np.arange(-3, 3.01, STEP_DEG)
     grid = np.meshgrid(np.radians(up), np.radians(across), indexing="ij")
@@ -79,4 +77,4 @@ def picture(path: Path) -> None:
     axes.legend(frameon=False, fontsize=8)
     axes.set_title("sign at 25 m, s = 2·10⁻⁵ at 1°", fontsize=10)
     axes.grid(alpha=0.25)
-    figure.savefig(path)
+    return figure

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 from lidarpool import Material, Mounted, Noise, Pose, Returns, SceneMesh, Survey
 from lidarsim.sensor.optics import Mode
 
-DRAWS = "effect-crosstalk.png"
 NOISE = Noise(detection_range_m=100, crosstalk=True)
 REVOLUTIONS = 10
 FIRINGS = 20_000
@@ -36,7 +34,7 @@ def with_effect(survey: Survey) -> Survey:
 def cast_pair(
     meshes: list[SceneMesh], distance_m: float, field_mrad: float, mode: Mode = "strongest"
 ) -> dict[str, NDArray[Any]]:
-    """Cast a sensor that receives pulses from a second sensor, and return its columns."""
+    """Cast a sensor that receives pulses of a second sensor; return its columns."""
     receiver = spinning_beam(FIRINGS)
     emitter = spinning_beam(FIRINGS - 300, OTHER_HZ, clockwise=True)
     receiver = replace(receiver, optics=replace(receiver.optics, divergence_mrad=field_mrad))
@@ -57,8 +55,8 @@ def cast_pair(
     return {name: values[of_receiver] for name, values in columns.items()}
 
 
-def picture(path: Path) -> None:
-    """Plot the pulses that a sensor receives from another, and the closed form of their number."""
+def picture() -> Figure:
+    """Plot the pulses that a sensor receives from another, with the closed form of their number."""
     figure = Figure((9, 3.9), layout="constrained", dpi=110)
     above, counts = figure.subplots(1, 2, width_ratios=[1.25, 1])
     columns = cast_pair(room(25, 15), 8.0, 1000 * WIDE_RAD)
@@ -95,4 +93,4 @@ def picture(path: Path) -> None:
     counts.legend(frameon=False, fontsize=8)
     counts.set_title("A and B at one place", fontsize=10)
     counts.grid(alpha=0.25)
-    figure.savefig(path)
+    return figure

@@ -1,9 +1,8 @@
-"""Data sheets: detection and precision of sensors as stated by their manufacturers."""
+"""Data sheets: what sensors detect, and how precisely, as their makers state it."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from docs.pictures.effects._receiver import BLUE, GRAY, RED, cast_scan, fixed_beams, wall
@@ -12,7 +11,6 @@ from matplotlib.figure import Figure
 from lidarpool import Material, Survey
 from lidarsim.sensor.models import read_model
 
-DRAWS = "effect-datasheet.png"
 SHOWN = {
     "ouster/os0-64": "#7b3f99",
     "livox/mid360": "#2e8b57",
@@ -24,12 +22,13 @@ RAYS = 2000
 
 
 def with_effect(survey: Survey) -> Survey:
+    """Return the survey with the data sheet's noise and 7 sub-rays."""
     sheet = read_model("ouster/os1-64").datasheet()
     return replace(survey, noise=sheet.noise, returns=sheet.returns)
 
 
-def picture(path: Path) -> None:
-    """Compare simulated detection rates and range precision with data sheet values."""
+def picture() -> Figure:
+    """Plot simulated detection rates and range precision with the values stated in data sheets."""
     figure = Figure((9, 3.7), layout="constrained", dpi=110)
     shares, sigmas = figure.subplots(1, 2)
     dark = [Material("*", 0.1)]
@@ -76,4 +75,4 @@ def picture(path: Path) -> None:
     for axes in (shares, sigmas):
         axes.minorticks_off()
         axes.grid(alpha=0.25)
-    figure.savefig(path)
+    return figure

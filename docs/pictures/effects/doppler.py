@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
 
 from lidarpool import Actor, Mounted, Noise, Pose, Survey, Track, load_sensor
 from lidarscenes.procedural.cars import MODELS, car
@@ -14,7 +15,6 @@ from lidarsim.simulator.rig import Rig
 from lidarview.render import theme
 from lidarview.render.coloring import DIVERGING
 
-DRAWS = "effect-doppler.png"
 DARK = "#3a3f47"
 # meters a second: of the sensor's car, and of the measurement
 SPEED = 8.0
@@ -37,11 +37,8 @@ def with_effect(survey: Survey) -> Survey:
     )
 
 
-def picture(path: Path) -> None:
+def picture() -> Figure:
     """Plot the points from above, and their radial velocities against azimuth."""
-    from matplotlib.colors import ListedColormap
-    from matplotlib.figure import Figure
-
     trajectories = [
         Track([-1, 2], [start - t * np.array(v) for t in (1, -2)])
         for (start, speed, yaw) in OTHERS
@@ -164,4 +161,4 @@ def picture(path: Path) -> None:
     map_axes.set_title("one revolution of an OS1-64, from above", fontsize=8.5)
     chart.grid(color=theme.LINE, lw=0.5)
     chart.legend(loc="lower left", fontsize=8, frameon=False)
-    figure.savefig(path)
+    return figure

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from docs.pictures.effects._receiver import (
@@ -20,7 +19,6 @@ from matplotlib.figure import Figure
 
 from lidarpool import Material, Noise, Returns, Survey, load_sensor
 
-DRAWS = "effect-false-alarms.png"
 NOISE = Noise(detection_range_m=100, false_alarm_hz=2e4)
 GATE_M = 150.0
 WALL_M = 90.0
@@ -32,7 +30,7 @@ def with_effect(survey: Survey) -> Survey:
     return replace(survey, noise=NOISE)
 
 
-def picture(path: Path) -> None:
+def picture() -> Figure:
     """Plot a VLP-16 revolution in a yard, and false alarms in front of and behind a wall."""
     figure = Figure((9, 3.9), layout="constrained", dpi=110)
     above, lies = figure.subplots(1, 2, width_ratios=[1, 1.15])
@@ -71,4 +69,4 @@ def picture(path: Path) -> None:
     lies.legend(frameon=False, fontsize=8, loc="lower left")
     lies.set_title("200 kHz: lines are the Poisson process", fontsize=10)
     lies.grid(alpha=0.25)
-    figure.savefig(path)
+    return figure

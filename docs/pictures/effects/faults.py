@@ -1,12 +1,10 @@
-"""Sensor faults: range images of a street, and a wall that a vehicle approaches."""
+"""Faults of a sensor: range images of a street, and a wall that a vehicle approaches."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-from docs.pictures.effects._air import save
 from docs.pictures.effects._receiver import BLUE, GRAY, RED, wall
 from docs.pictures.effects._street import survey_without
 from matplotlib.figure import Figure
@@ -15,7 +13,6 @@ from lidarpool import Fault, Scene, Sensor, Survey, Track
 from lidarscenes.procedural.city import city
 from lidarsim.simulator.rig import Rig
 
-DRAWS = "effect-faults.png"
 DIRT = Fault("dirt", azimuth_deg=(60, 130), elevation_deg=(-25, 5), transmission=0.3)
 DEAD = Fault("dead_channels", channels=[20, 21, 40])
 LOST = Fault("dropped_packets", share=0.1, packet=16)
@@ -24,15 +21,12 @@ SECONDS = 4.0
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with four faults that affect the points of individual sweeps."""
+    """Return the survey with all that changes points of single sweeps."""
     return replace(survey, faults=[DIRT, DEAD, LOST, Fault("time_jump", by_s=-0.5)])
 
 
 def image(survey: Survey) -> np.ndarray:
-    """Return the intensities of a revolution as an image.
-
-    The shape is (channels, firings). Pixels without a return are NaN.
-    """
+    """Return intensities of a revolution, channels by firings; NaN without a return."""
     first = survey.scan(0).firings[0]
     stop = survey.scan(survey.scan_count - 1).firings[1]
     intensities = np.full((survey.sensor.channels, stop - first), np.nan)
@@ -42,10 +36,7 @@ def image(survey: Survey) -> np.ndarray:
 
 
 def approach(*faults: Fault) -> tuple[np.ndarray, np.ndarray]:
-    """Return the timestamps and ranges of a forward beam as its vehicle approaches a wall.
-
-    Timestamps are in seconds.
-    """
+    """Return stamps, seconds, and ranges of a forward beam on a vehicle that approaches a wall."""
     sensor = Sensor.grid(10, 1, 1, step_deg=360, horizontal_fov_deg=1)
     track = Track([0, SECONDS], [(0, 0, 0), (SPEED_M_S * SECONDS, 0, 0)])
     survey = Survey(sensor, trajectory=track, columns=["time"], faults=faults)
@@ -56,8 +47,8 @@ def approach(*faults: Fault) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def picture(path: Path) -> None:
-    """Plot the effect of faults on range images and on ranges over time."""
+def picture() -> Figure:
+    """Plot the effect of faults on range images, and on ranges over time."""
     figure = Figure((11, 5.2), layout="constrained", dpi=100)
     images, charts = figure.subfigures(1, 2, width_ratios=[1.7, 1])
     bare = survey_without()
@@ -96,4 +87,4 @@ def picture(path: Path) -> None:
     axes.set_title(f"a vehicle at {SPEED_M_S:g} m/s", fontsize=9)
     axes.legend(frameon=False, fontsize=8, markerscale=4)
     axes.grid(alpha=0.25)
-    save(figure, path)
+    return figure

@@ -1,9 +1,8 @@
-"""Ghosts: reflections in window panes and paint."""
+"""Ghosts: what panes and paint mirror."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from docs.pictures.effects._receiver import BLUE, GRAY, RED, cast_scan, cloud
@@ -13,13 +12,12 @@ from lidarpool import Beams, Material, Noise, Returns, Scene, SceneMesh, Sensor,
 from lidarsim.media.materials import fresnel
 from lidarsim.scene.actors import box
 
-DRAWS = "effect-ghosts.png"
 PAINT = 0.04
 DIRT = 0.1
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with cars and buildings that reflect weakly like mirrors."""
+    """Return the survey with cars and buildings that mirror weakly."""
     materials = [
         Material(["car-*", "building-*"], reflectance=0.3, specular_reflectance=PAINT),
         Material("*", reflectance=0.3),
@@ -28,13 +26,13 @@ def with_effect(survey: Survey) -> Survey:
 
 
 def upright(name: str, start: tuple[float, float], stop: tuple[float, float]) -> SceneMesh:
-    """Return a wall between two positions, from 3 m below the sensor to 3 m above it."""
+    """Return a wall between two positions, 3 m below the sensor and 3 m above."""
     lower, upper = ([[*position, z] for position in (start, stop)] for z in (-3.0, 3.0))
     return SceneMesh(name, np.array([*lower, *upper]), np.array([[0, 1, 3], [0, 3, 2]]))
 
 
-def picture(path: Path) -> None:
-    """Plot the ghosts of a shop window from above, and energies against angle of incidence."""
+def picture() -> Figure:
+    """Plot ghosts of a shop window from above, and energies against the angle of incidence."""
     figure = Figure((12, 4.4), layout="constrained", dpi=100)
     above, right = figure.subplots(1, 2, width_ratios=[1.5, 1])
     car, van = (
@@ -119,4 +117,4 @@ def picture(path: Path) -> None:
     right.set_title("dirty glass; dots simulated, lines closed form", fontsize=10)
     right.legend(fontsize=8, frameon=False)
     right.grid(alpha=0.25)
-    figure.savefig(path)
+    return figure

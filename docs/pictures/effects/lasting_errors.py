@@ -1,31 +1,28 @@
-"""Systematic errors of channels, during warm-up, and of the encoder."""
+"""Systematic errors: of channels, during warm-up, and of the encoder."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-from docs.pictures.effects._air import save
 from docs.pictures.effects._receiver import BLUE, GRAY, RED, wall
 from matplotlib.figure import Figure
 
 from lidarpool import Noise, Scene, Sensor, Survey, load_sensor
 from lidarsim.simulator.rig import Rig
 
-DRAWS = "effect-lasting-errors.png"
 NOISE = Noise(
     0.005, channel_bias_m=0.015, warm_up_m=0.03, warm_up_s=600, ripple_deg=0.05, ripple_cycles=2
 )
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with systematic errors and without noise."""
+    """Return the survey with lasting errors, and without noise."""
     return replace(survey, noise=replace(NOISE, range_m=0.0))
 
 
 def errors(sensor: Sensor, noise: Noise, **options: object) -> dict[str, np.ndarray]:
-    """Return the range errors at a wall 10 m ahead, with the channels and times in seconds."""
+    """Return range errors at a wall 10 m ahead, with the channel and the time in seconds."""
     batches_by_noise = []
     for noise_of_run in (Noise(), noise):
         survey = Survey(
@@ -43,8 +40,8 @@ def errors(sensor: Sensor, noise: Noise, **options: object) -> dict[str, np.ndar
     }
 
 
-def picture(path: Path) -> None:
-    """Plot errors by channel, time and azimuth, with their closed forms."""
+def picture() -> Figure:
+    """Plot errors by channel, time and azimuth, together with their closed forms."""
     figure = Figure((11, 3.6), layout="constrained", dpi=100)
     by_channel, by_time, by_azimuth = figure.subplots(1, 3)
     revolution = errors(
@@ -77,11 +74,11 @@ def picture(path: Path) -> None:
     for axes in (by_channel, by_time, by_azimuth):
         axes.grid(alpha=0.25)
         axes.legend(framealpha=0.9, fontsize=8, loc="upper right")
-    save(figure, path)
+    return figure
 
 
 def ripple(cycles: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return azimuths and azimuth errors in degrees, computed from ranges of a slanted wall."""
+    """Return azimuths and their errors, degrees, computed from ranges of a slanted wall."""
     noise = Noise(ripple_deg=NOISE.ripple_deg, ripple_cycles=cycles)
     corner = np.array([[-30, -8, -9], [30, -8, -9], [30, -8, 9], [-30, -8, 9.0]])
     azimuths = []

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from lidarpool import Gnss, Imu, Navigation, Survey
 from lidarsim.motion.navigation import gnss_fixes, imu_samples
 from lidarview.render import theme
 
-DRAWS = "effect-navigation.png"
 HOURS = 4
 # Of an industrial MEMS unit, by order of magnitude: 0.2 degrees per root hour, 6 degrees an hour.
 IMU = Imu(
@@ -81,10 +80,8 @@ def outage(axes: Any, still: SimpleNamespace) -> None:
     axes.set_title("40 outages from 10 to 25 s; black: one σ", fontsize=9)
 
 
-def picture(path: Path) -> None:
+def picture() -> Figure:
     """Plot Allan deviations, position errors over several hours, and errors during outages."""
-    from matplotlib.figure import Figure
-
     from lidarsim.motion.trajectory import CENTER, Stations
 
     still = SimpleNamespace(
@@ -138,4 +135,4 @@ def picture(path: Path) -> None:
     gyroscopes.legend(fontsize=7.5, frameon=False, loc="upper right")
     for line in positions.legend(fontsize=7.5, frameon=False, loc="lower right").get_lines():
         line.set_linewidth(2)
-    figure.savefig(path)
+    return figure

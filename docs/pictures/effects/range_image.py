@@ -8,6 +8,7 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from benchmarks.odometry import cloud_of
 from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -15,13 +16,8 @@ from matplotlib.lines import Line2D
 from lidarpool import Material, Noise, Survey, load_sensor
 from lidarpool.clouds.writing import ExportSpec
 from lidarscenes.procedural.city import city
-from lidarsim.columns.table import SCAN
 from lidarsim.scene.scene import Scene
-from lidarsim.simulator.points.batch_columns import columns_of
-from lidarsim.simulator.rig import Rig
-from lidarsim.sweeps.sweeps import Sweeps
 
-DRAWS = "effect-range-image.png"
 SKY = "#dfe5ec"
 LOST = "#e0182d"
 MATERIALS = (
@@ -39,15 +35,13 @@ def with_effect(survey: Survey) -> Survey:
 
 def image_of(scene: Scene, survey: Survey) -> dict[str, np.ndarray]:
     """Return the channels of the range image of the first sweep."""
-    rig = Rig(scene, survey)
-    part = columns_of(list(rig.cast(0, survey.scan_count)))
-    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
+    cloud = cloud_of(survey, scene)
     with tempfile.TemporaryDirectory() as folder:
-        ExportSpec("images").write(Path(folder, "images"), cloud, Sweeps.from_survey(survey, scene))
+        ExportSpec("images").write(Path(folder, "images"), cloud, cloud.sweeps())
         return dict(np.load(Path(folder, "images/lidar/000000.npz")).items())
 
 
-def picture(path: Path) -> None:
+def picture() -> Figure:
     """Plot the range image of an OS1-128 with and without a detection threshold."""
     scene = city(200_000, trees=60, cars=60)
     sensor = load_sensor("ouster/os1-128", max_range_m=170)
@@ -114,4 +108,4 @@ def picture(path: Path) -> None:
     ]
     figure.legend(handles=keys, loc="upper right", ncols=2, fontsize=9, frameon=False)
     figure.text(0.062, 0.957, "Range image of a turn of an OS1-128", fontsize=12, weight="bold")
-    figure.savefig(path)
+    return figure

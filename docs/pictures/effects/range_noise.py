@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from docs.pictures.effects._receiver import BLUE, GRAY, RED, cast_scan, fixed_beams, wall
@@ -12,7 +11,6 @@ from matplotlib.figure import Figure
 from lidarpool import Material, Noise, Survey
 from lidarsim.simulator.steps.range_noise import range_walk
 
-DRAWS = "effect-range-noise.png"
 NOISE = Noise(0.01, detection_range_m=100, range_at_threshold_m=0.1)
 WALK = Noise(0.01, detection_range_m=100, walk_m=0.02)
 RAYS = 4000
@@ -22,7 +20,7 @@ def with_effect(survey: Survey) -> Survey:
     return replace(survey, noise=replace(NOISE, walk_m=0.02))
 
 
-def picture(path: Path) -> None:
+def picture() -> Figure:
     """Plot range noise and range walk at simulated walls against energy, with the model curves."""
     kinds = {
         "10 % reflectance": (Material("*", 0.1), GRAY, np.geomspace(4, 105, 9)),
@@ -70,4 +68,4 @@ def picture(path: Path) -> None:
     for axes in (scatter, walk):
         axes.set_xlabel("energy E / detection threshold T")
         axes.grid(alpha=0.25)
-    figure.savefig(path)
+    return figure

@@ -1,11 +1,11 @@
-"""Refraction in a pool: where the floor appears, and how much of its light returns."""
+"""Light that is refracted: a pool, where it seems to be, and what comes back of its floor."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
+from benchmarks.fit_coverage import box
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -15,7 +15,6 @@ from lidarsim.simulator.rig import Rig
 from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLORS
 from lidarview.render.theme import SENSOR as RED
 
-DRAWS = "effect-refraction.png"
 HEIGHT = 3.0
 DEPTH = 2.0
 INDEX = 1.33
@@ -30,19 +29,9 @@ Real = NDArray[np.float64]
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with cars made of glass."""
+    """Return the survey with cars of glass."""
     glass = Material("car-*", transparent="pass", refractive_index=1.5)
     return replace(survey, materials=[glass, Material("*")])
-
-
-def box(
-    name: str, lower: tuple[float, float, float], upper: tuple[float, float, float]
-) -> SceneMesh:
-    """Create a box whose triangles face outward."""
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    squares = ([0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3])
-    faces = [[a, b, c] for a, b, c, _ in squares] + [[a, c, d] for a, _, c, d in squares]
-    return SceneMesh(name, np.array(lower) + corners * np.subtract(upper, lower), np.array(faces))
 
 
 def pool() -> list[SceneMesh]:
@@ -58,7 +47,7 @@ def pool() -> list[SceneMesh]:
 
 
 def cast(meshes: list[SceneMesh], water: Material) -> tuple[Real, Real, Real, Real]:
-    """Return the x and z coordinates of points, and the angles and energies of their beams."""
+    """Return x and z of points, and angles and energies of their beams."""
     survey = Survey(
         SCANNER,
         poses=[(0, 0, HEIGHT)],
@@ -73,8 +62,8 @@ def cast(meshes: list[SceneMesh], water: Material) -> tuple[Real, Real, Real, Re
     return positions[:, 0], positions[:, 2], NADIRS[ray], points.intensity  # type: ignore[union-attr]
 
 
-def picture(path: Path) -> None:
-    """Plot a cross section of the pool, and the energies received from its floor."""
+def picture() -> Figure:
+    """Plot a cross section of the pool, and the received energies of its floor."""
     straight = Material("Water", transparent="pass")
     wet = Material("Water", transparent="pass", refractive_index=INDEX, attenuation_per_m=LOSS)
     figure = Figure((13.5, 4.7), dpi=100, layout="constrained")
@@ -147,4 +136,4 @@ def picture(path: Path) -> None:
     for axes in (section, energies):
         axes.tick_params(labelsize=8, colors=MUTED)
         axes.spines[:].set_color(LINE)
-    figure.savefig(path)
+    return figure

@@ -1,9 +1,8 @@
-"""Saturation of the receiver by strong pulses."""
+"""Saturation: pulses that fill the receiver."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from docs.pictures.effects._receiver import BLUE, GRAY, RED, cast_scan, fixed_beams, wall
@@ -17,7 +16,6 @@ from lidarsim.sensor.optics import LIGHT_M_NS
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 
-DRAWS = "effect-saturation.png"
 NOISE = Noise(detection_range_m=100, saturation=100)  # full by a white wall 31.6 m away
 PULSE_NS = 5.0
 MATERIALS = {
@@ -28,11 +26,12 @@ COLUMNS = ("range", "intensity", "amplitude", "pulse_width", "object")
 
 
 def with_effect(survey: Survey) -> Survey:
+    """Return the survey with saturation."""
     return replace(survey, noise=NOISE)
 
 
 def _waveform(wall_m: float, noise: Noise) -> tuple[NDArray, NDArray]:
-    """Return the ranges and signals of the samples in a white wall's waveform."""
+    """Return range and signal of the samples of a white wall's waveform."""
     survey = Survey(
         fixed_beams(1),
         poses=[(0, 0, 0)],
@@ -50,7 +49,7 @@ def _waveform(wall_m: float, noise: Noise) -> tuple[NDArray, NDArray]:
 
 
 def _separable_distance(name: str, plate_m: float) -> tuple[float, float]:
-    """Return a plate's signal over saturation, and its least separable distance to a wall."""
+    """Return a plate's signal over saturation, and the least separable distance to a wall."""
     beam = Returns("all", subrays=61, divergence_mrad=1)
     options = {"materials": MATERIALS[name], "returns": beam, "columns": COLUMNS}
     lower_m = 0.1
@@ -63,8 +62,8 @@ def _separable_distance(name: str, plate_m: float) -> tuple[float, float]:
     return columns["intensity"][0] / NOISE.saturation_energy, upper_m
 
 
-def picture(path: Path) -> None:
-    """Plot clipped pulses, pulse widths, range errors, and the least separable wall distance."""
+def picture() -> Figure:
+    """Plot clipped pulses, pulse widths and range errors, and the distance of separable walls."""
     figure = Figure((11, 3.7), layout="constrained", dpi=110)
     pulse, widths, apart = figure.subplots(1, 3)
     pulse.axhline(1, color="k", lw=0.8, ls=":")
@@ -128,4 +127,4 @@ def picture(path: Path) -> None:
         axes.set_xlabel("signal / saturation")
     for axes in (pulse, widths, apart):
         axes.grid(alpha=0.25)
-    figure.savefig(path)
+    return figure

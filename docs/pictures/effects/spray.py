@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from docs.pictures.effects._receiver import BLUE, GRAY, RED, cloud
@@ -27,7 +26,6 @@ from lidarpool import (
 from lidarsim.media.weather import spray_clumps
 from lidarsim.scene.actors import box
 
-DRAWS = "effect-spray.png"
 WEATHER = {"wet": 1.0, "spray_g_m3": 20.0}
 NOISE = Noise(detection_range_m=90)
 SPEED = 25.0
@@ -52,7 +50,7 @@ def lorry(name: str, start: tuple[float, float], height: float = 0.0) -> Actor:
     return Actor(box(name, (9, 2.5, 3)), drive)
 
 
-def picture(path: Path) -> None:
+def picture() -> Figure:
     """Plot a truck with spray from above and from the side, and the decrease of spray behind it."""
     figure = Figure((12, 4.4), layout="constrained", dpi=100)
     views = figure.subplot_mosaic([["above", "right"], ["aside", "right"]], width_ratios=[1.5, 1])
@@ -127,4 +125,4 @@ def picture(path: Path) -> None:
     axes.set_title("a beam from 8 m to the side", fontsize=10)
     axes.legend(fontsize=8, frameon=False)
     axes.grid(alpha=0.25)
-    figure.savefig(path)
+    return figure

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
-from docs.pictures.effects.refraction import box
+from benchmarks.fit_coverage import box
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -18,7 +17,6 @@ from lidarsim.media.leaves import mean_projection
 from lidarsim.simulator.rig import Rig
 from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLORS
 
-DRAWS = "effect-vegetation.png"
 # m²/m³, and meters of a canopy: a leaf area index of 1.8
 DENSITY = 0.6
 HIGH = 3.0
@@ -93,7 +91,7 @@ def canopy(kind: str, zenith_deg: float) -> Real:
     return np.where(scan.object == 0, depth, np.nan)
 
 
-def picture(path: Path) -> None:
+def picture() -> Figure:
     """Plot cross sections of a tree, gap fractions, and the depths of returns."""
     figure = Figure((13.5, 5.2), dpi=100, layout="constrained")
     grid = figure.add_gridspec(2, 3, width_ratios=[1.05, 1, 1])
@@ -138,4 +136,4 @@ def picture(path: Path) -> None:
     for axes in (above, below, gaps, depths):
         axes.tick_params(labelsize=8, colors=MUTED)
         axes.spines[:].set_color(LINE)
-    figure.savefig(path)
+    return figure

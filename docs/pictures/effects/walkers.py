@@ -6,13 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
 
 from lidarpool import Actor, Scanner, Scene, Sensor, Survey, Track
 from lidarsim.scene.actors import box, join_meshes
 from lidarsim.scene.files.meshfile import load_objects
 from lidarview.render.coloring import DIVERGING
 
-DRAWS = "effect-walkers.png"
 PERSON = Path(__file__).parents[3] / "examples" / "pedestrian.glb"
 # m at first, m/s towards the sensor
 AWAY = 9.0
@@ -27,11 +28,8 @@ def with_effect(survey: Survey) -> Survey:
     return replace(survey, columns=(*survey.columns, "radial_velocity"))
 
 
-def picture(path: Path) -> None:
+def picture() -> Figure:
     """Plot a pedestrian's points from the side, and their radial velocities over time."""
-    from matplotlib.colors import ListedColormap
-    from matplotlib.figure import Figure
-
     mesh = join_meshes("Person", load_objects(PERSON, animation="Walk").static)
     assert mesh.animation is not None
     mesh = replace(mesh, animation=replace(mesh.animation, speed_m_s=SPEED))
@@ -72,4 +70,4 @@ def picture(path: Path) -> None:
     figure.colorbar(shown, ax=chart, label="height, m", location="bottom", shrink=0.85, aspect=40)
     moments.set_title("one person in four sweeps, side view", fontsize=8.5)
     chart.set_title(f"all points; dashed: the person's own {SPEED} m/s", fontsize=8.5)
-    figure.savefig(path)
+    return figure

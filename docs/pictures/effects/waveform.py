@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 from lidarpool import Beams, Material, Optics, Pose, Returns, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarscenes.procedural.plants import SPECIES, tree
@@ -17,8 +16,6 @@ from lidarsim.columns.waveforms import WAVEFORM
 from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
-
-DRAWS = "effect-waveform.png"
 
 _HEIGHT_M = 300.0
 _PULSE_NS = 5.0
@@ -112,11 +109,10 @@ def _panel(
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def picture(path: Path) -> None:
+def picture() -> Figure:
     """Plot waveforms and returns at the edge of a roof and in an oak."""
-    figure, (edge_axes, tree_axes) = plt.subplots(
-        1, 2, figsize=(10, 4.2), layout="constrained", width_ratios=(1, 1.5), sharey=True
-    )
+    figure = Figure((10, 4.2), layout="constrained", dpi=110)
+    edge_axes, tree_axes = figure.subplots(1, 2, width_ratios=(1, 1.5), sharey=True)
     step = Scene.from_meshes([_flat("Terrace", 0.0, (-9, 9)), _flat("Roof", 0.68, (-9, 0.03))])
     _panel(edge_axes, step, (0.0, 0.0), (-1.2, 2.0))
     edge_axes.set_title("roof edge 0.68 m above a terrace", fontsize=10)
@@ -142,5 +138,4 @@ def picture(path: Path) -> None:
         "One pulse of 5 ns (FWHM) from 300 m, 0.75 m wide on the ground, and its returns",
         fontsize=11,
     )
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    return figure

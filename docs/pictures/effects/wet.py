@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from docs.pictures.effects._receiver import BLUE, GRAY, RED, cloud, points, wall
@@ -12,7 +11,6 @@ from matplotlib.figure import Figure
 from lidarpool import Beams, Material, Noise, Returns, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarsim.media.materials import WATER_INDEX, fresnel, wet_surface_factor
 
-DRAWS = "effect-wet.png"
 ROAD = 0.2
 
 
@@ -20,7 +18,7 @@ def with_effect(survey: Survey) -> Survey:
     return replace(survey, wet=1.0)
 
 
-def picture(path: Path) -> None:
+def picture() -> Figure:
     """Plot a dry and a wet road from the side, and reflectance against the angle of incidence."""
     figure = Figure((12, 4.4), layout="constrained", dpi=100)
     views = figure.subplot_mosaic([["dry", "right"], ["wet", "right"]], width_ratios=[1.5, 1])
@@ -70,4 +68,4 @@ def picture(path: Path) -> None:
     axes.set(ylabel="reflectance", title="asphalt; dots simulated, lines closed form")
     axes.legend(fontsize=8, frameon=False)
     axes.grid(alpha=0.25)
-    figure.savefig(path)
+    return figure

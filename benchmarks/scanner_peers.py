@@ -1,6 +1,6 @@
-"""The peers' side of benchmarks/sensors.py, in their Python: needs NumPy and the one that is named.
+"""Casters of other packages for benchmarks/scanner.py; requires only NumPy and these packages.
 
-It builds its tree, says "ready" and its version, then casts once for each line that comes in.
+The process builds its tree, prints "ready", and then casts once for each line on standard input.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -70,7 +69,7 @@ def mujoco_caster(job: Job) -> Callable[[], int]:
     return cast
 
 
-def mujoco_lidar_caster(job: Job, backend: str, device: str = "cpu") -> Callable[[], int]:
+def mujoco_lidar_caster(job: Job, backend: str) -> Callable[[], int]:
     """Return a function that casts each origin's rays with one call of MuJoCo-LiDAR."""
     if backend == "cpu":
         from mujoco_lidar.core_cpu.mjlidar_cpu import MjLidarCPU as Caster
@@ -79,7 +78,7 @@ def mujoco_lidar_caster(job: Job, backend: str, device: str = "cpu") -> Callable
         from mujoco_lidar.core_warp.mjlidar_warp import MjLidarWarp as Caster
 
         warp.config.quiet = True
-        warp.set_device(device)
+        warp.set_device("cpu")
     model, data = _mujoco_model(job)
     origin_count = len(job["origins"])
     max_range_m = float(job.get("far", 1e10))
@@ -102,39 +101,10 @@ def mujoco_lidar_caster(job: Job, backend: str, device: str = "cpu") -> Callable
     return cast
 
 
-def helios_caster(job: Job) -> Callable[[], int]:
-    """Return a function that casts Helios' spinning scan, with as many rays, on the same line."""
-    from pyhelios import Context, LiDARCloud
-
-    context = Context()
-    cloud = LiDARCloud()
-    context.addTrianglesFromArrays(
-        job["vertices"].astype(np.float32), job["faces"].astype(np.int32)
-    )
-    cloud.disableMessages()
-    firings = len(job["origins"])
-    seconds = float(job["seconds"])
-    cloud.addScanSpinning(
-        job["elevations"].tolist(),
-        2 * np.pi * float(job["turned"]) / firings,
-        len(job["directions"]) / seconds,
-        [0.0, seconds],
-        job["way"].tolist(),
-        [[0, 0, 0, 1], [0, 0, 0, 1]],
-    )
-
-    def cast() -> int:
-        cloud.syntheticScan(context, record_misses=False)
-        return int(cloud.getHitCount())
-
-    return cast
-
-
 CASTERS = {
     "mujoco": mujoco_caster,
     "mujoco-lidar cpu": partial(mujoco_lidar_caster, backend="cpu"),
     "mujoco-lidar warp": partial(mujoco_lidar_caster, backend="warp"),
-    "pyhelios3d": helios_caster,
 }
 
 
@@ -143,7 +113,7 @@ def main() -> None:
     name, path, clock = sys.argv[1:]
     clock_s = {"wall": time.perf_counter, "cpu": time.process_time}[clock]
     cast = CASTERS[name](dict(np.load(path)))
-    print("ready", version(name.partition(" ")[0]), flush=True)
+    print("ready", flush=True)
     for _ in sys.stdin:
         start = clock_s()
         hits = cast()

@@ -1,23 +1,21 @@
-"""Plots of returns from the air: a street from above, and comparisons with closed forms."""
+"""Weather that returns light: a street from above, and comparisons with closed forms."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from statistics import NormalDist
 from typing import Any
 
 import numpy as np
+from docs.pictures.effects._receiver import cloud
 from docs.pictures.effects._street import survey_without
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from lidarpool import Noise, Returns, Scene, SceneMesh, Survey
 from lidarscenes.procedural.city import city
 from lidarsim.media.weather import FAINTEST
 from lidarsim.sensor.noise import THRESHOLD_SIGMAS
-from lidarsim.simulator.rig import Rig
 from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLORS, SENSOR
 
 NOISE = Noise(detection_range_m=90)
@@ -26,47 +24,21 @@ AIR = SENSOR
 CURVE = INK
 TURNS = 20
 
-Real = NDArray[np.float64]
-
-
-def in_weather(survey: Survey, **weather: Any) -> Survey:
-    """Return the survey in this weather, with a sensor that detects 10 % at 90 m."""
-    return replace(survey, noise=NOISE, **weather)
-
-
-def points(scene: Scene, survey: Survey) -> dict[str, Real]:
-    """Simulate a survey and return the position, range, intensity and cause of all points."""
-    batches = list(Rig(scene, survey).cast(0, survey.scan_count))
-    columns = {
-        "cause": [
-            np.zeros(len(b)) if b.pulse_returns.cause is None else b.pulse_returns.cause
-            for b in batches
-        ],
-        "range": [b.pulse_returns.distance for b in batches],
-        "intensity": [b.intensity for b in batches],
-        "x": [b.positions[:, 0] for b in batches],
-        "y": [b.positions[:, 1] for b in batches],
-    }
-    return {name: np.concatenate(values) for name, values in columns.items()}
-
 
 def page(title: str, weather: dict[str, Any], reach_m: float) -> tuple[Figure, Any]:
-    """Draw the street from above, without and with the weather.
-
-    The third plot of the figure is returned empty.
-    """
+    """Draw the street from above without and with the weather; return an empty third plot."""
     figure = Figure((13.5, 4.7), dpi=100, layout="constrained")
     clear, wet, right = figure.subplots(1, 3, width_ratios=[1, 1, 1.25])
     scene = city(20_000)
-    survey = in_weather(survey_without())
+    survey = replace(survey_without(), noise=NOISE)
     for axes, options, words in ((clear, {}, "clear air"), (wet, weather, title)):
-        cloud = points(scene, replace(survey, **options))
-        air = cloud["cause"] == 1
+        points = cloud(scene, replace(survey, **options))
+        air = points["cause"] == 1
         dot = 1.8 if air.sum() > 2000 else 3.5
         for which, color, label, ms in ((~air, SURFACE, "surfaces", 1.2), (air, AIR, "air", dot)):
             name = f"{label}: {which.sum():,}"
             axes.plot(
-                cloud["x"][which], cloud["y"][which], ".", ms=ms, mew=0, color=color, label=name
+                points["x"][which], points["y"][which], ".", ms=ms, mew=0, color=color, label=name
             )
         axes.set(xlim=(-reach_m, reach_m), ylim=(-reach_m, reach_m), aspect="equal")
         axes.set(xlabel="x (m)", ylabel="y (m)")
@@ -79,21 +51,18 @@ def page(title: str, weather: dict[str, Any], reach_m: float) -> tuple[Figure, A
 
 
 def sky() -> Scene:
-    """Create a scene that contains only a small, distant triangle."""
+    """Nothing but a small triangle far away."""
     corner = np.array([[0, 0, -900], [1, 0, -900], [0, 1, -900.0]])
     return Scene.from_meshes([SceneMesh("Nothing", corner, np.array([[0, 1, 2]]))])
 
 
 def counts(axes: Any, weather: dict[str, Any], farthest_m: float) -> None:
-    """Plot the number of returns against range, with the closed form.
-
-    The pulses are fired into the open sky.
-    """
+    """Plot numbers of returns against range, of pulses into the open sky, and the closed form."""
     separate = Returns("all", pulse_ns=0)
-    survey = replace(in_weather(survey_without()), steps=TURNS * 36, returns=separate, **weather)
-    cloud = points(sky(), survey)
+    survey = replace(survey_without(), noise=NOISE, steps=TURNS * 36, returns=separate, **weather)
+    points = cloud(sky(), survey)
     edges = np.linspace(survey.sensor.min_range_m, farthest_m, 41)
-    axes.hist(cloud["range"], edges, color=AIR, alpha=0.55, label="simulated")
+    axes.hist(points["range"], edges, color=AIR, alpha=0.55, label="simulated")
     air = survey.air(0)
     (kind,) = survey.particles
     noise = survey.noise
@@ -112,20 +81,20 @@ def counts(axes: Any, weather: dict[str, Any], farthest_m: float) -> None:
     axes.plot(middle, rate * survey.ray_count * bin_m, color=CURVE, lw=1.6, label="closed form")
     axes.set(xlim=(0, farthest_m), xlabel="range (m)")
     axes.set_ylabel(f"returns in {100 * bin_m:.0f} cm of range")
-    title = f"{len(cloud['range']):,} returns of {survey.ray_count:,} pulses into the sky"
+    title = f"{len(points['range']):,} returns of {survey.ray_count:,} pulses into the sky"
     axes.set_title(title, fontsize=11, color=INK)
     axes.legend(fontsize=9, framealpha=0.9)
 
 
 def energies(axes: Any, weather: dict[str, Any]) -> None:
-    """Plot energies against range, with the closed forms for surfaces and for the air."""
-    survey = replace(in_weather(survey_without()), **weather)
-    cloud = points(city(20_000), survey)
-    air = cloud["cause"] == 1
+    """Plot energies against range, and the closed forms of surfaces and of the air."""
+    survey = replace(survey_without(), noise=NOISE, **weather)
+    points = cloud(city(20_000), survey)
+    air = points["cause"] == 1
     for which, color, label in ((~air, SURFACE, "surfaces"), (air, AIR, "air")):
         axes.plot(
-            cloud["range"][which],
-            cloud["intensity"][which],
+            points["range"][which],
+            points["intensity"][which],
             ".",
             ms=2,
             mew=0,
@@ -151,12 +120,32 @@ def energies(axes: Any, weather: dict[str, Any]) -> None:
         shown.set_markersize(9)
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a plot as an image with few colors."""
-    import io
+@dataclass(frozen=True)
+class Weather:
+    """Weather with its picture."""
 
-    from PIL import Image
+    options: dict[str, float]  # of a survey
+    title: str
+    reach_m: float  # half the side of the maps
+    farthest_m: float = 0.0  # in the diagram of counts; 0 for a diagram of energies
 
-    png = io.BytesIO()
-    figure.savefig(png, format="png")
-    Image.open(png).convert("RGB").quantize(64).save(path, optimize=True)
+    def with_effect(self, survey: Survey) -> Survey:
+        """Return the survey in this weather, with a sensor that detects 10 % at 90 m."""
+        return replace(survey, noise=NOISE, **self.options)
+
+    def picture(self) -> Figure:
+        """Plot a street, and the number or the energies of returns against range."""
+        figure, right = page(self.title, self.options, self.reach_m)
+        if self.farthest_m:
+            counts(right, self.options, self.farthest_m)
+        else:
+            energies(right, self.options)
+        return figure
+
+
+WEATHER = {
+    "dust": Weather({"dust_mg_m3": 100.0}, "100 mg/m³ of dust", 25.0),
+    "fog": Weather({"visibility_km": 0.05}, "fog, 50 m of visibility", 25.0),
+    "rain": Weather({"rain_mm_h": 50.0}, "50 mm/h of rain", 12.0, 6.0),
+    "snow": Weather({"snow_mm_h": 1.0}, "1 mm/h of snow", 20.0, 16.0),
+}

@@ -1,0 +1,23 @@
+"""Options that the programs for pictures share."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+IMAGES = Path(__file__).parents[1] / "images"
+
+
+def file_parser(doc: str | None, suffix: str) -> argparse.ArgumentParser:
+    """Return a parser of a program that writes one file."""
+    parser = argparse.ArgumentParser(description=doc)
+    parser.add_argument("file", type=Path, help=f"{suffix} file to write")
+    return parser
+
+
+def folder_parser(doc: str | None, folder: Path) -> argparse.ArgumentParser:
+    """Return a parser of a program that writes a picture for each name into a folder."""
+    parser = argparse.ArgumentParser(description=doc)
+    parser.add_argument("folder", nargs="?", type=Path, default=folder, help="output folder")
+    parser.add_argument("--only", nargs="*", default=[], help="only the pictures of these names")
+    return parser
