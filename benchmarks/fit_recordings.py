@@ -27,7 +27,7 @@ from lidarpool.comparing.fit.standstill import read_static
 from lidarpool.recordings.opening import open_recording
 from lidarsim.sensor.models import read_model
 from lidarsim.simulator.steps.angle_noise import angle_errors
-from lidarsim.simulator.steps.detection import detected
+from lidarsim.simulator.steps.detection import is_detected
 from lidarsim.simulator.steps.range_noise import noisy_ranges
 
 COLORS = {"recorded": "#1c2430", "data sheet": "#ee7733", "fitted": "#4477aa"}
@@ -49,7 +49,7 @@ def simulate_ranges(noise: Noise, rays: Any, energy: Any, sweeps: int) -> Any:
         across, _ = angle_errors(noise, np.full(len(keys), scan), keys)
         ranges = rays.distance + rays.slope * across  # along the steepest slope
         moved = noisy_ranges(noise, ranges, energy, np.full(len(keys), scan), keys, 0 * keys)
-        detected_rays = detected(noise, energy, np.full(len(keys), scan), keys, 0 * keys)
+        detected_rays = is_detected(noise, energy, np.full(len(keys), scan), keys, 0 * keys)
         result[scan] = np.where(detected_rays, moved, np.nan)
     return result
 

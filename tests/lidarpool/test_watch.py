@@ -16,7 +16,7 @@ def look(monkeypatch):
     clock = SimpleNamespace(now=0.0)
     monkeypatch.setattr(watch, "time", SimpleNamespace(monotonic=lambda: 1000.0 + clock.now))
     told: list[str] = []
-    watching = Watch(None, ["GPU", "OTHER"], lasting=["LIDAR"], tell=told.append)
+    watching = Watch(None, ["GPU", "OTHER"], lasting=["LIDAR"], report=told.append)
 
     def look(seconds, *workers):
         identities = {

@@ -18,7 +18,7 @@ from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
 from lidarsim.simulator.casting.surfaces import SceneSurfaces, SensorLight
 from lidarsim.simulator.returns import NO_SURFACE, Keys, PulseReturns
 from lidarsim.simulator.steps import spray_loops
-from lidarsim.simulator.steps.detection import detected
+from lidarsim.simulator.steps.detection import is_detected
 from lidarsim.simulator.steps.particles import (
     AIR,
     WeatherStep,
@@ -230,7 +230,7 @@ def test_noise_is_that_of_the_twin(noise, tolerance_m):
     assert noise.threshold == (
         0.1 * reference.energy_of(1, 50, 0) if noise.detection_range_m else 0
     )
-    seen = detected(noise, energy, *KEYS.scan_and_number(ray), number)
+    seen = is_detected(noise, energy, *KEYS.scan_and_number(ray), number)
     ranges = noisy_ranges(noise, distance, energy, *KEYS.scan_and_number(ray), number)
     columns = (column.tolist() for column in (distance, energy, number, ray))
     rows = [(r, e, n, key_of(pulse)) for r, e, n, pulse in zip(*columns, strict=True)]

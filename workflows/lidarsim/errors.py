@@ -142,7 +142,7 @@ def unreadable(subject: object, error: Exception, advice: str = "") -> str:
 
 
 @contextmanager
-def explained(failure: str, advice: str = "") -> Iterator[None]:
+def explain_os_errors(failure: str, advice: str = "") -> Iterator[None]:
     """Convert an OSError raised in the context into a LidarError.
 
     The message consists of the failure, the reason and the advice. If a file does not exist, the
@@ -161,7 +161,7 @@ def explained(failure: str, advice: str = "") -> Iterator[None]:
 
 
 @contextmanager
-def converted(failure: str) -> Iterator[None]:
+def convert_errors(failure: str) -> Iterator[None]:
     """Convert any exception raised in the context into a LidarError.
 
     Use this context for input files, whose readers and libraries raise exceptions of many classes.
@@ -182,7 +182,7 @@ def converted(failure: str) -> Iterator[None]:
 
 
 @contextmanager
-def prefixed(subject: object) -> Iterator[None]:
+def prefix_errors(subject: object) -> Iterator[None]:
     """Prefix a LidarError raised in the context with its subject, for example "leg 3: …"."""
     try:
         yield
@@ -198,14 +198,14 @@ class Mistakes:
         self.lines: list[str] = []
 
     @contextmanager
-    def noted(self) -> Iterator[None]:
+    def collect(self) -> Iterator[None]:
         """Collect a LidarError raised in the context instead of propagating it."""
         try:
             yield
         except LidarError as error:
             self.lines.append(str(error))
 
-    def tell(self) -> None:
+    def raise_if_any(self) -> None:
         """Raise LidarError with one line per distinct error if any errors were collected."""
         lines = list(dict.fromkeys(self.lines))
         if len(lines) > MAX_MISTAKES:

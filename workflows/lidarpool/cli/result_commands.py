@@ -258,7 +258,7 @@ def _make_export_specs(names: Iterable[str], layout: str, **options: Any) -> lis
 
 
 def _print_note(note: str) -> None:
-    """Print a note without importing Dask, which `Terminal.tell` would require."""
+    """Print a note without importing Dask, which `Terminal.report` would require."""
     click.echo(f"note: {note}", err=True)
 
 
@@ -325,7 +325,7 @@ def view(
 
         show_jobs(JobList(data_sets[0]), port=port, browser=not no_browser)
         return
-    reading = {"keep_noise": keep_noise, "of_mesh": of_mesh, "tell": _print_note}
+    reading = {"keep_noise": keep_noise, "of_mesh": of_mesh, "report": _print_note}
     with ExitStack() as stack:
         files = (CLOUD, PICTURE_FILE, SWEEPS_FILE)
         folders = [stack.enter_context(local_result(result, files)) for result in results]

@@ -116,7 +116,7 @@ def _run_survey(
     """
     job = prepared.job
     for note in advice(prepared):
-        terminal.tell(note)
+        terminal.report(note)
     jobs = SingleJob(job, title=prepared.scenario.title)
     output = SurveyOutput(out, job.survey, job.outputs, extent or "page", prepared.scenario)
     with page_of(jobs, options.live) as page:

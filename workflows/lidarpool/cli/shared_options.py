@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage, is_url
 from lidarsim.schema.vocabulary import BACKENDS, UNITS_M
 
@@ -272,7 +272,7 @@ def _check_combination(settings: Mapping[str, Any], file: Path | None, files: Tl
             "of an encrypted cluster, such as tls://host:8786."
         )
     for pem in filter(None, files):
-        with explained(f"{pem} cannot be read"):
+        with explain_os_errors(f"{pem} cannot be read"):
             input_size(pem)
 
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lidarsim.errors import LidarError
-from lidarsim.words import joined, plural, printable
+from lidarsim.words import join_names, plural, printable
 
 from . import completion
 from . import shared_options as options
@@ -215,7 +215,7 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
     terminal = Terminal(quiet=as_json)
     prepared, notes = _prepared_with_notes(scenario, terminal)
     with terminal.status("computing the visibility from all candidate positions"):
-        plan = plan_stations(prepared.scene.georeferenced((0, 0, 0)), sensor, **settings)
+        plan = plan_stations(prepared.scene.with_world_origin((0, 0, 0)), sensor, **settings)
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / PLAN_FILE
     file.write_text(
@@ -251,8 +251,8 @@ def _reject_planning_options(scene: Path, settings: dict[str, Any]) -> None:
     }
     if unused := [f"`{name}`" for name, value in chosen.items() if value is not None]:
         raise click.UsageError(
-            f"{joined(unused)} cannot be used with `--cloud`, because the stations and the sensor "
-            f"are those in {scene}."
+            f"{join_names(unused)} cannot be used with `--cloud`, because the stations and the "
+            f"sensor are those in {scene}."
         )
 
 
@@ -280,7 +280,7 @@ def _show_coverage(
     recording = open_recording(cloud)
     terminal = Terminal(quiet=as_json)
     prepared, notes = _prepared_with_notes(scenario, terminal)
-    if len(prepared.survey.carried) > 1:
+    if len(prepared.survey.mounted_sensors) > 1:
         raise LidarError(
             "`--cloud` requires a scenario with a single sensor, but the scenario has several."
         )
@@ -289,7 +289,7 @@ def _show_coverage(
     with terminal.status("finding points near the reachable surfaces"):
         coverage = survey_coverage(
             prepared.scene,
-            prepared.survey.carried[0].sensor,
+            prepared.survey.mounted_sensors[0].sensor,
             positions,
             clouds,
             targets=targets,
@@ -322,9 +322,9 @@ def _station_positions(prepared: PreparedScenario) -> Floats:
     The result has shape (s, 3).
     """
     path = prepared.survey.path
-    mount = prepared.survey.carried[0].mount
+    mount = prepared.survey.mounted_sensors[0].mount
     poses = [path.pose(number, 0.0).compose(mount) for number in range(path.stations)]
-    return prepared.scene.georeferenced((0, 0, 0)).origin + [pose.position for pose in poses]
+    return prepared.scene.with_world_origin((0, 0, 0)).origin + [pose.position for pose in poses]
 
 
 def _coverage_figures(coverage: SurveyCoverage, prepared: PreparedScenario) -> dict[str, Any]:
@@ -365,7 +365,7 @@ def _prepared_with_notes(
         prepared = prepare(scenario, plans=False)
     notes = advice(replace(prepared, placement=SensorPlacement(())))
     for note in notes:
-        terminal.tell(note)
+        terminal.report(note)
     if problem := prepared.job.location_warning:
         terminal.warn(problem)
     return prepared, [*notes, *terminal.warnings]
@@ -373,7 +373,7 @@ def _prepared_with_notes(
 
 def _target_phrase(targets: Sequence[str]) -> str:
     """Return a phrase such as " of Wall* and Roof", or an empty string without targets."""
-    return f" of {joined(targets)}" if targets else ""
+    return f" of {join_names(targets)}" if targets else ""
 
 
 def _target_notes(plan: StationPlan, prepared: PreparedScenario) -> Iterator[str]:
@@ -406,7 +406,7 @@ def _unreachable_notes(
         more = len(few) - _SHOWN_OBJECTS
         shown = few if more <= 0 else [*few[:_SHOWN_OBJECTS], f"little of {more:,} others"]
         yield (
-            f"Only {joined(shown)} {'is' if len(few) == 1 else 'are'} reachable from the "
+            f"Only {join_names(shown)} {'is' if len(few) == 1 else 'are'} reachable from the "
             f"{positions}, and the coverage does not count the rest. The rest is hidden, out of "
             "range or outside the field of view, or its angle of incidence exceeds `--slant`"
         )

@@ -100,7 +100,7 @@ class KITTI(MultiFileFormat):
         folder = self.sequences[sweeps.sensor[number]]
         name = f"{sweeps.numbers[number]:06}"
         rows = np.empty((len(points), 4), "<f4")
-        rows[:, :3] = sweeps.compensated(number, points)
+        rows[:, :3] = sweeps.compensate_motion(number, points)
         rows[:, 3] = kitti_intensity(points)
         labels = (points["object"].astype("<u4") + 1) << 16 | points["class"]
         files: dict[str, FileContent] = {

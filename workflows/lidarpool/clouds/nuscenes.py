@@ -103,7 +103,7 @@ class NuScenes(MultiFileFormat):
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, FileContent], Boxes]:
         """Return the point file and the label file of a sweep, and its boxes."""
-        inside = self.sweeps.compensated(number, points)
+        inside = self.sweeps.compensate_motion(number, points)
         intensity = np.clip(points["intensity"], 0, 1) * 255
         rows = np.empty((len(points), 5), "<f4")
         rows[:, :3] = inside

@@ -194,7 +194,7 @@ class SweepSequence:
             stamp_ns=self.start_ns + sweeps.stamp_ns(sweep),
             topic=points_topic(sweeps.sensors[sensor], self._frames[sensor]),
             frame=self._frames[sensor],
-            positions=sweeps.compensated(sweep, points).astype(np.float32),
+            positions=sweeps.compensate_motion(sweep, points).astype(np.float32),
             columns=viewer_columns(sweeps.columns_compensated(sweep, points)),
             transforms=self._transforms(sweep),
             boxes=ActorBoxes.from_points(sweeps, sweep, points) if sweeps.actors else None,

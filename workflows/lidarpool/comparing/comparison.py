@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 
-from lidarsim.errors import explained
+from lidarsim.errors import explain_os_errors
 from lidarsim.numerics.arrays import AnyArray, Floats
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.words import plural
@@ -77,7 +77,9 @@ class Comparison:
         path = Path(folder)
         with (
             result_folder(path),
-            explained(f"The comparison cannot be written to {path}", "free some disk space"),
+            explain_os_errors(
+                f"The comparison cannot be written to {path}", "free some disk space"
+            ),
             staging(path) as staged,
         ):
             pages = {"distances": draw_distances(self), "above": draw_above(self)}

@@ -29,11 +29,11 @@ from typing import IO, Any
 import numpy as np
 
 from lidarsim.columns.cloud import Cloud, CloudLike
-from lidarsim.errors import LidarError, as_sentence, explained
+from lidarsim.errors import LidarError, as_sentence, explain_os_errors
 from lidarsim.io.input_files import open_input
 from lidarsim.io.named_files import is_plain
 from lidarsim.io.storage import Storage
-from lidarsim.words import joined, printable
+from lidarsim.words import join_names, printable
 
 Value = bool | int | float | str
 
@@ -229,7 +229,7 @@ def write_table(
     LidarError
         If a row has a value that is not listed in `names`, or if the table cannot be written.
     """
-    with explained(
+    with explain_os_errors(
         f"The job table cannot be written to {storage}",
         "free some disk space, or check the permissions of the folder",
     ):
@@ -262,7 +262,7 @@ def read_table(storage: Storage, checksum: Sequence[int] | None = None) -> Itera
         numbers do not increase, or if a row does not match the header.
     """
     with ExitStack() as stack:
-        with explained(f"{storage.path(TABLE_FILE)} cannot be read", WRITE_AGAIN):
+        with explain_os_errors(f"{storage.path(TABLE_FILE)} cannot be read", WRITE_AGAIN):
             if storage.is_local:
                 path = storage.local(TABLE_FILE)
             else:
@@ -321,7 +321,7 @@ def _columns(
         if unknown := [name for name in row.values if name not in kinds]:
             raise LidarError(
                 f"Job {row.name} has a value for {unknown[0]!r}, which is not a varied "
-                f"quantity. The varied quantities are {joined(names) or 'none'}."
+                f"quantity. The varied quantities are {join_names(names) or 'none'}."
             )
         classes.update(row.classes)
         for name, value in row.values.items():

@@ -7,7 +7,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Any
 
-from lidarsim.words import rounded
+from lidarsim.words import format_rounded
 
 from ..datasets.job_table import JobRow, Value
 
@@ -85,5 +85,5 @@ class RecentJobs:
     def _format_values(self, values: Mapping[str, Value | None]) -> list[str]:
         """Format values in the order of the table columns. Missing values are empty strings."""
         shown = ("" if (value := values.get(name)) is None else value for name in self._names)
-        words = (rounded(value, 4) if isinstance(value, float) else value for value in shown)
+        words = (format_rounded(value, 4) if isinstance(value, float) else value for value in shown)
         return [str(value).lower() if isinstance(value, bool) else str(value) for value in words]

@@ -10,11 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import Self
 
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.packets.encoders import PacketEncoder
 from lidarsim.packets.send import LOOPBACK, ReceiverAddress, Sender, check_reachable
 from lidarsim.packets.service import Destination, Service
-from lidarsim.words import did_you_mean, joined
+from lidarsim.words import did_you_mean, join_names
 
 # Returns the interface of a sensor (see `PacketEncoder.service`).
 MakeService = Callable[[str, Destination, Callable[[Destination], None]], Service | None]
@@ -147,7 +147,7 @@ def _parse_addresses(
         if separator and name not in names:
             raise LidarError(
                 f"{option} {text} refers to the sensor {name!r}, which does not "
-                f"exist.{did_you_mean(name, names)} The sensors are {joined(names)}."
+                f"exist.{did_you_mean(name, names)} The sensors are {join_names(names)}."
             )
         parsed = ReceiverAddress.parse(address)
         for sensor in [name] if separator else names:
@@ -227,7 +227,7 @@ class Transmitter:
         """
         file = self._lateness_file
         if file is not None:
-            with explained(f"{file} cannot be written"):
+            with explain_os_errors(f"{file} cannot be written"):
                 text = json.dumps(self.sender.lateness.to_json(), indent=1) + "\n"
                 file.write_text(text, encoding="utf-8")
 

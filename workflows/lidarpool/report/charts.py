@@ -14,7 +14,7 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import TABLE, Z, names_by_value
 from lidarsim.numerics.arrays import Bools, Floats, Indices
 from lidarsim.numerics.even_samples import even_indices
-from lidarsim.words import plural, rounded, shorten_name
+from lidarsim.words import format_rounded, plural, shorten_name
 from lidarview.render import theme
 from lidarview.render.coloring import make_coloring
 from lidarview.render.picture_page import FONT, Page, label_logarithms
@@ -419,7 +419,8 @@ def draw_sweep(sweep: Sweep, names: Mapping[int, str]) -> Page:
     classes = None if sweep.classes is None else sweep.classes[rows]
     known = [(name, value) for name, value in sweep.values.items() if value is not None]
     values = [
-        f"{name} {rounded(value, 4) if isinstance(value, float) else shorten_name(str(value))}"
+        f"{name} "
+        f"{format_rounded(value, 4) if isinstance(value, float) else shorten_name(str(value))}"
         for name, value in known[:MAX_VALUES]
     ]
     page.title(

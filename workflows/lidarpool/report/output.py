@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from lidarsim.columns.table import optional_columns
 from lidarsim.environment.interrupts import defer_interrupts
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage, flush
 from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.schema.vocabulary import PICTURES
@@ -172,7 +172,7 @@ class SurveyOutput:
             "Specify another folder with `--out`, or replace the result with `--overwrite` "
             "(`overwrite=True` in Python)."
         )
-        with explained(f"{target} cannot be read"):
+        with explain_os_errors(f"{target} cannot be read"):
             try:
                 entries = set(storage.entries())
             except NotADirectoryError:
@@ -298,7 +298,7 @@ class SurveyOutput:
         if workers is not None and isinstance(self.target, Storage):
             sent = [entry for entry in self.formats if entry.has_many_files]
         with (
-            explained(
+            explain_os_errors(
                 f"The result cannot be written to {self.target}",
                 "free some disk space, or specify another folder with `--out`",
             ),
@@ -369,7 +369,7 @@ def _write_cloud(
 
     Returns the statistics of the cloud.
     """
-    with explained(f"{path} cannot be written"):
+    with explain_os_errors(f"{path} cannot be written"):
         counts = None if growing is None else growing.finish(path, points)
         return counts or write_cloud(path, points, sweeps, result.scene)
 
@@ -406,13 +406,13 @@ def _points_with_progress(result: RunResult, file: str, show: WritingProgress) -
     count = len(result.points)
     read_count = 0
 
-    def tell(increment: int) -> None:
+    def report(increment: int) -> None:
         nonlocal read_count
         read_count = min(read_count + increment, count)  # points may be read twice
         show(file, read_count, count, "points")
 
-    tell(0)
-    return replace(result.points, report=tell)
+    report(0)
+    return replace(result.points, report=report)
 
 
 def _write_sweeps(staged: Path, result: RunResult, sweeps: Sweeps) -> Sweeps:

@@ -189,7 +189,7 @@ class Screen:
         self._on_progress = on_progress
         self.warnings: list[str] = []
 
-    def tell(self, words: str) -> None:
+    def report(self, words: str) -> None:
         """Log a message for the user."""
         logger.info(words)
 

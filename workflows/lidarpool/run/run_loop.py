@@ -18,7 +18,7 @@ from typing import Any
 
 from lidarsim.errors import LidarError
 from lidarsim.simulator.memory import MB, scans_that_fit
-from lidarsim.words import listed, plural
+from lidarsim.words import list_names, plural
 
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
@@ -139,7 +139,7 @@ class RunLoop:
         if self._writer is not None and (lost := sorted(pipeline.dispatcher.lost_workers)):
             self._store.notes.append(
                 f"{plural(len(lost), 'worker')} died, left or stopped responding "
-                f"({listed(lost)}). Batches that were cast or sent again: {replayed:,}"
+                f"({list_names(lost)}). Batches that were cast or sent again: {replayed:,}"
             )
         if self._writer is not None and self._writer.hidden:
             storage = self._writer.dataset.storage

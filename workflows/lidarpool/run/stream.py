@@ -90,7 +90,7 @@ class SweepStream:
         screen = Screen()
         if options.starts_workers:
             check_backend_here(options.backend)
-        waiting = WaitTimer(options.startup_timeout_s, screen.tell)
+        waiting = WaitTimer(options.startup_timeout_s, screen.report)
         with open_client(options, {GPU: 1}, waiting, screen) as client:
             try:
                 with closing(_Casting(self, client, waiting)) as casting:

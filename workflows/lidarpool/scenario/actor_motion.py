@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BeforeValidator, Strict, model_validator
 
 from lidarscenes.files.formats import ROBOTS
-from lidarsim.errors import LidarError, prefixed
+from lidarsim.errors import LidarError, prefix_errors
 from lidarsim.io.time_units import TimeUnit, seconds_of
 from lidarsim.motion.rotations import quaternions_of, rotations_of
 from lidarsim.motion.trajectory import CLOCK_S, Beyond, InstrumentPose, Pose, Track
@@ -453,7 +453,7 @@ class ActorSection(DeformingSection):
         if self.trajectory is None:
             assert platform_track is not None, "guaranteed by the validation of the scenario"
             return platform_track
-        with prefixed(f"actor {self.name!r}"):
+        with prefix_errors(f"actor {self.name!r}"):
             return self.trajectory.track(
                 path, support, start_s, name=self.name, without_angles=without_angles
             )

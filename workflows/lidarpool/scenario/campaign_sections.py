@@ -45,7 +45,7 @@ from lidarsim.schema.declared import (
     UnitShare,
     about,
     accept_short_form,
-    allowed,
+    describe_allowed,
     is_text,
     not_allowed_error,
     require_one_of,
@@ -53,7 +53,7 @@ from lidarsim.schema.declared import (
 from lidarsim.schema.error_sentences import convert_validation_errors
 from lidarsim.schema.section_fields import sections_in
 from lidarsim.schema.value_texts import one_line
-from lidarsim.words import did_you_mean_each, format_yaml_list, joined, printable
+from lidarsim.words import did_you_mean_each, format_yaml_list, join_names, printable
 
 from ..clouds.format_table import DATA_SETS, LAYOUTS
 from ..clouds.writing import ExportSpec
@@ -203,7 +203,7 @@ Options = Annotated[
     Annotated[Several[Any], Field(min_length=1)]
     | Annotated[dict[Text, Any], Field(min_length=1)]
     | None,
-    allowed("a list of values, or a mapping of names to values"),
+    describe_allowed("a list of values, or a mapping of names to values"),
 ]
 Weight = Annotated[float, Field(ge=0, le=1e9)]
 
@@ -638,7 +638,7 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
     rows = []
     for line, cells in table.rows:
         source = f"{path}, line {line}"
-        with mistakes.noted(), convert_validation_errors(model, source):
+        with mistakes.collect(), convert_validation_errors(model, source):
             if len(cells) > len(table.header):
                 raise LidarError(
                     f"{source}: The line has {len(cells)} cells, but the header has "
@@ -646,7 +646,7 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
                 )
             values = [cell for index, cell in enumerate(cells) if index not in ignored]
             rows.append(_validate_row(adapter, dict(zip(names, values, strict=False))))
-    mistakes.tell()
+    mistakes.raise_if_any()
     return rows
 
 
@@ -687,7 +687,7 @@ def _check_columns(names: Sequence[str], model: Any) -> None:
     if unknown:
         noun = "columns" if unknown[1:] else "column"
         pronoun = "them" if unknown[1:] else "it"
-        shown = joined([printable(name) for name in unknown])
+        shown = join_names([printable(name) for name in unknown])
         raise ValueError(
             f"it contains the unknown {noun} {shown}.{did_you_mean_each(unknown, fields)} Rename "
             f"{pronoun}, or set `ignore: {format_yaml_list(unknown)}`. The available columns are "

@@ -106,7 +106,7 @@ class _ExternalScannerView(ScannerView):
     def __init__(self, viewer: Viewer, scanner: Scanner) -> None:
         super().__init__(scanner)
         self._viewer = viewer
-        name = scanner.survey.carried[0].name
+        name = scanner.survey.mounted_sensors[0].name
         surroundings = Surroundings(
             Surface.from_scene(scanner.scene),
             start_ns=time.time_ns(),
@@ -169,7 +169,7 @@ class Rerun(_ExternalScannerView):
 def _sweep_for_viewers(scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> ShownSweep:
     """Return a sweep of a scanner, with frames and boxes, for viewers."""
     scene = scanner.scene
-    (mounted,) = scanner.survey.carried
+    (mounted,) = scanner.survey.mounted_sensors
     vehicle = pose_at(pose, time_ns)
     sensor = vehicle.compose(mounted.mount)
     positions = cloud.positions.astype(np.float64)

@@ -150,7 +150,7 @@ class StageNodes:
                 node[1] = self._mesh(prim)
         if prim.IsInstance():
             moves = not inherited.still and self._any_below(prim.GetPrototype(), _transform_varies)
-            instance = str(prim.GetPath()) if moves else self._looks.inherited(prim)
+            instance = str(prim.GetPath()) if moves else self._looks.inherited_material(prim)
             inherited = inherited._replace(instance=instance)
         for child in prim.GetFilteredChildren(Usd.TraverseInstanceProxies(_SHOWN)):
             self._add_child(node, child, inherited)
@@ -367,7 +367,7 @@ class MaterialReader:
         self._materials: dict[Any, tuple[int | None, list[str]]] = {}
         self._numbers_by_content: dict[str, int] = {}  # {description of a material: number}
 
-    def inherited(self, instance: Any) -> Any:
+    def inherited_material(self, instance: Any) -> Any:
         """Return the material and color that prims in an instance inherit, or None."""
         if not (self._masks or self._colors or self._names_materials):
             return None

@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.errors import LidarError, explained, unreadable
+from lidarsim.errors import LidarError, explain_os_errors, unreadable
 from lidarsim.io.input_files import read_input
 from lidarsim.scene.files.scene_graph import MeshFileError, ReadOptions
 from lidarsim.scene.object_names import unique_names
@@ -121,7 +121,7 @@ def _loaded(world: Path, assets: Sequence[Path]) -> World:
 
     Raises LidarError if the file cannot be read.
     """
-    with explained("it cannot be read"):
+    with explain_os_errors("it cannot be read"):
         data = read_input(world)
     try:
         return load_world(data, world, _folders(world, assets))

@@ -46,7 +46,7 @@ def _sizes(shape: Element, name: str, count: int, default: str = "") -> Floats:
 def _scaled(mesh: SceneMesh, factors: Sequence[float] | Floats) -> SceneMesh | None:
     """Return a mesh scaled along the axes, or None if a factor is zero."""
     scale = np.asarray(factors, np.float64)
-    return mesh.moved(mesh.name, np.diag(scale), np.zeros(3)) if scale.all() else None
+    return mesh.affine_transform(mesh.name, np.diag(scale), np.zeros(3)) if scale.all() else None
 
 
 def _box(shape: Element) -> SceneMesh | None:

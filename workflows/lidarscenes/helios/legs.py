@@ -15,13 +15,13 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.errors import LidarError, prefixed
+from lidarsim.errors import LidarError, prefix_errors
 from lidarsim.io.time_units import seconds_of
 from lidarsim.motion.rotations import quaternions_of
 from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.transform import rotation_about
 
-from .files import Assets, read_file, read_flag, read_number, read_vector, rounded
+from .files import Assets, read_file, read_flag, read_number, read_vector, round_values
 
 _SPEED = 70.0  # default speed in m/s
 _BETWEEN_S = 0.001  # time in which the platform turns on the spot or moves to the next leg
@@ -73,7 +73,7 @@ class HeliosTrajectory:
         if self.rows.shape[1] == 5:
             names = ("time_s", "position", "yaw_deg")
             rows = ((r[0], r[1:4], r[4]) for r in self.rows)
-            points = [dict(zip(names, map(rounded, row), strict=True)) for row in rows]
+            points = [dict(zip(names, map(round_values, row), strict=True)) for row in rows]
             return {"points": points}, {}
         text = io.StringIO()
         np.savetxt(text, self.rows, "%.9g")
@@ -89,7 +89,7 @@ def read_legs(
     """
     legs = []
     for index, element in enumerate(survey.findall("leg")):
-        with prefixed(f"leg {index}"):
+        with prefix_errors(f"leg {index}"):
             platform = assets.read_settings(element.find("platformSettings"), home)
             scanner = assets.read_settings(element.find("scannerSettings"), home)
             position = read_vector(platform)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarsim.errors import LidarError, explained, unreadable
+from lidarsim.errors import LidarError, explain_os_errors, unreadable
 from lidarsim.io.input_files import read_input
 from lidarsim.numerics.arrays import Floats
 from lidarsim.numerics.elementary import arctan2, cos, sin
@@ -26,7 +26,7 @@ from lidarsim.scene.transform import affine
 from lidarsim.words import printable
 from lidarsim.worlds.mujoco_bodies import BodySelection, names_of, visible_geoms
 
-from ..writers.lidar_scenario import Lidar, rounded, write_scenario
+from ..writers.lidar_scenario import Lidar, round_value, write_scenario
 from .model_file import MujocoOptions, body_matrix, body_object_names, load_model
 
 _RANGEFINDER = 7  # mjSENS_RANGEFINDER in sensor_type
@@ -108,7 +108,7 @@ def _loaded(path: Path, assets: Sequence[Path]) -> Any:
 
     Raises LidarError if the file cannot be read.
     """
-    with explained("it cannot be read"):
+    with explain_os_errors("it cannot be read"):
         data = read_input(path)
     try:
         return load_model(data, path, _options(path, assets))
@@ -165,16 +165,18 @@ def _lidar(model: Any, name: str, group: _Group, sites: list[int]) -> Lidar:
     site_names = names_of(model, "site")
     channels = ", ".join(printable(site_names[sites[row]]) for row in order) if sites else ""
     if origins.any():
-        beams["origin_m"] = [[rounded(value) for value in origin] for origin in origins.tolist()]
+        beams["origin_m"] = [
+            [round_value(value) for value in origin] for origin in origins.tolist()
+        ]
     data: dict[str, Any] = {
         "name": f"{name} of MuJoCo",
         "sources": {"channels": f"rangefinders of {channels or 'the pixels, lowest first'}"},
-        "rate_hz": rounded(group.rate_hz),
+        "rate_hz": round_value(group.rate_hz),
         "firings_per_turn": 1,
         "beams": beams,
     }
     if group.noise_m > 0:
-        data["performance"] = {"range_m": rounded(group.noise_m)}
+        data["performance"] = {"range_m": round_value(group.noise_m)}
     root = int(model.body_rootid[group.body])
     return Lidar(
         name=name,
@@ -231,7 +233,7 @@ def _pixel_directions(model: Any, camera: int) -> Floats:
 
 def _degrees(angles: Floats) -> list[float]:
     """Return angles in degrees, rounded for a file."""
-    return [rounded(angle) for angle in np.degrees(angles).tolist()]
+    return [round_value(angle) for angle in np.degrees(angles).tolist()]
 
 
 def _unusable(model: Any, camera: int | None) -> str:

@@ -267,7 +267,7 @@ def place_stations(
         if surface.is_measured:
             counts = np.maximum(next(surface_counts), 1)
             columns = len(surface.points) + 2
-            allowance.take((int(counts.sum()) + 2 * len(counts)) * columns * bytes_per_point)
+            allowance.reserve((int(counts.sum()) + 2 * len(counts)) * columns * bytes_per_point)
         placed.append(
             surface.intervals.place(np.ceil(counts).astype(np.int64), surface.is_step(sag_m))
         )

@@ -186,7 +186,7 @@ class PlanTable:
         """Add a clothoid in pieces that turn by at most `_MAX_TURN`."""
         last = clothoid.curvature + clothoid.growth * length
         turn = max(abs(clothoid.curvature), abs(last)) * length
-        self._allowance.take(int(min(turn / _MAX_TURN, 1e15)) * 500)
+        self._allowance.reserve(int(min(turn / _MAX_TURN, 1e15)) * 500)
         count = max(1, ceil(turn / _MAX_TURN))
         piece = clothoid
         for k in range(count):

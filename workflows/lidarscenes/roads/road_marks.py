@@ -279,7 +279,7 @@ def _dashes(
     if space <= 0 or length <= 0:
         return np.array([start]), np.array([stop])
     count = (stop - start) / (length + space)
-    allowance.take(int(min(count, 1e15)) * _BYTES_PER_DASH)
+    allowance.reserve(int(min(count, 1e15)) * _BYTES_PER_DASH)
     starts = start + (length + space) * np.arange(int(count) + 1)
     starts = starts[starts < stop]
     return np.asarray(starts, np.float64), np.asarray(np.minimum(starts + length, stop))

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 
-from ..errors import LidarError, message_of, prefixed, unreadable
+from ..errors import LidarError, message_of, prefix_errors, unreadable
 
 CHECKOUT = "a checkout of lidarpool (docs/install.md#extras)"
 _PARTS = ("./kernels", "./scheduler", "./workflows/lidarsim", ".")  # distributions of a checkout
@@ -54,7 +54,7 @@ def reading(name: str) -> Iterator[None]:
     The message is a single line that starts with the name of the file.
     """
     try:
-        with prefixed(name):
+        with prefix_errors(name):
             yield
     except LidarError:
         raise

@@ -73,7 +73,7 @@ least 2.70 GiB, and the limit is 256.00 MiB. Export it again.
         """Return True if `count` more bytes are within the limit."""
         return self.used_bytes + count <= self.limit
 
-    def take(self, count: int) -> None:
+    def reserve(self, count: int) -> None:
         """Count bytes toward the limit before they are allocated.
 
         Raises

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from ..numerics.arrays import Floats
 from ..numerics.elementary import arccos, arcsin, cos, interp, log, sin, sin_cos
-from ..schema.declared import allowed
+from ..schema.declared import describe_allowed
 
 LeafAngles = Literal[
     "spherical", "planophile", "erectophile", "plagiophile", "extremophile", "uniform"
@@ -26,7 +26,9 @@ _ANGLES = 500  # number of leaf angles in the integrals
 
 LeafAngle = Annotated[
     LeafAngles | Annotated[float, Field(ge=0.05, le=20)],
-    allowed(f"one of {', '.join(NAMES)}, or the axis ratio of an ellipsoid from 0.05 to 20"),
+    describe_allowed(
+        f"one of {', '.join(NAMES)}, or the axis ratio of an ellipsoid from 0.05 to 20"
+    ),
 ]
 
 

@@ -76,7 +76,7 @@ class StraightLines(NamedTuple):
         return np.where(total > _STEP_S, total, 0.0)
 
     @classmethod
-    def find(cls, times_s: Floats, positions: Floats) -> StraightLines:
+    def from_trajectory(cls, times_s: Floats, positions: Floats) -> StraightLines:
         """Find the lines of a trajectory that last at least a second.
 
         Only the horizontal direction of travel is considered.

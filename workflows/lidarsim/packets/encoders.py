@@ -41,7 +41,7 @@ class Datagrams:
     def __len__(self) -> int:
         return len(self.payloads)
 
-    def without(self, dropped: Bools) -> Datagrams:
+    def drop(self, dropped: Bools) -> Datagrams:
         """Return the datagrams that are not lost.
 
         `dropped` (n,) is True for lost datagrams.
@@ -297,7 +297,7 @@ def _encoder_of_plugin(plugin: Plugin) -> type[PacketEncoder]:
     """Return the encoder class of a plug-in, or raise LidarError if it is no encoder class."""
     encoder = plugin.load(type)
     if not issubclass(encoder, PacketEncoder):
-        raise plugin.lacks("a subclass of lidarsim.packets.encoders.PacketEncoder")
+        raise plugin.missing_field_error("a subclass of lidarsim.packets.encoders.PacketEncoder")
     return encoder
 
 

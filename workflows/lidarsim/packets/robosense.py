@@ -193,7 +193,7 @@ class RobosenseEncoder(PacketEncoder):
             return []
         msop = self._msop(filling)
         dropped = np.all(filling.dropped.reshape(-1, self._firings), axis=1)
-        return [self._difop(filling, int(msop.due_ns[-1])), msop.without(np.asarray(dropped))]
+        return [self._difop(filling, int(msop.due_ns[-1])), msop.drop(np.asarray(dropped))]
 
     def finish(self) -> list[Datagrams]:
         """Return no packets, because the sensor sends only packets whose blocks are full."""
@@ -237,8 +237,8 @@ class RobosenseEncoder(PacketEncoder):
         if len(shots.range_m) == 1:
             return np.concatenate([first, first])
         signal = shots.columns["signal"]
-        first[0] = shots.returned[1] & (signal[1] > signal[0])
-        return np.concatenate([first, shots.returned[1:2] ^ first])
+        first[0] = shots.return_mask[1] & (signal[1] > signal[0])
+        return np.concatenate([first, shots.return_mask[1:2] ^ first])
 
     def _difop(self, shots: Shots, until_ns: int) -> Datagrams:
         """Return the device data due up to a time, starting with the first shots."""

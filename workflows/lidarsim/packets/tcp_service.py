@@ -55,7 +55,7 @@ class TcpService(Service):
         """Answer the requests on a connection and close the connection."""
 
     @contextmanager
-    def counted(self) -> Iterator[Callable[[], None]]:
+    def register_connection(self) -> Iterator[Callable[[], None]]:
         """Register the connection of the current task, and close the oldest if there are too many.
 
         Yields a function that marks the connection as the newest.

@@ -99,7 +99,7 @@ class Animation:
         return (1 - share) * start + share * stop, stop - start
 
     @cached_property
-    def pictured(self) -> Animation:
+    def for_pictures(self) -> Animation:
         """Animation for pictures, which has fewer keyframes if the mesh has many vertices.
 
         Coordinates are rounded to 1/1024 m.
@@ -116,7 +116,7 @@ class Animation:
         """
         return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
-    def moved(self, linear: Floats, offset: Floats) -> Animation:
+    def affine_transform(self, linear: Floats, offset: Floats) -> Animation:
         """Return the animation transformed by p -> linear @ p + offset."""
         points = rotate(self.vertices.reshape(-1, 3), linear) + offset
         return replace(self, vertices=points.reshape(self.vertices.shape))

@@ -210,8 +210,8 @@ class Lookup:
                 light = LINEAR[tints[rows][tinted[rows]]]
                 lights.append(_fit_planes(block[tinted[rows]], light))
             start += len(block)
-        self._texture = _Planes.joined(textured, textures)
-        self._light = _Planes.joined(tinted, lights)
+        self._texture = _Planes.concatenate(textured, textures)
+        self._light = _Planes.concatenate(tinted, lights)
 
     def colors_at(self, face_indices: Integers, points: Floats) -> UInts32:
         """Return the packed colors of points on given faces.
@@ -244,7 +244,7 @@ class _Planes(NamedTuple):
     everywhere: bool  # whether all faces have values
 
     @classmethod
-    def joined(cls, has_values: Bools, blocks: list[Floats]) -> _Planes | None:
+    def concatenate(cls, has_values: Bools, blocks: list[Floats]) -> _Planes | None:
         """Concatenate blocks of slopes for the faces that have values.
 
         Blocks have shape (k, 4 w). The result is None if no face has values.

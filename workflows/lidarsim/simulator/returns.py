@@ -90,7 +90,7 @@ class PulseReturns(NamedTuple):
     @property
     def height(self) -> Floats:
         """Peak heights of the returns in the waveform, or their energies without one."""
-        return required(self.energy if self.amplitude is None else self.amplitude)
+        return require_column(self.energy if self.amplitude is None else self.amplitude)
 
 
 # Surface normals of hits, and directions of the sub-rays at the sensor, each of shape (n, 3).
@@ -98,7 +98,7 @@ class PulseReturns(NamedTuple):
 Planes = tuple[Floats, Floats]
 
 
-def required(column: T | None) -> T:
+def require_column(column: T | None) -> T:
     """Return a column that an earlier step has written and that is therefore not None."""
     assert column is not None
     return column

@@ -53,7 +53,7 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
     hit_count = 0
     points = 0
     for batch in _batches(Rig(scene, sampled, backend), firsts, stops):
-        every = getattr(sampled.carried[batch.specs[0].sensor].sensor, "every", 1)
+        every = getattr(sampled.mounted_sensors[batch.specs[0].sensor].sensor, "every", 1)
         rays = sum(spec.ray_count for spec in batch.specs)
         cast_rays = cast_rays + rays
         sampled_rays = sampled_rays + rays * every
@@ -111,7 +111,7 @@ def _with_few_rays(survey: Survey, every: int) -> list[Mounted]:
     """Return the sensors of a survey, each replaced by a sample of one in `every` of its rays."""
     return [
         replace(mounted, sensor=_FewRays.from_sensor(mounted.sensor, every), steps=steps)
-        for mounted, steps in zip(survey.carried, survey.steps_each, strict=True)
+        for mounted, steps in zip(survey.mounted_sensors, survey.steps_each, strict=True)
     ]
 
 

@@ -260,7 +260,7 @@ def take_shot(
     positions = np.concatenate([sensors, *paths])
     caption = caption or plural(len(sensors), "sensor position")
     opened = _open_scene(scene, positions, trajectories, backend)
-    caption += opened.remark
+    caption += opened.part_caption
     stage = _stage(opened.bounds, positions, scene.origin)
     viewpoint = _choose_viewpoint(opened.surface, stage, positions, size, bool(paths or actors))
     camera = viewpoint.camera
@@ -300,7 +300,7 @@ class _OpenScene(NamedTuple):
     cut_height: float | None  # None if the part is not cut open
 
     @property
-    def remark(self) -> str:
+    def part_caption(self) -> str:
         """Remark on the displayed part for a caption, or an empty string for the whole scene."""
         if self.box is None:
             return ""

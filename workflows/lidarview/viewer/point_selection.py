@@ -335,7 +335,7 @@ class PointFinder:
             (-(-len(points) // BLOCK_ROWS), 2, 3), np.nan
         )  # NaN for unread blocks
 
-    def find(
+    def find_points(
         self,
         max_points: int,
         point_filter: PointFilter = PointFilter(),
@@ -385,7 +385,7 @@ class PointFinder:
             return rows[point_filter.mask(self.points, rows)], total
         if camera is None:
             return self._search(ranges, max_points, point_filter, is_disconnected)
-        sample, count = self.find(_SAMPLE_POINTS, point_filter, scans, None, is_disconnected)
+        sample, count = self.find_points(_SAMPLE_POINTS, point_filter, scans, None, is_disconnected)
         tiles = camera.tiles(self._local(sample))
         counts = np.bincount(tiles[tiles >= 0], minlength=TILES) * (count / max(len(sample), 1))
         if counts.sum() == 0:  # the sample may have missed rare points
@@ -416,7 +416,7 @@ class PointFinder:
 
         `ranges` are ranges of rows, start and stop. `shares` (tiles,) are the fractions of points
         to keep in each tile of the camera's image. The other parameters and the results are the
-        same as in `find`.
+        same as in `find_points`.
         """
         random = np.random.default_rng(0)
         thin = 1.0

@@ -20,7 +20,7 @@ import click
 import numpy as np
 from PIL import Image
 
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.numerics.arrays import AnyArray, Floats, Ints
@@ -94,7 +94,7 @@ def export_view(
             raise LidarError(
                 f"{file} cannot be written, because the folder {file.parent} does not exist."
             )
-    if not len(PointFinder(view.points, view.origin).find(1000)[0]):
+    if not len(PointFinder(view.points, view.origin).find_points(1000)[0]):
         raise LidarError("There are no points to show, because no ray hit a surface.")
     if view.note:
         click.echo(f"note: {view.note}", err=True)
@@ -106,7 +106,7 @@ def export_view(
             content = (
                 render_page(view, show) if file == page else render_film(view, file.suffix, show)
             )
-        with explained(f"{file} cannot be written", "choose another path"):
+        with explain_os_errors(f"{file} cannot be written", "choose another path"):
             Storage.at(file.parent, durable=False).write(file.name, content)
         click.echo(click.format_filename(file))
 
@@ -162,7 +162,7 @@ class _FilmSource:
 
     def positions(self, max_points: int, scans: ScanRanges | None = None) -> Floats:
         """Return the local positions of a sample of the points below `top`."""
-        rows, _ = self.finder.find(max_points, scans=scans)
+        rows, _ = self.finder.find_points(max_points, scans=scans)
         local = read_positions(self.view.points, rows) - self.view.origin
         return local[local[:, 2] <= self.top]
 
@@ -366,7 +366,7 @@ def _packed(header: dict[str, Any], arrays: dict[str, AnyArray]) -> str:
 def _thinned(view: View, max_points: int) -> Answer:
     """Sample points, fewer of them where they are dense, and pack all their columns."""
     points = view.shown_points
-    rows, _ = PointFinder(points, view.origin).find(_SAMPLE_POINTS)
+    rows, _ = PointFinder(points, view.origin).find_points(_SAMPLE_POINTS)
     world = read_positions(points, rows)
     cell_m = max(float(np.linalg.norm(np.ptp(world, axis=0))) / _CELLS, 1e-9)
     cells = ((world - world.min(axis=0)) / cell_m).astype(np.int64) @ [1 << 20, 1 << 10, 1]

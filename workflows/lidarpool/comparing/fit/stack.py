@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from lidarsim.columns.sweep import Sweep
-from lidarsim.errors import LidarError, prefixed
+from lidarsim.errors import LidarError, prefix_errors
 from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
 from lidarsim.numerics.even_samples import even_indices
-from lidarsim.words import rounded
+from lidarsim.words import format_rounded
 
 from ...clouds.recording import Recording
 from ..compared_sweep import compared_sweep, rings_note
@@ -85,15 +85,15 @@ class SweepStack:
             )
         for index, number in enumerate(cells.numbers.tolist()):
             sweep = read(number)
-            with prefixed(recording.name):
+            with prefix_errors(recording.name):
                 cells.add_sweep(index, sweep)
         elevation_deg, values = cells.sorted_by_elevation()
         covered = covered_cells(np.isfinite(values[0]))
         has_return = np.isfinite(values[0]).any(axis=0)
         if (gaps := 1 - covered[:, has_return].mean()) > 0.5 / covered.size:
             notes.append(
-                f"{rounded(100 * gaps, 2)} % of the cells in the sweeps are gaps, which are runs "
-                "of cells without a return that are too long for individually lost pulses. "
+                f"{format_rounded(100 * gaps, 2)} % of the cells in the sweeps are gaps, which are "
+                "runs of cells without a return that are too long for individually lost pulses. "
                 "Possible causes are lost packets, truncated sweeps, and motion of the sensor or "
                 "of objects. Gaps are not counted as lost pulses"
             )
@@ -143,10 +143,10 @@ class _CommonCells:
         reference = max(map(read, range(min(3, recording.count))), key=len)
         if not len(reference):
             raise LidarError(f"{recording.name} contains no points, so there is nothing to fit.")
-        # This call determines the rings. It stays outside `prefixed`, because errors that occur
-        # when a sweep is read already name the recording.
+        # This call determines the rings. It stays outside `prefix_errors`, because errors that
+        # occur when a sweep is read already name the recording.
         ring_notes = rings_note(recording, reference)
-        with prefixed(recording.name):
+        with prefix_errors(recording.name):
             images = range_images(reference, reference, ("a sweep", "a sweep"))
         shape = len(images.rings), round(360 / images.step_deg)
         max_sweeps = max(MAX_RETURNS // (shape[0] * shape[1]), 2)

@@ -23,7 +23,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 from PIL import Image
 
-from lidarsim.errors import explained
+from lidarsim.errors import explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.media.weather import Weather
 from lidarsim.numerics.arrays import Ints
@@ -85,7 +85,7 @@ def write_page(
     OSError
         If the file cannot be written.
     """
-    has_model = any(mounted.sensor.name for mounted in result.survey.carried)
+    has_model = any(mounted.sensor.name for mounted in result.survey.mounted_sensors)
     marks = _station_marks(result, cloud)
     text = render_template(
         "page.html",
@@ -114,7 +114,7 @@ def insert_picture(page: Path, name: str, svg: str) -> None:
         If the page cannot be written.
     """
     pattern = re.compile(rf'(<figure data-picture="{name}").*?(?=<figcaption>)', re.DOTALL)
-    with explained(f"{page} cannot be written"):
+    with explain_os_errors(f"{page} cannot be written"):
         text = pattern.sub(lambda match: f"{match[1]}>{svg}", page.read_text(encoding="utf-8"))
         Storage.at(page.parent, durable=False).write(page.name, text.encode())
 

@@ -85,7 +85,7 @@ class ClusterConnection:
         slots = slots_needed(options, planning=first.planning is not None, writing=writing)
         if options.cluster is not None:
             options.cluster.require(slots)
-        waiting = WaitTimer(options.startup_timeout_s, self.screen.tell)
+        waiting = WaitTimer(options.startup_timeout_s, self.screen.report)
         client = self._stack.enter_context(
             open_client(options, slots, waiting, self.screen, self._local)
         )
@@ -118,7 +118,7 @@ def open_client(
                 return nullcontext(own_client())
         return connect_client(options.scheduler, options.files, waiting)
     if options.cluster is not None:
-        started = start_client(options.cluster, screen.tell)
+        started = start_client(options.cluster, screen.report)
         return screen.starting(started, f"starting {options.cluster}")
     local = local or _start_local(options, required_slots)
     return screen.starting(local, "starting the workers", shares_terminal=True)
@@ -240,7 +240,9 @@ class Cluster:
 
     def watch(self, names: Sequence[str], lasting: Sequence[str] = ()) -> Watch:
         """Start watching the workers of partitions (see `Watch`)."""
-        return Watch(self.client, names, lasting, self.options.worker_timeout_s, self._screen.tell)
+        return Watch(
+            self.client, names, lasting, self.options.worker_timeout_s, self._screen.report
+        )
 
     def check(self, job: Job) -> None:
         """Raise JobError if the workers have too little memory for a job."""
@@ -267,7 +269,7 @@ class Cluster:
             yield
             return
         with suppress(PoolError):
-            self._screen.tell(f"partitions page: {self._workers.pool.page()}")
+            self._screen.report(f"partitions page: {self._workers.pool.page()}")
         try:
             yield
         finally:

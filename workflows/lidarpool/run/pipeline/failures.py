@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, contextmanager
 
 from distributed import Client, Future, KilledWorker
 
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
 from poolpart.task_context import WorkerLeavingError
 
@@ -56,7 +56,7 @@ def naming_scans(first: int, stop: int) -> Iterator[None]:
 def storing(storage: Storage) -> AbstractContextManager[None]:
     """Convert an OSError in the body to a LidarError with advice on the storage."""
     advice = "Free space there, or choose a different location with `--scratch-dir`"
-    return explained(f"The points cannot be stored in {storage.url}", advice)
+    return explain_os_errors(f"The points cannot be stored in {storage.url}", advice)
 
 
 def error_of(future: Future) -> BaseException | None:

@@ -14,11 +14,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.sensor import Sensor
 from lidarsim.simulator.casting.scene_caster import AUTO_ADVICE
-from lidarsim.words import rounded
+from lidarsim.words import format_rounded
 
 from ...columns.parts import deletable_files, mark_name, parse_part_name
 from ...datasets.job_table import JobRow
@@ -128,7 +128,7 @@ class RunStore:
         if location is None or self._remote:
             weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         advice = "Create its parent folder first, or choose a different folder"
-        with explained(f"The run folder {folder} cannot be created", advice):
+        with explain_os_errors(f"The run folder {folder} cannot be created", advice):
             folder.mkdir(exist_ok=True)
         self.in_flight: dict[int, StoredJob] = {}  # {number: job that has not ended}
         # Jobs in flight whose input hashes are stored, so that a later run can recognize them.
@@ -236,7 +236,7 @@ class RunStore:
     def _claim(self, resume: bool) -> None:
         """Find existing parts, check the earlier run, and write the mark file."""
         self.storage = replace(parts_of(self.location, self.db.meta["parts"]), durable=self.lasting)
-        with explained(f"{self.storage.url} cannot be listed"):
+        with explain_os_errors(f"{self.storage.url} cannot be listed"):
             self._sizes = self.storage.sizes()  # fails if the location is not accessible
         self._strays: dict[int, list[str]] = {}  # {job: names of existing parts}
         for name in self._sizes:
@@ -434,7 +434,7 @@ class RunStore:
             (mounted.name or "lidar", _describe_model(mounted.sensor))
             for row, stored in ended
             if row.done
-            for mounted in stored.job.survey.carried
+            for mounted in stored.job.survey.mounted_sensors
         )
         sensors = add_sensors(self.sensors, named)
         if sensors != self.sensors:
@@ -556,7 +556,7 @@ def add_sensors(sensors: Mapping[str, str], added: Iterable[tuple[str, str]]) ->
 
 
 def _describe_model(sensor: Sensor) -> str:
-    return f"{sensor.model}, {rounded(1e9 / sensor.revolution_start_ns(1))} Hz"
+    return f"{sensor.model}, {format_rounded(1e9 / sensor.revolution_start_ns(1))} Hz"
 
 
 def _hash_inputs(job: Job) -> str:
@@ -624,7 +624,7 @@ def _remove(location: Storage, part_storage: Storage, mark: str | None) -> None:
     If `mark` is None because the database cannot be read, the parts of all mark files in the parts
     folder are removed.
     """
-    with explained(f"The run in {location} cannot be removed"):
+    with explain_os_errors(f"The run in {location} cannot be removed"):
         names = deletable_files(part_storage, mark)  # fails if the folder is a symbolic link
         part_storage.remove(names, folder=True)
         location.remove([FILE, f"{FILE}-journal", OWNER], folder=True)

@@ -161,7 +161,7 @@ class StoredJob:
             spec = survey.scan(scan)
             yield ScanFrame(
                 scan=scan,
-                sensor=survey.carried[spec.sensor].name,
+                sensor=survey.mounted_sensors[spec.sensor].name,
                 rays=spec.ray_count,
                 hit_count=int(summary["hits"]),
                 count=int(summary["points"]),

@@ -119,7 +119,7 @@ class AreaOfUse:
         """Width in degrees of longitude."""
         return (self.east - self.west) % 360 or 360.0
 
-    def reaches(self, longitude: float, latitude: float, margin_deg: float = 0.0) -> bool:
+    def contains(self, longitude: float, latitude: float, margin_deg: float = 0.0) -> bool:
         """Return whether a location is inside the area or within `margin_deg` of it.
 
         The margin is an angular distance in degrees.
@@ -330,7 +330,7 @@ def missed_area(
     if area is None:
         return None
     place = longitude_latitude(crs, x, y)
-    is_near = place is not None and area.reaches(*place, margin_deg)
+    is_near = place is not None and area.contains(*place, margin_deg)
     return None if is_near else area
 
 
@@ -379,7 +379,7 @@ def zone_in_area(epsg: int, x: float, y: float) -> int | None:
     latitude = (area.south + area.north) / 2
     codes = {utm_code((at + 180) % 360 - 180, latitude) for at in longitudes}
     places = {code: longitude_latitude(crs_from_code(code), x, y) for code in codes - {epsg}}
-    fitting = [code for code, at in places.items() if at is not None and area.reaches(*at)]
+    fitting = [code for code, at in places.items() if at is not None and area.contains(*at)]
     return fitting[0] if len(fitting) == 1 else None
 
 

@@ -72,7 +72,7 @@ class GltfMaterials:
         if not self._allowance.fits(FACE_BYTES * len(faces)):
             raise MaskError("there are too many triangles")
         if "COLOR_0" in primitive["attributes"]:
-            light = self._file.normalized(self._attribute("COLOR_0", primitive, mesh))
+            light = self._file.normalize_integers(self._attribute("COLOR_0", primitive, mesh))
             check_corners(faces, len(light))
             if light.shape[1] < 3:
                 raise MaskError("its COLOR_0 is not red, green and blue")
@@ -190,7 +190,7 @@ class GltfMaterials:
             # then translates.
             angle = float(transform.get("rotation", 0))
             s, c = sin_cos_of(angle)
-            self._allowance.take(32 * len(uv))
+            self._allowance.reserve(32 * len(uv))
             uv = uv * np.array(transform.get("scale", (1, 1)), np.float64)
             uv = matmul(uv, [[c, -s], [s, c]]) + np.array(transform.get("offset", (0, 0)))
         return uv
@@ -206,7 +206,7 @@ class GltfMaterials:
         packed = primitive["extensions"][DRACO]["attributes"][name]
         rows = np.asarray(mesh.get_attribute_by_unique_id(packed)["data"])
         normal = self._file.part("accessors", accessor).get("normalized")
-        return self._file.normalized(rows) if normal else rows
+        return self._file.normalize_integers(rows) if normal else rows
 
 
 def _base_of(material: dict[str, Any]) -> tuple[dict[str, Any] | None, Sequence[float]]:

@@ -29,7 +29,7 @@ class OmittedPoints(NamedTuple):
     withheld: int = 0
     noise: int = 0
 
-    def note(self) -> str:
+    def omission_note(self) -> str:
         """Return a note that states the numbers, or an empty string if they are zero."""
         kinds = []
         if self.withheld:

@@ -15,7 +15,17 @@ from raybeam import Pattern
 
 from ...columns.table import CAUSES, COLORS
 from ...media.weather import FAINTEST
-from ...numerics.arrays import Bools, Bytes, Floats, Indices, Integers, Ints, Ints32, UInts32, owned
+from ...numerics.arrays import (
+    Bools,
+    Bytes,
+    Floats,
+    Indices,
+    Integers,
+    Ints,
+    Ints32,
+    UInts32,
+    to_writable,
+)
 from ...numerics.random_numbers import Purpose, raw
 from ...numerics.vectors import dot, rotate_into_frames
 from ...scene.colors import luminance
@@ -201,7 +211,7 @@ class CastStep(PulseStep):
         # Largest energy that any kind of surface returns from a distance of 10 m.
         self._brightest = float(table.relative_energy(np.arange(len(white)), white, white).max())
         shown = any(column.name in COLORS for column in survey.stored_columns)
-        self._colored = shown or surfaces.materials.textured
+        self._colored = shown or surfaces.materials.has_textures
         # Whether the origins of rays are needed in addition to their directions.
         self._needs_origins = (
             self._colored
@@ -559,7 +569,7 @@ class CastStep(PulseStep):
 
         materials = self.surfaces.at_wavelength(self._sensor_light.wavelength_nm)
         bright = None
-        if materials.textured and surface_hits.color is not None:
+        if materials.has_textures and surface_hits.color is not None:
             bright = luminance(surface_hits.color[row_indices])
         in_media = light.in_media
         drops_faint = light.mirrored is not None and not (
@@ -743,11 +753,11 @@ def _pattern_behind(
     from ..casting import surface_loops
 
     origins = np.empty((3, len(clear_m)))
-    directions = owned(outgoing.T)
+    directions = to_writable(outgoing.T)
     surface_loops.start_behind(
-        owned(light.origins.T),
-        owned(light.directions.T),
-        owned(step_m),
+        to_writable(light.origins.T),
+        to_writable(light.directions.T),
+        to_writable(step_m),
         clear_m,
         origins,
         directions,

@@ -18,7 +18,7 @@ LOSS = Purpose(5, "whether a return is lost")
 class DetectionStep(PulseStep):
     """Drops weak returns found in waveforms, and a random share of all returns (`Noise.dropout`).
 
-    Without waveforms, `SeparationStep` drops returns with the same function, `detected`.
+    Without waveforms, `SeparationStep` drops returns with the same function, `is_detected`.
     """
 
     role = Role.CHANGES
@@ -33,13 +33,13 @@ class DetectionStep(PulseStep):
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the detected returns."""
         scan, ray = batch.keys.scan_and_number(returns.ray)
-        detected_mask = detected(
+        detected_mask = is_detected(
             self.setup.noise, returns.height, scan, ray, number_within_ray(returns.ray)
         )
         return returns.take(detected_mask)
 
 
-def detected(
+def is_detected(
     noise: Noise, energy: Floats, scan: Integers, ray: Integers, number: Integers
 ) -> Bools:
     """Return whether returns with the given energies are detected.
@@ -68,7 +68,7 @@ def exceeds_threshold(
 ) -> Bools:
     """Return whether signals with noise exceed the threshold.
 
-    The arguments are the same as in `detected`, with a purpose for the random numbers.
+    The arguments are the same as in `is_detected`, with a purpose for the random numbers.
     """
     signal = THRESHOLD_SIGMAS * (energy / noise.threshold - 1)
     return np.asarray(signal + normal(noise.seed, purpose, scan, ray, number) > 0)

@@ -17,7 +17,7 @@ import numpy as np
 from ...columns.table import CAUSES
 from ...media.materials import MaterialTable
 from ...media.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles, particle_range
-from ...numerics.arrays import Bools, Floats, Indices, Ints, owned
+from ...numerics.arrays import Bools, Floats, Indices, Ints, to_writable
 from ...numerics.elementary import exp, expm1, geomspace, interp, log1p
 from ...numerics.elementary_scalars import exp_of
 from ...numerics.random_numbers import Purpose, named_seed, starts
@@ -283,7 +283,9 @@ def random_keys(seed: int, purposes: tuple[Purpose, ...], keys: Keys, first: int
     """Return the random number keys of beams from number `first` on, for compiled loops."""
     from .random_loops import RandomKeys
 
-    return RandomKeys(starts(seed, *purposes), keys.scan, owned(keys.scan_starts, np.int64), first)
+    return RandomKeys(
+        starts(seed, *purposes), keys.scan, to_writable(keys.scan_starts, np.int64), first
+    )
 
 
 def room_for_hits(size: int) -> SampledHits:
