@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from lidarpool.reconstruction.alignment import AlignedSweeps
-from lidarpool.reconstruction.building import NO_RETURN, colored, fit_sensor
+from lidarpool.reconstruction.building import NO_RETURN, color_by_reflectance, fit_sensor
 from lidarpool.reconstruction.lost_pulses import SensorCoverage
 from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
@@ -229,7 +229,7 @@ def meshes(
     dark = surface_map.surfels.dark
     lit = surface_map.surfels.select(~dark).mesh
     if reflectances is not None:
-        lit = colored(lit, replace(reflectances, surfels=reflectances.surfels[~dark]))
+        lit = color_by_reflectance(lit, replace(reflectances, surfels=reflectances.surfels[~dark]))
     corners = surface_map.surfels.mesh.vertices.reshape(-1, 4, 3)[dark]
     return lit, [surfel_mesh(NO_RETURN, corners)] if len(corners) else []
 

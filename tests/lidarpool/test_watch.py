@@ -81,7 +81,7 @@ def test_what_runs_already_goes_on_where_workers_are_paused(look):
 
 
 def test_a_partition_with_nothing_left_to_do_may_leave(look):
-    look.watching.forget(["OTHER"])
+    look.watching.remove_partitions(["OTHER"])
     look(61, ALL[0], ALL[2])
     assert look.told == []
     with pytest.raises(LidarError, match="'GPU' has had no workers for 60 s"):

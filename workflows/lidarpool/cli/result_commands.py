@@ -428,7 +428,7 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None
     comparison = compared(a, b, **settings)
     page = next(path for path in comparison.save(out) if path.suffix == ".html")
     lines = [repr(comparison), f"page     {click.format_filename(page)}"]
-    options.show(comparison.figures, lines, as_json)
+    options.print_results(comparison.figures, lines, as_json)
 
 
 @click.command()
@@ -478,4 +478,4 @@ def fit(
     keep_freed_memory()
     fitted_sensor = fitted(recording, pose=[*pose] or None, **settings)
     lines = [repr(fitted_sensor), *map(click.format_filename, fitted_sensor.save(out))]
-    options.show(fitted_sensor.figures, lines, as_json)
+    options.print_results(fitted_sensor.figures, lines, as_json)

@@ -45,7 +45,7 @@ from ..scenario.job import Job
 from ..scenario.plausibility import plausibility_warnings
 from ..scenario.prepare import PreparedScenario, prepare
 from ..scenario.scenario import Scenario
-from .shared_options import show
+from .shared_options import print_results
 from .terminal import Terminal
 
 
@@ -99,7 +99,7 @@ def run_scenario(
         "use lidarpool merge"
     )
     figures = {"folder": str(out), "shard": str(shard), "points": points}
-    show(figures, [*terminal.notes(result.notes), line], terminal.as_json)
+    print_results(figures, [*terminal.notes(result.notes), line], terminal.as_json)
 
 
 def _run_survey(
@@ -122,7 +122,7 @@ def _run_survey(
     with page_of(jobs, options.live) as page:
         result, report = run_survey(jobs, options, output, terminal, page, compare)
         lines = _result_lines(out, result, job, report, terminal)
-        show(summarize_report(out, report), lines, terminal.as_json)
+        print_results(summarize_report(out, report), lines, terminal.as_json)
         timeline.mark(timeline.SUMMARY)
         if options.live and options.stay:
             with local_result(out, [CLOUD]) as folder:
@@ -163,7 +163,7 @@ def run_campaign(
             f"{plural(run.points, 'point')} in the data set ({run.seconds:.1f} s)",
             f"data set in {click.format_filename(str(out))}; see its README.md",
         ]
-        show(figures, lines, terminal.as_json)
+        print_results(figures, lines, terminal.as_json)
         timeline.mark(timeline.SUMMARY)
         if options.live and options.stay:
             page.stay()
@@ -256,7 +256,7 @@ def _result_lines(
         f"{plural(result.rays, 'ray')}, {plural(result.hit_count, 'hit')}"
         f"{f' ({hits_elsewhere:,} not on a surface)' if hits_elsewhere > 0 else ''}, "
         f"{plural(len(result.points), 'point')} in the cloud{_objects_with_points(report)}"
-        f"{result.thinned} ({result.backend}, {result.survey_seconds:.1f} s)"
+        f"{result.thinning_note} ({result.backend}, {result.survey_seconds:.1f} s)"
     )
     if (plan := result.plan) is not None:
         outcome = "no collision-free path was found"

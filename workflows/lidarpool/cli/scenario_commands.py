@@ -243,9 +243,9 @@ def check(
     except LidarError as error:
         if as_json:
             reasons = {"reasons": [str(error)], "notes": [], "warnings": []}
-            options.show({"can_run": False, **reasons}, (), True)
+            options.print_results({"can_run": False, **reasons}, (), True)
         raise
-    options.show(figures, lines, as_json)
+    options.print_results(figures, lines, as_json)
     subject = "scenario" if number is None else "job"
     if figures["reasons"]:
         reasons = figures["reasons"]

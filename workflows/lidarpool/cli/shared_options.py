@@ -306,7 +306,7 @@ def world_lines(epsg: int | None, origin: Sequence[float]) -> Iterator[str]:
     yield f"world       {system}{moved}"
 
 
-def show(figures: Mapping[str, Any], lines: Iterable[str], as_json: bool) -> None:
+def print_results(figures: Mapping[str, Any], lines: Iterable[str], as_json: bool) -> None:
     """Print results as a JSON document or as lines of text."""
     if as_json:
         lines = [json.dumps(figures, indent=1, allow_nan=False, default=str)]

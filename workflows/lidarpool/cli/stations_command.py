@@ -232,7 +232,7 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
         shortfalls += _target_notes(plan, prepared)
     figures = _plan_figures(plan, prepared, sensor.model, [*notes, *shortfalls])
     note_lines = map("note: {}".format, shortfalls)
-    options.show(
+    options.print_results(
         figures, chain(_plan_lines(plan, prepared, settings["targets"]), note_lines), as_json
     )
     if not as_json:
@@ -313,7 +313,7 @@ def _show_coverage(
     )
     table = _object_lines(prepared.scene.names, coverage)
     note_lines = map("note: {}".format, recording.omission_notes)
-    options.show(figures, chain([head], table, note_lines), as_json)
+    options.print_results(figures, chain([head], table, note_lines), as_json)
 
 
 def _station_positions(prepared: PreparedScenario) -> Floats:

@@ -102,4 +102,4 @@ def twin(
     paths = [click.format_filename(path) for path in built.save(out)]
     scenario = shlex.quote(str(out / SCENARIO_FILE))
     following = f"next: lidarpool run {scenario} [--sensor MODEL]"
-    options.show(built.figures, [repr(built), *paths, following], as_json)
+    options.print_results(built.figures, [repr(built), *paths, following], as_json)

@@ -163,7 +163,7 @@ class NuScenes(MultiFileFormat):
     def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
         """Return the name of the point file and, if classes have names, the label file."""
         sweeps = job.sweeps
-        names = job.cached(
+        names = job.get_or_compute(
             "names",
             lambda: _files(sweeps, _channels(sweeps), _samples(sweeps)[1], job.entry),
         )

@@ -71,7 +71,7 @@ class RRD(CloudFormat):
             log.show_surroundings(surroundings)
             sequence = SweepSequence(self.sweeps)
             for sweep, points in enumerate(self.sweeps.points(self.cloud)):
-                log.show_sweep(sequence.show(sweep, points))
+                log.show_sweep(sequence.shown_sweep(sweep, points))
 
 
 @contextmanager

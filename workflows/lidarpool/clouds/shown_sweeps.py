@@ -185,7 +185,7 @@ class SweepSequence:
             FramePose(VEHICLE, self._frames[number], *mount) for number, mount in enumerate(mounts)
         ]
 
-    def show(self, sweep: int, points: Cloud) -> ShownSweep:
+    def shown_sweep(self, sweep: int, points: Cloud) -> ShownSweep:
         """Convert a sweep, given its number and its points."""
         sweeps = self.sweeps
         sensor = sweeps.sensor[sweep]

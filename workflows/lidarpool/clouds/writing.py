@@ -236,7 +236,7 @@ class ExportSpec(FileSection):
         return []
 
     @property
-    def installed(self) -> bool:
+    def is_installed(self) -> bool:
         """Whether the packages that the format requires are installed in this environment."""
         return not self.row.missing_packages
 

@@ -164,14 +164,14 @@ def _range_colors(images: RangeImages, index: int, scale: LogNorm) -> AnyArray:
     """Return the colors of the range image of A (`index` 0) or B (`index` 1)."""
     ranges = np.nan_to_num(images.ranges[index], nan=1.0)
     colors = theme.apply_colormap(theme.RANGE_COLORS, scale(ranges).filled(0))
-    colors[~images.returned[index]] = NO_RETURN
+    colors[~images.return_masks[index]] = NO_RETURN
     return colors
 
 
 def _residual_colors(images: RangeImages, scale: Normalize) -> AnyArray:
     """Return the colors of the residual image, which also mark cells without a return."""
     residual = images.ranges[0] - images.ranges[1]
-    in_a, in_b = images.returned
+    in_a, in_b = images.return_masks
     colors = theme.apply_colormap(RESIDUAL_COLORS, scale(1000 * np.nan_to_num(residual)).data)
     colors[~in_a & ~in_b] = NO_RETURN
     colors[in_a & ~in_b] = ONLY_A

@@ -59,7 +59,7 @@ class RangeImages:
         return self.images[:, 0]
 
     @property
-    def returned(self) -> tuple[Bools, Bools]:
+    def return_masks(self) -> tuple[Bools, Bools]:
         """Masks of the cells with a return in A and in B. Shape (r, c) each."""
         return np.isfinite(self.ranges[0]), np.isfinite(self.ranges[1])
 

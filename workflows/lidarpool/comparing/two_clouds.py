@@ -123,13 +123,15 @@ def compare(
         if sweeps:
             pairs = _choose_pairs(pairs, sweeps)
         elif len(pairs) < max(first.count, second.count):
-            comparing.note(
+            comparing.add_note(
                 f"A has {plural(first.count, 'sweep')} and B has {second.count:,}. Matching "
                 f"by {match} results in {plural(len(pairs), 'pair')}"
             )
         comparing.pairs = pairs
         if {first.compensated, second.compensated} == {True, False}:
-            comparing.note(_motion_note(*sorted((first, second), key=lambda r: not r.compensated)))
+            comparing.add_note(
+                _motion_note(*sorted((first, second), key=lambda r: not r.compensated))
+            )
         budget = MAX_VALUES // len(pairs)
         for number_a, number_b in pairs:
             sweep_a, sweep_b = (
@@ -148,7 +150,7 @@ def compare(
     points_a = comparing.read_cloud(first, max_points)
     points_b = comparing.read_cloud(second, max_points)
     if max(len(points_a), len(points_b)) > MAX_VALUES:
-        comparing.note(f"distances are measured from {MAX_VALUES:,} points of each cloud")
+        comparing.add_note(f"distances are measured from {MAX_VALUES:,} points of each cloud")
     comparing.add_points(points_a, points_b, MAX_VALUES)
     return comparing.result()
 
@@ -268,7 +270,7 @@ class _Comparing:
         # observed, so its count is 0.
         self.ray_counts = np.zeros(4, np.int64)
 
-    def note(self, text: str) -> None:
+    def add_note(self, text: str) -> None:
         """Add a note unless it was added before."""
         if text not in self.notes:
             self.notes.append(text)
@@ -285,7 +287,7 @@ class _Comparing:
             parts.append(part)
         if share == 1 or not parts:
             return Sweep.concatenate(parts)
-        self.note(
+        self.add_note(
             f"{100 * share:.3g} % of the {count:,} points in {recording.name} are compared, "
             "sampled evenly. Distances to this cloud are therefore overestimated"
         )
@@ -297,7 +299,7 @@ class _Comparing:
         At most `budget` cells and points of each sweep are compared.
         """
         if max(len(a), len(b)) > budget:
-            self.note(
+            self.add_note(
                 f"at most {budget:,} points and cells of each sweep are compared, sampled evenly"
             )
         if len(a) and len(b):
@@ -351,7 +353,7 @@ class _Comparing:
             self.without_images[str(error)] += 1
         if images is not None:
             for note in (*rings_note(first, a), *rings_note(second, b), *images.notes):
-                self.note(note)
+                self.add_note(note)
             self._add_image_cells(images, budget)
         elif rays is not None:
             self._add_rays(rays, budget)
@@ -387,7 +389,7 @@ class _Comparing:
         The masks `in_a` and `in_b` mark returns. Both have shape (k,).
         """
         rows = images.cell_rows
-        returned_a, returned_b = images.returned
+        returned_a, returned_b = images.return_masks
         rows_of_neither, _ = np.nonzero(~returned_a & ~returned_b)
         rows_of_states = (
             rows_of_neither,

@@ -157,10 +157,10 @@ class Tally:
         """Return the tally of a whole cloud."""
         tally = cls()
         for chunk in cloud.chunks():
-            tally.add(chunk)
+            tally.add_points(chunk)
         return tally
 
-    def add(self, chunk: Cloud) -> None:
+    def add_points(self, chunk: Cloud) -> None:
         """Add the next chunk of points.
 
         Raises LidarError if its columns differ from those of earlier chunks.

@@ -39,7 +39,7 @@ class RecentJobs:
             self._list_at = time_s + LIST_EVERY_S
             self.under_way = under_way()
 
-    def end(self, row: JobRow, opens: bool) -> None:
+    def add_ended_job(self, row: JobRow, opens: bool) -> None:
         """Count a job, and move its entry from the running jobs to the ended jobs.
 
         `opens` states whether the page can open the job.

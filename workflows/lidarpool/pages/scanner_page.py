@@ -291,7 +291,7 @@ class SweepFeed:
         if not self._count:
             return 0
         view = self.view
-        if self._shown < self._count and self._share.due:
+        if self._shown < self._count and self._share.is_due:
             self._shown = self._count
             now = time.monotonic()
             keep_scales = now < self._scales_until

@@ -71,7 +71,7 @@ class ViewerPage(RunPage):
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
         """Record committed parts of the only job."""
         if self._survey is not None:
-            self._survey.add(receipts)
+            self._survey.add_receipts(receipts)
 
     def on_frame(self, frame: ScanFrame) -> None:
         """Record that a scan of the only job, and all earlier scans, are in storage."""
@@ -85,12 +85,12 @@ class ViewerPage(RunPage):
         if self._survey is not None:
             self._survey.show_path()
 
-    def look(self, row: JobRow, job: StoredJob) -> None:
+    def on_job_written(self, row: JobRow, job: StoredJob) -> None:
         """Show a finished job of a campaign before its parts are removed."""
-        if self._share.due:
+        if self._share.is_due:
             with self._share.use(SHOW_EVERY_S), suppress(LidarError):
                 reader = SweepReader(job)
-                reader.add(job.parts.ordered)
+                reader.add_receipts(job.parts.ordered)
                 self._viewer.show_surroundings(reader.surroundings())
                 count = len(reader.sequence.sweeps)
                 for sweep in np.unique(np.linspace(0, count - 1, JOB_SWEEPS).astype(int)).tolist():
@@ -138,7 +138,7 @@ class SweepReader:
         self._lock = threading.Lock()
         self._last: tuple[str, Cloud] | None = None  # most recently read part
 
-    def add(self, receipts: Sequence[Receipt]) -> None:
+    def add_receipts(self, receipts: Sequence[Receipt]) -> None:
         """Record stored parts without reading them."""
         with self._lock:
             self._parts |= {receipt.first: receipt for receipt in receipts}
@@ -165,7 +165,7 @@ class SweepReader:
             ]
         clouds = [self._read(part.name) for part in sorted(parts, key=lambda part: part.first)]
         selected = [cloud[(start <= cloud["scan"]) & (cloud["scan"] < stop)] for cloud in clouds]
-        return self.sequence.show(sweep, Cloud.concatenate(selected))
+        return self.sequence.shown_sweep(sweep, Cloud.concatenate(selected))
 
     def _read(self, name: str) -> Cloud:
         """Return the points of a part.
@@ -192,15 +192,15 @@ class SurveyFeed:
         self._share = CpuShare(READING_SHARE)
         self._has_surroundings = threading.Event()
         self._has_path = False
-        self.add(job.parts.ordered)
+        self.add_receipts(job.parts.ordered)
         self._thread = threading.Thread(target=self._send_sweeps, name="viewer", daemon=True)
         self._thread.start()
 
     # -- called by the run --------------------------------------------------------------
 
-    def add(self, receipts: Sequence[Receipt]) -> None:
+    def add_receipts(self, receipts: Sequence[Receipt]) -> None:
         """Record stored parts without reading them."""
-        self._reader.add(receipts)
+        self._reader.add_receipts(receipts)
 
     def finish_scan(self, scan: int) -> None:
         """Record that a scan and all earlier scans are in storage."""
@@ -244,7 +244,7 @@ class SurveyFeed:
             self._viewer.show_surroundings(self._reader.surroundings())
         self._has_surroundings.set()
         while not self._ended.wait(_WAIT_S):
-            while self._waiting and self._share.due and not self._ended.is_set():
+            while self._waiting and self._share.is_due and not self._ended.is_set():
                 with self._share.use():
                     self._send_next()
 

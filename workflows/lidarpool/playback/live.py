@@ -146,13 +146,13 @@ def _send_all(
 
     def deadlines_ns(due_ns: Ints) -> Ints:
         """Convert times with the schedule, which starts with the first datagrams."""
-        if not schedule.started:
+        if not schedule.is_started:
             schedule.start(float(due_ns.min()), _START_NS)
         return schedule.deadlines_ns(due_ns)
 
     for number, start_s, points in sweeps:
         groups = packets.encode(points, number=number)
-        if not schedule.started:
+        if not schedule.is_started:
             if ready is not None:
                 ready(f"ready: {transmitter.description}")
         elif note is not None and schedule.late_s(start_s * 1e9) > BEHIND_S:

@@ -316,7 +316,7 @@ def twin(
         if folder is None:
             folder = stack.enter_context(TemporaryDirectory(prefix="lidarpool-"))
         made_of = (_fingerprint_inputs(recorded, track), voxel_m)
-        steps = FinishedSteps.begin(Path(folder), made_of, resume=resume)
+        steps = FinishedSteps.create_or_resume(Path(folder), made_of, resume=resume)
         built = _Building(recorded, base, voxel_m, steps, client, report).twin(track)
         steps.remove()
     return built
@@ -477,7 +477,7 @@ class _Building:
         }
         if response is not None:
             meshes = {
-                index: colored(
+                index: color_by_reflectance(
                     mesh,
                     response.reflectances(self._load_observations(index), surfel_centers(mesh)),
                 )
@@ -777,7 +777,7 @@ def _median(values: Floats) -> float | None:
     return float(np.median(known)) if len(known) else None
 
 
-def colored(mesh: SceneMesh, reflectances: Reflectances | None) -> SceneMesh:
+def color_by_reflectance(mesh: SceneMesh, reflectances: Reflectances | None) -> SceneMesh:
     """Color the surfels of a mesh by their reflectances."""
     if reflectances is None:
         return mesh

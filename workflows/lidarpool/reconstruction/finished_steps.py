@@ -40,7 +40,7 @@ class FinishedSteps:
     folder: Path
 
     @classmethod
-    def begin(cls, folder: Path, made_of: object, *, resume: bool) -> FinishedSteps:
+    def create_or_resume(cls, folder: Path, made_of: object, *, resume: bool) -> FinishedSteps:
         """Create the folder, or resume from a folder whose steps have the same inputs.
 
         Parameters

@@ -185,7 +185,7 @@ class DataSetOutput:
         """Report that the data set is complete and return its totals."""
         self.screen.report(f"{self.dataset.storage} is already complete")
         for row in complete.rows:
-            self.page.ended(row)
+            self.page.on_job_end(row)
         notes = (*self._warn_of_empty_jobs(complete.rows),)
         sums = CampaignRun.from_rows(complete.rows, time.monotonic() - self.begun_at, notes=notes)
         self.page.finish(sums.seconds)
@@ -226,12 +226,12 @@ class DataSetOutput:
             wrong = _check_jobs(self.dataset, store.rows(), options.verify, self.campaign)
         if not store.committed_text:
             self.campaign.check_files()
-        retried = store.db.failed() if options.retry_failed else ()
-        store.forget([*wrong, *retried])
+        retried = store.db.failed_jobs() if options.retry_failed else ()
+        store.reset_jobs([*wrong, *retried])
         if wrong:
             store.notes.append(f"these jobs are run again: {list_names([*wrong.values()])}")
         for row in store.rows():
-            self.page.ended(row)
+            self.page.on_job_end(row)
 
     def _adopt_finished_jobs(self, store: RunStore) -> None:
         """Add finished jobs to a store that has lost its database."""

@@ -58,7 +58,7 @@ def draw_varied(figures: DataSetStatistics) -> Page | None:
     labels, the one whose groups of jobs differ most in their mean number of points. Return None if
     there are no varied quantities or no jobs.
     """
-    drawable = [varied for varied in figures.varied if len(varied.known_values)]
+    drawable = [varied for varied in figures.varied_quantities if len(varied.known_values)]
     if not drawable:
         return None
     scales = [varied.merge_rare_labels() for varied in drawable[:MAX_VARIED]]

@@ -433,7 +433,7 @@ def _add_rows(
                 "manifests elsewhere, and merge again."
             )
         added.add(number)
-        if row.done or not db.ended(number):
+        if row.done or not db.has_ended(number):
             row = replace(row, seconds=seconds.get(number))
             batch.append((number, bool(row.error), asdict(row)))
         if len(batch) == _BATCH_ROWS:
@@ -478,7 +478,7 @@ def _missing_manifests(shard_folders: Sequence[_ShardFolder], db: RunDatabase) -
         for folder in shard_folders
         for numbers in folder.ranges
         for number in numbers
-        if not db.ended(number)
+        if not db.has_ended(number)
     ]
 
 

@@ -317,7 +317,7 @@ class SurveyOutput:
                     points = _points_with_progress(result, output_format.row.file, show)
                     output_format.write_to_storage(target, points, sweeps, workers)
             if workers:
-                result = workers.recorded(result)
+                result = workers.with_range_tasks(result)
             report = make_report(result, counts)
             for output_format in self.formats:
                 report["notes"] += output_format.notes(result.points, sweeps, self._requested)

@@ -171,7 +171,9 @@ class RunLoop:
         watch = self._cluster.watch([GPU, OTHER] if self._trials else [GPU], lasting=[LIDAR])
         shown_at = saved_at = float("-inf")
         tasks_beside = [beside.tasks for beside in (self._writer, self._trials) if beside]
-        while not (pipeline.stages.ended and (self._trials is None or "planning" in self._times)):
+        while not (
+            pipeline.stages.has_ended and (self._trials is None or "planning" in self._times)
+        ):
             self._step_jobs(started, watch)
             self._step_planning(started, watch)
             now_s = time.monotonic()
@@ -182,7 +184,7 @@ class RunLoop:
             if now_s - shown_at >= PROGRESS_EVERY_S or self._finished:
                 shown_at = now_s
                 self._show_progress(show, now_s - started)
-            if pipeline.stages.ended:
+            if pipeline.stages.has_ended:
                 time.sleep(PLANNING_PAUSE_S)
             else:
                 pipeline.wait(future.key for tasks in tasks_beside for future in tasks.running)
@@ -201,7 +203,7 @@ class RunLoop:
         at which the loop started.
         """
         pipeline = self._pipeline
-        if pipeline.stages.closed:
+        if pipeline.stages.is_closing:
             return
         self._admit()
         news = pipeline.step(self._scans_to_come)
@@ -215,7 +217,7 @@ class RunLoop:
             elif self._writer is None:
                 self._only_committed = True
             else:
-                self._writer.add(self._write_request(job))
+                self._writer.queue_job(self._write_request(job))
         error_of_all = self._write()
         self._commit()
         if error_of_all is not None:
@@ -226,16 +228,16 @@ class RunLoop:
             pipeline.close()
             self._times["survey"] = time.monotonic() - started
             timeline.mark(timeline.LAST_RECEIPT)
-            watch.forget([GPU, LIDAR])
+            watch.remove_partitions([GPU, LIDAR])
 
     def _step_planning(self, started: float, watch: Watch) -> None:
         if self._trials is None or "planning" in self._times:
             return
         self._trials.step()
-        if self._trials.finished:
+        if self._trials.is_finished:
             self._times["planning"] = time.monotonic() - started
             timeline.mark(timeline.PLANNED)
-            watch.forget([OTHER])
+            watch.remove_partitions([OTHER])
 
     def _save(self) -> None:
         """Store finished trials and the number of delivered frames in the run's database."""
@@ -371,7 +373,7 @@ class RunLoop:
         jobs_left = len(self._store.jobs.numbers) - self._store.db.ended_count
         limit = self._cluster.options.batch_mb * MB
         on_device = self._cluster.backend == "cuda"
-        self._jobs[job.number] = self._pipeline.begin(
+        self._jobs[job.number] = self._pipeline.add_job(
             stored.committed,
             job.scene,
             job.survey,
@@ -413,10 +415,10 @@ class RunLoop:
         self._rows = []
         if not rows:
             return
-        ended = self._store.end(rows)  # excludes jobs that could not be created
+        ended = self._store.commit_jobs(rows)  # excludes jobs that could not be created
         for row in rows:
             self._jobs.pop(row.number, None)
-            self._page.ended(row)
+            self._page.on_job_end(row)
         self._remover.submit(self._remove, ended)
 
     def _remove(self, ended: Sequence[tuple[JobRow, StoredJob]]) -> None:
@@ -424,6 +426,6 @@ class RunLoop:
         for row, job in ended:
             with suppress(LidarError, OSError):  # leftover files are harmless
                 if row.done:
-                    self._page.look(row, job)
+                    self._page.on_job_written(row, job)
             with suppress(LidarError, OSError):
                 self._store.storage.remove([part.name for part in job.parts.ordered])

@@ -20,7 +20,7 @@ class RunPage:
     """Live page of a run.
 
     The methods of this base class do nothing. They are called in the thread of the run and must
-    return immediately, except for `look`, which is called in the thread that removes the parts of
+    return immediately, except for `on_job_written`, which is called in the thread that removes the parts of
     ended jobs.
     """
 
@@ -60,10 +60,10 @@ class RunPage:
             If a user of the page has stopped the run.
         """
 
-    def ended(self, row: JobRow) -> None:
+    def on_job_end(self, row: JobRow) -> None:
         """Show a job that has ended, in this run or in an earlier run."""
 
-    def look(self, row: JobRow, job: StoredJob) -> None:
+    def on_job_written(self, row: JobRow, job: StoredJob) -> None:
         """Read the points to show for a finished job before its parts are removed."""
 
     def finish(self, seconds: float, result: RunResult | None = None) -> None:

@@ -76,7 +76,7 @@ class RunResult:
     replayed: int = 0
 
     @property
-    def thinned(self) -> str:
+    def thinning_note(self) -> str:
         """Clause on points that were thinned out, to follow their number.
 
         The clause is empty if all points are kept.

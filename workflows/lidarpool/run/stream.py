@@ -257,7 +257,7 @@ class _Casting:
         options = self._stream.options
         try:
             check_workers(job, options, self._backend, self._workers)
-            _, scene_name = self._casting.add(job.number, job.scene, job.survey)
+            _, scene_name = self._casting.register_job(job.number, job.scene, job.survey)
         except JobError as error:
             self._warn_of_failure(job.name, error)
             return True

@@ -152,7 +152,7 @@ class DataSetWriter:
         yield from (job.row for jobs in self.tasks.running.values() for job in jobs)
         yield from (job.row for job in (*self._driver_writes.values(), *self._waiting))
 
-    def add(self, files: WriteRequest) -> None:
+    def queue_job(self, files: WriteRequest) -> None:
         """Queue a job for writing."""
         if not self._waiting:
             self._due_at = time.monotonic() + GATHER_S
@@ -311,7 +311,7 @@ class LidarWorkers:
                 running.clear()
         return written
 
-    def recorded(self, result: RunResult) -> RunResult:
+    def with_range_tasks(self, result: RunResult) -> RunResult:
         """Return a copy of a result that includes the tasks that wrote ranges."""
         return replace(result, stages=(*result.stages, *self._tasks.book.stages.values()))
 

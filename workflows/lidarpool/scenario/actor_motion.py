@@ -98,7 +98,7 @@ class MountedSensorSection(SensorSection):
         about("number of time steps (scans) of the sensor (default: from the survey)", 120),
     ] = None
 
-    def mounted(
+    def mounted_sensor(
         self,
         path: ResolvePath,
         mount: Pose,
@@ -108,10 +108,10 @@ class MountedSensorSection(SensorSection):
     ) -> Mounted:
         """Return the sensor on its platform, with its start and time steps.
 
-        The parameters are those of `SensorSection.mounted`. Raise LidarError if a file cannot be
+        The parameters are those of `SensorSection.mounted_sensor`. Raise LidarError if a file cannot be
         used.
         """
-        mounted = super().mounted(path, mount, noise, returns, name)
+        mounted = super().mounted_sensor(path, mount, noise, returns, name)
         sensor = mounted.sensor
         if self.start_s:
             sensor = replace(sensor, start_ns=self.start_s * 1e9)

@@ -136,7 +136,7 @@ def prepare(
     """
     with scenario.explain_missing_files():
         _check_sensors(scenario)
-        static = read_static_scene(scenario) if cache is None else cache.find(scenario)
+        static = read_static_scene(scenario) if cache is None else cache.get_scene(scenario)
         return _prepare(scenario, static, plans, columns, fields)
 
 
@@ -325,7 +325,7 @@ def _check_sensors(scenario: Scenario) -> None:
     sections: Mapping[str, SensorSection] = scenario.sensors or {"": scenario.sensor}
     with prefix_errors(scenario.source):
         for name, section in sections.items():
-            section.mounted(scenario.path, CENTER, scenario.noise, scenario.returns, name)
+            section.mounted_sensor(scenario.path, CENTER, scenario.noise, scenario.returns, name)
 
 
 def _mounted_sensors(shapes: ShapeLoader) -> list[Mounted]:
@@ -335,7 +335,7 @@ def _mounted_sensors(shapes: ShapeLoader) -> list[Mounted]:
     noise = scenario.noise
     returns = scenario.returns
     return [
-        section.mounted(path, _mount_pose(section, shapes), noise, returns, name)
+        section.mounted_sensor(path, _mount_pose(section, shapes), noise, returns, name)
         for name, section in sections.items()
     ]
 

@@ -328,7 +328,7 @@ class Scenario(Section):
         for section in self.sensors.values() or (self.sensor,):
             if section.calibration is None:
                 with mistakes.collect(), self.explain_missing_files(), prefix_errors(self._source):
-                    mounted = section.mounted(self.path, CENTER, self.noise, self.returns)
+                    mounted = section.mounted_sensor(self.path, CENTER, self.noise, self.returns)
                     (mounted.returns or self.returns).divergence(mounted.sensor.optics)
         mistakes.raise_if_any()
 

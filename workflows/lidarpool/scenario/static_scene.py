@@ -137,15 +137,15 @@ class SceneCache:
         self._objects = _LeastRecentlyUsedCache[_StaticObjects](max_scenes)
         self._scenes = _LeastRecentlyUsedCache[StaticScene](max_scenes)
 
-    def find(self, scenario: Scenario) -> StaticScene:
+    def get_scene(self, scenario: Scenario) -> StaticScene:
         """Return the static scene of a scenario, from the cache or read from its files."""
         key = _cache_key(scenario)
         if scenario.scene.ground is None:
-            return self._scenes.find(key, lambda: read_static_scene(scenario))
-        static = self._objects.find(key, lambda: _read_objects(scenario))
+            return self._scenes.get_or_create(key, lambda: read_static_scene(scenario))
+        static = self._objects.get_or_create(key, lambda: _read_objects(scenario))
         ground = _build_ground(scenario, static)
         rectangle = ground.vertices.tobytes()
-        return self._scenes.find((key, rectangle), lambda: _static_scene(static, ground))
+        return self._scenes.get_or_create((key, rectangle), lambda: _static_scene(static, ground))
 
 
 class _LeastRecentlyUsedCache(Generic[Value]):
@@ -155,7 +155,7 @@ class _LeastRecentlyUsedCache(Generic[Value]):
         self._max_count = max_count
         self._values = dict[object, Value]()
 
-    def find(self, key: object, make: Callable[[], Value]) -> Value:
+    def get_or_create(self, key: object, make: Callable[[], Value]) -> Value:
         """Return the value of a key, after creating it if it is not in the cache."""
         value = self._values.pop(key) if key in self._values else make()
         self._values[key] = value  # dictionaries are ordered, so the most recent value is the last

@@ -246,7 +246,7 @@ def _point_cloud(job: JobReader, sweep: int, file: str) -> Any:
     """Return the PointCloud2 of a sweep. Raises ValueError if the bag does not contain it."""
     from .messages import sweep_topic
 
-    bag = job.cached("bag", lambda: _open_job(job, file))
+    bag = job.get_or_compute("bag", lambda: _open_job(job, file))
     topic = sweep_topic(job.sweeps, sweep)
     connections = [opened for opened in bag.connections if opened.topic == topic]
     time_ns = survey_start_ns(job.sweeps) + round(job.sweeps.begins_ns[sweep])

@@ -143,7 +143,7 @@ def measure_moving(
     `white` is the intensity of a white surface. Raises LidarError if the sensor is not at its poses
     in the scene, or if too few pulses hit smooth surfaces.
     """
-    stack, sweeps = measure_pulses(recording, scene, poses.fired(recording))
+    stack, sweeps = measure_pulses(recording, scene, poses.sweep_reader(recording))
     _check_pose(sweeps.near / max(sweeps.compared, 1), recording.name)
     pulses = sweeps.pulses
     if np.isfinite(stack.intensities).any():

@@ -105,7 +105,7 @@ class Watch:
         self._checked_at = float("-inf")
         self.notes: list[str] = []  # notes for the user about workers that Dask has paused
 
-    def forget(self, names: Iterable[str]) -> None:
+    def remove_partitions(self, names: Iterable[str]) -> None:
         """Stop watching partitions that have no more tasks."""
         for name in names:
             self._waits.pop(name, None)

@@ -418,7 +418,7 @@ class LongStages:
         self._closed_at = time.monotonic()
 
     @property
-    def closed(self) -> bool:
+    def is_closing(self) -> bool:
         """True if the stages are shutting down or have exited."""
         return self._closed_at is not None
 
@@ -427,7 +427,7 @@ class LongStages:
         return [self._scans, self._news, *(task.inlet for task in self._tasks.values())]
 
     @property
-    def ended(self) -> bool:
+    def has_ended(self) -> bool:
         """True once all stages have exited after `close`, or the shutdown timeout has elapsed."""
         if self._closed_at is None:
             return False
@@ -455,7 +455,7 @@ class LongStages:
         futures = [task.future for task in self._tasks.values()]
         try:
             self._closed_at = self._closed_at or time.monotonic()
-            while not self.ended:
+            while not self.has_ended:
                 time.sleep(0.01)
             ended = [future.key for future in futures if future.status == "finished"]
             results = fetch_available(self.client, ended)

@@ -180,7 +180,7 @@ class RunStore:
             if not path.exists():
                 return _EarlierDatabase()
             db = RunDatabase(path, durable=durable)
-            if db.used:
+            if db.has_results:
                 return _EarlierDatabase(db)
             db.close()
             return _EarlierDatabase(mark=db.meta["mark"], parts_location=db.meta.get("parts", ""))
@@ -242,12 +242,12 @@ class RunStore:
         for name in self._sizes:
             if resume and (scans := parse_part_name(name, self.db.meta["mark"])) is not None:
                 self._strays.setdefault(scans[0], []).append(name)
-        if self.db.used:
+        if self.db.has_results:
             self._check_same(self.db.meta)
         if (only_job := self.jobs.only_job) is not None:
             self.only_job = self._load(only_job)
             self._identified.add(only_job.number)  # the identity of the run identifies it
-        if self.db.used:
+        if self.db.has_results:
             self._check_resumable(resume)
         if self._remote:
             self._remote.claim(self.db)
@@ -347,7 +347,11 @@ class RunStore:
         """Number of committed scans, trials or jobs as text, or an empty string for none."""
         if self.only_job is not None:
             return self.only_job.committed_text
-        return f"{self.db.ended_count:,} of {len(self.jobs.numbers):,} jobs" if self.db.used else ""
+        return (
+            f"{self.db.ended_count:,} of {len(self.jobs.numbers):,} jobs"
+            if self.db.has_results
+            else ""
+        )
 
     @property
     def advice(self) -> str:
@@ -424,7 +428,7 @@ class RunStore:
         self.only_job.committed.advance_frames(self.only_job.scans.stop)
         self.only_job = self._add(replace(self.only_job, job=job, resumed=0))
 
-    def end(self, rows: Sequence[JobRow]) -> list[tuple[JobRow, StoredJob]]:
+    def commit_jobs(self, rows: Sequence[JobRow]) -> list[tuple[JobRow, StoredJob]]:
         """Commit the rows of ended jobs, and return the jobs that were in flight with their rows.
 
         The models and rates of their sensors are also stored, for the data set card.
@@ -445,7 +449,7 @@ class RunStore:
             self._identified.discard(row.number)
         return ended
 
-    def forget(self, numbers: Iterable[int]) -> None:
+    def reset_jobs(self, numbers: Iterable[int]) -> None:
         """Reset ended jobs, so that they are cast again."""
         if forgotten := [*numbers]:
             self.db.forget_jobs(forgotten)
@@ -455,7 +459,7 @@ class RunStore:
         """Add jobs that are already finished in the data set, and store values of `meta`."""
         if meta:
             self.db.set(**meta)
-        self.end([row for row in rows if not self.db.ended(row.number)])
+        self.commit_jobs([row for row in rows if not self.db.has_ended(row.number)])
         self.resumed = self.db.ended_count
 
     # -- the end -----------------------------------------------------------------------------
@@ -467,7 +471,7 @@ class RunStore:
         `force` is True. Raise LidarError if this fails, or if another run has taken over.
         """
         for number, stored in self.in_flight.items():
-            begun = stored.parts.scans_done and not stored.complete
+            begun = stored.parts.scans_done and not stored.is_complete
             if begun and number not in self._identified:
                 self._identified.add(number)
                 self.db.set_input_hash(number, _hash_inputs(stored.job))
@@ -475,7 +479,9 @@ class RunStore:
         if self._remote:
             self._remote.save(self.db, force=force)
 
-    def keep(self, scenario_source: Mapping[str, Any] | None, notes: Sequence[str]) -> None:
+    def close_with_points(
+        self, scenario_source: Mapping[str, Any] | None, notes: Sequence[str]
+    ) -> None:
         """Close the store and keep its points.
 
         If `scenario_source` is given, it is stored together with the notes.
@@ -526,7 +532,7 @@ class RunStore:
 
     def close(self) -> None:
         """Close the database of an unfinished run, and remove the store if it is empty."""
-        used = self.db.used or self.begun
+        used = self.db.has_results or self.begun
         self.db.close()
         if not used:
             with suppress(OSError, LidarError):

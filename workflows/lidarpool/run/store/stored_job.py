@@ -98,7 +98,7 @@ class StoredJob:
         return ""
 
     @property
-    def complete(self) -> bool:
+    def is_complete(self) -> bool:
         """True if all scans and planning trials are committed and all frames were delivered."""
         return self.committed.scans_complete and len(self.trials) == self.job.trials
 
