@@ -222,8 +222,8 @@ def _level(moves: Floats, axes: Floats) -> Floats:
         Directions to use for rows without a movement, with shape (k, 3) or (3,). Vertical axes are
         replaced by the x axis.
     """
-    stands = np.hypot(moves[:, 0], moves[:, 1]) < _MIN_STEP_M
-    ahead = np.where(stands[:, None], axes, moves) * (1.0, 1.0, 0.0)
+    is_stationary = np.hypot(moves[:, 0], moves[:, 1]) < _MIN_STEP_M
+    ahead = np.where(is_stationary[:, None], axes, moves) * (1.0, 1.0, 0.0)
     lengths = np.linalg.norm(ahead, axis=1)
     ahead[lengths < 1e-9] = (1.0, 0.0, 0.0)
     return np.asarray(ahead / np.where(lengths < 1e-9, 1.0, lengths)[:, None])

@@ -200,8 +200,8 @@ def _pair_sweeps(a: Recording, b: Recording, match: str) -> list[tuple[int, int]
         if pairs:
             order = np.argsort(times_a)
             sorted_times = times_a[order]
-            middles = (sorted_times[1:] + sorted_times[:-1]) / 2
-            nearest_a = order[np.searchsorted(middles, times_b)]
+            midpoints = (sorted_times[1:] + sorted_times[:-1]) / 2
+            nearest_a = order[np.searchsorted(midpoints, times_b)]
             period = np.median(np.diff(times_b)) if len(times_b) > 1 else 1e8
             close = np.flatnonzero(np.abs(times_a[nearest_a] - times_b) <= period / 2)
             pairs = [(int(nearest_a[number]), int(number)) for number in close]

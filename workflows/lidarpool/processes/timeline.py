@@ -1,7 +1,7 @@
 """Timeline of a command, which records when each of its steps ends.
 
-Steps are always recorded, even if the timeline is not shown, because `record_step` takes only about one
-microsecond.
+Steps are always recorded, even if the timeline is not shown, because `record_step` takes only about
+one microsecond.
 """
 
 from __future__ import annotations

@@ -361,9 +361,9 @@ def _adjoining_bars(groups: Sequence[Floats]) -> Floats:
     """
     lowest = np.array([values.min() for values in groups])
     highest = np.array([values.max() for values in groups])
-    middles = (highest[:-1] + lowest[1:]) / 2
-    left = np.concatenate([lowest[:1], middles])
-    right = np.concatenate([middles, highest[-1:]])
+    midpoints = (highest[:-1] + lowest[1:]) / 2
+    left = np.concatenate([lowest[:1], midpoints])
+    right = np.concatenate([midpoints, highest[-1:]])
     return np.stack([left, right, np.full(len(groups), np.nan)], axis=1)
 
 

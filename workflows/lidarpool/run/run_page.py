@@ -20,8 +20,8 @@ class RunPage:
     """Live page of a run.
 
     The methods of this base class do nothing. They are called in the thread of the run and must
-    return immediately, except for `on_job_written`, which is called in the thread that removes the parts of
-    ended jobs.
+    return immediately, except for `on_job_written`, which is called in the thread that removes the
+    parts of ended jobs.
     """
 
     def begun(self, job: StoredJob) -> None:

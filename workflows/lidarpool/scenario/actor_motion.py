@@ -108,8 +108,8 @@ class MountedSensorSection(SensorSection):
     ) -> Mounted:
         """Return the sensor on its platform, with its start and time steps.
 
-        The parameters are those of `SensorSection.mounted_sensor`. Raise LidarError if a file cannot be
-        used.
+        The parameters are those of `SensorSection.mounted_sensor`. Raise LidarError if a file
+        cannot be used.
         """
         mounted = super().mounted_sensor(path, mount, noise, returns, name)
         sensor = mounted.sensor

@@ -203,7 +203,7 @@ def _boxes(scanner: Scanner, cloud: Cloud, poses: list[Pose], time_ns: float) ->
     actors = scene.actors
     bounds = np.array([actor.bounds for actor in actors])
     rotations = np.array([pose.rotation_matrix for pose in poses])
-    middles = (rotations @ bounds.mean(axis=1)[..., None])[..., 0]
+    local_centers = (rotations @ bounds.mean(axis=1)[..., None])[..., 0]
     positions = np.array([pose.position for pose in poses]) + scene.origin
     hit_actors = cloud["object"].astype(np.int64) - len(scene.names)
     counts = np.bincount(hit_actors[hit_actors >= 0], minlength=len(actors))
@@ -211,7 +211,7 @@ def _boxes(scanner: Scanner, cloud: Cloud, poses: list[Pose], time_ns: float) ->
     return ActorBoxes(
         names=names,
         types=[actor_type(name) for name in names],
-        centers=positions + middles,
+        centers=positions + local_centers,
         quaternions=quaternions_of(rotations),
         sizes=np.ptp(bounds, axis=1),
         points=counts.tolist(),

@@ -142,11 +142,11 @@ def _dashed_knots(line: _Line, s: Floats, steps: Ints) -> tuple[Ints, Floats, In
     stops = _positions(line.stops, s, np.searchsorted(s, line.stops, "left") - 1)
     positions = np.sort(np.concatenate([starts, stops, np.arange(last + 1)]))
     positions = positions[np.append(True, np.diff(positions) > 0)]
-    middles = (positions[1:] + positions[:-1]) / 2
-    dash = np.searchsorted(starts, middles, "right") - 1
-    is_painted = (dash >= 0) & (middles < stops[np.maximum(dash, 0)])
+    midpoints = (positions[1:] + positions[:-1]) / 2
+    dash = np.searchsorted(starts, midpoints, "right") - 1
+    is_painted = (dash >= 0) & (midpoints < stops[np.maximum(dash, 0)])
     if len(steps):
-        is_painted &= ~np.isin(middles.astype(np.int64), steps)
+        is_painted &= ~np.isin(midpoints.astype(np.int64), steps)
     stations = np.minimum(positions.astype(np.int64), last - 1)
     return stations, positions - stations, np.flatnonzero(is_painted)
 

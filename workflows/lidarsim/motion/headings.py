@@ -78,11 +78,11 @@ def _turns_between_legs(times_s: Floats, positions: Floats) -> _Turns:
     arrive = times_s[before + 1]
     leave = times_s[after]
     # Both ends of a leg use the same expressions, so that turns never overlap due to rounding.
-    middles = (times_s[:-1] + times_s[1:]) / 2
+    midpoints = (times_s[:-1] + times_s[1:]) / 2
     is_long = lengths > 2 * CORNER_M * _ROOM
     corner_s = CORNER_M * np.diff(times_s) / np.where(is_long, lengths, 1.0)
-    starts = np.where(is_long[before], arrive - corner_s[before], middles[before])
-    stops = np.where(is_long[after], leave + corner_s[after], middles[after])
+    starts = np.where(is_long[before], arrive - corner_s[before], midpoints[before])
+    stops = np.where(is_long[after], leave + corner_s[after], midpoints[after])
     pauses = after > before + 1
     starts[pauses] = np.where(
         leave - arrive > STATIONARY_TURN_S * _ROOM, leave - STATIONARY_TURN_S, arrive

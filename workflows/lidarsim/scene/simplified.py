@@ -223,10 +223,10 @@ def _triangle_shares(
     positions = np.concatenate([np.empty((0, 3)), *near_positions])
     if even_share == 1 or not len(positions):
         return np.full(len(shared), even_share)
-    middles = shared.bounds.mean(axis=1)
+    centers = shared.bounds.mean(axis=1)
     distance = np.full(len(shared), np.inf)
     for position in positions[:: len(positions) // _MAX_POSITIONS + 1]:
-        np.minimum(distance, np.linalg.norm(middles - position, axis=1), out=distance)
+        np.minimum(distance, np.linalg.norm(centers - position, axis=1), out=distance)
     distance += 1e-3
     full_distance = distance.max()  # up to this distance, instances keep all triangles
     while True:

@@ -193,10 +193,10 @@ def _divide(
     unit_weights = np.ones(len(points))
     for _ in range(_GRID_LEVELS):
         is_hit = hit[owner]
-        middles = pieces.mean(axis=1)
-        point_count = _WeightGrid(points, unit_weights, width, lower).interpolate(middles[active])
-        area = _WeightGrid(middles[is_hit], areas[is_hit], width, lower).interpolate(
-            middles[active]
+        centers = pieces.mean(axis=1)
+        point_count = _WeightGrid(points, unit_weights, width, lower).interpolate(centers[active])
+        area = _WeightGrid(centers[is_hit], areas[is_hit], width, lower).interpolate(
+            centers[active]
         )
         # Cells with few points are not divided again, so this density is final.
         parts = np.bincount(owner)[owner[active]]

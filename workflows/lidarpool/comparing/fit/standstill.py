@@ -37,17 +37,17 @@ class Speed(NamedTuple):
     period_ns: float | None  # time between consecutive sweeps, if known
 
 
-def read_static(recording: Recording, *, stands: bool = False) -> SweepStack:
+def read_static(recording: Recording, *, is_stationary: bool = False) -> SweepStack:
     """Read the sweeps of a stationary sensor into common cells.
 
-    If `stands` is true, the sensor is known to be stationary. Raises the same errors as
+    If `is_stationary` is true, the sensor is known to be stationary. Raises the same errors as
     `SweepStack.read`, and LidarError if the sensor or the recorded scene moves.
     """
     stack = SweepStack.read(recording)
     if stack.sweep_count < 2:
         return stack
     name = recording.name
-    speed = None if stands else find_motion(stack, sweep_period_ns(recording, stack.numbers))
+    speed = None if is_stationary else find_motion(stack, sweep_period_ns(recording, stack.numbers))
     if speed is not None:
         raise LidarError(
             moving_message(

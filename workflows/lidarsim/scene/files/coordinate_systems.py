@@ -503,8 +503,8 @@ def center_of(objects: Sequence[SceneMesh | SceneInstance]) -> Floats:
     """
     if not objects:
         return np.zeros(2)
-    middles = np.array([_center(item)[:2] for item in objects])
-    middle: Floats = (middles.min(axis=0) + middles.max(axis=0)) / 2
+    centers = np.array([_center(item)[:2] for item in objects])
+    middle: Floats = (centers.min(axis=0) + centers.max(axis=0)) / 2
     return middle
 
 

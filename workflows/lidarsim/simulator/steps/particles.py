@@ -288,7 +288,7 @@ def random_keys(seed: int, purposes: tuple[Purpose, ...], keys: Keys, first: int
     )
 
 
-def room_for_hits(size: int) -> SampledHits:
+def empty_hits(size: int) -> SampledHits:
     """Return arrays to which compiled loops write up to `size` hits."""
     from .pulse_loops import SampledHits
 
@@ -307,7 +307,7 @@ def _particles(
     )
     beam = 0
     while beam < beams:
-        hits = room_for_hits(2 * beams + len(detectable.counts))
+        hits = empty_hits(2 * beams + len(detectable.counts))
         beam, count = particle_loops.sample_particles(
             beam, beams, subrays=subrays, tables=tables, keys=random, reach=reach, hits=hits
         )
@@ -321,7 +321,7 @@ def _fog_hits(fog: FogCells, random: RandomKeys, subrays: int, reach: Floats) ->
     """
     from . import particle_loops
 
-    hits = room_for_hits(len(reach) // subrays)
+    hits = empty_hits(len(reach) // subrays)
     tables = particle_loops.FogTables(fog.begin_m, FARTHEST_M, fog.cell_m, fog.energy, fog.peaks)
     count = particle_loops.sample_fog(subrays, tables, random, reach, hits)
     return hits.first(count)

@@ -36,7 +36,7 @@ from .particles import (
     exponential_quantiles,
     light_reach,
     random_keys,
-    room_for_hits,
+    empty_hits,
     seen_by_range,
 )
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
@@ -150,7 +150,7 @@ class SprayStep(PulseStep):
         clump_hits: list[PulseReturns] = []
         row = 0
         while row < len(crossings.beam):
-            hits = room_for_hits(1024 + len(crossings.beam))
+            hits = empty_hits(1024 + len(crossings.beam))
             row, count = spray_loops.sample_clumps(
                 row,
                 crossings,

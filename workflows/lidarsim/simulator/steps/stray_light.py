@@ -168,7 +168,7 @@ def _ray_cells(origins: Floats, directions: Floats) -> RayCells:
 class _Bounds(NamedTuple):
     """Bounding sphere and centers of triangles."""
 
-    middles: Floats  # (k, 3): centers of the triangles
+    centers: Floats  # (k, 3): centers of the triangles
     center: Floats  # (3,): center of the bounding sphere
     radius: float  # radius of the bounding sphere, meters
 
