@@ -43,14 +43,14 @@ _MIN_REACHABLE_SHARE = 0.25  # a target with a smaller reachable share causes a 
 def _parse_percentage(text: str) -> float:
     """Parse a percentage such as 95% or 95."""
     try:
-        share = float(text.removesuffix("%")) / 100
+        fraction = float(text.removesuffix("%")) / 100
     except ValueError:
-        share = math.nan
-    if not (0.01 <= share <= 1):
+        fraction = math.nan
+    if not (0.01 <= fraction <= 1):
         raise click.BadParameter(
             f"{text!r} is not a valid percentage. Expected a value from 1% to 100%, such as 95%."
         )
-    return share
+    return fraction
 
 
 @click.command(context_settings={"show_default": True})
@@ -380,12 +380,12 @@ def _target_notes(plan: StationPlan, prepared: PreparedScenario) -> Iterator[str
     """Yield a note if a single object accounts for most of the reachable area."""
     reachable_m2 = plan.reachable_m2
     largest = int(reachable_m2.argmax())
-    share = float(reachable_m2[largest] / reachable_m2.sum())
-    if share > _DOMINANT_SHARE and (reachable_m2 > 0).sum() > 1:
+    fraction = float(reachable_m2[largest] / reachable_m2.sum())
+    if fraction > _DOMINANT_SHARE and (reachable_m2 > 0).sum() > 1:
         yield (
-            f"{printable(prepared.scene.names[largest])} accounts for {share:.0%} of the reachable "
-            "area, so it largely determines the stations. To cover other objects, select them with "
-            "`--target`"
+            f"{printable(prepared.scene.names[largest])} accounts for {fraction:.0%} of the "
+            "reachable area, so it largely determines the stations. To cover other objects, select "
+            "them with `--target`"
         )
 
 
@@ -479,8 +479,8 @@ def _plan_figures(
         "places": len(plan.candidates),
         "spacing_m": plan.spacing_m,
         "stations": [
-            {"position": [round(float(part), 3) for part in position], "coverage": float(share)}
-            for position, share in zip(plan.stations, plan.coverage, strict=True)
+            {"position": [round(float(part), 3) for part in position], "coverage": float(fraction)}
+            for position, fraction in zip(plan.stations, plan.coverage, strict=True)
         ],
         "objects": _object_figures(names, plan),
         "epsg": prepared.survey.epsg,
@@ -500,12 +500,12 @@ def _plan_lines(
         f"m²{_target_phrase(targets)} are reachable (within range, field of view and slant)"
     )
     yield "station        x          y          z   covered     added"
-    previous_share = 0.0
+    previous_fraction = 0.0
     rows = zip(plan.stations.tolist(), plan.coverage.tolist(), strict=True)
-    for number, ((x, y, z), share) in enumerate(rows, 1):
-        gain = share - previous_share
-        yield f"{number:7} {x:10,.2f} {y:10,.2f} {z:10,.2f} {share:9.1%} {gain:9.1%}"
-        previous_share = share
+    for number, ((x, y, z), fraction) in enumerate(rows, 1):
+        gain = fraction - previous_fraction
+        yield f"{number:7} {x:10,.2f} {y:10,.2f} {z:10,.2f} {fraction:9.1%} {gain:9.1%}"
+        previous_fraction = fraction
     yield from _object_lines(names, plan)
     blind = int((plan.targets & (plan.reachable_m2 == 0)).sum())
     if blind:

@@ -278,17 +278,17 @@ class _Comparing:
     def read_cloud(self, recording: Recording, max_points: int) -> Sweep:
         """Read a cloud in world coordinates, evenly subsampled to about `max_points` points."""
         count = recording.point_count
-        share = 1.0 if count is None else min(1.0, max_points / max(count, 1))
+        fraction = 1.0 if count is None else min(1.0, max_points / max(count, 1))
         parts = []
         for number in range(recording.count):
             part = compared_in_world(recording, number)
-            if share < 1:
-                part = part.select(even_indices(len(part), round(share * len(part))))
+            if fraction < 1:
+                part = part.select(even_indices(len(part), round(fraction * len(part))))
             parts.append(part)
-        if share == 1 or not parts:
+        if fraction == 1 or not parts:
             return Sweep.concatenate(parts)
         self.add_note(
-            f"{100 * share:.3g} % of the {count:,} points in {recording.name} are compared, "
+            f"{100 * fraction:.3g} % of the {count:,} points in {recording.name} are compared, "
             "sampled evenly. Distances to this cloud are therefore overestimated"
         )
         return Sweep.concatenate(parts)
@@ -587,10 +587,10 @@ def _scores(precision: float | None, recall: float | None) -> dict[str, float | 
 
 def _distance_quantiles(values: Floats) -> dict[str, Any]:
     """Return the mean and the quantiles of distances in meters."""
-    shares = {"median_m": 0.5, "p90_m": 0.9, "p95_m": 0.95, "p99_m": 0.99, "max_m": 1.0}
-    quantiles = np.quantile(values, list(shares.values())).tolist()
+    fractions = {"median_m": 0.5, "p90_m": 0.9, "p95_m": 0.95, "p99_m": 0.99, "max_m": 1.0}
+    quantiles = np.quantile(values, list(fractions.values())).tolist()
     return {
         "points": len(values),
         "mean_m": float(values.mean()),
-        **dict(zip(shares, quantiles, strict=True)),
+        **dict(zip(fractions, quantiles, strict=True)),
     }

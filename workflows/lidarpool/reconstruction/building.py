@@ -420,8 +420,8 @@ class _Building:
         """Build the surface maps of all submaps."""
         sizes = [len(task.recorded.read(int(one.numbers[0]))) for one in submaps]
         count = sum(sizes) / len(sizes) * sum(len(one.own_numbers) for one in submaps)
-        share = STATIONARY_DOTS / max(count, 1.0)
-        tasks = [replace(task, submap=one, drawn_share=share) for one in submaps]
+        fraction = STATIONARY_DOTS / max(count, 1.0)
+        tasks = [replace(task, submap=one, drawn_share=fraction) for one in submaps]
         parts = []
         for number, part in enumerate(self.steps.each(_BUILD, run, build_submap, tasks), 1):
             self.report(f"built {number} of {plural(len(submaps), 'submap')}")

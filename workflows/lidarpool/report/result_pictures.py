@@ -259,8 +259,8 @@ def max_deviation(path: Floats, other: Floats) -> float:
     distances = np.full(len(positions), np.inf)
     for start, stop in itertools.pairwise(other):
         way = stop - start
-        share = ((positions - start) @ way / max(float(way @ way), 1e-300)).clip(0, 1)
-        nearest = start + share[:, None] * way
+        fraction = ((positions - start) @ way / max(float(way @ way), 1e-300)).clip(0, 1)
+        nearest = start + fraction[:, None] * way
         distances = np.minimum(distances, np.linalg.norm(positions - nearest, axis=1))
     return float(distances.max())
 

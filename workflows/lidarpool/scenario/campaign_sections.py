@@ -120,10 +120,10 @@ class JobRandom:
     def log_uniform(self, minimum: float, maximum: float) -> float:
         """Draw a number whose logarithm is uniformly distributed."""
         log_minimum, log_maximum = (_EXACT.ln(Decimal(limit)) for limit in (minimum, maximum))
-        share = _as_fraction(self.bits(53))
+        fraction = _as_fraction(self.bits(53))
         number = _EXACT.exp(
             _EXACT.add(
-                log_minimum, _EXACT.multiply(share, _EXACT.subtract(log_maximum, log_minimum))
+                log_minimum, _EXACT.multiply(fraction, _EXACT.subtract(log_maximum, log_minimum))
             )
         )
         return _clip(_round(float(number)), minimum, maximum)
@@ -227,8 +227,8 @@ class NormalDistribution(Section):
     def _check_limits(self) -> NormalDistribution:
         """Raise ValueError if the limits exclude nearly all numbers, or if numbers overflow."""
         if self.limits is not None:
-            lower_share, upper_share = map(NormalDist(self.mean, self.std).cdf, self.limits)
-            if upper_share - lower_share < MIN_SHARE:
+            lower_fraction, upper_fraction = map(NormalDist(self.mean, self.std).cdf, self.limits)
+            if upper_fraction - lower_fraction < MIN_SHARE:
                 raise ValueError(
                     f"`limits` must include at least {MIN_SHARE:.0%} of the distribution."
                 )
@@ -564,14 +564,14 @@ class Splits:
 
     def __init__(self, shares: Mapping[str, float], seed: int) -> None:
         self._seed = seed
-        exact = {name: Fraction(str(share)) for name, share in shares.items()}
+        exact = {name: Fraction(str(fraction)) for name, fraction in shares.items()}
         total = sum(exact.values())
-        exact = {name: share / total for name, share in exact.items()}
-        size = min(lcm(*(share.denominator for share in exact.values())), self.MAX_BLOCK)
+        exact = {name: fraction / total for name, fraction in exact.items()}
+        size = min(lcm(*(fraction.denominator for fraction in exact.values())), self.MAX_BLOCK)
         self._block: list[str] = []
         cumulative = Fraction(0)
-        for name, share in exact.items():
-            cumulative += share
+        for name, fraction in exact.items():
+            cumulative += fraction
             self._block += [name] * (round(cumulative * size) - len(self._block))
 
     def __call__(self, number: int) -> str:

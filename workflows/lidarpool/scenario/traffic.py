@@ -589,9 +589,9 @@ def build_traffic_actors(
         tracks = _passage_tracks(passage, section, mesh, support, start_s)
         named = replace(mesh, name=f"{entry.name or passage.kind} ({passage.name})")
         # Different animation offsets keep the actors of an entry from walking in step.
-        share = zlib.crc32(passage.name.encode()) / 2**32
+        fraction = zlib.crc32(passage.name.encode()) / 2**32
         offset_s = 0.0 if entry.animation is None else entry.animation.offset_s
-        offset_s += 0.0 if mesh.animation is None else share * mesh.animation.duration_s
+        offset_s += 0.0 if mesh.animation is None else fraction * mesh.animation.duration_s
         actors += [(Actor(named, piece, offset_s), entry) for piece in tracks]
         if len(actors) > MAX_ACTORS:
             raise LidarError(

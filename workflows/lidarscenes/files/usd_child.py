@@ -336,10 +336,14 @@ def _poses_up_to(
     step = stop.code - start.code
     if not depth:
         return [stop]
-    for share in _PROBES:
-        pose = _TimedPose(prim, start.code + share * step)
-        offset = pose.matrix[:3, 3] - (1 - share) * start.matrix[:3, 3] - share * stop.matrix[:3, 3]
-        rotation = Gf.Slerp(share, start.rotation, stop.rotation)
+    for fraction in _PROBES:
+        pose = _TimedPose(prim, start.code + fraction * step)
+        offset = (
+            pose.matrix[:3, 3]
+            - (1 - fraction) * start.matrix[:3, 3]
+            - fraction * stop.matrix[:3, 3]
+        )
+        rotation = Gf.Slerp(fraction, start.rotation, stop.rotation)
         cosine = abs(Gf.Dot(rotation, pose.rotation))
         if not (np.abs(offset).max() <= max_offset and cosine >= math.cos(_MAX_ANGLE_RAD / 2)):
             middle = _TimedPose(prim, start.code + step / 2)

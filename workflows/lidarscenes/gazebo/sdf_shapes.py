@@ -211,10 +211,10 @@ def height_map_mesh(shape: Element, image: Path, allowance: Allowance) -> SceneM
     rows, columns = values.shape
     if min(rows, columns) < 2 or not size[:2].all():
         raise LidarError("a <heightmap> has no area.")
-    shares = values / max(float(values.max()), 1e-9)
+    fractions = values / max(float(values.max()), 1e-9)
     x = np.linspace(-size[0] / 2, size[0] / 2, columns)
     y = np.linspace(size[1] / 2, -size[1] / 2, rows)
-    grid = np.stack([*np.meshgrid(x, y), shares * size[2]], axis=-1).reshape(-1, 3)
+    grid = np.stack([*np.meshgrid(x, y), fractions * size[2]], axis=-1).reshape(-1, 3)
     numbers = np.arange(rows * columns).reshape(rows, columns)
     upper_left = numbers[:-1, :-1].ravel()
     lower_left = numbers[1:, :-1].ravel()

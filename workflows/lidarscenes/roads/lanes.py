@@ -462,9 +462,9 @@ class SectionSurface:
         t_right = columns[right, queries]
         gap = columns[right + 1, queries] - t_right
         within = np.clip(t, columns[0], columns[-1])
-        share = np.where(gap > 0, (within - t_right) / np.where(gap > 0, gap, 1), 0.0)
+        fraction = np.where(gap > 0, (within - t_right) / np.where(gap > 0, gap, 1), 0.0)
         first = self._points[right, stations]
-        inside = first + share[:, None] * (self._points[right + 1, stations] - first)
+        inside = first + fraction[:, None] * (self._points[right + 1, stations] - first)
         return np.asarray(inside + (t - within)[:, None] * frames.side[stations])
 
     @cached_property
@@ -519,9 +519,9 @@ class SectionSurface:
                 inner = lane.inner_heights.values(self.stations)
                 outer = lane.outer_heights.values(self.stations)
                 width = t[-1] - t[0]
-                share = (t - t[0]) / np.where(width == 0, 1, width)
-                share[-1] = 1
-                base = base + (inner + share * (outer - inner))[..., None] * frames.up
+                fraction = (t - t[0]) / np.where(width == 0, 1, width)
+                fraction[-1] = 1
+                base = base + (inner + fraction * (outer - inner))[..., None] * frames.up
             yield Strip(lane, t, base, self.steps)
 
     def _t_across(self, inner_t: Floats, outer_t: Floats) -> Floats:

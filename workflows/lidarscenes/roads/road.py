@@ -217,9 +217,9 @@ class LateralShapes:
         station_indices = np.clip(np.searchsorted(self.stations, distances, "right") - 1, 0, last)
         following = np.minimum(station_indices + 1, last)
         gaps = np.maximum(self.stations[following] - self.stations[station_indices], 1e-9)
-        share = np.clip((distances - self.stations[station_indices]) / gaps, 0, 1)
+        fraction = np.clip((distances - self.stations[station_indices]) / gaps, 0, 1)
         lower = self._profiles(station_indices, t, pieces)
-        return np.asarray(lower + share * (self._profiles(following, t, pieces) - lower))
+        return np.asarray(lower + fraction * (self._profiles(following, t, pieces) - lower))
 
     def kinks(self, start: float, stop: float) -> Floats:
         """Return the t coordinates at which cubics start.

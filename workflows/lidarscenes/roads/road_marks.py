@@ -114,14 +114,14 @@ def _knots_of(line: _Line, surface: SectionSurface, border: Floats) -> _Knots:
     last = len(s) - 1
     if len(line.starts) == 1 and line.starts[0] <= s[0] and line.stops[0] >= s[-1]:
         stations = np.append(np.arange(last), last - 1)
-        shares = np.append(np.zeros(last), 1.0)
+        fractions = np.append(np.zeros(last), 1.0)
         quads = np.delete(np.arange(last), surface.steps)
     else:
-        stations, shares, quads = _dashed_knots(line, s, surface.steps)
+        stations, fractions, quads = _dashed_knots(line, s, surface.steps)
     middle = border + line.shift
     return _Knots(
         stations=stations,
-        shares=shares,
+        shares=fractions,
         first_t=middle[stations],
         second_t=middle[stations + 1],
         width=line.width,
@@ -155,14 +155,14 @@ def _positions(distances: Floats, s: Floats, stations: Ints) -> Floats:
     """Express distances as fractional station indices."""
     stations = np.minimum(np.maximum(stations, 0), len(s) - 2)
     lengths = np.maximum(s[stations + 1] - s[stations], GAP_M)
-    shares = (distances - s[stations]) / lengths
-    return np.asarray(stations + np.minimum(np.maximum(shares, 0), 1))
+    fractions = (distances - s[stations]) / lengths
+    return np.asarray(stations + np.minimum(np.maximum(fractions, 0), 1))
 
 
 def _points_of(surface: SectionSurface, knots: Sequence[_Knots]) -> Floats:
     """Return the right and then the left edges of lines on the lanes. Shape (2q, 3)."""
     station_indices = np.concatenate([entry.stations for entry in knots])
-    shares = np.concatenate([entry.shares for entry in knots])
+    fractions = np.concatenate([entry.shares for entry in knots])
     first_t = np.concatenate([entry.first_t for entry in knots])
     second_t = np.concatenate([entry.second_t for entry in knots])
     half = np.concatenate([np.full(len(entry.stations), entry.width / 2) for entry in knots])
@@ -173,8 +173,8 @@ def _points_of(surface: SectionSurface, knots: Sequence[_Knots]) -> Floats:
         ),
         np.concatenate([first_t - half, first_t + half, second_t - half, second_t + half]),
     )
-    both_shares = np.concatenate([shares, shares])[:, None]
-    points = corners[: 2 * count] + both_shares * (corners[2 * count :] - corners[: 2 * count])
+    both_fractions = np.concatenate([fractions, fractions])[:, None]
+    points = corners[: 2 * count] + both_fractions * (corners[2 * count :] - corners[: 2 * count])
     up = surface.frames.up[np.concatenate([station_indices, station_indices])]
     return np.asarray(points + LIFT_M * up)
 

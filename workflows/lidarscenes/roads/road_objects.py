@@ -141,8 +141,8 @@ class ObjectBuilder:
         count = span / distance + 1e-6 if distance > 0 else 0
         self._allowance.reserve(int(min(count, 1e15)) * _BYTES_PER_COPY)
         for k in range(int(count) + 1):
-            share = min(1.0, k * distance / span) if span > 0 else 0.0
-            yield base.repeat_at(repeat, share, read_number(repeat, "s") + k * distance)
+            fraction = min(1.0, k * distance / span) if span > 0 else 0.0
+            yield base.repeat_at(repeat, fraction, read_number(repeat, "s") + k * distance)
 
     def _markings(
         self,
@@ -277,13 +277,13 @@ class _Rail(NamedTuple):
 
     def rings(self, stations: RoadStations, frames: RoadFrames) -> Floats:
         """Return the cross sections, clockwise from the lower right. Shape (k, 4, 3)."""
-        share = (stations.s - self.start) / (self.stop - self.start)
+        fraction = (stations.s - self.start) / (self.stop - self.start)
         first = self.first
         last = self.last
-        width = np.maximum(first.wide + share * (last.wide - first.wide), 1e-3)
-        t = first.t + share * (last.t - first.t)
-        lower = first.z + share * (last.z - first.z)
-        upper = lower + (first.height + share * (last.height - first.height))
+        width = np.maximum(first.wide + fraction * (last.wide - first.wide), 1e-3)
+        t = first.t + fraction * (last.t - first.t)
+        lower = first.z + fraction * (last.z - first.z)
+        upper = lower + (first.height + fraction * (last.height - first.height))
         right_side = (t - width / 2)[:, None] * frames.side
         left_side = (t + width / 2)[:, None] * frames.side
         lower_up = lower[:, None] * frames.up

@@ -93,8 +93,8 @@ def _light_table(leaf_angle: str | float) -> _LightTable:
     """Integrate the projection and brightness of leaves over the leaf angles."""
     cosine = sin(np.linspace(0, np.pi / 2, _NODES))[:, None]
     angle = (np.arange(_ANGLES, dtype=np.float64) + 0.5) * (np.pi / 2 / _ANGLES)
-    share = leaf_angle_density(leaf_angle, angle)
-    share /= share.sum()
+    fraction = leaf_angle_density(leaf_angle, angle)
+    fraction /= fraction.sum()
     # The cosine of the angle between the light and the normal of a leaf is
     # `constant + amplitude * cos(azimuth)`.
     leaf_sine, leaf_cosine = sin_cos(angle)
@@ -105,8 +105,8 @@ def _light_table(leaf_angle: str | float) -> _LightTable:
     edge_on = arccos(-np.minimum(constant / np.maximum(amplitude, 1e-300), 1))
     mean = (constant * (2 * edge_on - np.pi) + 2 * amplitude * sin(edge_on)) / np.pi
     square = constant**2 + amplitude**2 / 2
-    projected = (mean * share).sum(axis=1)
-    bright = (square * share).sum(axis=1)
+    projected = (mean * fraction).sum(axis=1)
+    bright = (square * fraction).sum(axis=1)
     return _LightTable(cosine[:, 0], projected, bright / projected)
 
 

@@ -162,11 +162,11 @@ class _Stops(NamedTuple):
         first, last = self.yaws.take(row, axis=0).T
         change = last - first
         change = change - 2 * np.pi * np.round(change / (2 * np.pi))
-        share = ((times_s - (stops_s - duration)) / duration).clip(0.0, 1.0)
+        fraction = ((times_s - (stops_s - duration)) / duration).clip(0.0, 1.0)
         # A polynomial whose first and second derivatives are 0 at both ends.
-        progress = share * share * share * (10 - 15 * share + 6 * share * share)
+        progress = fraction * fraction * fraction * (10 - 15 * fraction + 6 * fraction * fraction)
         sine, cosine = sin_cos(first + change * progress)
-        slope = 30 * (share * (1 - share)) * (share * (1 - share))
+        slope = 30 * (fraction * (1 - fraction)) * (fraction * (1 - fraction))
         return Heading(cosine, sine, change * slope / duration)
 
 
@@ -207,8 +207,8 @@ class CurveHeadings:
         steps = np.diff(times_s)
         still: Bools = np.asarray(~knots[1:].any(axis=(0, 1)))
         count = len(steps)
-        shares = np.array([_NEAR_END, 0.5, 1 - _NEAR_END])
-        since = (steps[:, None] * shares).reshape(-1)
+        fractions = np.array([_NEAR_END, 0.5, 1 - _NEAR_END])
+        since = (steps[:, None] * fractions).reshape(-1)
         slopes = evaluate_curve(knots, steps, np.arange(count).repeat(3), since, 1)[1]
         velocities = slopes[:2].T.reshape(count, 3, 2)
         moves = hypot(velocities[..., 0], velocities[..., 1]) > _SAME

@@ -131,8 +131,8 @@ def normal(
 @cache
 def quantiles() -> Floats:
     """Return 65,536 quantiles of the standard normal distribution with equal probabilities."""
-    shares = (np.arange(2**15) + 0.5) / 2**16
-    lower_half = np.array([NormalDist().inv_cdf(share) for share in shares])
+    fractions = (np.arange(2**15) + 0.5) / 2**16
+    lower_half = np.array([NormalDist().inv_cdf(fraction) for fraction in fractions])
     table = np.concatenate([lower_half, -lower_half[::-1]])
     # The logarithms of different C libraries agree once they are rounded to single precision.
     return (table / np.sqrt((table**2).mean())).astype(np.float32).astype(np.float64)

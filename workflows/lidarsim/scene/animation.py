@@ -92,11 +92,11 @@ class Animation:
         each frame, pass their indices as `vertex` with shape (n, k).
         """
         first_pose = frames.astype(np.int64).clip(0, len(self.vertices) - 2)
-        share = (frames - first_pose)[:, None, None]
+        fraction = (frames - first_pose)[:, None, None]
         first_pose = first_pose if isinstance(vertex, slice) else first_pose[:, None]
         start = self.vertices[first_pose, vertex]
         stop = self.vertices[first_pose + 1, vertex]
-        return (1 - share) * start + share * stop, stop - start
+        return (1 - fraction) * start + fraction * stop, stop - start
 
     @cached_property
     def for_pictures(self) -> Animation:

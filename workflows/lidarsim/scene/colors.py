@@ -39,8 +39,8 @@ def as_bytes(shares: ArrayLike) -> Bytes:
 
     NaN becomes 0.
     """
-    finite_shares = np.nan_to_num(np.asarray(shares, np.float64))
-    return np.rint(255 * np.clip(finite_shares, 0, 1)).astype(np.uint8)
+    finite_fractions = np.nan_to_num(np.asarray(shares, np.float64))
+    return np.rint(255 * np.clip(finite_fractions, 0, 1)).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)

@@ -59,8 +59,12 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
         sampled_rays = sampled_rays + rays * every
         hit_count += int(batch.hit_counts.sum()) * every
         points += int(np.ceil(batch.hit_counts * every / survey.keep_every).sum())
-    share = survey.ray_count / sampled_rays
-    return {"rays": cast_rays, "hits": round(hit_count * share), "points": round(points * share)}
+    fraction = survey.ray_count / sampled_rays
+    return {
+        "rays": cast_rays,
+        "hits": round(hit_count * fraction),
+        "points": round(points * fraction),
+    }
 
 
 def sample_ranges(scene: Scene, survey: Survey, scans: range | None = None) -> Floats:

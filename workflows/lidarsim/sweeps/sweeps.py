@@ -298,11 +298,13 @@ class Sweeps:
             return points
         moved = points[rows]
         owners = actor[rows]
-        shares = self._shares(sweep, moved)
-        sensor = self._sensor_firing_poses(sweep, shares) if self.coordinates == "sensor" else None
+        fractions = self._shares(sweep, moved)
+        sensor = (
+            self._sensor_firing_poses(sweep, fractions) if self.coordinates == "sensor" else None
+        )
         masks = {owner: owners == owner for owner in np.unique(owners).tolist()}
         bodies = {
-            owner: self._actor_firing_poses(owner, sweep, shares[mask])
+            owner: self._actor_firing_poses(owner, sweep, fractions[mask])
             for owner, mask in masks.items()
         }
 

@@ -168,8 +168,8 @@ def _density_colors(density: Floats, hit: Bools, limits: tuple[float, float]) ->
     with hits, marked by the mask `hit` (...,), never do.
     """
     lower, upper = limits
-    share = np.log(np.maximum(density, lower) / lower) / np.log(upper / lower)
-    colors = TURBO[np.clip(share * 255, 0, 255).astype(np.int64)]
+    fraction = np.log(np.maximum(density, lower) / lower) / np.log(upper / lower)
+    colors = TURBO[np.clip(fraction * 255, 0, 255).astype(np.int64)]
     opacity = np.where(hit, 1.0, np.clip(density / lower / 0.6 - 0.3, 0, 1))[..., None]
     return np.asarray(rgb(UNSEEN) * (1 - opacity) + colors * opacity)
 

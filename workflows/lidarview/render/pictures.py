@@ -196,8 +196,8 @@ def _object_colors(scene: Scene, kinds: Ints) -> Floats:
     """
     width = scene.object_bounds[:, 1] - scene.object_bounds[:, 0]
     scene_size = np.maximum(scene.bounds[1] - scene.bounds[0], 1e-9)
-    share = np.where(np.isfinite(width), width, 0.0)[:, :2].prod(axis=1) / scene_size[:2].prod()
-    gray = (share >= MIN_FLOOR_SHARE) & (len(scene.names) > 1)
+    fraction = np.where(np.isfinite(width), width, 0.0)[:, :2].prod(axis=1) / scene_size[:2].prod()
+    gray = (fraction >= MIN_FLOOR_SHARE) & (len(scene.names) > 1)
     colors = np.empty((len(scene.names), 3))
     kind_numbers, kind = np.unique(kinds[~gray], return_inverse=True)
     colors[~gray] = theme.object_colors(len(kind_numbers))[kind]

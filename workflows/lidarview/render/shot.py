@@ -202,10 +202,10 @@ class SurfaceView:
             (segments[:, end] - self.camera.eye) @ self.camera.axes[2] for end in (0, 1)
         )
         s = np.linspace(0, 1, STEPS)[None]
-        share = (
+        fraction = (
             s * start_depth[:, None] / (stop_depth[:, None] * (1 - s) + s * start_depth[:, None])
         )
-        path = segments[:, :1] + share[..., None] * (segments[:, 1:] - segments[:, :1])
+        path = segments[:, :1] + fraction[..., None] * (segments[:, 1:] - segments[:, :1])
         pixels, shown = is_visible(path.reshape(-1, 3))
         pieces = []
         for line, visible in zip(

@@ -174,9 +174,9 @@ class _FilmSource:
         The colors span the height of `box`, which has shape (2, 3).
         """
         local = self.positions(max_points, scans)
-        share = np.clip((local[:, 2] - box[0, 2]) / max(np.ptp(box[:, 2]), 1e-9), 0, 1)
+        fraction = np.clip((local[:, 2] - box[0, 2]) / max(np.ptp(box[:, 2]), 1e-9), 0, 1)
         # The darkest colors are skipped, because they are hard to see on a dark background.
-        colors = TURBO[(24 + 231 * np.sqrt(share)).astype(np.int64)]
+        colors = TURBO[(24 + 231 * np.sqrt(fraction)).astype(np.int64)]
         return local, np.pad(colors, ((0, 0), (0, 1)), constant_values=1)
 
     def new_points(
@@ -371,8 +371,8 @@ def _thinned(view: View, max_points: int) -> Answer:
     cell_m = max(float(np.linalg.norm(np.ptp(world, axis=0))) / _CELLS, 1e-9)
     cells = ((world - world.min(axis=0)) / cell_m).astype(np.int64) @ [1 << 20, 1 << 10, 1]
     _, cell_of_point, counts = np.unique(cells, return_inverse=True, return_counts=True)
-    shares = even_shares(counts, max_points)[cell_of_point]
-    chosen = np.random.default_rng(0).random(len(rows)) < shares
+    fractions = even_shares(counts, max_points)[cell_of_point]
+    chosen = np.random.default_rng(0).random(len(rows)) < fractions
     columns = {c.name: points.values(c.name, rows[chosen]) for c in points.table}
     order = _compact_order(columns, int(chosen.sum()))
     return _packed_points(

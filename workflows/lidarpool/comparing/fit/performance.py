@@ -307,8 +307,8 @@ def fit_threshold(
     from scipy.stats import binom
 
     def detection(log_threshold: Any) -> Floats:
-        share = ndtr(THRESHOLD_SIGMAS * (energy / np.exp(log_threshold) - 1))
-        return np.clip((1 - dropout) * share, 1e-9, 1 - 1e-9)
+        fraction = ndtr(THRESHOLD_SIGMAS * (energy / np.exp(log_threshold) - 1))
+        return np.clip((1 - dropout) * fraction, 1e-9, 1 - 1e-9)
 
     def deviance(log_threshold: Any) -> Floats:
         p: Floats = detection(log_threshold)

@@ -277,8 +277,8 @@ def covered_cells(returned: Bools) -> Bools:
     rings, is considered a gap if independent losses of pulses are very unlikely to produce such a
     run.
     """
-    share = (returned.sum(axis=0) + 0.5) / (len(returned) + 1)
-    log_chance = np.where(share > _MIN_CELL_SHARE, np.log1p(-share), 0.0)
+    fraction = (returned.sum(axis=0) + 0.5) / (len(returned) + 1)
+    log_chance = np.where(fraction > _MIN_CELL_SHARE, np.log1p(-fraction), 0.0)
     # Columns without a return in any ring are gaps even if few sweeps return there.
     sparse_log_chance = np.log1p(-returned.sum(axis=0) / (len(returned) + 1)).sum(axis=0)
     columns = _improbable_runs(np.asarray(~returned.any(axis=1)), sparse_log_chance)
@@ -329,11 +329,11 @@ def steady_cells(returned: Bools, covered: Bools) -> Bools:
 
     pulses = sum(patch_sums(mask) for mask in covered)
     return_counts = sum(patch_sums(mask) for mask in returned & covered)
-    mean_share = return_counts / np.maximum(pulses, 1)
-    unsteady = np.zeros(mean_share.shape, bool)
+    mean_fraction = return_counts / np.maximum(pulses, 1)
+    unsteady = np.zeros(mean_fraction.shape, bool)
     for sweep_returned, sweep_covered in zip(returned, covered, strict=True):
         trials = patch_sums(sweep_covered)
-        share = patch_sums(sweep_returned & sweep_covered) / np.maximum(trials, 1)
-        divergence = rel_entr(share, mean_share) + rel_entr(1 - share, 1 - mean_share)
+        fraction = patch_sums(sweep_returned & sweep_covered) / np.maximum(trials, 1)
+        divergence = rel_entr(fraction, mean_fraction) + rel_entr(1 - fraction, 1 - mean_fraction)
         unsteady |= np.where(trials > 0, divergence, 0) * trials > -_MAX_LOG_CHANCE
     return ~maximum_filter(unsteady, _STEADY_PATCH, mode=modes)

@@ -109,7 +109,7 @@ class GltfMaterials:
         image, light, wrap_u, wrap_v = key
         colors = self._file.image(image, partial(read_colors, notes=self.notes))
         if light != (1.0, 1.0, 1.0):
-            scaled = [as_srgb(LINEAR * share) for share in light]
+            scaled = [as_srgb(LINEAR * fraction) for fraction in light]
             colors = np.stack([table[colors[..., k]] for k, table in enumerate(scaled)], axis=-1)
         return Texture(colors, (wrap_u, wrap_v), self._allowance)
 

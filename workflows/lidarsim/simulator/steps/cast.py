@@ -537,11 +537,11 @@ class CastStep(PulseStep):
         order = order_along_rings(
             light.ray[row_indices] // subrays_per_beam, self.setup.sensor.channels
         )
-        row_indices, reflected, share = self._divide(
+        row_indices, reflected, fraction = self._divide(
             light, surface_hits, row_indices[order], reflected[order]
         )
         onward = light.take(row_indices)
-        onward.share = share
+        onward.share = fraction
         crossings = SurfaceCrossings(
             step_m=surface_hits.step_m[row_indices],
             distance=surface_hits.distance[row_indices],
@@ -575,7 +575,7 @@ class CastStep(PulseStep):
         drops_faint = light.mirrored is not None and not (
             in_media is not None and in_media.differentials
         )
-        share = np.empty(len(row_indices))
+        fraction = np.empty(len(row_indices))
         film = np.zeros(0, np.bool_) if surface_hits.film is None else surface_hits.film
         count = surface_loops.divide_light(
             row_indices,
@@ -597,9 +597,9 @@ class CastStep(PulseStep):
                 self._sensor_light.extinction,
                 self._faintest if drops_faint else -1.0,
             ),
-            onward_share=share,
+            onward_share=fraction,
         )
-        return OnwardRows(row_indices[:count], reflected[:count], share[:count])
+        return OnwardRows(row_indices[:count], reflected[:count], fraction[:count])
 
     def _cast_again(self, onward: OnwardLight, actor_trajectories: ActorTrajectories) -> CastLight:
         """Cast the light behind surfaces, and return the light that hits a surface in range.
@@ -704,7 +704,7 @@ class CastStep(PulseStep):
         This moves the light into the media behind the surfaces.
         """
         outgoing = light.directions
-        share = light.share
+        fraction = light.share
         mirrored = crossings.reflected
         if light.in_media is not None:
             refraction = light.in_media.cross(
@@ -716,11 +716,13 @@ class CastStep(PulseStep):
                 crossings.reflected,
             )
             outgoing = refraction.directions
-            share = share * refraction.shares**2  # light passes on the way out and on the way back
+            fraction = (
+                fraction * refraction.shares**2
+            )  # light passes on the way out and on the way back
             mirrored = mirrored | refraction.totally_reflected
         twice_normals = 2 * mirrored[:, None] * crossings.normals
         outgoing = outgoing - crossings.cosines[:, None] * twice_normals
-        return Deflection(outgoing, share, mirrored, twice_normals)
+        return Deflection(outgoing, fraction, mirrored, twice_normals)
 
 
 def _range_rate_behind(

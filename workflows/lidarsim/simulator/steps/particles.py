@@ -372,8 +372,8 @@ def seen_by_range(
     rate = air.particle_rate(kind, min_energy, distance)
     integrals = (rate[1:] + rate[:-1]) / 2 * np.diff(distance)
     sums = np.concatenate([[0.0], np.cumsum(integrals)])
-    shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
-    distance = round_to_single(interp(shares, sums / sums[-1], distance))
+    fractions = (np.arange(QUANTILES) + 0.5) / QUANTILES
+    distance = round_to_single(interp(fractions, sums / sums[-1], distance))
     smallest = np.minimum(air.min_diameter_mm(kind, min_energy, distance), kind.largest)
     larger = -expm1(-kind.slope * (kind.largest - smallest))
     full_beam_energy = kind.reflectance * air.white_energy(distance)
@@ -436,8 +436,8 @@ def highest_probabilities(signals: Floats) -> Floats:
     product = np.ones(len(levels))
     for number in range(1, count + 1):
         product = product * below[number - 1]
-        share = (density[:number] * product).sum(axis=1)
-        probabilities[number, :number] = np.cumsum(share / share.sum())
+        fraction = (density[:number] * product).sum(axis=1)
+        probabilities[number, :number] = np.cumsum(fraction / fraction.sum())
         probabilities[number, number - 1 :] = 1.0
     return probabilities
 
@@ -453,5 +453,5 @@ def round_to_single(table: Floats) -> Floats:
 @cache
 def exponential_quantiles() -> Floats:
     """Return the quantiles of the exponential distribution at the centers of equal shares."""
-    shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
-    return round_to_single(-log1p(-shares))
+    fractions = (np.arange(QUANTILES) + 0.5) / QUANTILES
+    return round_to_single(-log1p(-fractions))

@@ -33,10 +33,10 @@ from ..returns import (
 )
 from .particles import (
     add_air_hits,
+    empty_hits,
     exponential_quantiles,
     light_reach,
     random_keys,
-    empty_hits,
     seen_by_range,
 )
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes

@@ -187,8 +187,12 @@ def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
         tangent = math.sqrt((x + step * u) * (x + step * u) + (y + step * v) * (y + step * v))
         if tangent < min_tangent:
             # A step on the plane corresponds to a different share of the edge in space.
-            share = step * p_depth / (step * p_depth + (1 - step) * q_depth)
-            nearest = px + share * (qx - px), py + share * (qy - py), pz + share * (qz - pz)
+            fraction = step * p_depth / (step * p_depth + (1 - step) * q_depth)
+            nearest = (
+                px + fraction * (qx - px),
+                py + fraction * (qy - py),
+                pz + fraction * (qz - pz),
+            )
             min_tangent = tangent
     return (0.0 if all_left or all_right else min_tangent), nearest
 
