@@ -179,7 +179,7 @@ class Stages:
         known = {"generate": self.described, "sort": self.unsorted}
         (known[name] if name in known else self.orders[name]).extend(messages)
 
-    def advise(self, scans):
+    def set_message_scans(self, scans):
         pass
 
     def store_held(self, receipt):
@@ -794,7 +794,7 @@ def test_stage_1_always_has_jobs_before_it_and_few_of_them(empty):
     most = 0
     empty.stages.advice = 5
     empty.stages.seconds = 0.001
-    empty.stages.advise = lambda scans: None
+    empty.stages.set_message_scans = lambda scans: None
 
     def begin():
         nonlocal begun, most

@@ -51,7 +51,7 @@ def make_job(scans: int) -> SingleJob:
 def shown(store: RunStore):
     """Yield the page of a run that nobody looks at."""
     with live_page(port=0, browser=False) as live:
-        live.begun(store.only_job)
+        live.on_survey_start(store.only_job)
         yield live
 
 
@@ -222,7 +222,7 @@ def test_a_page_that_stays_shows_the_file_of_the_cloud_and_its_sweeps(live, tmp_
     live.on_progress(progress(1.0, 1), list)
     before = news(live)["ends"]
     live.stopped.set()  # it stays no longer than that
-    live.stay(path)
+    live.keep_open(path)
     assert news(live)["ends"] > before  # the page asks for all again
     assert displayed(live) == 3000
     assert "sweep_scans" in ask(live.page.url, "state")["arrays"]

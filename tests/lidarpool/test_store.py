@@ -100,7 +100,7 @@ def test_a_run_from_its_beginning_to_its_end(folder):
     mark = store.db.meta["mark"]
     store.storage.write(part_name(mark, 0, 0, 2), b"of a collector that died")
     store.storage.write(probe_name(mark, "0a1b2c3d"), b"of a driver that died")
-    store.tidy()
+    store.remove_orphaned_parts()
     assert store.storage.sizes().keys() == {*store.only_job.points().names, mark_name(mark)}
     store.remove()
     assert not folder.exists()
@@ -217,7 +217,7 @@ def test_a_damaged_part_is_made_again(damage, unfinished):
     (note,) = store.notes
     assert "scans 3 to 4, because " in note and f"{part.name} was damaged" in note
     assert add(store, 3, 5)
-    store.tidy()
+    store.remove_orphaned_parts()
     assert {*store.only_job.points().names, mark_of(store)} == store.storage.sizes().keys()
     assert len(store.only_job.points().load()) == 12
     store.db.close()
@@ -280,7 +280,7 @@ def test_parts_elsewhere_have_a_folder_of_their_own_and_go_with_the_run(folder, 
     store = opened(folder, place)
     add(store, 0, 6)
     assert names(folder) <= {"run.db", "run.db-journal"}
-    store.tidy()
+    store.remove_orphaned_parts()
     assert len(store.only_job.points().load()) == 18
     store.remove()
     assert not folder.exists() and store.storage.sizes() == {}
@@ -368,7 +368,7 @@ def test_foreign_files_among_the_parts_stay(how, request, folder):
     if how == "finished":
         store = opened(folder)
         add(store, 0, 6)
-        store.tidy()
+        store.remove_orphaned_parts()
         store.remove()
     elif how == "dropped":
         remove_run(folder)
@@ -614,7 +614,7 @@ def test_it_goes_on_from_the_last_copy(remote_run):
     assert add(store, 2, 3) and add(store, 5, 6)
     store.only_job.committed.advance_frames(6)
     store.save(force=True)
-    store.tidy()
+    store.remove_orphaned_parts()
     mark = mark_name(store.db.meta["mark"])
     assert left(remote_run) == {"run.db", "run.owner", mark, *store.only_job.points().names}
     again = opened(remote_run, resume=True)

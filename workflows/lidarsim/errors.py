@@ -124,16 +124,16 @@ def as_sentence(advice: str) -> str:
     return f"{advice[:1].upper()}{advice[1:].rstrip('.')}."
 
 
-def unreadable(subject: object, error: Exception, advice: str = "") -> str:
+def unreadable_message(subject: object, error: Exception, advice: str = "") -> str:
     """Return a message about a file that cannot be read.
 
     `error` may be an exception of any class. The advice, if any, follows as a second sentence.
 
     Examples
     --------
-    >>> unreadable("vlp16.yaml", KeyError("lasers"))
+    >>> unreadable_message("vlp16.yaml", KeyError("lasers"))
     "vlp16.yaml cannot be read: 'lasers' is missing."
-    >>> unreadable("a.stl", CutShortError("line 7 is the last"), "export it again")
+    >>> unreadable_message("a.stl", CutShortError("line 7 is the last"), "export it again")
     'a.stl is truncated: line 7 is the last. Export it again.'
     """
     failure = "is truncated" if isinstance(error, CutShortError) else "cannot be read"

@@ -126,7 +126,7 @@ def _run_survey(
         timeline.mark(timeline.SUMMARY)
         if options.live and options.stay:
             with local_result(out, [CLOUD]) as folder:
-                page.stay(folder / CLOUD)
+                page.keep_open(folder / CLOUD)
 
 
 def run_campaign(
@@ -166,7 +166,7 @@ def run_campaign(
         print_results(figures, lines, terminal.as_json)
         timeline.mark(timeline.SUMMARY)
         if options.live and options.stay:
-            page.stay()
+            page.keep_open()
     if run.failed:
         raise LidarError(describe_failures(run))
 

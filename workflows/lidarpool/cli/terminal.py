@@ -103,7 +103,7 @@ class Terminal(Screen):
             yield PlainLines(self._stream) if self._stream else lambda progress: None
 
     @contextmanager
-    def starting(
+    def start_cluster(
         self, cluster: AbstractContextManager[Client], words: str, *, shares_terminal: bool = False
     ) -> Iterator[Client]:
         """Show a status until the cluster has started, and yield its client.

@@ -55,7 +55,7 @@ def result_folder(output: Path | Storage) -> Iterator[Path]:
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 lock = _lock(folder)
-            Storage.at(folder).tidy(deep=False)
+            Storage.at(folder).remove_unfinished(deep=False)
         except BlockingIOError as error:
             raise LidarError(
                 f"Another run or export is using the folder {folder}. Wait until it has "

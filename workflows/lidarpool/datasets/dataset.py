@@ -265,7 +265,7 @@ class DataSet:
         """
         with explain_os_errors(f"{self.storage} cannot be written"):
             self.storage.remove([INDEX_FILE])
-            self.storage.tidy()
+            self.storage.remove_unfinished()
             with self.storage.writing(INDEX_FILE) as file:
                 index = SealedWriter(file)
                 head: dict[str, Any] = {"lidarpool": __version__, "version": VERSION}

@@ -62,7 +62,7 @@ class LivePage(RunPage):
 
     # -- called by the run --------------------------------------------------------------
 
-    def begun(self, job: StoredJob) -> None:
+    def on_survey_start(self, job: StoredJob) -> None:
         """Show the only job, including scans that were committed earlier."""
         if job.committed_text:
             self._status.progress = job.progress()
@@ -127,7 +127,7 @@ class LivePage(RunPage):
         self._loads.clear()
         self._status.finish(seconds, None if result is None else len(result.points))
 
-    def stay(self, cloud: Path | None = None) -> None:
+    def keep_open(self, cloud: Path | None = None) -> None:
         """Keep the page open until Ctrl-C or until a user stops it.
 
         The points of a survey are read from the written `cloud`, because the parts have been

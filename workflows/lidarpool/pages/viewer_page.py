@@ -64,7 +64,7 @@ class ViewerPage(RunPage):
         self._survey: SurveyFeed | None = None  # feed of the only job
         self._share = CpuShare(READING_SHARE)
 
-    def begun(self, job: StoredJob) -> None:
+    def on_survey_start(self, job: StoredJob) -> None:
         """Show the only job of a run."""
         self._survey = SurveyFeed(job, self._viewer)
 
@@ -109,7 +109,7 @@ class ViewerPage(RunPage):
         if self._survey is not None:
             self._survey.stop()
 
-    def stay(self, cloud: Path | None = None) -> None:
+    def keep_open(self, cloud: Path | None = None) -> None:
         """Keep the viewer open until Ctrl-C."""
         click.echo(f"{self._viewer.description}. Press Ctrl-C to stop.", err=True)
         wait_for_interrupt()

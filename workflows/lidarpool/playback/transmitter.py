@@ -55,7 +55,7 @@ class Stream:
         ports = " and ".join(map(str, self.ports))
         return f"{words}, port {ports}" if ports else words
 
-    def to(self, receiver: ReceiverAddress) -> Stream:
+    def with_destination(self, receiver: ReceiverAddress) -> Stream:
         """Return a copy of the stream with a new destination.
 
         The port of the receiver is that of the returns. Ports of other kinds of datagrams are
@@ -119,7 +119,7 @@ def streams_to(streams: Sequence[Stream], to: Sequence[str], api: Sequence[str])
     for number, stream in enumerate(streams):
         name = stream.name
         moved = replace(
-            stream.to(receivers.get(name, ReceiverAddress(LOOPBACK))),
+            stream.with_destination(receivers.get(name, ReceiverAddress(LOOPBACK))),
             address=interfaces.get(name, _loopback_address(number, stream.has_own_address)),
             api_given=name in interfaces,
         )

@@ -398,7 +398,7 @@ class _Building:
         def find() -> tuple[RecordedPoses]:
             return (find_poses(self.recorded, trajectory),)
 
-        (poses,) = self.steps.once(_POSES, find)
+        (poses,) = self.steps.run_once(_POSES, find)
         return poses._replace(
             source=str(poses.source), share=float(poses.share), first_s=float(poses.first_s)
         )

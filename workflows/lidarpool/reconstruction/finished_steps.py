@@ -99,7 +99,7 @@ class FinishedSteps:
                 self._save(step, index, next(results))
             yield self.load(step, index)
 
-    def once(self, step: TwinStep, call: Callable[[], tuple[Any, ...]]) -> tuple[Any, ...]:
+    def run_once(self, step: TwinStep, call: Callable[[], tuple[Any, ...]]) -> tuple[Any, ...]:
         """Return the results of a step that runs once, from the folder or by calling `call`."""
         if not self._file(step, 0).exists():
             self._save(step, 0, call())

@@ -540,7 +540,7 @@ def _remove_dataset(storage: Storage, run_folder: Storage) -> None:
     begun = CAMPAIGN_FILE in storage.sizes() or FILE in run_folder.sizes()
     files = list_dataset_files(storage, begun=begun)
     with explain_os_errors(f"{storage} cannot be removed"):
-        storage.tidy()
+        storage.remove_unfinished()
         # INDEX_FILE, which marks the data set as finished, is removed first. CAMPAIGN_FILE, which
         # identifies the folder as a data set, is removed last.
         storage.prune(sorted(files, key=lambda name: (name == CAMPAIGN_FILE, name != INDEX_FILE)))

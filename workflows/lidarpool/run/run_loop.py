@@ -120,7 +120,7 @@ class RunLoop:
         cluster = self._cluster
         pipeline = self._pipeline
         try:
-            with cluster.partitions_page(), cluster.stopping(self._stop):
+            with cluster.partitions_page(), cluster.stop_on_error(self._stop):
                 pipeline.open()
                 self._loop(first, show)
                 pipeline.finish()
@@ -130,7 +130,7 @@ class RunLoop:
             self._remover.shutdown()
         self._save()
         self._store.save(force=True)
-        self._store.tidy()
+        self._store.remove_orphaned_parts()
         tasks_beside = [beside.tasks for beside in (self._writer, self._trials) if beside]
         books = [pipeline.book, *(tasks.book for tasks in tasks_beside)]
         self._store.notes += pipeline.notes

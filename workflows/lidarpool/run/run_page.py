@@ -24,7 +24,7 @@ class RunPage:
     parts of ended jobs.
     """
 
-    def begun(self, job: StoredJob) -> None:
+    def on_survey_start(self, job: StoredJob) -> None:
         """Show the job of a survey, including results from an earlier run."""
 
     def follow(self, partitions: Mapping[str, Partition], dataset: DataSet | None = None) -> None:
@@ -72,7 +72,7 @@ class RunPage:
         The parts may be removed afterwards.
         """
 
-    def stay(self, cloud: Path | None = None) -> None:
+    def keep_open(self, cloud: Path | None = None) -> None:
         """Keep the page open until the user ends it.
 
         Points are read from the written file `cloud`.

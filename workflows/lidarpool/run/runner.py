@@ -121,7 +121,7 @@ def cast(
         remaining = (number for number in store.jobs.numbers if not store.db.has_ended(number))
         maker = JobProducer(store.jobs, remaining, dataset.columns)
     if store.only_job is not None:
-        page.begun(store.only_job)
+        page.on_survey_start(store.only_job)
     with nullcontext() if maker is None else closing(maker):
         first = _first_job(store, maker, page)
         if first is None:

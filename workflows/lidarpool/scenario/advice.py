@@ -16,7 +16,7 @@ from lidarsim.media.weather import FOG_LIDAR_RATIO_SR
 from lidarsim.motion.headings import CORNER_M
 from lidarsim.motion.trajectory import Track, presence_ns
 from lidarsim.scene.files.mesh_formats import format_of
-from lidarsim.scene.files.meshfile import written_by_lidarpool
+from lidarsim.scene.files.meshfile import is_written_by_lidarpool
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor.optics import TWO_RETURNS
 from lidarsim.simulator.steps.particles import WeatherStep
@@ -177,7 +177,7 @@ def _size_note(prepared: PreparedScenario, side: float) -> str:
 def _lacks_unit(path: Path) -> bool:
     """Return whether neither a mesh file nor its format specifies a unit."""
     row = format_of(path)
-    return row is not None and row.unitless and not written_by_lidarpool(path)
+    return row is not None and row.unitless and not is_written_by_lidarpool(path)
 
 
 def _color_note(prepared: PreparedScenario) -> str:

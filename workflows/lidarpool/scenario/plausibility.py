@@ -398,14 +398,14 @@ def _orientation_warnings(motion: _Motion) -> Iterator[str]:
     quaternions = quaternions_of(motion.rotations)
     w_first = _MeanOrientation.measure(motion, matrices(quaternions[:, [1, 2, 3, 0]]))
     tilted = as_read.level <= _TILTED
-    is_w_first = as_read.level <= _LEVEL < w_first.level and not w_first.askew
-    if not (tilted or as_read.askew or is_w_first):
+    is_w_first = as_read.level <= _LEVEL < w_first.level and not w_first.is_askew
+    if not (tilted or as_read.is_askew or is_w_first):
         return
     faults = []
     if tilted or is_w_first:
         tilt = np.degrees(np.arccos(np.clip(as_read.level, -1, 1)))
         faults.append(f"the z axis of the platform is tilted by {tilt:.0f} degrees from vertical")
-    if as_read.askew:
+    if as_read.is_askew:
         faults.append(
             f"the platform constantly faces {abs(as_read.angle_deg):.0f} degrees to the "
             f"{'left' if as_read.angle_deg > 0 else 'right'} of its direction of travel"
@@ -429,7 +429,7 @@ class _MeanOrientation(NamedTuple):
     constancy: float  # constancy of that angle, from 0 to 1; 0 if the platform hardly moves
 
     @property
-    def askew(self) -> bool:
+    def is_askew(self) -> bool:
         """Whether the platform constantly faces away from its direction of travel."""
         return self.constancy > _CONSTANT and abs(self.angle_deg) > _ASKEW_DEG
 

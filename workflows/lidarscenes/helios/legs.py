@@ -42,7 +42,7 @@ class Leg:
     longest_s: float  # maximum duration; infinite without a limit
 
     @property
-    def active(self) -> bool:
+    def is_active(self) -> bool:
         """Whether the scanner is active during the leg."""
         return read_flag(self.scanner, "active", True)
 
@@ -127,7 +127,7 @@ def moving_trajectory(legs: Sequence[Leg]) -> HeliosTrajectory:
             yaw = float(np.degrees(np.arctan2(displacement[1], displacement[0])))
         target = position + displacement * (seconds * speed / length)
         rows += [[clock, *position, yaw], [clock + seconds, *target, yaw]]
-        segments.append(LegSegment(leg.number, leg.active, clock, seconds))
+        segments.append(LegSegment(leg.number, leg.is_active, clock, seconds))
         clock = clock + seconds + _BETWEEN_S
         position = target
     if not rows:
@@ -145,7 +145,7 @@ def stationary_trajectory(legs: Sequence[Leg], heads: dict[int, float]) -> Helio
     segments = []
     clock = 0.0
     for leg in legs:
-        if not leg.active:
+        if not leg.is_active:
             continue
         seconds = min(heads[leg.number] or np.inf, leg.longest_s)
         if seconds == np.inf:
@@ -202,7 +202,7 @@ def _segment_between(leg: Leg, first_s: float, last_s: float) -> LegSegment:
         raise LidarError(
             f"leg {leg.number}: tStart and tEnd are outside the time range of the trajectory."
         )
-    return LegSegment(leg.number, leg.active, float(start - first_s), float(stop - start))
+    return LegSegment(leg.number, leg.is_active, float(start - first_s), float(stop - start))
 
 
 def _platform_rotation(kind: str, roll: float, pitch: float, yaw: float) -> Floats:

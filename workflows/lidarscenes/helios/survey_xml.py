@@ -218,7 +218,7 @@ class _Import:
         devices = {}
         for leg in legs:
             with prefix_errors(f"leg {leg.number}"):
-                if leg.active:
+                if leg.is_active:
                     devices[leg.number] = {
                         channel: make_device(scanner, leg.scanner)
                         for channel, scanner in self._scanners.items()

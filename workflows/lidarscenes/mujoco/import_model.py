@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarsim.errors import LidarError, explain_os_errors, unreadable
+from lidarsim.errors import LidarError, explain_os_errors, unreadable_message
 from lidarsim.io.input_files import read_input
 from lidarsim.numerics.arrays import Floats
 from lidarsim.numerics.elementary import arctan2, cos, sin
@@ -115,7 +115,7 @@ def _loaded(path: Path, assets: Sequence[Path]) -> Any:
     except MeshFileError as error:
         raise LidarError(f"it {error}.") from error
     except ValueError as error:
-        raise LidarError(unreadable("it", error)) from error
+        raise LidarError(unreadable_message("it", error)) from error
 
 
 def _groups(model: Any) -> dict[_Group, list[int]]:

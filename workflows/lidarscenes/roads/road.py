@@ -123,7 +123,7 @@ class Road:
         return LateralShapes(elements) if elements else None
 
     @property
-    def curved_across(self) -> bool:
+    def has_curved_sections(self) -> bool:
         """Whether the cross sections of lanes are curved or have kinks."""
         return self.shapes is not None or any(map(len, self.crossfalls.values()))
 
@@ -131,7 +131,7 @@ class Road:
     def is_plain(self) -> bool:
         """Whether the road is a plane where its reference line is straight."""
         return not (
-            self.curved_across or self.lane_offset.bent or not self.superelevation.is_constant
+            self.has_curved_sections or self.lane_offset.bent or not self.superelevation.is_constant
         )
 
     @cached_property

@@ -119,9 +119,9 @@ def open_client(
         return connect_client(options.scheduler, options.files, waiting)
     if options.cluster is not None:
         started = start_client(options.cluster, screen.report)
-        return screen.starting(started, f"starting {options.cluster}")
+        return screen.start_cluster(started, f"starting {options.cluster}")
     local = local or _start_local(options, required_slots)
-    return screen.starting(local, "starting the workers", shares_terminal=True)
+    return screen.start_cluster(local, "starting the workers", shares_terminal=True)
 
 
 def _start_local(options: RunOptions, slots: Mapping[str, int]) -> BackgroundClient:
@@ -278,7 +278,7 @@ class Cluster:
                     self._workers.pool.leave_page()
 
     @contextmanager
-    def stopping(self, stop: Callable[[str], None]) -> Iterator[None]:
+    def stop_on_error(self, stop: Callable[[str], None]) -> Iterator[None]:
         """Call `stop` with the reason if the body raises an error, and convert cluster errors.
 
         Finally, the partitions are allowed to shrink.

@@ -53,7 +53,7 @@ def naming_scans(first: int, stop: int) -> Iterator[None]:
         raise ScanError(f"{words}: {type(error).__name__}: {error}") from error
 
 
-def storing(storage: Storage) -> AbstractContextManager[None]:
+def convert_storage_errors(storage: Storage) -> AbstractContextManager[None]:
     """Convert an OSError in the body to a LidarError with advice on the storage."""
     advice = "Free space there, or choose a different location with `--scratch-dir`"
     return explain_os_errors(f"The points cannot be stored in {storage.url}", advice)

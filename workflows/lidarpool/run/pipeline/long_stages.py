@@ -35,7 +35,7 @@ from poolpart.task_locations import PartitionSnapshot, take_snapshot
 
 from ...columns.parts import probe_name
 from ...identity.software import call_with_same_sources
-from .failures import memory_clause, raise_if_failed, storing, was_killed
+from .failures import convert_storage_errors, memory_clause, raise_if_failed, was_killed
 from .long_stage_tasks import collect, generate, sort_frames
 from .stage_messages import CollectOrder, Description, Message, Receipt, StageStart, Summaries
 from .stage_names import COLLECT, GENERATE, SORT
@@ -140,7 +140,7 @@ class LongStages:
 
     def open(self) -> None:
         """Create the pipes and the probe file. Call `finish` to remove them."""
-        with storing(self._storage):
+        with convert_storage_errors(self._storage):
             self._storage.prepare()
             self._storage.write(*self.probe)
         for pipe in (self._scans, self._news):
@@ -183,7 +183,7 @@ class LongStages:
         if task is not None:
             self._outbox.setdefault(task.inlet.name, []).extend(messages)
 
-    def advise(self, scans: int) -> None:
+    def set_message_scans(self, scans: int) -> None:
         """Set the number of scans that stage 1 sends in each message."""
         set_advice(self._scans, scans)
 
@@ -193,7 +193,7 @@ class LongStages:
         data = fetch_held_bytes(self.client, receipt.held_at, receipt.name)
         if data is None:
             return False
-        with storing(self._storage):
+        with convert_storage_errors(self._storage):
             self._storage.write(receipt.name, data)
         return True
 

@@ -288,7 +288,7 @@ class Pipeline:
         advice = self.dispatcher.advice
         self.dispatcher.release((self.jobs[receipt.job], receipt) for receipt in new)
         if self.dispatcher.advice != advice:
-            self.stages.advise(self.dispatcher.advice)
+            self.stages.set_message_scans(self.dispatcher.advice)
         parts_of_jobs: dict[PipelineJob, list[Receipt]] = {}
         for receipt in new:
             job = self.jobs[receipt.job]

@@ -29,7 +29,7 @@ from ...identity.software import software
 from ...scenario.job import Job
 from ..job_source import CONTENT, Jobs, input_fingerprints
 from ..pipeline.committed_results import CommittedResults
-from ..pipeline.failures import storing
+from ..pipeline.failures import convert_storage_errors
 from .database import (
     FILE,
     PARTS_FOLDER,
@@ -252,7 +252,7 @@ class RunStore:
         if self._remote:
             self._remote.claim(self.db)
         if mark_name(self.db.meta["mark"]) not in self._sizes:
-            with storing(self.storage):
+            with convert_storage_errors(self.storage):
                 self.storage.prepare()
                 self._write_mark()
         if self.only_job is not None:  # after it is certain that the run is the same
@@ -328,7 +328,7 @@ class RunStore:
         """Store the backend and the software that all scans are cast with."""
         if backend != self.backend or casting != self.casting:
             self.db.set(backend=backend, casting=json.dumps(casting))
-            with storing(self.storage):
+            with convert_storage_errors(self.storage):
                 self._write_mark()
 
     @property
@@ -491,7 +491,7 @@ class RunStore:
             self.save(force=True)
         self.db.close()
 
-    def tidy(self) -> None:
+    def remove_orphaned_parts(self) -> None:
         """Remove parts from dead or replaced collectors, which belong to no job in flight."""
         mark = self.db.meta["mark"]
         part_names = [part.name for job in self.in_flight.values() for part in job.parts.ordered]

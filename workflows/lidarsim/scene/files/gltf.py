@@ -30,10 +30,10 @@ from .gltf_file import (
     INSTANCING,
     VISIBILITY,
     GltfFile,
+    check_index,
     check_readable,
     extension,
     extension_notes,
-    natural,
     root_nodes,
     split_chunks,
 )
@@ -211,7 +211,7 @@ class _NodeReader:
         if not indices:
             return None
         counts = [
-            natural(self._file.part("accessors", index)["count"]) for index in indices.values()
+            check_index(self._file.part("accessors", index)["count"]) for index in indices.values()
         ]
         if len({*counts}) > 1:
             raise ValueError(

@@ -127,7 +127,7 @@ class GltfFile:
             If the index is out of range.
         """
         entries: list[dict[str, Any]] = self.header.get(kind, [])
-        number = natural(index)
+        number = check_index(index)
         if number >= len(entries):
             raise ValueError(
                 f"it refers to index {number} of its {kind}, but there are {len(entries)}"
@@ -140,7 +140,7 @@ class GltfFile:
         The shape is (count, width).
         """
         accessor = self.part("accessors", index)
-        count = natural(accessor["count"])
+        count = check_index(accessor["count"])
         if accessor["type"] not in _WIDTHS or accessor["componentType"] not in _TYPES:
             raise ValueError(
                 f"accessor {index} has the type {accessor['type']!r} with components of type "
@@ -251,7 +251,7 @@ def extension(part: dict[str, Any], name: str) -> dict[str, Any]:
     return content
 
 
-def natural(number: Any) -> int:
+def check_index(number: Any) -> int:
     """Validate a count or an index.
 
     Raises

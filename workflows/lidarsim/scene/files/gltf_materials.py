@@ -24,7 +24,7 @@ from ..masks import (
     read_opacity,
 )
 from .gltf_draco import DRACO
-from .gltf_file import GltfFile, extension, natural
+from .gltf_file import GltfFile, check_index, extension
 from .polygons import check_corners
 from .scene_graph import Piece, ReadOptions
 
@@ -79,7 +79,7 @@ class GltfMaterials:
             corners = as_srgb(np.clip(light[:, :3], 0, 1))[faces]
             colors = Colors.from_vertex_colors(corners)
         if number is not None:
-            base, info = self._base(natural(number))
+            base, info = self._base(check_index(number))
             if isinstance(base, Texture):
                 colors = base.colors(self._coordinates(info, primitive, mesh), faces)
             else:
@@ -222,4 +222,4 @@ def _image_of(texture: dict[str, Any]) -> int:
     index = texture.get("source", extension(texture, "EXT_texture_webp").get("source"))
     if index is None:
         raise MaskError("its image is in a format that cannot be read")
-    return natural(index)
+    return check_index(index)

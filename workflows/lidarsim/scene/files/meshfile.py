@@ -24,7 +24,7 @@ from ...errors import (
     MissingFileError,
     as_sentence,
     prefix_errors,
-    unreadable,
+    unreadable_message,
 )
 from ...io.input_files import not_found, open_input, read_input
 from ...motion.rotations import quaternions_of
@@ -285,7 +285,7 @@ def _summary(
     return ", ".join(words)
 
 
-def written_by_lidarpool(path: Path) -> bool:
+def is_written_by_lidarpool(path: Path) -> bool:
     """Return whether lidarpool wrote the file, which is in meters then.
 
     The format of the file must not state a unit itself.
@@ -359,7 +359,7 @@ def _read(path: Path, row: MeshFormat, data: bytes, options: ReadOptions) -> Con
         # BadZipFile, ParseError and struct.error.
         failure = _truncation_error(error, data) or error
         raise LidarError(
-            f"{unreadable(path, failure, _advice(failure))}{_other_format(path, data)}"
+            f"{unreadable_message(path, failure, _advice(failure))}{_other_format(path, data)}"
         ) from error
 
 

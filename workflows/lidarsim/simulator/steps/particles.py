@@ -20,7 +20,7 @@ from ...media.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles, partic
 from ...numerics.arrays import Bools, Floats, Indices, Ints, to_writable
 from ...numerics.elementary import exp, expm1, geomspace, interp, log1p
 from ...numerics.elementary_scalars import exp_of
-from ...numerics.random_numbers import Purpose, named_seed, starts
+from ...numerics.random_numbers import Purpose, initial_states, named_seed
 from ...sensor.noise import THRESHOLD_SIGMAS
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import SceneSurfaces
@@ -284,7 +284,7 @@ def random_keys(seed: int, purposes: tuple[Purpose, ...], keys: Keys, first: int
     from .random_loops import RandomKeys
 
     return RandomKeys(
-        starts(seed, *purposes), keys.scan, to_writable(keys.scan_starts, np.int64), first
+        initial_states(seed, *purposes), keys.scan, to_writable(keys.scan_starts, np.int64), first
     )
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ...numerics.arrays import Bools, to_writable
-from ...numerics.random_numbers import quantiles, starts
+from ...numerics.random_numbers import initial_states, quantiles
 from ...scene.colors import GRAY, pack_colors
 from ...sensor.disc import neighboring_subrays
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise
@@ -136,7 +136,7 @@ def _detection_keys(reporting: Reporting) -> RandomKeys:
     keys = reporting.keys
     detects = noise is not None and noise.loses_returns
     return RandomKeys(
-        starts=starts(noise.seed, LOSS, DETECTION)
+        starts=initial_states(noise.seed, LOSS, DETECTION)
         if noise is not None and detects
         else np.zeros(0, np.uint64),
         scan=0 if keys is None else keys.scan,
