@@ -164,8 +164,8 @@ class Lender:
         This is the case if the task has lent its slots before and the worker has more slots than
         threads. Dask counts a task that has seceded as long-running until it ends, even after it
         has rejoined the worker's threads. Therefore, a nested task may have started in a free slot
-        and wait for the thread of this task. It does not wait for slots, so `has_slot_requests` does not
-        include it.
+        and wait for the thread of this task. It does not wait for slots, so `has_slot_requests`
+        does not include it.
         """
         slots = sum(count_slots(self.worker, name)[1] for name in loan.slots)
         return loan.key in self._lent and slots > threads_of(self.worker)
