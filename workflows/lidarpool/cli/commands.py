@@ -144,7 +144,7 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
                 from ..run.options import RunOptions
                 from . import run_command  # noqa: F401
                 from .terminal import Terminal
-            steps.mark(steps.COMMAND)
+            steps.record_step(steps.COMMAND)
             set_logs(verbose)
             run_settings: dict[str, Any] = {}
             if cluster is not None:

@@ -77,7 +77,7 @@ def run_scenario(
         check_backend_here(options.backend)
     with terminal.status("reading the scene", logged=False):
         prepared = prepare(scenario)
-    timeline.mark(timeline.SCENE)
+    timeline.record_step(timeline.SCENE)
     for warning in plausibility_warnings(prepared):
         terminal.warn(warning)
     if shard is None:
@@ -123,7 +123,7 @@ def _run_survey(
         result, report = run_survey(jobs, options, output, terminal, page, compare)
         lines = _result_lines(out, result, job, report, terminal)
         print_results(summarize_report(out, report), lines, terminal.as_json)
-        timeline.mark(timeline.SUMMARY)
+        timeline.record_step(timeline.SUMMARY)
         if options.live and options.stay:
             with local_result(out, [CLOUD]) as folder:
                 page.keep_open(folder / CLOUD)
@@ -164,7 +164,7 @@ def run_campaign(
             f"data set in {click.format_filename(str(out))}; see its README.md",
         ]
         print_results(figures, lines, terminal.as_json)
-        timeline.mark(timeline.SUMMARY)
+        timeline.record_step(timeline.SUMMARY)
         if options.live and options.stay:
             page.keep_open()
     if run.failed:

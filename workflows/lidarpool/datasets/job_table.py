@@ -142,7 +142,7 @@ class Tally:
     (3, {2: 1, 6: 2})
     >>> again = Tally()
     >>> for piece in cloud.chunks(2):
-    ...     again.add(piece)
+    ...     again.add_points(piece)
     >>> again.sha256 == tally.sha256
     True
     """

@@ -146,4 +146,4 @@ class Timeline:
 
 
 timeline = Timeline()
-mark = timeline.record_step
+record_step = timeline.record_step

@@ -111,7 +111,7 @@ def run_survey(
                     result = replace(result, notes=(*result.notes, note))
                 if not output.in_pieces:
                     connection.close()
-                    timeline.mark(timeline.STOPPED)
+                    timeline.record_step(timeline.STOPPED)
                 return output.publish(folder, result, store, screen, connection.cluster, cloud)
 
 
@@ -308,7 +308,7 @@ class SurveyOutput:
             sweeps = _write_sweeps(staged, result, sweeps)
             points = _points_with_progress(result, CLOUD, show)
             counts = _write_cloud(staged / CLOUD, points, sweeps, result, growing)
-            timeline.mark(timeline.CLOUD_WRITTEN)
+            timeline.record_step(timeline.CLOUD_WRITTEN)
             others = [entry for entry in self.formats if entry not in sent]
             full_scales = _write_formats(others, staged, result, sweeps, workers, show)
             if workers and sent:
@@ -326,7 +326,7 @@ class SurveyOutput:
             if self.extent != "cloud":
                 self._write_page(result, report, counts, staged, show)
             _write_report(staged, report, further)
-            timeline.mark(timeline.REPORT_WRITTEN)
+            timeline.record_step(timeline.REPORT_WRITTEN)
             if isinstance(self.target, Storage):
                 if not sent:
                     _remove_earlier(target, further, earlier)
@@ -335,7 +335,7 @@ class SurveyOutput:
                     on_written()
             else:
                 _move_into_place(staged, folder, report["files"], earlier, on_written)
-        timeline.mark(timeline.IN_PLACE)
+        timeline.record_step(timeline.IN_PLACE)
         return report
 
     def _write_page(

@@ -166,7 +166,7 @@ class RunLoop:
         pipeline = self._pipeline
         started = time.monotonic()
         self._begin(first)  # and its trials
-        timeline.mark(timeline.FIRST_BATCH)
+        timeline.record_step(timeline.FIRST_BATCH)
         # The stages on LIDAR run until the end, so their workers do not have to accept new tasks.
         watch = self._cluster.watch([GPU, OTHER] if self._trials else [GPU], lasting=[LIDAR])
         shown_at = saved_at = float("-inf")
@@ -223,11 +223,11 @@ class RunLoop:
         if error_of_all is not None:
             raise error_of_all
         if pipeline.progress:
-            timeline.mark(timeline.FIRST_RECEIPT)
+            timeline.record_step(timeline.FIRST_RECEIPT)
         if self._finished:
             pipeline.close()
             self._times["survey"] = time.monotonic() - started
-            timeline.mark(timeline.LAST_RECEIPT)
+            timeline.record_step(timeline.LAST_RECEIPT)
             watch.remove_partitions([GPU, LIDAR])
 
     def _step_planning(self, started: float, watch: Watch) -> None:
@@ -236,7 +236,7 @@ class RunLoop:
         self._trials.step()
         if self._trials.is_finished:
             self._times["planning"] = time.monotonic() - started
-            timeline.mark(timeline.PLANNED)
+            timeline.record_step(timeline.PLANNED)
             watch.remove_partitions([OTHER])
 
     def _save(self) -> None:

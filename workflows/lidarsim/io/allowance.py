@@ -37,7 +37,7 @@ class Allowance:
 
     Examples
     --------
-    >>> Allowance(1_500_000, "export it again").take(2_900_000_000)
+    >>> Allowance(1_500_000, "export it again").reserve(2_900_000_000)
     Traceback (most recent call last):
     lidarsim.errors.LidarError: it has 1.43 MiB but would unpack to at \
 least 2.70 GiB, and the limit is 256.00 MiB. Export it again.

@@ -92,7 +92,8 @@ class StraightLines(NamedTuple):
         --------
         >>> times = np.arange(0.0, 21.0, 0.5)
         >>> there_and_back = np.minimum(times, 20 - times)
-        >>> lines = StraightLines.find(times, np.stack([60 * there_and_back] * 3, axis=1))
+        >>> positions = np.stack([60 * there_and_back] * 3, axis=1)
+        >>> lines = StraightLines.from_trajectory(times, positions)
         >>> len(lines.starts_s), round(lines.seconds)
         (2, 20)
         """

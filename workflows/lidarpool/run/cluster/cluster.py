@@ -89,7 +89,7 @@ class ClusterConnection:
         client = self._stack.enter_context(
             open_client(options, slots, waiting, self.screen, self._local)
         )
-        timeline.mark(timeline.WORKERS)
+        timeline.record_step(timeline.WORKERS)
         self.cluster = Cluster(client, first, store, options, self.screen, slots, waiting)
         return self.cluster
 
@@ -209,7 +209,7 @@ class Cluster:
         if note := gpu_note(self._workers.pool, self._workers.casting, self.backend):
             store.notes.append(note)
         self._callers_error: BaseException | None = None
-        timeline.mark(timeline.CHECKED)
+        timeline.record_step(timeline.CHECKED)
 
     def _request_slots(
         self, first: Job, store: RunStore, required_slots: Mapping[str, int]
