@@ -97,7 +97,7 @@ def true_points(survey: Survey, cloud: Cloud) -> list[Any]:
     points = []
     for number, sweep in enumerate(sweeps.points(cloud)):
         end = survey.path.pose(0, float(sweeps.ends_ns[number]))
-        sensor = end.compose(survey.carried[0].mount)
+        sensor = end.compose(survey.mounted_sensors[0].mount)
         points.append((sweep.positions - np.array(sensor.position)) @ sensor.rotation_matrix)
     return points
 

@@ -285,7 +285,7 @@ def _row(
     static = static_points(sweeps, compared)
     returned = np.concatenate([static[number] for number in compared.tolist()])
     is_static = np.zeros(len(rays.range_m), bool)
-    is_static[rays.returned] = returned
+    is_static[rays.return_mask] = returned
     masked = replace(rays, standing=is_static)
     plane_m = [sweeps.alignment.plane_distance_m[number] for number in compared.tolist()]
     return {

@@ -37,11 +37,17 @@ def main() -> None:
     collisions = newton.CollisionPipeline(model)
     contacts = collisions.contacts()
     # The origin of a Newton box is its center, that of `box` is the center of its bottom face.
-    mesh = box("Box", (SIZE_M, SIZE_M, SIZE_M)).moved("Box", np.eye(3), np.array([0, 0, -0.3]))
+    mesh = box("Box", (SIZE_M, SIZE_M, SIZE_M)).affine_transform(
+        "Box", np.eye(3), np.array([0, 0, -0.3])
+    )
     follower = Follower(
         [mesh] * len(positions),
         load_sensor("velodyne/vlp16"),
-        static=[box("Ground", (200, 200, 0.1)).moved("Ground", np.eye(3), np.array([0, 0, -0.1]))],
+        static=[
+            box("Ground", (200, 200, 0.1)).affine_transform(
+                "Ground", np.eye(3), np.array([0, 0, -0.1])
+            )
+        ],
         columns=["range", "time", "intensity"],
         noise=Noise(range_m=0.01),
     )

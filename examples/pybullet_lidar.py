@@ -34,11 +34,17 @@ def main() -> None:
     positions = np.random.default_rng(7).uniform((2, -3, 1), (8, 3, 4), (12, 3))
     boxes = [bullet.createMultiBody(5, shape, basePosition=p) for p in positions.tolist()]
     # The origin of a PyBullet box is its center, that of `box` is the center of its bottom face.
-    mesh = box("Box", (SIZE_M, SIZE_M, SIZE_M)).moved("Box", np.eye(3), np.array([0, 0, -0.3]))
+    mesh = box("Box", (SIZE_M, SIZE_M, SIZE_M)).affine_transform(
+        "Box", np.eye(3), np.array([0, 0, -0.3])
+    )
     follower = Follower(
         [mesh] * len(boxes),
         load_sensor("velodyne/vlp16"),
-        static=[box("Ground", (200, 200, 0.1)).moved("Ground", np.eye(3), np.array([0, 0, -0.1]))],
+        static=[
+            box("Ground", (200, 200, 0.1)).affine_transform(
+                "Ground", np.eye(3), np.array([0, 0, -0.1])
+            )
+        ],
         columns=["range", "time", "intensity"],
         noise=Noise(range_m=0.01),
     )

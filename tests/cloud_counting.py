@@ -21,7 +21,7 @@ def counts_of(cloud: CloudLike, objects: int, materials: int = 0) -> CloudCounts
     if not len(cloud):
         return counts
     points = Cloud.concatenate(list(cloud.chunks()))
-    counts.add(points.columns)
+    counts.add_points(points.columns)
     cells = np.rint((points.positions - origin) / precision_m).astype(np.int32)
     counts.widen(np.stack([cells.min(axis=0), cells.max(axis=0)]).astype(np.int64))
     counts.add_positions(list(cells.T))

@@ -109,7 +109,7 @@ class Backend(ABC):
         """
         parts: list[HitColumns] = []
         for start in range(0, len(rays), self.chunk):
-            hits = self.closest_hits(rays.normalized(start, start + self.chunk))
+            hits = self.closest_hits(rays.normalize_range(start, start + self.chunk))
             ray = hits.ray.astype(np.uint32) + np.uint32(start)
             distance = hits.t / self._scene.frame.scale
             parts.append((ray, distance, hits.triangle, hits.instance))
@@ -143,7 +143,7 @@ class Backend(ABC):
             np.full(n, -1, np.int32),
         )
         for start in range(0, n, self.chunk):
-            chunk_hits = self.closest_hits(rays.normalized(start, start + self.chunk))
+            chunk_hits = self.closest_hits(rays.normalize_range(start, start + self.chunk))
             row = start + chunk_hits.ray.astype(np.int64)
             hits.distance[row] = chunk_hits.t / self._scene.frame.scale
             hits.triangle[row] = chunk_hits.triangle

@@ -130,7 +130,7 @@ class RayCaster:
         self._lock = threading.Lock()
 
     def __repr__(self) -> str:
-        instances = f" in {self.instance_count} instances" if self._scene.nested else ""
+        instances = f" in {self.instance_count} instances" if self._scene.has_matrices else ""
         return f"RayCaster({self.face_count} triangles{instances}, backend={self.backend!r})"
 
     @property
@@ -217,7 +217,7 @@ class RayCaster:
                 f"Instance {outside[0]} does not exist. This caster has {self.instance_count} "
                 "instances, numbered from 0."
             )
-        if not self._scene.nested:
+        if not self._scene.has_matrices:
             raise ValueError(
                 "A single mesh without a transform cannot be moved. Create the caster with "
                 "RayCaster.from_instances([Instance(mesh, numpy.eye(4))]) instead."

@@ -148,7 +148,9 @@ class CudaBackend(Backend):
             # The stack size is rounded up so that different scenes can share compiled kernels.
             stack = -(-max(self._stack + layout.stack, 1) // _STACK_STEP) * _STACK_STEP
             self._module = _compiled(
-                self._cupy, self._device.id, compiler_options(stack, scene.nested, self._masked)
+                self._cupy,
+                self._device.id,
+                compiler_options(stack, scene.has_matrices, self._masked),
             )
             tables = (layout.frame, layout.top, layout.instances)
             self._instance_tables = tuple(to_device(self._cupy, table) for table in tables)
@@ -225,7 +227,7 @@ class CudaBackend(Backend):
             scan.rays(0, len(scan))  # writes the rays to `scan.out`
         with self._device:
             max_hits = -(-len(scan) // scan.keep_every) + len(scan.groups)
-            transfer = HitTransfer(self._cupy, max_hits, nested=self._scene.nested)
+            transfer = HitTransfer(self._cupy, max_hits, nested=self._scene.has_matrices)
             try:
                 hit_counts, counted = self.scan_on_device(scan, transfer.send)
             finally:  # Wait in any case, because the device still writes to this memory.
@@ -425,7 +427,7 @@ class CudaBackend(Backend):
         """
         t = self._cupy.empty(n)
         row = self._cupy.empty(n, np.int32)
-        instance = self._cupy.empty(n if self._scene.nested else 1, np.int32)
+        instance = self._cupy.empty(n if self._scene.has_matrices else 1, np.int32)
         local_limits = [np.float64(t * self._scene.frame.scale) for t in limits]
         scene = (*self._meshes, *self._instance_tables)
         arguments = (*_table_arguments(table), *local_limits, t, row, instance)

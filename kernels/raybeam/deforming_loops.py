@@ -167,7 +167,7 @@ def cast_pairs(pairs, tree, nearest):  # type: ignore[no-untyped-def]  # noqa: C
         sheared_ray = a, b, c, d, e, f
         frame = np.int64(max(pairs.frame[n], 0.0))
         frame = frame if frame < last else last
-        share = min(max(pairs.frame[n] - frame, 0.0), 1.0)
+        fraction = min(max(pairs.frame[n] - frame, 0.0), 1.0)
         frame_boxes = boxes.ctypes.data + _BOX * len(child) * frame
         best = min(distance[k], t_max)
         hit_triangle = np.int64(-1)
@@ -202,9 +202,9 @@ def cast_pairs(pairs, tree, nearest):  # type: ignore[no-untyped-def]  # noqa: C
                 for leaf_row in range(first, first + (~code & ((1 << LEAF_BITS) - 1)) + 1):
                     face = np.int64(order[leaf_row])
                     corners = (
-                        _corner(vertices, frame, share, faces[face, 0], axis),
-                        _corner(vertices, frame, share, faces[face, 1], axis),
-                        _corner(vertices, frame, share, faces[face, 2], axis),
+                        _corner(vertices, frame, fraction, faces[face, 0], axis),
+                        _corner(vertices, frame, fraction, faces[face, 1], axis),
+                        _corner(vertices, frame, fraction, faces[face, 2], axis),
                     )
                     a, b, c, det, t = intersect_plane(corners, sheared_ray)
                     if det == 0 or not same_sign(a, b, c) or not t_min <= t <= best:

@@ -148,7 +148,7 @@ class LocalScene:
     mesh_frames: MeshFrames | None = None
 
     @property
-    def nested(self) -> bool:
+    def has_matrices(self) -> bool:
         """Whether rays must be transformed to the coordinates of each mesh."""
         return self.matrices is not None
 
@@ -179,7 +179,7 @@ class LocalScene:
 
     def tally_rows(self, instance: Ints32, triangle: Ints32) -> Integers:
         """Return the tally row of each hit, given the hit instance and triangle."""
-        return self.first_face[self.mesh[instance]] + triangle if self.nested else triangle
+        return self.first_face[self.mesh[instance]] + triangle if self.has_matrices else triangle
 
     def to_mesh_coordinates(
         self, instance: Indices, origins: Floats, directions: Floats

@@ -238,7 +238,7 @@ class NumpyBackend(Backend):
     def update_scene(self, scene: LocalScene) -> None:
         """Replace the scene by one with the same instances but new transforms."""
         super().update_scene(scene)
-        if scene.nested:
+        if scene.has_matrices:
             self._top = _Nodes(build_instance_tree(scene.boxes, _WIDTH))
             # Corners (3, n) of the bounding box of each instance's mesh in mesh coordinates.
             frames = [mesh.frame for mesh in scene.meshes]
@@ -260,7 +260,7 @@ class NumpyBackend(Backend):
         query = _Query(origins[row], rays.directions[row], t_min, best)
         packet = _packet(query.origins, query.directions, entry[row], t_max)
         roots = np.zeros(count, np.intp)
-        if self._scene.nested:
+        if self._scene.has_matrices:
             self._top.walk(packet, roots, lambda leaves: self._visit(query, packet, leaves))
         else:
             self._walk(query, packet, roots)

@@ -40,7 +40,7 @@ class Rays:
     def __len__(self) -> int:
         return len(self.directions)
 
-    def normalized(self, start: int, stop: int) -> Rays:
+    def normalize_range(self, start: int, stop: int) -> Rays:
         """Return rays `start` to `stop` in float64, with unit directions.
 
         Backends normalize rays part by part, so that the temporary memory does not grow with the

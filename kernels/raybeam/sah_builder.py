@@ -55,9 +55,9 @@ def build_by_sah(lower: Floats32, upper: Floats32, weight: Floats) -> list[Indic
         The children (k, 2) of the nodes on each level, starting at the root. A child is the index
         of a box, or ``-1 - j`` for node j of the next level.
     """
-    middles = lower.astype(np.float64) + upper
+    centers = lower.astype(np.float64) + upper
     n = lower.shape[1]
-    level = _Level([np.argsort(m, kind="stable") for m in middles], np.array([0]), np.array([n]))
+    level = _Level([np.argsort(m, kind="stable") for m in centers], np.array([0]), np.array([n]))
     levels: list[Indices] = []
     while n > 1 and len(level.start):
         node = np.repeat(np.arange(len(level.start)), level.stop - level.start)

@@ -73,7 +73,7 @@ class TileBackend(Backend):
         cast["mesh"] = self._meshes.ctypes.data
         cast["index"] = self._index.ctypes.data
         self._records = self._instance_records(scene)
-        if scene.nested:
+        if scene.has_matrices:
             cast["instances"] = self._records.ctypes.data
         self._base = cast
         self._plans: dict[tuple[int, int, int], tuple[ref[AnyArray], TilePlan]] = {}
@@ -111,7 +111,7 @@ class TileBackend(Backend):
         base = self._base
         base["center"] = frame.center
         base["scale"] = frame.scale
-        if scene.nested:
+        if scene.has_matrices:
             self._top, top_stack = self._top_nodes(scene.boxes)
             self._top_stack = top_stack
             base["top"] = self._top.ctypes.data
@@ -164,7 +164,7 @@ class TileBackend(Backend):
 
     def _tile_address(self, rays: int) -> int:
         """Return the address of this thread's tile memory for the given number of rays."""
-        nested = self._scene.nested
+        nested = self._scene.has_matrices
         pending = self._pending_nodes + (self._top_stack if nested else 0)
         return self._tiles.address(rays, pending, len(self._scene.mesh) if nested else 0)
 
@@ -227,7 +227,7 @@ class TileBackend(Backend):
         ray = np.empty(n, np.uint32)
         distance = np.empty(n)
         triangle = np.empty(n, np.int32)
-        instance = (np.empty if self._scene.nested else np.zeros)(n, np.int32)
+        instance = (np.empty if self._scene.has_matrices else np.zeros)(n, np.int32)
 
         def cast_share(begin: int) -> HitColumns:
             """Cast up to `share` rays from `begin` on, and return their hits as output views."""

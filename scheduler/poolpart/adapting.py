@@ -56,7 +56,9 @@ class JobBounds:
     idle_s: float = IDLE_S  # time without work after which a job ends
 
     @classmethod
-    def validated(cls, name: str, minimum: Any, maximum: Any, idle_s: Any = IDLE_S) -> JobBounds:
+    def from_user_values(
+        cls, name: str, minimum: Any, maximum: Any, idle_s: Any = IDLE_S
+    ) -> JobBounds:
         """Create job bounds from values that a user has passed.
 
         Raises

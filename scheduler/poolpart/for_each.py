@@ -45,7 +45,7 @@ class _PipeItems:
         self._pipe = pipe
         _ = pipe.client  # on a worker, a thread without a task would create another client
 
-    def take(self, futures: Sequence[Future], limit: int, seconds: float) -> Sequence[Any]:
+    def next_items(self, futures: Sequence[Future], limit: int, seconds: float) -> Sequence[Any]:
         """Return up to `limit` items, after waiting for an item or the end of a task."""
         items, self.closed, self.drained = take_items(self._pipe, futures, limit, seconds)
         return items
@@ -65,7 +65,7 @@ class _IterableItems:
         self.drained = False
         self._iterator = iter(iterable)
 
-    def take(self, futures: Sequence[Future], limit: int, seconds: float) -> Sequence[Any]:
+    def next_items(self, futures: Sequence[Future], limit: int, seconds: float) -> Sequence[Any]:
         """Return the next item, or no items at the end of the iterable."""
         for item in self._iterator:
             return [item]
@@ -138,7 +138,7 @@ class ItemTasks:
                     with suppress(TimeoutError):
                         wait(futures, timeout=self._until_next_s, return_when="FIRST_COMPLETED")
                 else:
-                    items = self._items.take(futures, free, self._until_next_s)
+                    items = self._items.next_items(futures, free, self._until_next_s)
                     self._submit(items)
                 full = len(self._running) >= self._window
                 self._check_tasks()

@@ -163,7 +163,7 @@ class ChunkSize:
     >>> size.items(target_s=0.1)
     1
     >>> for _ in range(3):  # each item takes 10 ms
-    ...     size.learn(items=size.items(0.1), seconds=0.01 * size.items(0.1), nbytes=100)
+    ...     size.update(items=size.items(0.1), seconds=0.01 * size.items(0.1), nbytes=100)
     ...     print(size.items(target_s=0.1))
     4
     10
@@ -174,7 +174,7 @@ class ChunkSize:
         self._tried = 0  # number of items processed so far
         self._item_s = self._item_bytes = 0.0  # moving averages
 
-    def learn(self, items: int, seconds: float, nbytes: int) -> None:
+    def update(self, items: int, seconds: float, nbytes: int) -> None:
         """Update the averages with the measurements of a processed chunk."""
         weight = 0.3 if self._tried else 1.0
         self._item_s += weight * (seconds / items - self._item_s)
@@ -548,7 +548,7 @@ class Results(Iterator[Any]):
         for future, answer in zip(finished, answers, strict=True):
             chunk = self._running.pop(future)
             self._undelivered[chunk.first] = chunk, answer
-            self._size.learn(max(1, len(answer.results)), sum(answer.seconds), answer.nbytes)
+            self._size.update(max(1, len(answer.results)), sum(answer.seconds), answer.nbytes)
             self._lead.count_task(self._busy_s(answer.seconds))
         self._lead.review(self._sizes()[1])
 

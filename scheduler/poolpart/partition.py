@@ -783,7 +783,7 @@ class Partition:
         --------
         >>> gpu.adapt(0, 8)                                              # doctest: +SKIP
         """
-        bounds = JobBounds.validated(self.name, minimum, maximum, idle_s)
+        bounds = JobBounds.from_user_values(self.name, minimum, maximum, idle_s)
         if not run_on_scheduler(self.client, set_bounds, name=self.name, bounds=bounds):
             raise PoolError(
                 f"Partition {self.name!r} has no jobs that can be started. Only partitions that "

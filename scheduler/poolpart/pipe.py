@@ -735,7 +735,7 @@ def _ask(client: Client, handler: str, **arguments: Any) -> Replies:
     """
     _install_handlers(client)
     replies: Replies = client.sync(
-        send_request, client, None, handler, asker=client.id, **arguments
+        send_request, client, None, handler, client_id=client.id, **arguments
     )
     return replies
 
@@ -770,7 +770,7 @@ def _ask_until(
 
     async def request() -> Replies:
         seconds = min(WAIT_S, max(0.0, deadline - time.monotonic()))
-        options = {"asker": client.id, "seconds": seconds, **arguments}
+        options = {"client_id": client.id, "seconds": seconds, **arguments}
         replies: Replies = await send_request(client, None, handler, **options)
         on_replies(replies)
         return replies

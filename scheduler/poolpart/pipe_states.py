@@ -352,7 +352,7 @@ class PipeRegistry(SchedulerPlugin):
     def change(
         self,
         names: Sequence[str],
-        asker: str,
+        client_id: str,
         producer: str = "",
         failure: str = "",
         advice: int = 0,
@@ -374,7 +374,7 @@ class PipeRegistry(SchedulerPlugin):
     def put(
         self,
         names: Sequence[str],
-        asker: str,
+        client_id: str,
         items: list[bytes],
         unbounded: bool,
         seconds: float,
@@ -388,7 +388,7 @@ class PipeRegistry(SchedulerPlugin):
         """
 
         def put_into(state: PipeState) -> int:
-            if state.has_ended or asker not in self.scheduler.clients:
+            if state.has_ended or client_id not in self.scheduler.clients:
                 return 0
             fitting = items if unbounded else items[: state.queue.free_capacity]
             state.put(fitting)
@@ -409,7 +409,7 @@ class PipeRegistry(SchedulerPlugin):
     async def pop_items(
         self,
         names: Sequence[str],
-        asker: str,
+        client_id: str,
         seconds: float,
         *,
         linger_s: float = 0.0,
@@ -424,7 +424,7 @@ class PipeRegistry(SchedulerPlugin):
         ----------
         names
             Pipes to take from.
-        asker
+        client_id
             ID of the client. A client that has left receives no items.
         seconds
             Maximum wait.
@@ -441,7 +441,7 @@ class PipeRegistry(SchedulerPlugin):
             Key of the requesting task, or "" outside tasks.
         """
         for name, items in (puts or {}).items():
-            self.put([name], asker, items, unbounded=True, seconds=0.0)
+            self.put([name], client_id, items, unbounded=True, seconds=0.0)
 
         def has_items(state: PipeState) -> bool:
             return limit > 0 and not state.queue.empty()
@@ -460,7 +460,7 @@ class PipeRegistry(SchedulerPlugin):
             )
 
         def take_from(state: PipeState) -> list[Any]:
-            return state.pop_items(limit) if asker in self.scheduler.clients else []
+            return state.pop_items(limit) if client_id in self.scheduler.clients else []
 
         states = self._states_for_taker(task, names)
         pipe_waiters = [state.queue.waiters for state in states.values()]

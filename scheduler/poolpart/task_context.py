@@ -28,7 +28,7 @@ def own_client() -> Client:
     not wait for a thread that creates the client, because the thread needs the event loop, which
     would be a deadlock.
     """
-    if in_event_loop():
+    if is_in_event_loop():
         return get_client()
     with _one_at_a_time:
         for _ in range(_TRIES - 1):
@@ -41,7 +41,7 @@ def own_client() -> Client:
         return get_client()
 
 
-def in_event_loop() -> bool:
+def is_in_event_loop() -> bool:
     """Return whether the caller runs in an event loop and therefore must not block."""
     try:
         asyncio.get_running_loop()

@@ -287,7 +287,9 @@ def campaign_under_way():
         for number in range(5):
             values = {"height_m": 1.5 + number, "rain_mm_h": number}
             error = "The mesh wall.obj has no faces: give another." if number == 3 else ""
-            live.ended(JobRow(number, f"{number:02}", "", values, error, 36, 1, 900, 800, 700, 1.5))
+            live.on_job_end(
+                JobRow(number, f"{number:02}", "", values, error, 36, 1, 900, 800, 700, 1.5)
+            )
         under_way = [
             {"name": "05", "writing": False, "stored": 9, "scans": 36, "points": 90, "number": 5,
              "seconds": 1.0, "values": {"height_m": 6.5, "rain_mm_h": 5}, "opens": False}

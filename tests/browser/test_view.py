@@ -721,7 +721,7 @@ def test_actors_deform_with_the_time(view, new_tab, tmp_path):
                     mesh = f"{PICTURE}.actors[{number}].mesh"
                     found = tab.value(f"[...{mesh}.geometry.attributes.position.array]")
                     placed = np.reshape(found, (-1, 3)) + tab.value(f"{mesh}.position.toArray()")
-                    shown = actor.placed(1e9 * seconds)
+                    shown = actor.mesh_at(1e9 * seconds)
                     np.testing.assert_allclose(
                         placed, shown.vertices[shown.faces].reshape(-1, 3), atol=1e-5
                     )

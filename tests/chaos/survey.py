@@ -101,7 +101,7 @@ def growing(*arguments: Any, **options: Any) -> tuple[Result, bytes | None]:
                 path = Path(folder, "cloud.ply")
                 if cloud.finish(path, job.points()) is not None:
                     written.append(path.read_bytes())
-            store.keep(None, ())
+            store.close_with_points(None, ())
             return result
 
     with tempfile.TemporaryDirectory(prefix="chaos-ply-") as folder:

@@ -168,7 +168,7 @@ def test_nuscenes_interpolates_boxes_between_samples(drive, tmp_path):
     """By the rule of the devkit: sweeps between samples point to the sample that follows."""
     survey, scene = drive
     rear = Mounted(Sensor.grid(SCANS * 10, 4, rate_hz=30.0), Pose((-1, 0, 0.5), 200.0), "rear")
-    cloud = cloud_of(replace(survey, sensors=[survey.carried[0], rear]), scene)
+    cloud = cloud_of(replace(survey, sensors=[survey.mounted_sensors[0], rear]), scene)
     save_cloud(cloud, tmp_path / "nu", format="nuscenes")
     tables = nuscenes_tables(tmp_path / "nu")
     samples = tables["sample"]
@@ -438,7 +438,7 @@ def moving_corners(coordinates="world"):
     for step in range(survey.scan_count):
         time_ns = survey.begins_ns(step)
         for actor, moving in enumerate(actors):
-            vertices = moving.placed(time_ns).vertices
+            vertices = moving.mesh_at(time_ns).vertices
             _, rotations = moving.trajectory.poses(0, np.array([time_ns]))
             forward = [1, 0, 0] if rotations is None else rotations[0][:, 0]
             if coordinates == "sensor":
@@ -500,7 +500,7 @@ def test_actors_are_compensated_in_both_coordinates(coordinates):
     moved = replace(sweeps, actors_at_start=True)
     for number, points in enumerate(moved.points(cloud)):
         boxes = boxes_by_sweep[number]
-        at_start = moved.compensated(number, points)
+        at_start = moved.compensate_motion(number, points)
         assert outside(boxes, points["object"], at_start).max() < 2e-4
         columns = moved.columns_compensated(number, points)
         normals = np.stack([columns[f"normal_{axis}"] for axis in "xyz"], axis=1)
@@ -543,7 +543,7 @@ def test_sweeps_of_one_firing_have_velocities(drive):
 
 def test_repeated_points_of_an_actor_that_has_left_have_no_box(drive):
     survey, scene = drive
-    survey = replace(survey, sensors=survey.carried[:1], faults=[Fault("frozen", 0.75)])
+    survey = replace(survey, sensors=survey.mounted_sensors[:1], faults=[Fault("frozen", 0.75)])
     sweeps = Sweeps.from_survey(survey, scene)
     guest = len(scene.names) + 3
     points = Cloud(np.zeros((1, 3)), {"scan": [SCANS * 9], "object": [guest]})
@@ -564,7 +564,8 @@ def test_the_first_sensor_of_nuscenes_is_lidar_top_and_a_note_says_so(drive, tmp
         ),
     ):
         sensors = [
-            replace(carried, name=name) for carried, name in zip(survey.carried, names, strict=True)
+            replace(carried, name=name)
+            for carried, name in zip(survey.mounted_sensors, names, strict=True)
         ]
         cloud = cloud_of(replace(survey, sensors=sensors), scene)
         folder = tmp_path / "-".join(names)

@@ -28,7 +28,7 @@ def grid_of(cells: np.ndarray, across: int, pieces: int) -> GridCounts:
     for piece in np.array_split(cells, pieces):
         grid.widen(box_of(piece))
         for block in np.array_split(piece, 3):
-            grid.add(*block.T)
+            grid.add_points(*block.T)
     return grid
 
 
@@ -70,12 +70,14 @@ def test_merged_counts_are_those_of_one_grid(step):
 def test_labels_of_no_surface_and_of_no_object_are_told_apart():
     counts = CloudCounts([TABLE["object"], TABLE["material"]], 3, 2, 0.01, np.zeros(3))
     labels = np.array([0, 0, -1, 2, 2, 2, -1, -1, 0], np.int32)
-    counts.add({"object": labels, "material": np.array([-1, 1, 1, 0, 0, 0, 0, 1, -1], np.int32)})
+    counts.add_points(
+        {"object": labels, "material": np.array([-1, 1, 1, 0, 0, 0, 0, 1, -1], np.int32)}
+    )
     assert counts.by_object.tolist() == [3, 0, 3]
     assert counts.no_surface == 3
     assert counts.by_material.tolist() == [4, 3]
     assert counts.point_count == 9
-    counts.add({"object": np.array([3], np.int32), "material": np.array([0], np.int32)})
+    counts.add_points({"object": np.array([3], np.int32), "material": np.array([0], np.int32)})
     assert counts.point_count == 9  # an object that the scene lacks
     assert counts.limits == {"object": (-1, 3), "material": (-1, 1)}
 

@@ -193,7 +193,7 @@ def test_values_and_trials_come_back(db, job):
     db.set(backend="numpy", note="π")
     again = reopened(db)
     assert again.meta["backend"] == "numpy" and again.meta["note"] == "π"
-    assert again.begun == {JOB} and again.used
+    assert again.begun == {JOB} and again.has_results
     found = read(again).trials
     assert [t.trial for t in found] == [0, 1]
     for one, two in zip(found, reversed(trials), strict=True):
@@ -208,27 +208,29 @@ def test_of_a_job_that_has_ended_a_row_is_left(db, job):
     db.commit([(job, receipt(0, 5)), (read(db, 9), receipt(0, 5, job=9))])
     assert db.begun == {JOB, 9}
     db.end_jobs([(JOB, False, {"points": 3}), (2, True, {"error": "too large"})])
-    assert db.begun == {9} and db.failed() == [2]
+    assert db.begun == {9} and db.failed_jobs() == [2]
     again = reopened(db)
     for found in (db, again):
-        assert [found.ended(number) for number in (0, 2, JOB, 8, 10**6)] == [
+        assert [found.has_ended(number) for number in (0, 2, JOB, 8, 10**6)] == [
             False, True, True, False, False,
         ]  # fmt: skip
         assert found.ended_count == 2
-    assert again.failed() == [2] and again.begun == {9} and read(again, 9).parts.scans_done == 5
+    assert (
+        again.failed_jobs() == [2] and again.begun == {9} and read(again, 9).parts.scans_done == 5
+    )
     assert [*again.job_rows()] == [{"error": "too large"}, {"points": 3}]
     again.close()
 
 
 def test_jobs_that_are_forgotten_are_done_again(db):
-    assert not db.used
+    assert not db.has_results
     db.end_jobs([(number, number == 2, {}) for number in (1, 2)])
     db.end_jobs([(2, False, {"points": 1})])
-    assert db.failed() == []
+    assert db.failed_jobs() == []
     db.forget_jobs([1, 2])
-    assert db.ended_count == 0 and not db.ended(1) and db.used
+    assert db.ended_count == 0 and not db.has_ended(1) and db.has_results
     again = reopened(db)
-    assert again.used and not again.begun and again.ended_count == 0
+    assert again.has_results and not again.begun and again.ended_count == 0
     again.close()
 
 
@@ -254,7 +256,7 @@ def test_a_job_that_is_restarted_has_nothing(db, job):
 def test_thousands_of_jobs_take_little_memory_and_time(db):
     db.end_jobs((number, number % 1000 == 0, {"points": number}) for number in range(50_000))
     again = reopened(db)
-    assert again.ended_count == 50_000 and len(again.failed()) == 50
+    assert again.ended_count == 50_000 and len(again.failed_jobs()) == 50
     # Private, since memory is what is tested: a byte for each job.
     assert not again.begun and len(again._ended) < 100_000
     again.close()

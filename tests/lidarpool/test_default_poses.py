@@ -192,7 +192,9 @@ def test_a_tree_is_an_object_and_on_ground_the_sensor_stands_beside_it(species):
     assert place_sensor(Scene.from_meshes([alone]), GRID).surrounds_object
     lawn = level("lawn", 0, 20)
     for far in (0.0, 4_000_000.0):
-        meshes = [mesh.moved(mesh.name, np.eye(3), np.full(3, far)) for mesh in (lawn, alone)]
+        meshes = [
+            mesh.affine_transform(mesh.name, np.eye(3), np.full(3, far)) for mesh in (lawn, alone)
+        ]
         scene = Scene.from_meshes(meshes)
         placed = place_sensor(scene, GRID)
         at = np.array([pose.position for pose in placed.poses]) - scene.origin

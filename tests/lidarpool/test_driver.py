@@ -73,7 +73,7 @@ class Workers:
     def refresh(self):
         return self.seen
 
-    def add(self, job, scene, survey):
+    def register_job(self, job, scene, survey):
         self.jobs[job] = scene
         return b"", str(id(scene))
 
@@ -100,7 +100,7 @@ class Workers:
             raise outcome
         return outcome
 
-    def forget(self, key):
+    def release_task(self, key):
         self.casts.pop(key, None)
 
     def memory_clause(self, worker):
@@ -132,7 +132,7 @@ class Stages:
     collector_count = 2
     waiting = False
     notes = ()
-    closed = False
+    is_closing = False
 
     def __init__(self, storage, workers):
         self.described = deque()  # what stage 1 has to do
@@ -144,7 +144,7 @@ class Stages:
         self.advice = 5  # scans in a batch
         self.seconds = 0.1  # that a batch takes to cast
         self.held = {}  # {name: part that is not in storage}
-        self.ended = False
+        self.has_ended = False
         self.failure = ""
         self.wanted = True  # whether scans are taken
         self.changes = ({}, ["generate", "sort", *self.collectors])
@@ -179,7 +179,7 @@ class Stages:
         known = {"generate": self.described, "sort": self.unsorted}
         (known[name] if name in known else self.orders[name]).extend(messages)
 
-    def advise(self, scans):
+    def set_message_scans(self, scans):
         pass
 
     def store_held(self, receipt):
@@ -189,7 +189,7 @@ class Stages:
         return data is not None
 
     def close(self):
-        self.closed = self.ended = True
+        self.is_closing = self.has_ended = True
 
     def stop(self, reason):
         self.failure = reason
@@ -275,7 +275,7 @@ class Run:
         self.frames.setdefault(number, [])
         committed = CommittedResults(number, range(survey.scan_count), has_frames=frames)
         self.db.read(committed)
-        self.begun[number] = self.driver.begin(committed, scene, survey, scans_per_task=fit)
+        self.begun[number] = self.driver.add_job(committed, scene, survey, scans_per_task=fit)
         return self.begun[number]
 
     def step(self):
@@ -316,7 +316,7 @@ class Run:
         """Let everybody work to the end, and check that each scan has come once, in order."""
         self.until(lambda: not self.driver.jobs)
         self.driver.close()
-        assert self.stages.ended
+        assert self.stages.has_ended
         self.driver.finish()
         done = [number for number, error in self.ended.items() if error is None]
         for number in done:
@@ -794,7 +794,7 @@ def test_stage_1_always_has_jobs_before_it_and_few_of_them(empty):
     most = 0
     empty.stages.advice = 5
     empty.stages.seconds = 0.001
-    empty.stages.advise = lambda scans: None
+    empty.stages.set_message_scans = lambda scans: None
 
     def begin():
         nonlocal begun, most

@@ -51,7 +51,7 @@ def pose(x=0.0, quaternion=(1.0, 0.0, 0.0, 0.0)):
 def scene_and_notes(path, scans, **options):
     notes = []
     write_scans(path, scans)
-    scene = scene_from_points(path, voxel_m=0.01, tell=notes.append, **options)
+    scene = scene_from_points(path, voxel_m=0.01, report=notes.append, **options)
     return scene, [note.removeprefix(f"{path}").lstrip(": ") for note in notes]
 
 

@@ -10,7 +10,7 @@ from lidarpool.identity.field_words import describe_changes, describe_fields
 from lidarpool.run.job_source import describe_inputs
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.words import rounded
+from lidarsim.words import format_rounded
 
 POSES = [[x, 0, 1] for x in range(30)]
 
@@ -79,4 +79,4 @@ def test_a_plan_is_of_the_fields():
     ],
 )
 def test_large_numbers_in_messages_have_no_exponent(number, digits, text):
-    assert rounded(number, digits) == text
+    assert format_rounded(number, digits) == text

@@ -17,7 +17,7 @@ def varied(values: list[object]) -> VariedQuantity:
         JobRow(n, f"{n}", "train", {} if value is None else {"it": value})
         for n, value in enumerate(values)
     )
-    (found,) = DataSetStatistics(["it"], jobs).varied
+    (found,) = DataSetStatistics(["it"], jobs).varied_quantities
     return found
 
 

@@ -133,7 +133,7 @@ def xyz_of(rows):
 def test_bags_hold_what_a_driver_publishes(tmp_path, layout, model):
     made = Drive(model)
     save_cloud(made.cloud(), tmp_path / "a.mcap", layout=layout)
-    sensor = made.survey.carried[0].sensor
+    sensor = made.survey.mounted_sensors[0].sensor
     begins = made.cloud().sweeps().begins_ns
     messages = messages_of(tmp_path / "a.mcap")
     assert len(messages) == len(begins) == 3
@@ -314,8 +314,8 @@ def test_a_clock_that_jumps_and_a_frozen_sensor_do_not_move_points():
     pairs = zip(sweeps.points(world), sensor.sweeps().points(sensor), strict=True)
     for sweep, (points, fired) in enumerate(pairs):
         np.testing.assert_allclose(sweeps.as_fired(sweep, points), fired.positions, atol=5e-5)
-        back = sensor.sweeps().compensated(sweep, fired)
-        np.testing.assert_allclose(back, sweeps.compensated(sweep, points), atol=5e-5)
+        back = sensor.sweeps().compensate_motion(sweep, fired)
+        np.testing.assert_allclose(back, sweeps.compensate_motion(sweep, points), atol=5e-5)
 
 
 def test_autoware_has_the_types_of_two_returns(tmp_path):
@@ -492,7 +492,9 @@ def test_normals_and_origins_are_in_the_axes_of_the_points(
         cosine = -(ray * normal).sum(axis=1) / points.range
         np.testing.assert_allclose(cosine, np.cos(np.radians(points.incidence_deg)), atol=5e-5)
         for row in range(0, len(points), 211):
-            fired = survey.path.pose(0, float(points.time[row])).compose(survey.carried[0].mount)
+            fired = survey.path.pose(0, float(points.time[row])).compose(
+                survey.mounted_sensors[0].mount
+            )
             pose = survey.pose(36 * sweep) if compensated else fired
             # In the world normals are those of the sides of the room, on which the points lie.
             upright = pose.rotation @ normal[row]
@@ -503,7 +505,7 @@ def test_normals_and_origins_are_in_the_axes_of_the_points(
             # Rays begin within the sensor: Ouster's 16 mm from the axis of its head.
             began = pose.rotation @ origin[row] + pose.position
             lever = (began - fired.position) @ fired.rotation
-            beams = survey.carried[0].sensor.beams
+            beams = survey.mounted_sensors[0].sensor.beams
             assert (
                 abs(np.hypot(*lever[:2]) - np.hypot(*beams.origin[points.channel[row], :2])) < 5e-5
             )
@@ -574,7 +576,7 @@ def across_deg(survey, positions, time_ns):
     path = survey.path
     places, turns = path.poses(0, time_ns.astype(float))
     velocities, _ = path.velocities(0, time_ns.astype(float))
-    rays = positions - (places + turns @ np.array(survey.carried[0].mount.position))
+    rays = positions - (places + turns @ np.array(survey.mounted_sensors[0].mount.position))
     ahead = velocities * (1, 1, 0)
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     right = np.cross(ahead, (0, 0, 1))
@@ -683,9 +685,11 @@ def test_parquet_and_ply_are_in_the_world_and_their_columns_fit(tmp_path):
     rays = [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation),
             np.sin(elevation)]  # fmt: skip
     inside = np.stack(rays, axis=1) * columns["range"][:, None]
-    inside += made.survey.carried[0].sensor.beams.origin[columns["ring"]]  # on the head's axis
+    inside += made.survey.mounted_sensors[0].sensor.beams.origin[
+        columns["ring"]
+    ]  # on the head's axis
     places, turns = made.survey.path.poses(0, columns["time"].astype(float))
-    mount = made.survey.carried[0].mount
+    mount = made.survey.mounted_sensors[0].mount
     placed = inside @ mount.rotation.T + mount.position
     expected = np.einsum("nij,nj->ni", turns, placed) + places
     np.testing.assert_allclose(np.stack([columns[a] for a in "xyz"], axis=1), expected, atol=2e-4)

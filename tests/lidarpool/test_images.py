@@ -145,7 +145,7 @@ def test_images_have_the_values_of_the_cloud(made, name):
     """Each value is found by the scan, the firing and the channel of its ray."""
     cloud, sweeps, images = made(name)
     survey = SURVEYS[name]
-    channels = {k: one.sensor.channels for k, one in enumerate(survey.carried)}
+    channels = {k: one.sensor.channels for k, one in enumerate(survey.mounted_sensors)}
     left = Counter(zip(cloud.scan.tolist(), cloud.ray.tolist(), cloud.range.tolist(), strict=True))
     rows = {}
     for row, key in enumerate(zip(cloud.scan.tolist(), cloud.ray.tolist(), strict=True)):

@@ -172,7 +172,7 @@ def test_hash_and_classes_do_not_depend_on_the_division(cuts):
     tally = Tally()
     edges = [0, *sorted(cuts), 500]
     for first, stop in pairwise(edges):
-        tally.add(cloud[first:stop])
+        tally.add_points(cloud[first:stop])
     whole = Tally.from_cloud(cloud)
     assert (tally.points, tally.sha256, tally.classes) == (500, whole.sha256, whole.classes)
     assert sum(tally.classes.values()) == 500

@@ -51,7 +51,7 @@ def make_job(scans: int) -> SingleJob:
 def shown(store: RunStore):
     """Yield the page of a run that nobody looks at."""
     with live_page(port=0, browser=False) as live:
-        live.begun(store.only_job)
+        live.on_survey_start(store.only_job)
         yield live
 
 
@@ -101,7 +101,7 @@ def test_points_are_bounded_and_even_and_hits_exact_where_all_parts_are_read():
     live = LiveJob(store.only_job, max_points=500)
     for scan in range(100):
         commit(store, scan, [33], [scan % 10], [165])
-        live.add([store.only_job.parts.part_of(scan)])
+        live.add_receipts([store.only_job.parts.part_of(scan)])
         live.gather()
     assert 150 < len(live.cloud) <= 500
     by_tenth = np.histogram(live.cloud["scan"], bins=10, range=(0, 100))[0]
@@ -115,7 +115,7 @@ def test_a_part_that_cannot_be_read_is_left_out_and_the_others_are_shown():
     for scan in range(3):
         commit(store, scan, [5], [7], [25])
     store.storage.remove([store.only_job.parts.part_of(1).name])
-    live.add(store.only_job.parts.ordered)
+    live.add_receipts(store.only_job.parts.ordered)
     live.gather()
     assert len(live.cloud) == 10
 
@@ -222,7 +222,7 @@ def test_a_page_that_stays_shows_the_file_of_the_cloud_and_its_sweeps(live, tmp_
     live.on_progress(progress(1.0, 1), list)
     before = news(live)["ends"]
     live.stopped.set()  # it stays no longer than that
-    live.stay(path)
+    live.keep_open(path)
     assert news(live)["ends"] > before  # the page asks for all again
     assert displayed(live) == 3000
     assert "sweep_scans" in ask(live.page.url, "state")["arrays"]
@@ -286,7 +286,7 @@ def test_the_page_tells_of_jobs_and_keeps_few_of_them():
     busy = [status(5000 + k, k) for k in range(20)]
     with campaign_shown(10_000) as live:
         for number in range(5000):
-            live.ended(row(number, error="no surface" if number % 100 == 0 else ""))
+            live.on_job_end(row(number, error="no surface" if number % 100 == 0 else ""))
         live.on_progress(jobs_progress(3000, 10_000, 50.0), lambda: busy)
         live.on_progress(jobs_progress(5000, 10_000, 150.0), lambda: busy)
         told = ask(live.page.url, "jobs")
@@ -303,7 +303,7 @@ def test_the_page_tells_of_jobs_and_keeps_few_of_them():
         assert [told["under_way"][4][name] for name in ("stored", "scans")] == [4, 40]
         assert told["under_way"][4]["values"] == ["2", "left"]
         assert told["under_way"][4]["points"] == 40
-        live.ended(row(5003))
+        live.on_job_end(row(5003))
         told = ask(live.page.url, "jobs")
         assert told["ended"][0]["name"] == "5003"
         assert "5003" not in [job["name"] for job in told["under_way"]], "it is listed once"

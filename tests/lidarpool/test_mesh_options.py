@@ -43,7 +43,7 @@ def test_a_view_and_a_played_mesh_have_its_unit_and_axis(tmp_path):
     of_mesh = {"unit": "mm", "up_axis": "y"}
     notes = []
     for scene in (
-        open_view(part, of_mesh=of_mesh, tell=notes.append).pictured.scene,
+        open_view(part, of_mesh=of_mesh, report=notes.append).pictured.scene,
         scenario_job(part, None, of_mesh, notes.append).scene,
     ):
         np.testing.assert_allclose(np.ptp(scene.bounds, axis=0), (8, 6, 3))

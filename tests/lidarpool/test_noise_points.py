@@ -38,7 +38,7 @@ def marks(value, other=0):
 def top_of(path, **options):
     """Return the height of the highest surface of the scene of a cloud, and the notes."""
     notes = []
-    scene = scene_from_points(path, tell=notes.append, **options)
+    scene = scene_from_points(path, report=notes.append, **options)
     return round((scene.bounds + scene.origin)[1, 2]), notes
 
 
@@ -170,8 +170,8 @@ def test_numbers_of_what_is_left_out():
     usable, left_out = usable_points(columns)
     assert usable.tolist() == [False, False, True, False] and left_out == OmittedPoints(2, 1)
     assert usable_points({"x": np.zeros(3)}) == (None, OmittedPoints())
-    assert OmittedPoints().note() == ""
-    assert OmittedPoints(1, 0).note() == (
+    assert OmittedPoints().omission_note() == ""
+    assert OmittedPoints(1, 0).omission_note() == (
         "1 withheld point was skipped. To keep it, use --keep-noise (keep_noise=True in Python)"
     )
 

@@ -404,7 +404,7 @@ def test_what_a_scanner_cannot_send_is_refused_in_a_line():
 
 def test_packets_of_a_scanner_are_those_of_a_survey(played):
     job = scenario_job(played / "s.yaml")
-    sensor = job.survey.carried[0].sensor
+    sensor = job.survey.mounted_sensors[0].sensor
     packets = Packets(sensor)
     scanner = Scanner(job.scene, sensor, columns=packets.columns, precision_m=0.002)
     payloads = []

@@ -202,9 +202,9 @@ def test_classes_colors_and_intensities_stay_in_the_scene(tmp_path, name):
     points = plane().repeat(3, axis=0)
     path = written_with_columns(tmp_path / name, points, CLASSES, INTENSITIES, COLORS)
     notes = []
-    scene_from_points(path, voxel_m=0.01, tell=notes.append)
+    scene_from_points(path, voxel_m=0.01, report=notes.append)
     for color in ("rgb", "intensity"):
-        scene = scene_from_points(path, voxel_m=0.01, color=color, tell=notes.append)
+        scene = scene_from_points(path, voxel_m=0.01, color=color, report=notes.append)
         write_scene(tmp_path / "b.glb", scene)
         again = Scene.load(tmp_path / "b.glb", colors=True, materials=True)
         assert again.triangles == 2 * len(GRID)
@@ -368,7 +368,7 @@ def test_what_one_of_two_scans_lacks_is_gray(tmp_path, first, second, quantity):
     path = tmp_path / "a.ptx"
     path.write_text(ptx_scan(1, first) + ptx_scan(50, second))
     notes = []
-    scene = scene_from_points(path, voxel_m=1e-3, tell=notes.append)
+    scene = scene_from_points(path, voxel_m=1e-3, report=notes.append)
     red, x = reds(scene)
     assert (red[x < 10] == (200 if quantity == "color" else 255)).all()
     assert (red[x > 10] == 188).all()
@@ -385,7 +385,7 @@ def test_clouds_of_a_pts_without_colors_are_gray(tmp_path, second):
     path = tmp_path / "a.pts"
     path.write_text(pts_cloud(1, "100 200 200 200") + pts_cloud(50, second))
     notes = []
-    red, x = reds(scene_from_points(path, voxel_m=1e-3, tell=notes.append))
+    red, x = reds(scene_from_points(path, voxel_m=1e-3, report=notes.append))
     assert (red[x < 10] == 200).all() and (red[x > 10] == 188).all()
     assert any("1,200 of 2,400 points have no color. Surfels" in note for note in notes)
 
@@ -411,7 +411,7 @@ def test_the_first_column_with_values_is_used_and_others_are_named_as_in_the_fil
         Empty=np.zeros(len(GRID)),
     )
     notes = []
-    scene = scene_from_points(path, voxel_m=1e-3, tell=notes.append)
+    scene = scene_from_points(path, voxel_m=1e-3, report=notes.append)
     red, x = reds(scene)
     assert (red[x < 1.9] == 188).all() and (red[x > 2.1] == 255).all()
     assert scene.material_names == ("class 2",)
@@ -422,7 +422,7 @@ def test_the_first_column_with_values_is_used_and_others_are_named_as_in_the_fil
 def test_origins_that_are_zero_are_not_named_as_skipped(tmp_path):
     zeros = dict.fromkeys(["origin_x", "origin_y", "origin_z"], np.zeros(len(GRID)))
     notes = []
-    scene_from_points(ply_with(tmp_path / "a.ply", **zeros), voxel_m=1e-3, tell=notes.append)
+    scene_from_points(ply_with(tmp_path / "a.ply", **zeros), voxel_m=1e-3, report=notes.append)
     assert not notes
 
 
@@ -447,7 +447,7 @@ def test_parts_of_a_las_are_one_cloud(tmp_path, monkeypatch):
 
     def made():
         notes = []
-        scene = scene_from_points(path, voxel_m=1e-3, tell=notes.append)
+        scene = scene_from_points(path, voxel_m=1e-3, report=notes.append)
         return scene.vertices.tolist(), reds(scene)[0].tolist(), scene.material_names, notes
 
     whole = made()
@@ -476,7 +476,7 @@ def test_a_parquet_file_is_a_scene(tmp_path):
     path = tmp_path / "a.parquet"
     parquet.write_table(pyarrow.table(columns), path, row_group_size=500)
     notes = []
-    scene = scene_from_points(path, voxel_m=1e-3, tell=notes.append)
+    scene = scene_from_points(path, voxel_m=1e-3, report=notes.append)
     assert scene.triangles == 2 * len(GRID) and off_plane(scene) < 1e-5
     assert scene.material_names == ("class 5",)
     assert len(notes) == 1 and notes[0].endswith("which were skipped: t")
@@ -509,7 +509,7 @@ def test_intensities_of_leica_begin_at_zero(tmp_path, name):
     intensities[0] = -2048
     notes = []
     scene = scene_from_points(
-        leica_file(tmp_path / name, intensities), voxel_m=1e-3, tell=notes.append
+        leica_file(tmp_path / name, intensities), voxel_m=1e-3, report=notes.append
     )
     red, x = reds(scene)
     assert (red[x > 2] == 188).all() and set(red[x < 2].tolist()) == {0, 255}
@@ -522,7 +522,7 @@ def test_negative_intensities_of_an_unknown_scale_are_noted(tmp_path):
     intensities[0] = -25
     path = leica_file(tmp_path / "a.ply", intensities)
     notes = []
-    red, x = reds(scene_from_points(path, voxel_m=1e-3, tell=notes.append))
+    red, x = reds(scene_from_points(path, voxel_m=1e-3, report=notes.append))
     assert (red[x > 2] == 188).all() and set(red[x < 2].tolist()) == {0, 255}
     scale = "has intensities from -25 to 5 on an unknown scale"
     assert notes == [f"{path} {scale}. They were shifted so that -25 becomes 0"]
@@ -550,7 +550,7 @@ def test_empty_cells_are_missing_intensities_and_classes(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("x,y,z,intensity,class\n" + "\n".join(rows))
     notes = []
-    scene = scene_from_points(path, voxel_m=1e-3, tell=notes.append)
+    scene = scene_from_points(path, voxel_m=1e-3, report=notes.append)
     red, x = reds(scene)
     assert (red[x < 2] == 255).all() and (red[x > 2.5] == 188).all()
     names = np.array(scene.meshes()[0].materials.names)[scene.meshes()[0].materials.index]
@@ -570,7 +570,7 @@ def test_pulses_without_a_return_are_left_out_with_a_note(tmp_path):
     points = np.concatenate([plane((1, 0, 0)), np.zeros((20, 3))])
     notes = []
     path = written(tmp_path / "a.npy", points)
-    scene = scene_from_points(path, voxel_m=1e-3, tell=notes.append)
+    scene = scene_from_points(path, voxel_m=1e-3, report=notes.append)
     assert scene.triangles == 2 * len(GRID)
     assert notes == [f"20 points of {path} at the origin were skipped as pulses without a return"]
 
@@ -579,13 +579,13 @@ def test_units_of_a_header_are_converted_with_a_note(tmp_path):
     path = written(tmp_path / "a.csv", plane() * 1000)
     path.write_text(path.read_text().replace("x,y,z", "x_mm,y_mm,z_mm"))
     notes = []
-    scene = scene_from_points(path, tell=notes.append)
+    scene = scene_from_points(path, report=notes.append)
     np.testing.assert_allclose(scene.bounds, [[0, 0, 0], [4, 3, 2]], atol=0.2)
     assert (
         "was converted to meters, because its header states units of 0.001, 0.001, 0.001 m"
         in notes[0]
     )
-    meters = scene_from_points(path, unit="cm", tell=notes.append)
+    meters = scene_from_points(path, unit="cm", report=notes.append)
     np.testing.assert_allclose(meters.bounds, [[0, 0, 0], [40, 30, 20]], atol=2)
     np.testing.assert_allclose(open_recording(path)[0].points.max(axis=0), [4, 3, 2])
     points = open_recording(path, unit="m")[0].points
@@ -606,11 +606,11 @@ def test_missing_intensities_are_an_error(tmp_path, name, words):
 
 def test_columns_without_names_are_noted(tmp_path):
     notes = []
-    scene_from_points(written(tmp_path / "a.xyz", plane()), voxel_m=0.1, tell=notes.append)
+    scene_from_points(written(tmp_path / "a.xyz", plane()), voxel_m=0.1, report=notes.append)
     assert len(notes) == 1 and notes[0].endswith("which were skipped: column_4")
     rows = "\n".join(f"wall {x} {y} {z} 7" for x, y, z in plane())
     (tmp_path / "b.csv").write_text("kind,x,y,z,gps\n" + rows.replace(" ", ","))
-    scene_from_points(tmp_path / "b.csv", voxel_m=0.1, tell=notes.append)
+    scene_from_points(tmp_path / "b.csv", voxel_m=0.1, report=notes.append)
     assert len(notes) == 2 and notes[1].endswith("which were skipped: gps, kind")
 
 

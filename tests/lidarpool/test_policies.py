@@ -191,7 +191,7 @@ def test_totals_are_exact_however_many_tasks_there_are():
     book = TaskBook()
     count = 5 * MAX_RECORDS
     for number in range(count):
-        book.add(record(number))
+        book.add_task(record(number))
     totals = book.stages["intersect"]
     assert (totals.tasks, totals.items) == (count, 2 * count)
     assert totals.seconds == pytest.approx(0.5 * count)
@@ -204,7 +204,7 @@ def test_totals_are_exact_however_many_tasks_there_are():
 def test_tasks_elsewhere_are_counted_and_the_first_are_kept():
     totals = StageTotals("intersect", "GPU")
     for number in range(3 * MAX_MISPLACED):
-        totals.add(record(number, ("OTHER",) if number % 2 else ()))
+        totals.add_task(record(number, ("OTHER",) if number % 2 else ()))
     assert totals.violations == 3 * MAX_MISPLACED
     assert totals.misplaced == [
         record(n, ("OTHER",) if n % 2 else ()) for n in range(MAX_MISPLACED)

@@ -109,7 +109,7 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
         trials = tuple(run_trial(plan, number) for number in range(plan.trials)) if plan else ()
         book = TaskBook()
         for task in tasks:
-            book.add(task)
+            book.add_task(task)
         result = Result(
             **{
                 "scene": scene,

@@ -151,7 +151,7 @@ def driven() -> tuple[Survey, Cloud]:
 def in_the_sensor(survey: Survey, points: Cloud, sensor: int, times_ns: np.ndarray) -> np.ndarray:
     """Return points (n, 3) in the frame of a sensor at times (n,)."""
     places, turns = survey.path.poses(0, times_ns.astype(float))
-    mount = survey.carried[sensor].mount
+    mount = survey.mounted_sensors[sensor].mount
     on_vehicle = np.einsum("nji,nj->ni", turns, points.positions - the_scene().origin - places)
     return (on_vehicle - mount.position) @ (np.eye(3) if mount.rotation is None else mount.rotation)
 

@@ -24,7 +24,9 @@ print(view.url)
 @pytest.fixture(scope="module")
 def hall():
     """Return a scene far from zero, with an actor."""
-    floor = box("Floor", (40, 40, 0.1)).moved("Floor", np.eye(3), np.array([5e5, 5e6, 0.0]))
+    floor = box("Floor", (40, 40, 0.1)).affine_transform(
+        "Floor", np.eye(3), np.array([5e5, 5e6, 0.0])
+    )
     return Scene.from_meshes([floor]).with_actors([Actor(box("Car 1", (4, 2, 1.5)))])
 
 

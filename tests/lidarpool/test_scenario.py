@@ -266,7 +266,7 @@ def test_a_model_of_ones_own_is_a_file_beside_the_scenario(scenario, tmp_path):
     (tmp_path / "mine.yaml").write_text(data.read_text().replace("VLP-16", "Mine"))
     made = scenario("scene: seed\nsensor: mine.yaml")
     assert made.files == (tmp_path / "mine.yaml",)
-    assert prepare(made).survey.carried[0].sensor.name == "Velodyne Mine"
+    assert prepare(made).survey.mounted_sensors[0].sensor.name == "Velodyne Mine"
 
 
 def test_actors_that_stand(scenario):
@@ -274,9 +274,9 @@ def test_actors_that_stand(scenario):
     text += "  - {name: B, box: [2, 1, 1], at: {position: [9, 8, 1], yaw_deg: 90}}\n"
     straight, turned = prepare(scenario(text)).scene.actors
     for time in (0, 1e9, 1e12):
-        low, high = (corner(straight.placed(time).vertices, 0) for corner in (np.min, np.max))
+        low, high = (corner(straight.mesh_at(time).vertices, 0) for corner in (np.min, np.max))
         np.testing.assert_allclose([low, high], [[8, 7.5, 1], [10, 8.5, 2]], atol=1e-12)
-    low, high = (corner(turned.placed(5e9).vertices, 0) for corner in (np.min, np.max))
+    low, high = (corner(turned.mesh_at(5e9).vertices, 0) for corner in (np.min, np.max))
     np.testing.assert_allclose([low, high], [[8.5, 7, 1], [9.5, 9, 2]], atol=1e-12)
 
 

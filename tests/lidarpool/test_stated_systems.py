@@ -72,7 +72,7 @@ def written(path, points, records=(), step_m=1e-4):
 def bounds_of(path, **options):
     """Return the bounds of the scene of a cloud in the world, and the notes."""
     notes = []
-    scene = scene_from_points(path, tell=notes.append, voxel_m=0.3, size=0.01, **options)
+    scene = scene_from_points(path, report=notes.append, voxel_m=0.3, size=0.01, **options)
     return scene.bounds + scene.origin, [note.removeprefix(f"{path} ") for note in notes]
 
 

@@ -74,7 +74,7 @@ def unfinished(folder):
 
 def test_a_run_from_its_beginning_to_its_end(folder):
     store = opened(folder)
-    assert (store.committed_text, store.only_job.complete, store.only_job.resumed) == (
+    assert (store.committed_text, store.only_job.is_complete, store.only_job.resumed) == (
         "",
         False,
         0,
@@ -83,7 +83,7 @@ def test_a_run_from_its_beginning_to_its_end(folder):
     assert store.committed_text == "4 of 6 scans" and store.only_job.progress().points == 12
     add(store, 0, 2)
     store.only_job.committed.advance_frames(6)
-    assert store.only_job.complete
+    assert store.only_job.is_complete
     cloud = store.only_job.points().load()
     assert cloud.scan.tolist() == np.repeat(np.arange(6), 3).tolist()
     assert len(store.only_job.points()) == 18 == store.only_job.parts.point_count
@@ -100,7 +100,7 @@ def test_a_run_from_its_beginning_to_its_end(folder):
     mark = store.db.meta["mark"]
     store.storage.write(part_name(mark, 0, 0, 2), b"of a collector that died")
     store.storage.write(probe_name(mark, "0a1b2c3d"), b"of a driver that died")
-    store.tidy()
+    store.remove_orphaned_parts()
     assert store.storage.sizes().keys() == {*store.only_job.points().names, mark_name(mark)}
     store.remove()
     assert not folder.exists()
@@ -182,7 +182,9 @@ def test_trials_are_gone_on_with_too(folder):
     assert store.committed_text == "1 of 2 planning trials"
     store.db.close()
     again = opened(folder, resume=True, job=job)
-    assert [trial.trial for trial in again.only_job.trials] == [1] and not again.only_job.complete
+    assert [trial.trial for trial in again.only_job.trials] == [
+        1
+    ] and not again.only_job.is_complete
 
 
 def part_of(folder, first):
@@ -215,7 +217,7 @@ def test_a_damaged_part_is_made_again(damage, unfinished):
     (note,) = store.notes
     assert "scans 3 to 4, because " in note and f"{part.name} was damaged" in note
     assert add(store, 3, 5)
-    store.tidy()
+    store.remove_orphaned_parts()
     assert {*store.only_job.points().names, mark_of(store)} == store.storage.sizes().keys()
     assert len(store.only_job.points().load()) == 12
     store.db.close()
@@ -278,7 +280,7 @@ def test_parts_elsewhere_have_a_folder_of_their_own_and_go_with_the_run(folder, 
     store = opened(folder, place)
     add(store, 0, 6)
     assert names(folder) <= {"run.db", "run.db-journal"}
-    store.tidy()
+    store.remove_orphaned_parts()
     assert len(store.only_job.points().load()) == 18
     store.remove()
     assert not folder.exists() and store.storage.sizes() == {}
@@ -366,7 +368,7 @@ def test_foreign_files_among_the_parts_stay(how, request, folder):
     if how == "finished":
         store = opened(folder)
         add(store, 0, 6)
-        store.tidy()
+        store.remove_orphaned_parts()
         store.remove()
     elif how == "dropped":
         remove_run(folder)
@@ -439,7 +441,7 @@ def test_a_survey_and_a_campaign_do_not_take_each_others_folder(left, folder, un
         store.open_job(job)
         add(store, 0, 2, job)
     else:
-        store.end([JobRow(0, "0000")])
+        store.commit_jobs([JobRow(0, "0000")])
     store.db.close()
     before = names(folder)
     for resume in (False, True):
@@ -464,7 +466,7 @@ def test_a_job_under_way_is_gone_on_with_if_its_content_is_the_same(change, fold
 
 def test_a_lost_database_is_made_again_though_drivers_end_meanwhile(folder):
     store, _ = campaign(folder)
-    store.end([JobRow(0, "0000")])
+    store.commit_jobs([JobRow(0, "0000")])
     store.db.close()
     (folder / "run.db").unlink()
     for end in ("killed", "interrupted", "alive"):
@@ -612,12 +614,14 @@ def test_it_goes_on_from_the_last_copy(remote_run):
     assert add(store, 2, 3) and add(store, 5, 6)
     store.only_job.committed.advance_frames(6)
     store.save(force=True)
-    store.tidy()
+    store.remove_orphaned_parts()
     mark = mark_name(store.db.meta["mark"])
     assert left(remote_run) == {"run.db", "run.owner", mark, *store.only_job.points().names}
     again = opened(remote_run, resume=True)
     assert (
-        again.notes == [] and again.only_job.complete and len(again.only_job.points().load()) == 18
+        again.notes == []
+        and again.only_job.is_complete
+        and len(again.only_job.points().load()) == 18
     )
     again.remove()
     assert left(remote_run) == set()

@@ -13,7 +13,7 @@ pytest.importorskip("open3d", reason="Open3D does not exist")
 
 OPTIONS = {
     "size": 1.0, "unit": None, "epsg": None, "keep_noise": False, "color": None,
-    "tell": lambda note: None,
+    "report": lambda note: None,
 }  # fmt: skip
 RINGS = Sensor.grid(rays_per_revolution=1800, layers=16, step_deg=0.2, vertical_fov_deg=40)
 

@@ -246,7 +246,7 @@ def test_what_moved_is_no_part_of_the_place(place):
 def test_surfaces_are_as_bright_as_they_were(place):
     scene = place.scene
     middles = scene.vertices[scene.faces].mean(axis=1)
-    (colors,) = scene.colored
+    (colors,) = scene.all_colors
     light = LINEAR[colors.mean_colors()].mean(axis=1)
     floor = np.median(light[middles[:, 2] < 0.05])
     walls = np.median(light[(np.abs(middles[:, 1]) > 7.3) & (middles[:, 2] > 1)])
@@ -265,7 +265,7 @@ def test_a_twin_is_a_scenario_that_runs_with_another_sensor(place, tmp_path):
     np.testing.assert_allclose(pose.position, place.poses[middle, :3, 3], atol=1e-5)
     np.testing.assert_allclose(pose.rotation_matrix, place.poses[middle, :3, :3], atol=1e-5)
     other = prepare(Scenario.load(path, {"sensor": "velodyne/vlp16"}))
-    assert other.survey.carried[0].sensor.channels == 16
+    assert other.survey.mounted_sensors[0].sensor.channels == 16
     result = CliRunner().invoke(cli, ["twin", str(tmp_path), "--out", str(path.parent)])
     assert "already contains scenario.yaml. Use another folder, or pass `--overwrite`." in str(
         result.exception

@@ -16,7 +16,7 @@ def look(monkeypatch):
     clock = SimpleNamespace(now=0.0)
     monkeypatch.setattr(watch, "time", SimpleNamespace(monotonic=lambda: 1000.0 + clock.now))
     told: list[str] = []
-    watching = Watch(None, ["GPU", "OTHER"], lasting=["LIDAR"], tell=told.append)
+    watching = Watch(None, ["GPU", "OTHER"], lasting=["LIDAR"], report=told.append)
 
     def look(seconds, *workers):
         identities = {
@@ -81,7 +81,7 @@ def test_what_runs_already_goes_on_where_workers_are_paused(look):
 
 
 def test_a_partition_with_nothing_left_to_do_may_leave(look):
-    look.watching.forget(["OTHER"])
+    look.watching.remove_partitions(["OTHER"])
     look(61, ALL[0], ALL[2])
     assert look.told == []
     with pytest.raises(LidarError, match="'GPU' has had no workers for 60 s"):

@@ -89,13 +89,13 @@ def test_without_a_world_files_state_no_system(tmp_path):
 
 def test_a_scene_is_placed_in_python_and_again():
     scene = Scene.seed()
-    placed = scene.georeferenced((500_000, 5_400_000, 300))
+    placed = scene.with_world_origin((500_000, 5_400_000, 300))
     np.testing.assert_array_equal(placed.vertices, scene.vertices)
     assert placed.origin.tolist() == [500_000, 5_400_000, 300]
-    assert placed.georeferenced((1, 2, 3)).origin.tolist() == [1, 2, 3]
-    assert placed.georeferenced((0, 0, 0)).origin.tolist() == [0, 0, 0]
+    assert placed.with_world_origin((1, 2, 3)).origin.tolist() == [1, 2, 3]
+    assert placed.with_world_origin((0, 0, 0)).origin.tolist() == [0, 0, 0]
     with pytest.raises(LidarError, match="must be x, y and z in meters"):
-        scene.georeferenced((1, 2))
+        scene.with_world_origin((1, 2))
 
 
 def test_fields_that_do_not_fit_the_world_are_refused(tmp_path):

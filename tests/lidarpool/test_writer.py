@@ -33,7 +33,7 @@ def jobs(tmp_path, monkeypatch):
 
 def add(to, count):
     for _ in range(count):
-        to.add(SimpleNamespace(cloud=[]))
+        to.queue_job(SimpleNamespace(cloud=[]))
 
 
 def test_jobs_wait_a_moment_to_be_written_with_others(jobs):

@@ -42,7 +42,7 @@ def write(path, document):
 
 def load(tmp_path, document, notes=None, **options):
     path = write(tmp_path / "a.city.json", document)
-    return load_meshes(path, tell=[].append if notes is None else notes.append, **options)
+    return load_meshes(path, report=[].append if notes is None else notes.append, **options)
 
 
 def area(mesh):

@@ -63,7 +63,7 @@ def add_model(folder, name, text=None, versions=(("1.9", "model.sdf"),)):
 
 def load(folder, text, name="w.sdf", **options):
     notes = []
-    objects = load_objects(write(folder / name, text), tell=notes.append, **options)
+    objects = load_objects(write(folder / name, text), report=notes.append, **options)
     return {item.name: item for item in objects.static}, objects.actors, notes
 
 
@@ -786,7 +786,7 @@ def test_garbled_worlds_give_objects_or_a_line(tmp_path):
             data[at] = rng.integers(32, 127)
         path.write_bytes(data[: rng.integers(0, len(data))] if rng.random() < 0.2 else data)
         try:
-            read += bool(load_objects(path, colors=True, tell=lambda line: None).static)
+            read += bool(load_objects(path, colors=True, report=lambda line: None).static)
         except LidarError as error:
             assert len(str(error).splitlines()) == 1
     assert 2 < read < 95

@@ -111,7 +111,7 @@ def about(axis, degrees):
 
 def fired(made, number, firings):
     """Directions in the world of firings of a sensor: (k, channels, 3)."""
-    carried = made.carried[number]
+    carried = made.mounted_sensors[number]
     path = made.path
     firings = np.asarray(firings)
     _, turns = path.poses(0, carried.sensor.begins_ns(firings))
@@ -137,7 +137,7 @@ def test_a_cone_is_that_of_helios(imported):
     there = [about(Y, 3.6 * k) @ about(X, 20) for k in PULSES]
     assert np.allclose(fired(of, 0, PULSES)[:, 0], expected(there, 30), atol=1e-9)
     assert of.ray_count == 500  # 5 m at 10 m/s
-    assert of.carried[0].sensor.name == "S/1" and made.path.with_name("s_1.yaml").is_file()
+    assert of.mounted_sensors[0].sensor.name == "S/1" and made.path.with_name("s_1.yaml").is_file()
     # Where mount and emitter sit does not turn with the platform.
     assert np.allclose(of.path.pose(0).position + scene.origin, [0, 0.1, 50.5])
 
@@ -148,7 +148,7 @@ def test_a_polygon_fires_the_pulses_of_helios_within_its_angles(imported):
     # 33.33 pulses a line: it begins anew after 34, at -60 degrees.
     angles = np.array([-60 + 3.6 * k for k in range(34)])
     kept = np.flatnonzero((angles > -30) & (angles <= 30))
-    sensor = of.carried[0].sensor
+    sensor = of.mounted_sensors[0].sensor
     times = sensor.begins_ns(np.arange(len(kept) + 1))
     assert np.allclose(np.diff(times), [1e6] * (len(kept) - 1) + [(35 - len(kept)) * 1e6])
     there = [about(X, angle) for angle in angles[kept]]
@@ -164,7 +164,7 @@ def test_lines_wider_than_the_scanner_end_where_it_does(imported):
     kept = angles[(angles > -45) & (angles <= 41)]
     there = [about(X, angle) for angle in kept]
     assert np.allclose(fired(of, 0, np.arange(len(kept)))[:, 0], expected(there), atol=1e-9)
-    assert of.carried[0].sensor.head.firings_per_turn == len(kept)
+    assert of.mounted_sensors[0].sensor.head.firings_per_turn == len(kept)
 
 
 def test_a_swinging_mirror_and_fibers_are_those_of_helios(imported, tmp_path):
@@ -225,7 +225,7 @@ def test_a_head_turns_from_start_to_stop_while_its_mirror_draws_lines(imported):
     _, scene, of = imported(device, inside, platform="tripod")
     elevations = [-120 + 4.8 * k for k in range(50)]
     kept = [e for e in elevations if -40 < e <= 60]
-    assert [carried.name for carried in of.carried] == ["leg0", "leg1"]
+    assert [carried.name for carried in of.mounted_sensors] == ["leg0", "leg1"]
     assert of.steps_each == (3, 3)
     for line in (0, 1, 41):
         made = fired(of, 0, [line])[0]
@@ -234,7 +234,7 @@ def test_a_head_turns_from_start_to_stop_while_its_mirror_draws_lines(imported):
             assert np.allclose(made[channel], about(Z, turned) @ about(X, elevation + 5) @ Y)
     back = fired(of, 1, [0])[0]
     assert np.allclose(back[0], about(Z, 90) @ about(X, elevations[17] + 5) @ Y)
-    lines = of.carried[1].sensor.firings(2)[1]
+    lines = of.mounted_sensors[1].sensor.firings(2)[1]
     assert lines == 50 and of.scan(3).firings == (0, 17)  # 30 degrees at 12 a second, 20 lines
     last = fired(of, 1, [49])[0, 0]
     assert np.allclose(last, about(Z, 90 - 12 * 49 / 20) @ about(X, elevations[17] + 5) @ Y)
@@ -268,7 +268,7 @@ def test_channels_of_a_mirror_that_stands_are_the_beams_of_a_head_that_turns(imp
     device = scanner("rotating", inside, headRotatePerSecMax_deg=3600, **limits)
     head = 'headRotatePerSec_deg="3600" headRotateStart_deg="0" headRotateStop_deg="720"'
     _, _, of = imported(device, legs(f'pulseFreq_hz="18000" {head}', (0, 0)), platform="tripod")
-    assert [c.name for c in of.carried] == ["leg0--15", "leg0-15"] and of.ray_count == 7200
+    assert [c.name for c in of.mounted_sensors] == ["leg0--15", "leg0-15"] and of.ray_count == 7200
     for number, elevation in enumerate((-15, 15)):
         there = about(Z, 0.2 * 7) @ about(X, elevation) @ Y
         assert np.allclose(fired(of, number, [7])[0, 0], there)
@@ -312,9 +312,11 @@ def test_waveform_settings_become_those_of_returns(imported):
         0.6,
     )
     assert made.unsupported == ["maxFullwaveRange_ns (waveforms are as long as their echoes)"]
-    assert of.returns_each[0].system_ns(of.carried[0].sensor.optics) == pytest.approx(4 / 2.35482)
+    assert of.returns_each[0].system_ns(of.mounted_sensors[0].sensor.optics) == pytest.approx(
+        4 / 2.35482
+    )
     assert of.visibility_km == pytest.approx(10 * np.log(20) / 3.91)
-    nm = of.carried[0].sensor.optics.wavelength_nm
+    nm = of.mounted_sensors[0].sensor.optics.wavelength_nm
     assert 1000 * of.extinction_at(nm) == pytest.approx(3.91 / 10 * (nm / 550) ** -1.3)
 
 
@@ -406,7 +408,7 @@ def test_a_trajectory_of_its_own_is_followed(imported):
         parts={"way.trj": names + rows},
     )
     assert (made.path.parent / "trajectory.tum").is_file()
-    assert [c.sensor.start_ns for c in of.carried] == [0, 1e9]
+    assert [c.sensor.start_ns for c in of.mounted_sensors] == [0, 1e9]
     assert [of.scan(s).firings[1] for s in (19, 24)] == [2000, 500]
     assert np.allclose(of.pose(20).position + scene.origin, [60, 2, 30.5])
     platform = about(-Z, 94) @ about(Y, 4)  # ARINC 705
@@ -670,7 +672,7 @@ def test_angular_resolutions_set_the_rates(imported):
     fine = 'pulseFreq_hz="9000" verticalResolution_deg="2" horizontalResolution_deg="0.5" '
     ends = 'headRotateStart_deg="0" headRotateStop_deg="50"'
     made, _, of = imported(device, legs(fine + ends, (0, 0)), platform="tripod")
-    head = of.carried[0].sensor.head
+    head = of.mounted_sensors[0].sensor.head
     assert head.firings_per_turn == pytest.approx(720) and head.rate_hz == pytest.approx(50 / 360)
     assert of.ray_count == 100 * 50  # lines half a degree apart, of -48 to 50 degrees by 2
     assert scenario_of(made).sensors["leg0"].steps == 5

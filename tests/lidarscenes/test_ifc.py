@@ -186,7 +186,7 @@ def two_storeys():
 
 
 def named(path, **options):
-    return {mesh.name: mesh for mesh in load_meshes(path, tell=[].append, **options)}
+    return {mesh.name: mesh for mesh in load_meshes(path, report=[].append, **options)}
 
 
 @pytest.fixture(scope="module")
@@ -241,7 +241,7 @@ def test_a_scenario_takes_a_storey_and_has_classes(house, forked):
 
 def test_styles_are_colors_and_materials(house, forked):
     notes = []
-    objects = load_objects(house, colors=True, materials=True, tell=notes.append)
+    objects = load_objects(house, colors=True, materials=True, report=notes.append)
     meshes = {mesh.name: mesh for mesh in objects.static}
     wall = meshes["IfcWall South"]
     assert wall.materials.names == ("Brick",)
@@ -261,7 +261,7 @@ def test_units_are_those_of_the_project(forked, tmp_path, schema, prefix, unit_m
     model.rooted("IfcRelAssociatesMaterial", None, RelatedObjects=[wall], RelatingMaterial=material)
     notes = []
     path = model.write(tmp_path / "a.ifc")
-    (mesh,) = load_meshes(path, materials=True, tell=notes.append)
+    (mesh,) = load_meshes(path, materials=True, report=notes.append)
     assert mesh.bounds[:, 0] == pytest.approx([4, 6])
     assert mesh.materials.names == ("Concrete",)
     assert ["does not specify a length unit" in note for note in notes] == [True] * (prefix == "")
@@ -289,27 +289,27 @@ def test_a_map_conversion_is_noted_and_not_applied(forked, tmp_path):
     )
     path = tmp_path / "a.ifc"
     notes = []
-    load_meshes(model.write(path), tell=notes.append)
+    load_meshes(model.write(path), report=notes.append)
     assert notes == [
         f"{path} contains a map conversion, which was not applied. To move the building to "
         "EPSG:25832, use translation [691000.5, 5336000.25, 500] and rotation_deg [0, 0, 90]."
     ]
     system.Name = "EPSG:3857"
-    load_meshes(model.write(path), tell=notes.append)
+    load_meshes(model.write(path), report=notes.append)
     if find_spec("rasterio") is not None:
         assert "to EPSG:3857, whose meter is 0.72" in notes[1]
         assert "long on the ground here, unlike the meter of the building, use" in notes[1]
     system.Name = "EPSG:25832"
     del notes[1]
     conversion.Scale = 0.5
-    load_meshes(model.write(path), tell=notes.append)
+    load_meshes(model.write(path), report=notes.append)
     assert notes[1].endswith(
         "cannot be used because its scale, 500, is not consistent with its units."
     )
     model.file.remove(conversion)
     model.site.RefLatitude = (48, 8, 15, 600_000)
     model.site.RefLongitude = (-11, -34, -30, -600_000)
-    load_meshes(model.write(path), tell=notes.append)
+    load_meshes(model.write(path), report=notes.append)
     assert notes[2].endswith("a site position, 48.1377° N, 11.5752° W, which was ignored.")
 
 
@@ -337,7 +337,7 @@ def with_map_sets(model, owner, system, conversion, names=("ePSet_MapConversion"
 def map_note(model, path):
     notes = []
     model.element("IfcWall", "W")
-    load_meshes(model.write(path), tell=notes.append)
+    load_meshes(model.write(path), report=notes.append)
     (note,) = notes
     return note.removeprefix(f"{path} ")
 
@@ -493,7 +493,7 @@ def test_styles_of_edges_are_not_styles_of_triangles(forked, tmp_path):
     shape = geometric_set(model, ((0, 0), (3, 0), (3, 4), (0, 0)))
     model.paint(model.element("IfcBeam", "B", solid=shape), "Steel", (0.2, 0.4, 0.6))
     (mesh,) = load_meshes(
-        model.write(tmp_path / "a.ifc"), colors=True, materials=True, tell=[].append
+        model.write(tmp_path / "a.ifc"), colors=True, materials=True, report=[].append
     )
     assert len(mesh.faces) == 1
     assert mesh.bounds == pytest.approx(np.array([(0, 0, 0), (3, 4, 0)]))
@@ -507,7 +507,7 @@ def test_a_shape_of_edges_with_styles_is_noted(forked, tmp_path):
     flat = geometric_set(model, ((0, 0), (1, 0), (2, 0), (0, 0)))
     model.paint(model.element("IfcBeam", "Line", solid=flat), "Steel", (0.2, 0.4, 0.6))
     notes = []
-    (mesh,) = load_meshes(model.write(tmp_path / "a.ifc"), materials=True, tell=notes.append)
+    (mesh,) = load_meshes(model.write(tmp_path / "a.ifc"), materials=True, report=notes.append)
     assert mesh.name == "IfcWall W"
     [note] = notes
     assert "1 element that ifcopenshell cannot convert to triangles: 'IfcBeam Line'" in note
@@ -524,7 +524,7 @@ def test_elements_that_openings_take_away_are_noted(forked, tmp_path):
     )
     notes = []
     path = model.write(tmp_path / "a.ifc")
-    (mesh,) = load_meshes(path, materials=True, tell=notes.append)
+    (mesh,) = load_meshes(path, materials=True, report=notes.append)
     assert mesh.name == "IfcWall W"
     [note] = notes
     assert "1 element that ifcopenshell cannot convert to triangles: 'IfcBeam Gone'" in note
@@ -544,7 +544,7 @@ def test_schemas_with_the_layout_of_another_are_read(forked, tmp_path, schema, l
     path = tmp_path / f"a{suffix}"
     write_text(path, in_schema(model.file.to_string(), layout, schema))
     notes = []
-    (mesh,) = load_meshes(path, tell=notes.append)
+    (mesh,) = load_meshes(path, report=notes.append)
     assert np.ptp(mesh.bounds, axis=0) == pytest.approx([2, 1, 1])
     assert not notes
 
@@ -571,7 +571,7 @@ def test_triangulated_faces_of_ifc4x3_are_read(forked, tmp_path):
     text = in_schema(model.file.to_string(), "IFC4X3_ADD2", "IFC4X3")
     assert ",$,.F.,((1,2,3))" in text
     (tmp_path / "a.ifc").write_text(text.replace(",$,.F.,((1,2,3))", ",.F.,$,((1,2,3))"))
-    (mesh,) = load_meshes(tmp_path / "a.ifc", tell=[].append)
+    (mesh,) = load_meshes(tmp_path / "a.ifc", report=[].append)
     assert sorted(mesh.vertices[mesh.faces][0].tolist()) == sorted(map(list, corners))
 
 
@@ -610,7 +610,7 @@ def test_elements_without_triangles_are_noted(forked, tmp_path):
     model.element("IfcWall", "W")
     model.element("IfcBeam", "Thin", (1, 1, 0))
     notes = []
-    load_meshes(model.write(tmp_path / "a.ifc"), tell=notes.append)
+    load_meshes(model.write(tmp_path / "a.ifc"), report=notes.append)
     [note] = notes
     assert note.endswith(
         "was read without 1 element that ifcopenshell cannot convert to triangles: 'IfcBeam Thin'."
@@ -657,7 +657,7 @@ def test_unknown_entities_are_noted(house, forked, tmp_path):
     path = tmp_path / "a.ifc"
     path.write_text(house.read_text().replace("IFCSLAB(", "IFCSLEB("))
     notes = []
-    assert len(load_meshes(path, tell=notes.append)) == 3
+    assert len(load_meshes(path, report=notes.append)) == 3
     assert any("that ifcopenshell ignored" in n and "IFCSLEB" in n for n in notes)
 
 
@@ -673,7 +673,7 @@ def test_garbled_files_are_read_or_refused(house, forked, tmp_path):
         path.write_bytes(garbled.tobytes())
         notes = []
         try:
-            load_meshes(path, tell=notes.append)
+            load_meshes(path, report=notes.append)
         except LidarError as error:
             notes.append(str(error))
         assert not any("\n" in note for note in notes)

@@ -114,7 +114,7 @@ def world(*elements):
 
 def load(path, **options):
     notes = []
-    objects = load_objects(path, tell=notes.append, **options)
+    objects = load_objects(path, report=notes.append, **options)
     return {item.name: item for item in objects.static}, notes
 
 

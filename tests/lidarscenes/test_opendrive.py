@@ -185,7 +185,7 @@ def network():
 def load(tmp_path, text, notes=None, **options):
     path = tmp_path / "a.xodr"
     path.write_text(text)
-    meshes = load_meshes(path, tell=[].append if notes is None else notes.append, **options)
+    meshes = load_meshes(path, report=[].append if notes is None else notes.append, **options)
     return {mesh.name: mesh for mesh in meshes}
 
 
@@ -683,6 +683,6 @@ def test_garbled_files_are_read_or_refused(tmp_path):
         )
         path.write_bytes(garbled.tobytes())
         try:
-            load_meshes(path, tell=[].append)
+            load_meshes(path, report=[].append)
         except LidarError as error:
             assert "\n" not in str(error)

@@ -60,7 +60,7 @@ def write(path, heights=SLOPE, *, crs="EPSG:25832", place=None, mask=None, units
 def read(path, **options):
     """Return the mesh, what was taken, and the notes."""
     notes = []
-    found = load_objects(path, tell=notes.append, **options)
+    found = load_objects(path, report=notes.append, **options)
     (mesh,) = found.static
     return mesh, found.raster, [note.removeprefix(f"{path} ") for note in notes]
 

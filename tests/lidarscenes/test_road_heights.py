@@ -544,7 +544,7 @@ def test_roads_that_turn_inside_their_lanes_are_read(tmp_path):
     text = document(road(lanes, length=12, shape='<arc curvature="0.125"/>', profiles=up))
     path = tmp_path / "a.xodr"
     path.write_text(text)
-    assert sum(len(mesh.faces) for mesh in load_meshes(path, tell=[].append)) < 5000
+    assert sum(len(mesh.faces) for mesh in load_meshes(path, report=[].append)) < 5000
 
 
 def test_a_road_continues_straight_beyond_the_end_of_its_cubic(tmp_path):

@@ -129,7 +129,7 @@ def test_a_link_is_where_the_joints_before_it_put_it(tmp_path):
 def test_links_that_are_fixed_to_one_another_are_one_actor(tmp_path):
     notes = []
     robot = robot_of(tmp_path, *ARM)
-    actors = robot.actors(joints={"pan": 3.5}, name="Arm", tell=notes.append)
+    actors = robot.actors(joints={"pan": 3.5}, name="Arm", report=notes.append)
     assert [actor.name for actor in actors] == ["Arm/base", "Arm/upper", "Arm/rod", "Arm/tip"]
     assert [len(actor.mesh.faces) for actor in actors] == [24, 12, 12, 12]
     assert notes == ["r: joint pan has values from 3.5 to 3.5, which exceed its limits of -1 to 3."]
@@ -138,7 +138,7 @@ def test_links_that_are_fixed_to_one_another_are_one_actor(tmp_path):
     cube = corner[:3, :3] @ (box("", (0.2, 0.2, 0.2)).vertices - [0, 0, 0.1]).T
     assert np.allclose(plate.mesh.vertices - [0.1, 0.2, 0.3], cube.T, atol=1e-15)
     assert plate.name == "r/base", "the same name, whatever is left out"
-    again = robot.actors(name="Other", tell=notes.append)
+    again = robot.actors(name="Other", report=notes.append)
     assert all(a.mesh.vertices is b.mesh.vertices for a, b in zip(actors, again, strict=True))
     # A joint without a value is at zero, or at its limit nearest to zero.
     limits = '<limit lower="0.2" upper="0.5"/>'
@@ -343,7 +343,7 @@ def test_xacro_other_files_and_garbled_copies(tmp_path):
             data[at] = rng.integers(32, 127)
         path.write_bytes(data[: rng.integers(0, len(data))] if rng.random() < 0.2 else data)
         try:
-            read += bool(load_robot(path, colors=True, tell=lambda line: None).actors())
+            read += bool(load_robot(path, colors=True, report=lambda line: None).actors())
         except LidarError as error:
             assert len(str(error).splitlines()) == 1
     assert 5 < read < 140
@@ -356,7 +356,7 @@ def test_what_is_left_out_is_told(tmp_path):
         link("a", visual('<box size="1 1 1"/>') + visual('<box size="1 0 1"/>')),
         link("b", "<collision><geometry><box size='1 1 1'/></geometry></collision>"),
         joint("j", "floating", "a", "b"),
-        tell=notes.append,
+        report=notes.append,
     )
     assert list(robot.meshes) == ["a"] and not robot.moving
     held, collide, flat = notes
@@ -372,7 +372,7 @@ def test_tables_of_joints(tmp_path):
     table = tmp_path / "joints.csv"
     notes = []
     table.write_text("time_ns;pan;effort\n0;0;1\n1000000000;1;1\n")
-    (*_, tip) = robot.actors(joints=table, ignore=["effort"], tell=notes.append)
+    (*_, tip) = robot.actors(joints=table, ignore=["effort"], report=notes.append)
     assert np.allclose(tip.trajectory.pose(0, 5e8).position, tip_at(0.5, 0)[:3, 3])
     assert not notes
     table.write_text(f"time [s],Pan [deg]\n0,0\n1,{np.degrees(1)}\n")
@@ -564,7 +564,7 @@ def test_a_scenario_has_its_robot_and_its_sensor_on_a_link(folder):
     turret = actors["Rover/shoulder_block"].trajectory.pose(0, 1e9)
     assert np.allclose([*turret.position, turret.yaw_deg], [1.3, 0, 0.4, np.degrees(0.5)])
     survey = built.survey
-    (carried,) = survey.carried
+    (carried,) = survey.mounted_sensors
     assert np.allclose(carried.mount.position, (-0.36, 0, 1.076))
     assert carried.mount.yaw_deg == pytest.approx(90)
     kinds = {name: next(m for m in survey.materials if m.applies_to(name)) for name in actors}

@@ -82,7 +82,7 @@ def test_colors_of_base_materials_and_color_groups(tmp_path):
     path = tmp_path / "m.3mf"
     path.write_bytes(packed({"3D/3dmodel.model": model('<item objectid="2"/>', objects=objects)}))
     notes = []
-    (mesh,) = load_meshes(path, colors=True, tell=notes.append)
+    (mesh,) = load_meshes(path, colors=True, report=notes.append)
     first = [1, 2, 3]
     last = [255, 254, 253]
     base = [255, 128, 0]

@@ -68,7 +68,7 @@ def write(path, *prims, stage=METERS):
 def told(path, **options):
     """Objects, and lines on what was left or turned."""
     lines = []
-    objects = load_meshes(path, tell=lines.append, axes=lines.append, **options)
+    objects = load_meshes(path, report=lines.append, axes=lines.append, **options)
     return objects, [line.replace(str(path), path.name) for line in lines]
 
 
@@ -167,7 +167,7 @@ def vertices(path, seconds, **options):
     """Vertices of the actors at a time, and the lines that were told."""
     scene = Scene.load(path, **options)
     assert scene.names == ("Ground",)
-    return {one.name: one.placed(seconds * 1e9).vertices + scene.origin for one in scene.actors}
+    return {one.name: one.mesh_at(seconds * 1e9).vertices + scene.origin for one in scene.actors}
 
 
 def test_moving_prims_are_actors(tmp_path):
@@ -217,7 +217,7 @@ def test_what_moves_in_instances_moves_in_each(tmp_path):
     meta = "references = @./car.usda@\ninstanceable = true"
     places = [prim(f"I{y}", "Xform", MOVED.format((0, y, 0)), meta) for y in (0, 10)]
     scene = Scene.load(write(tmp_path / "m.usda", prim("Ground"), *places, stage=STAGE))
-    low = [actor.placed(1e9).bounds[0].tolist() for actor in scene.actors]
+    low = [actor.mesh_at(1e9).bounds[0].tolist() for actor in scene.actors]
     assert low == [[5, 0, 0], [5, 10, 0]] and len(scene.names) == 1
 
 
@@ -401,7 +401,7 @@ def test_what_moves_too_far_away_is_left_out(tmp_path):
     falls = sampled("translate", t0="(0, 0, 5)", t24="(0, 0, -750000000)") + order("translate")
     path = write(tmp_path / "m.usda", prim("Quad"), prim("Fallen", text=QUAD + falls))
     notes = []
-    objects = load_objects(path, tell=notes.append)
+    objects = load_objects(path, report=notes.append)
     assert [mesh.name for mesh in objects.static] == ["Quad"] and not objects.actors
     assert any("(7.5e+08 m from the origin), which were skipped: Fallen" in note for note in notes)
 
@@ -801,7 +801,7 @@ def test_masks_let_light_pass(folder):
     path = write(folder / "m.usda", material(IMAGE + HOLES), quad)
     assert seen(path) == ([BLUE, None, RED, None], [])
     assert seen(path, opacity="ignore")[0] == PICTURE
-    assert Scene.load(path).masked == ("Q",)  # also where no colors are asked for
+    assert Scene.load(path).masked_objects == ("Q",)  # also where no colors are asked for
     assert not Scene.load(path, opacity="ignore").instances
     glass = write(folder / "m.usda", material("float inputs:opacity = 0.2"), quad)
     assert "without holes, which are treated as opaque: M." in seen(glass)[1][0]

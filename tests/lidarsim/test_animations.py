@@ -530,8 +530,8 @@ def test_pictures_of_a_saved_result_show_people_as_they_walk(walker, tmp_path):
     assert len({id(actor.mesh.animation) for actor in again}) == 3, "copies share their poses"
     for time_ns in (0, 0.7e9, 1.49e9, 1.7e9, 2.4e9, 2.9e9):
         for one, other in zip(actors, again, strict=True):
-            want = one.placed(time_ns).vertices
-            found = other.placed(time_ns).vertices
+            want = one.mesh_at(time_ns).vertices
+            found = other.mesh_at(time_ns).vertices
             there = np.ptp(want, axis=0).any()
             assert there == np.ptp(found, axis=0).any()
             # The pose is within 1/1024 m; halves of it, and a way between a thousand places.
@@ -550,7 +550,7 @@ def test_poses_of_many_vertices_are_fewer_in_pictures(tmp_path):
     assert ring.mesh.animation.vertices.shape == (MAX_PICTURED_VERTICES // 50_000, 50_000, 3)
     for time_ns in (0, 0.77e9, 2e9, 2.5e9):
         want = points * (1 + min(time_ns / 2e9, 1))
-        np.testing.assert_allclose(ring.placed(time_ns).vertices, want, atol=1e-3)
+        np.testing.assert_allclose(ring.mesh_at(time_ns).vertices, want, atol=1e-3)
 
 
 @pytest.mark.extended

@@ -5,7 +5,7 @@ import pickle
 import pytest
 
 from lidarsim import LidarError, Pose, Scene, load_sensor
-from lidarsim.errors import MissingFileError, explained, prefixed
+from lidarsim.errors import MissingFileError, explain_os_errors, prefix_errors
 
 
 @pytest.mark.parametrize(("load", "name"), [(Scene.load, "a.glb"), (load_sensor, "a.yaml")])
@@ -34,9 +34,9 @@ def test_another_error_stays_alone(tmp_path):
 def test_the_kind_outlives_prefixes_processes_and_further_explanations(tmp_path):
     with (
         pytest.raises(MissingFileError) as raised,
-        explained("The run cannot start"),
-        prefixed("leg 3"),
-        explained("the table cannot be read"),
+        explain_os_errors("The run cannot start"),
+        prefix_errors("leg 3"),
+        explain_os_errors("the table cannot be read"),
     ):
         (tmp_path / "nope.csv").read_text()
     copy = pickle.loads(pickle.dumps(raised.value))

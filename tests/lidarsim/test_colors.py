@@ -338,7 +338,9 @@ def test_instances_and_actors_have_the_colors_of_their_mesh():
     pose = Pose((1.0, 0.5, 0.1), 50)
     half = np.radians(25)
     way = Track([0, 10], [pose.position] * 2, [[0, 0, np.sin(half), np.cos(half)]] * 2)
-    far = SceneMesh("Far", mesh.vertices, mesh.faces).moved("Far", np.eye(3), np.array([0, 0, -90]))
+    far = SceneMesh("Far", mesh.vertices, mesh.faces).affine_transform(
+        "Far", np.eye(3), np.array([0, 0, -90])
+    )
     moving = Scene.from_meshes([far]).with_actors([Actor(mesh, way)])
     _, want = sweep(Scene.from_meshes([SceneInstance(mesh, pose), far]))
     _, found = sweep(moving)
@@ -354,7 +356,7 @@ def test_an_image_is_sent_once_whatever_shares_it():
 
 
 def test_textures_are_the_reflectance(caplog):
-    bare = SceneMesh("Bare", *hills()[:2]).moved("Bare", np.eye(3), np.array([0, 9, 0]))
+    bare = SceneMesh("Bare", *hills()[:2]).affine_transform("Bare", np.eye(3), np.array([0, 9, 0]))
     scene = Scene.from_meshes([textured(), bare])
     materials = [Material("Hills", "texture", scale=0.8), Material("*", 0.4)]
     cloud, found = sweep(scene, "reflectance", "intensity", materials=materials)

@@ -210,10 +210,10 @@ def test_areas_may_cross_the_date_line():
         (area.east + 0.1, False),
         (0.0, False),
     ]:
-        assert area.reaches(longitude, middle) is inside, longitude
-        assert area.reaches(longitude, middle, 0.2) is (inside or longitude != 0.0)
-    assert not area.reaches(180.0, area.north + 0.1)
+        assert area.contains(longitude, middle) is inside, longitude
+        assert area.contains(longitude, middle, 0.2) is (inside or longitude != 0.0)
+    assert not area.contains(180.0, area.north + 0.1)
     # A degree of arc is two degrees of longitude at a latitude of 60.
     north = area_of_use(crs_from_code(25833))
-    assert north.reaches(north.west - 1.9, 60.0, 1.0)
-    assert not north.reaches(north.west - 2.1, 60.0, 1.0)
+    assert north.contains(north.west - 1.9, 60.0, 1.0)
+    assert not north.contains(north.west - 2.1, 60.0, 1.0)

@@ -54,7 +54,7 @@ def same(cloud, other):
 def test_sweeps_and_ranges_are_those_of_a_scene_with_the_bodies_in_place(shift):
     """Also far from zero, where the scene has a local origin."""
     away = np.array([shift, -shift, 0])
-    static = [item.moved(item.name, np.eye(3), away) for item in STATIC]
+    static = [item.affine_transform(item.name, np.eye(3), away) for item in STATIC]
     follower = Follower(BODIES, GRID, static=static, columns=COLUMNS, backend="numpy")
     assert follower.names == ("Ground", "Post", "Crate", "Wall", "Crate.2")
     lidar = LIDAR.copy()

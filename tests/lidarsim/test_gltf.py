@@ -191,7 +191,7 @@ def test_skins_are_bent_by_their_joints_as_they_stand(tmp_path):
     header["animations"] = [{"channels": [], "samplers": []}]
     notes = []
     path = write(tmp_path / "m.glb", glb(header, body))
-    (bar,) = load_meshes(path, up_axis="z", tell=notes.append)
+    (bar,) = load_meshes(path, up_axis="z", report=notes.append)
     # The first two follow the lower joint, the third the upper one, the last is between them.
     upper = np.array([0, 2, 5]), np.array([0, 3, 5])
     expected = [[0, 0, 5], [1, 0, 5], upper[0], (upper[1] + [1, 2, 5]) / 2]
@@ -241,12 +241,12 @@ def test_a_node_that_is_too_far_away_is_left_out(tmp_path, monkeypatch, shared):
     header["scenes"][0]["nodes"] = [0, 1, 2]
     notes = []
     path = write(tmp_path / "m.glb", glb(header, CORNERS))
-    meshes = load_meshes(path, up_axis="z", tell=notes.append)
+    meshes = load_meshes(path, up_axis="z", report=notes.append)
     assert [mesh.name for mesh in meshes] == ["Sign", "Near"]
     assert all(isinstance(mesh, SceneInstance) == shared for mesh in meshes)
     assert len(notes) == 1 and "(7.5e+08 m from the origin), which were skipped: Fal" in notes[0]
     wide = Transform.from_parts(scale=3e7)
-    (sign,) = load_meshes(path, up_axis="z", transform=wide, tell=notes.append)
+    (sign,) = load_meshes(path, up_axis="z", transform=wide, report=notes.append)
     assert sign.name == "Sign"
 
 
@@ -272,7 +272,7 @@ def test_hidden_nodes_are_left_out_with_all_below(tmp_path, where):
     header[where] = ["KHR_node_visibility"]
     notes = []
     path = write(tmp_path / "m.glb", glb(header, CORNERS))
-    meshes = load_meshes(path, up_axis="z", tell=notes.append)
+    meshes = load_meshes(path, up_axis="z", report=notes.append)
     assert [mesh.name for mesh in meshes] == ["Sign", "Post"]
     assert notes == [
         f"{path} has 2 hidden nodes (KHR_node_visibility). Hidden nodes and their descendants were "
@@ -297,7 +297,7 @@ def test_extensions_that_are_used_and_not_read_are_noted_once(tmp_path):
     header["nodes"][0]["extensions"] = {"ACME_tilt": {}, "MSFT_lod": {"ids": [0]}}
     notes = []
     path = write(tmp_path / "m.glb", glb(header, CORNERS))
-    assert len(load_meshes(path, up_axis="z", tell=notes.append)) == 1
+    assert len(load_meshes(path, up_axis="z", report=notes.append)) == 1
     (note,) = notes
     assert note.endswith("not supported and were ignored: MSFT_lod, ACME_tilt.")
     header["extensionsUsed"] = known

@@ -252,7 +252,7 @@ def expected_rows(model: str, mode: str, packets: int) -> list[Row]:
     """Return the returns of a survey's points, of the firings in a number of packets."""
     manual = MODELS[model]
     survey, cloud, _ = scanned(model, mode)
-    sensor = survey.carried[0].sensor
+    sensor = survey.mounted_sensors[0].sensor
     lasers = np.argsort(lasers_deg(model)[0], kind="stable")
     first_firings = np.array([sensor.firings(step)[0] for step in range(survey.steps)])
     firing = first_firings[cloud["scan"]] + cloud["ray"] // manual.channels
@@ -418,7 +418,7 @@ def test_packets_continue_from_sweep_to_sweep_while_the_sensor_moves():
     survey = moving_survey(rate_hz=7, steps=40)
     cloud, sweeps = points_of(survey, room())
     payloads = data_of(encoded(cloud, sweeps))
-    assert len(payloads) == survey.carried[0].sensor.firings(39)[1] // 8
+    assert len(payloads) == survey.mounted_sensors[0].sensor.firings(39)[1] // 8
     rows = np.array(plain_rows(payloads[350:365], "xt32", "strongest", 351, rate_hz=7))
     assert len(rows) == 15 * 8 * 32  # in a closed room
     firing = cloud["time"] // 50_000

@@ -124,7 +124,7 @@ def test_a_note_names_materials_that_are_a_pointer_of_git_lfs(tmp_path):
     path = tmp_path / "a.obj"
     path.write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl Glass\nf 1 2 3\n")
     notes = []
-    load_meshes(path, tell=notes.append)
+    load_meshes(path, report=notes.append)
     assert any("a.mtl (it is a Git LFS pointer. Download the file" in note for note in notes)
 
 

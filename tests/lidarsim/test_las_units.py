@@ -116,7 +116,7 @@ def check_conversion(folder, records, meters, height_m, **options):
     factors = np.array([meters, meters, height_m])
     path = written(folder / "a.las", PLACE / factors, records, **options)
     notes = []
-    scene = scene_from_points(path, voxel_m=0.01, tell=notes.append)
+    scene = scene_from_points(path, voxel_m=0.01, report=notes.append)
     low, high = scene.bounds
     np.testing.assert_allclose((low + high) / 2, (302, 201.5, 11), atol=0.01)
     assert bool(notes) == ((meters, height_m) != (1.0, 1.0)), notes

@@ -150,7 +150,7 @@ def payloads_of(model, kind):
 
 def firings_of(survey, cloud):
     """Return the firing of each point."""
-    sensor = survey.carried[0].sensor
+    sensor = survey.mounted_sensors[0].sensor
     first = np.array([sensor.firings(step)[0] for step in range(survey.steps)])
     return first[cloud["scan"]] + cloud["ray"] // sensor.channels
 
@@ -299,7 +299,7 @@ def test_packets_continue_from_frame_to_frame_while_the_sensor_moves():
     cloud, sweeps = points_of(survey, room())
     groups = encoded(cloud, sweeps)
     payloads = payloads_to(56_301, groups)
-    count = survey.carried[0].sensor.firings(89)[1] // 24
+    count = survey.mounted_sensors[0].sensor.firings(89)[1] // 24
     assert len(payloads) == count
     headers = [header_of(payload.tobytes()) for payload in payloads]
     stamps = np.array([header.stamp_ns for header in headers])

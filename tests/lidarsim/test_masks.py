@@ -115,7 +115,7 @@ def test_a_card_of_leaves_lets_through_what_it_should(tmp_path, backend, kind):
     scene = load(tmp_path / "m.glb", header, body)
     solid = load(tmp_path / "m.glb", header, body, opacity="ignore")
     check(scene, solid, texel, backend)
-    assert (scene.masked, solid.masked) == (("Leaves",), ())
+    assert (scene.masked_objects, solid.masked_objects) == (("Leaves",), ())
     assert solid.instances is None
 
 
@@ -198,7 +198,7 @@ def test_copies_of_a_node(tmp_path):
     header["extensionsRequired"] = [*copies]
     path = write(tmp_path / "m.glb", glb(header, body))
     notes = []
-    found = load_meshes(path, up_axis="z", tell=notes.append)
+    found = load_meshes(path, up_axis="z", report=notes.append)
     assert [one.name for one in found] == ["Tree", "Tree", "Leaf"]
     assert notes == [f"{path} has objects without an area, which were skipped: Tree."]
     bounds = [one.flat().bounds for one in found]
@@ -271,7 +271,7 @@ def test_triangles_are_read_whatever_is_broken_in_their_material(tmp_path, caplo
     assert scene.triangles == 2
     assert (says in caplog.text) if says else not caplog.messages
     if says:
-        assert not scene.masked and len(caplog.messages) == 1
+        assert not scene.masked_objects and len(caplog.messages) == 1
         assert caplog.records[0].levelno == logging.WARNING
 
 
@@ -282,10 +282,10 @@ def test_an_image_beside_is_read_and_too_large_ones_are_not(tmp_path, monkeypatc
     write(tmp_path / "a b" / "leaf.png", image())
     for uri in ("a%20b/leaf.png", "a b/leaf.png"):
         header["images"] = [{"uri": uri}]
-        assert load(tmp_path / "m.glb", header, body).masked == ("Leaves",)
+        assert load(tmp_path / "m.glb", header, body).masked_objects == ("Leaves",)
     write(tmp_path / "leaf.tga", image(kind="tga"))
     header["images"] = [{"uri": "leaf.tga"}]
-    assert load(tmp_path / "m.glb", header, body).masked == ("Leaves",)
+    assert load(tmp_path / "m.glb", header, body).masked_objects == ("Leaves",)
 
     def bomb(path, side):
         whole = np.zeros((side, side, 4), np.uint8)
@@ -294,10 +294,10 @@ def test_an_image_beside_is_read_and_too_large_ones_are_not(tmp_path, monkeypatc
 
     header["images"] = [{"uri": bomb(tmp_path / "large.png", 3000).name}]
     monkeypatch.setattr(allowance, "MIN_LIMIT_BYTES", 1000)
-    assert not load(tmp_path / "m.glb", header, body).masked
+    assert not load(tmp_path / "m.glb", header, body).masked_objects
     assert "Leaf (large.png has too many pixels)" in caplog.text
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
-    assert not load(tmp_path / "m.glb", header, body).masked
+    assert not load(tmp_path / "m.glb", header, body).masked_objects
 
 
 def test_draco(tmp_path):
@@ -363,7 +363,7 @@ def test_obj(tmp_path, backend, lines, face):
     write(tmp_path / "inverse.png", image(~MASK, mode="L"))
     (tmp_path / "bark.jpg").write_bytes(b"not read")
     scene, solid = (obj(tmp_path, lines, face, opacity=one) for one in ("mask", "ignore"))
-    assert (scene.masked, scene.names, scene.triangles) == (("Fence",), ("Fence",), 3)
+    assert (scene.masked_objects, scene.names, scene.triangles) == (("Fence",), ("Fence",), 3)
     flat = [Scene.from_meshes(one.meshes()[-1:]) for one in (scene, solid)]
     check(flat[0], flat[1], texel, backend)
 
@@ -392,7 +392,7 @@ def test_obj_with_broken_materials_is_solid(tmp_path, caplog, lines, face, says)
     Image.new("RGB", (8, 8)).save(tmp_path / "photo.jpg")
     caplog.set_level(logging.WARNING)
     scene = obj(tmp_path, lines, face)
-    assert (scene.triangles, scene.masked) == (2, ())
+    assert (scene.triangles, scene.masked_objects) == (2, ())
     assert (says in caplog.text) if says else not caplog.messages
 
 
@@ -403,7 +403,7 @@ def test_a_library_that_is_not_there_is_told(tmp_path, caplog):
     caplog.clear()
     write(tmp_path / "mask.png", image(mode="L"))
     write(tmp_path / "other.mtl", "")
-    assert obj(tmp_path, "map_d mask.png", library="other.mtl m.mtl").masked
+    assert obj(tmp_path, "map_d mask.png", library="other.mtl m.mtl").masked_objects
     assert not caplog.messages
 
 
@@ -424,7 +424,7 @@ def test_scenes_with_masks_are_written(tmp_path, suffix):
         return
     assert read.names == made.names == ("Card", "Tree", "Tree.2", "Tree.3")
     if suffix == ".glb":
-        assert read.masked == made.masked == made.names
+        assert read.masked_objects == made.masked_objects == made.names
         np.testing.assert_allclose(seen(read), seen(made), atol=2e-4)
         assert (
             len({id(part.mask) for part in read.instances.mesh_parts if part.mask is not None}) == 2
@@ -459,7 +459,7 @@ def test_a_scenario_ignores_masks_if_told(tmp_path):
     path = tmp_path / "s.yaml"
     for opacity, masked in (("mask", ("Leaves",)), ("ignore", ())):
         write(path, json.dumps({"scene": {"files": [{"file": "m.glb", "opacity": opacity}]}}))
-        assert prepare(Scenario.load(path)).scene.masked == masked
+        assert prepare(Scenario.load(path)).scene.masked_objects == masked
     write(path, json.dumps({"scene": {"files": [{"file": "m.glb", "opacity": "glass"}]}}))
     with pytest.raises(LidarError, match="opacity"):
         Scenario.load(path)

@@ -159,7 +159,7 @@ def test_objects_farther_than_anything_on_earth(tmp_path):
     path = write(tmp_path / "m.obj", OBJ.format(x=0, x1=2e5))
     assert len(load_meshes(path)) == 2
     notes = []
-    (near,) = load_meshes(path, unit="km", tell=notes.append)
+    (near,) = load_meshes(path, unit="km", report=notes.append)
     assert near.name == "Ball" and np.abs(near.bounds).max() < 1e5
     assert [note.partition(" has objects ")[2] for note in notes] == [
         "farther than anything on Earth (2e+08 m from the origin), which were skipped: Box. Check "

@@ -79,8 +79,8 @@ def test_materials_outside_are_noted_with_what_to_name(tmp_path, name):
     name = name.format(root=tmp_path)
     (folder / "a.obj").write_text(f"mtllib {name}\nusemtl A\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     notes = []
-    (mesh,) = load_meshes(folder / "a.obj", colors=True, tell=notes.append)
+    (mesh,) = load_meshes(folder / "a.obj", colors=True, report=notes.append)
     assert mesh.colors is None
     assert f"{name} (outside the folder of the mesh; set assets to" in notes[0]
-    (mesh,) = load_meshes(folder / "a.obj", colors=True, assets=tmp_path, tell=notes.append)
+    (mesh,) = load_meshes(folder / "a.obj", colors=True, assets=tmp_path, report=notes.append)
     assert mesh.colors is not None and len(notes) == 1

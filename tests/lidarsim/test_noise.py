@@ -28,7 +28,7 @@ from lidarpool import (
 )
 from lidarsim.media.weather import Weather, raindrops, snowflakes
 from lidarsim.motion.navigation import gnss_fixes, imu_samples
-from lidarsim.numerics.random_numbers import Purpose, named_seed, raw, starts
+from lidarsim.numerics.random_numbers import Purpose, initial_states, named_seed, raw
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps import particle_loops, pulse_loops, random_loops, spray_loops
 from lidarsim.simulator.steps.losses import PACKET
@@ -95,7 +95,7 @@ class Draws:
         return bits
 
     def starts(self, seed, *which):
-        made = starts(seed, *which)
+        made = initial_states(seed, *which)
         self._purposes.update(zip(made.tolist(), which, strict=True))
         return made
 
@@ -110,7 +110,7 @@ def watch_arrays(monkeypatch, draws):
     """Have all modules draw arrays of random numbers by `draws`."""
     for name, module in [*sys.modules.items()]:
         if name.startswith(("lidarpool", "lidarscenes", "lidarsim")):
-            for known, watched in ((raw, draws.raw), (starts, draws.starts)):
+            for known, watched in ((raw, draws.raw), (initial_states, draws.starts)):
                 if getattr(module, known.__name__, None) is known:
                     monkeypatch.setattr(module, known.__name__, watched)
 

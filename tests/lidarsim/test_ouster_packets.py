@@ -221,7 +221,7 @@ def lidar_of(groups):
 
 def expected_frames(survey, cloud, profile, start_ns=START_NS) -> tuple[Frames, np.ndarray]:
     """What packets must say of a survey's points, by the points alone; and their positions."""
-    sensor = survey.carried[0].sensor
+    sensor = survey.mounted_sensors[0].sensor
     width = int(sensor.head.firings_per_turn)
     rows = sensor.channels
     first_firings = np.array([sensor.firings(step)[0] for step in range(survey.steps + 1)])

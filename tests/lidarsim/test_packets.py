@@ -109,7 +109,7 @@ def test_shots_are_in_the_makers_order_with_rays_without_return():
     shots = Shots.from_points(sweeps, 0, points[points["channel"] != 3], ["reflectivity"])
     assert shots.range_m.shape == shots.columns["reflectivity"].shape == (2, 101, 16)
     # Lasers 0, 2, 4, … of a VLP-16 are channels 0, 1, 2, …
-    assert not shots.returned[:, :, 6].any() and shots.returned[0].sum() == 101 * 15
+    assert not shots.return_mask[:, :, 6].any() and shots.return_mask[0].sum() == 101 * 15
     assert (shots.columns["reflectivity"][0, :, 6] == 0).all()
     first = points[(points["scan"] == 0) & (points["ray"] == 8)]
     assert shots.range_m[0, 0, 1] == first["range"][0]

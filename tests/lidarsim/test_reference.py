@@ -12,13 +12,13 @@ from tests.shapes import quad
 
 from lidarpool import Beams, Material, Noise, Optics, Returns, Scene, Sensor, Spin, Survey
 from lidarsim.media.weather import Air, spray_clumps
-from lidarsim.numerics.random_numbers import Purpose, named_seed, raw, starts
+from lidarsim.numerics.random_numbers import Purpose, initial_states, named_seed, raw
 from lidarsim.sensor.disc import Beam
 from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
 from lidarsim.simulator.casting.surfaces import SceneSurfaces, SensorLight
 from lidarsim.simulator.returns import NO_SURFACE, Keys, PulseReturns
 from lidarsim.simulator.steps import spray_loops
-from lidarsim.simulator.steps.detection import detected
+from lidarsim.simulator.steps.detection import is_detected
 from lidarsim.simulator.steps.particles import (
     AIR,
     WeatherStep,
@@ -230,7 +230,7 @@ def test_noise_is_that_of_the_twin(noise, tolerance_m):
     assert noise.threshold == (
         0.1 * reference.energy_of(1, 50, 0) if noise.detection_range_m else 0
     )
-    seen = detected(noise, energy, *KEYS.scan_and_number(ray), number)
+    seen = is_detected(noise, energy, *KEYS.scan_and_number(ray), number)
     ranges = noisy_ranges(noise, distance, energy, *KEYS.scan_and_number(ray), number)
     columns = (column.tolist() for column in (distance, energy, number, ray))
     rows = [(r, e, n, key_of(pulse)) for r, e, n, pulse in zip(*columns, strict=True)]
@@ -337,7 +337,7 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
     light = np.ones(len(hits))
     crossings = spray_loops.BoxCrossings(beam, crossed)
     spray_loops.attenuate(crossings, each, 0.1, far, SampledHits(hits, place, light))
-    begun = starts(9, SPRAY_DEPTH, SPRAY_SUBRAY, SPRAY_DIAMETER)
+    begun = initial_states(9, SPRAY_DEPTH, SPRAY_SUBRAY, SPRAY_DIAMETER)
     keys = RandomKeys(begun, KEYS.scan, KEYS.scan_starts, FIRST)
     out = SampledHits(np.empty(4000, np.int64), *np.empty((2, 4000)))
     clumps = []

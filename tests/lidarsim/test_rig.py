@@ -75,7 +75,7 @@ def about_z(angle):
 def rays_of_scan(survey, scan):
     """Origins, directions in the scene and in the sensor, and times of a scan's rays."""
     spec = survey.scan(scan)
-    carried = survey.carried[spec.sensor]
+    carried = survey.mounted_sensors[spec.sensor]
     head = carried.sensor.head
     beams = carried.sensor.beams
     mount = carried.mount

@@ -175,7 +175,7 @@ def payloads_of(model, mode):
 
 def firings_of(survey, cloud):
     """Return the firing and the laser of each point."""
-    sensor = survey.carried[0].sensor
+    sensor = survey.mounted_sensors[0].sensor
     channels = sensor.channels
     first = np.array([sensor.firings(step)[0] for step in range(survey.steps)])
     elevations = read_model("/".join(["robosense", model_of(channels)])).beams.elevation_deg
@@ -405,7 +405,7 @@ def test_packets_continue_from_sweep_to_sweep_while_the_sensor_moves():
     survey = moving_survey()
     cloud, sweeps = points_of(survey, room())
     payloads = payloads_to(MSOP, encoded(cloud, sweeps))
-    assert len(payloads) == survey.carried[0].sensor.firings(53)[1] // 24
+    assert len(payloads) == survey.mounted_sensors[0].sensor.firings(53)[1] // 24
     rows = np.array(plain_rows(payloads, "rs-lidar-16", "strongest"))
     assert len(rows) == len(payloads) * 24 * 16  # in a closed room
     stamps = np.array([time_of(payload[20:30].tobytes(), "rs-lidar-16") for payload in payloads])
@@ -421,7 +421,7 @@ def test_dropped_packets_are_left_out():
     survey = moving_survey(faults=[fault])
     cloud, sweeps = points_of(survey, room())
     payloads = payloads_to(MSOP, encoded(cloud, sweeps))
-    count = survey.carried[0].sensor.firings(53)[1] // 24
+    count = survey.mounted_sensors[0].sensor.firings(53)[1] // 24
     stamps = np.array([time_of(payload[20:30].tobytes(), "rs-lidar-16") for payload in payloads])
     numbers = np.rint((stamps - START_NS // 1000) / (24 * 55.5))
     in_cloud = np.unique(firings_of(survey, cloud)[0] // 24)

@@ -112,11 +112,17 @@ def survey():
     way = Track(np.arange(4) * 0.07, [[6, -5, 0], [5, -2, 0.2], [6, 2, 0.1], [4, 5, 0]], turns)
     walls = [
         cylinder(30.0, 8.0, 64, "Around"),
-        cylinder(1.0, 3.0, 24, "Mirror").moved("Mirror", np.eye(3), np.array([-6.0, 3, 0])),
-        capsule(1.2, 1.0, 24, "Water").moved("Water", np.eye(3), np.array([3.0, 4.5, 0])),
-        cylinder(0.8, 3.0, 24, "Pane").moved("Pane", np.eye(3), np.array([4.0, -4.0, 0])),
-        capsule(1.5, 0.5, 16, "Tree").moved("Tree", np.eye(3), np.array([-4.0, -5, 0])),
-        capsule(0.6, 0.5, 16, "Sign").moved("Sign", np.eye(3), np.array([0.0, 8, 0])),
+        cylinder(1.0, 3.0, 24, "Mirror").affine_transform(
+            "Mirror", np.eye(3), np.array([-6.0, 3, 0])
+        ),
+        capsule(1.2, 1.0, 24, "Water").affine_transform(
+            "Water", np.eye(3), np.array([3.0, 4.5, 0])
+        ),
+        cylinder(0.8, 3.0, 24, "Pane").affine_transform(
+            "Pane", np.eye(3), np.array([4.0, -4.0, 0])
+        ),
+        capsule(1.5, 0.5, 16, "Tree").affine_transform("Tree", np.eye(3), np.array([-4.0, -5, 0])),
+        capsule(0.6, 0.5, 16, "Sign").affine_transform("Sign", np.eye(3), np.array([0.0, 8, 0])),
     ]
     scene = Scene.from_meshes(walls).with_actors([Actor(capsule(0.9, 0.6, 24, "Car"), way)])
     materials = [

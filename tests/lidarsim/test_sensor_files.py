@@ -828,7 +828,7 @@ def test_import_makes_a_scenario_of_a_file(name, file_format, tmp_path):
     )
     assert len(left_out) == (file_format is None), left_out
     built = prepare(Scenario.load(tmp_path / "new/scenario.yaml"), plans=False)
-    [carried] = built.survey.carried
+    [carried] = built.survey.mounted_sensors
     firings = np.arange(len(file.rays))
     assert angle_deg(carried.sensor.directions(firings)[:, 0], file.rays.directions) < 1e-5
     assert np.array_equal(carried.sensor.times_ns(firings)[:, 0], file.rays.times_ns)

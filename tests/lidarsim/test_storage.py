@@ -101,7 +101,7 @@ def test_only_files_of_killed_writers_are_tidied_away(tmp_path):
         for name in (left, *theirs):
             (place / name).write_text("x")
     (folder / "link").symlink_to(outside)
-    Storage.at(folder).tidy()
+    Storage.at(folder).remove_unfinished()
     assert {path.name for path in (folder / "in").iterdir()} == {*theirs}
     assert {path.name for path in outside.iterdir()} == {left, *theirs}
 

@@ -27,7 +27,7 @@ THREE = [(8, 0), (12, 15), (8, 0), (12, -15), (8, 0)]
 
 @pytest.mark.parametrize("jitter_m", [0.0, 0.01])
 def test_turns_are_no_part_of_the_lines(jitter_m):
-    lines = StraightLines.find(*flown(THREE, jitter_m=jitter_m))
+    lines = StraightLines.from_trajectory(*flown(THREE, jitter_m=jitter_m))
     assert lines.starts_s == pytest.approx([0, 20, 40], abs=0.3)
     assert lines.stops_s == pytest.approx([8, 28, 48], abs=0.3)
     assert lines.seconds == pytest.approx(24, abs=0.9)
@@ -37,22 +37,22 @@ def test_turns_are_no_part_of_the_lines(jitter_m):
 
 def test_slow_turns_of_aircraft_are_turns():
     """Three degrees a second is the standard rate."""
-    lines = StraightLines.find(*flown([(60, 0), (60, 3), (60, 0)]))
+    lines = StraightLines.from_trajectory(*flown([(60, 0), (60, 3), (60, 0)]))
     assert lines.starts_s == pytest.approx([0, 120], abs=1)
     assert lines.stops_s == pytest.approx([60, 180], abs=1)
-    assert not len(StraightLines.find(*flown([(100, 3)])).starts_s)
+    assert not len(StraightLines.from_trajectory(*flown([(100, 3)])).starts_s)
 
 
 def test_a_line_with_a_gust_is_one_line():
     gust = [(10, 0), (1, 6), (2, -6), (1, 6), (10, 0)]
-    lines = StraightLines.find(*flown(gust))
+    lines = StraightLines.from_trajectory(*flown(gust))
     assert (lines.starts_s.tolist(), lines.seconds) == ([0], pytest.approx(24))
 
 
 def test_corners_without_turns_are_found_and_short_flights_have_no_lines():
     times = np.array([0.0, 6, 12])
-    lines = StraightLines.find(times, np.array([[0.0, 0, 9], [90, 0, 9], [90, 60, 9]]))
+    lines = StraightLines.from_trajectory(times, np.array([[0.0, 0, 9], [90, 0, 9], [90, 60, 9]]))
     assert lines.stops_s == pytest.approx([6, 12], abs=0.25)
     assert lines.lengths_m == pytest.approx([90, 60], abs=4)
-    assert not len(StraightLines.find(times / 20, np.eye(3)).starts_s)
-    assert not len(StraightLines.find(times, np.ones((3, 3))).starts_s), "it hovers"
+    assert not len(StraightLines.from_trajectory(times / 20, np.eye(3)).starts_s)
+    assert not len(StraightLines.from_trajectory(times, np.ones((3, 3))).starts_s), "it hovers"

@@ -139,7 +139,7 @@ def expected_rows(model: str, mode: str, packets: int) -> list[Row]:
     """Return the returns of a survey's points, of the firings in a number of packets."""
     manual = MODELS[model]
     survey, cloud, _ = scanned(model, mode)
-    sensor = survey.carried[0].sensor
+    sensor = survey.mounted_sensors[0].sensor
     elevations = elevations_of(model)
     lasers = sorted(range(manual.channels), key=lambda laser: elevations[laser])
     first_firings = np.array([sensor.firings(step)[0] for step in range(survey.steps)])
@@ -381,7 +381,7 @@ def test_packets_continue_from_sweep_to_sweep_while_the_sensor_moves():
     survey = moving_survey()
     cloud, sweeps = points_of(survey, room())
     payloads = data_of(encoded(cloud, sweeps))
-    assert len(payloads) == survey.carried[0].sensor.firings(89)[1] // 24
+    assert len(payloads) == survey.mounted_sensors[0].sensor.firings(89)[1] // 24
     rows = np.array(plain_rows(payloads, MODELS["vlp16"], "strongest"))
     assert len(rows) == len(payloads) * 24 * 16  # in a closed room
     stamps = np.array(
@@ -400,7 +400,7 @@ def test_dropped_packets_are_left_out():
     survey = moving_survey(faults=[fault])
     cloud, sweeps = points_of(survey, room())
     payloads = data_of(encoded(cloud, sweeps))
-    count = survey.carried[0].sensor.firings(89)[1] // 24
+    count = survey.mounted_sensors[0].sensor.firings(89)[1] // 24
     numbers = [
         round((struct.unpack_from("<I", payload.tobytes(), 1200)[0] - 2_800_000_000) / 1327.104)
         for payload in payloads

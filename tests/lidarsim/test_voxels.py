@@ -57,9 +57,9 @@ def written(path, density, low=(0, 0, 0), size=1.0, skip=(), head="", names=NAME
     return path
 
 
-def tree(path, *arguments, tell=None, **options):
+def tree(path, *arguments, report=None, **options):
     """Write a file and read it: its only object."""
-    (mesh,) = load_meshes(written(path, *arguments, **options), tell=tell or pytest.fail)
+    (mesh,) = load_meshes(written(path, *arguments, **options), report=report or pytest.fail)
     return mesh
 
 
@@ -112,7 +112,7 @@ def test_variants_of_the_format(tmp_path):
     text = first.read_text().replace("#max_corner", "  #max_corner").replace("#split", "\t#split")
     first.write_text(text.replace("\n", "\r\n").replace("i j k", " i j k"))
     told = []
-    (one,) = load_meshes(first, tell=told.append)
+    (one,) = load_meshes(first, report=told.append)
     assert told == [
         f"{first} specifies the leaf angle distribution 'Planophile'. Set the same leaf_angle for "
         "its object."
@@ -129,7 +129,7 @@ def test_variants_of_the_format(tmp_path):
 
 def test_unknown_voxels_are_empty_and_told_of(tmp_path):
     told = []
-    mesh = tree(tmp_path / "a.vox", [[[np.nan, 1.0, np.nan, 2.0]]], tell=told.append)
+    mesh = tree(tmp_path / "a.vox", [[[np.nan, 1.0, np.nan, 2.0]]], report=told.append)
     assert mesh.voxels.density.tolist() == [[[1, 0, 2]]]
     assert "contains 2 voxels without data (NaN). Voxels without" in told[0]
 
@@ -290,7 +290,7 @@ def test_turned_scaled_and_mirrored_copies_are_where_they_stand(tmp_path):
     matrix = np.diag([2.0, -2, 2, 1])
     matrix[:3, 3] = 4, 0.3, -1.2
     flat = Transform(matrix[:3, :3], matrix[:3, 3])
-    scaled = [SceneInstance(mesh, matrix), mesh.moved("T", flat.linear, flat.offset)]
+    scaled = [SceneInstance(mesh, matrix), mesh.affine_transform("T", flat.linear, flat.offset)]
     first, *others = (cast([m, sky], sensor, (0, 0, 0.5)) for m in (larger, *scaled))
     assert (first["object"] == 0).sum() > 500
     for found in others:

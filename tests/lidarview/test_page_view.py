@@ -803,42 +803,42 @@ class Read:
 
 
 def test_without_a_filter_an_even_choice_of_all_is_found(file):
-    rows, count = PointFinder(file, np.zeros(3)).find(5000)
+    rows, count = PointFinder(file, np.zeros(3)).find_points(5000)
     assert (len(rows), count) == (5000, 100_000)
     assert np.histogram(rows, 10, (0, 100_000))[0].tolist() == [500] * 10
-    rows, count = PointFinder(file, np.zeros(3)).find(5000, scans=((10, 19), (500, 504)))
+    rows, count = PointFinder(file, np.zeros(3)).find_points(5000, scans=((10, 19), (500, 504)))
     assert rows.tolist() == [*range(1000, 2000), *range(50_000, 50_500)]
     assert count == 1500
 
 
 def test_all_points_that_a_filter_keeps_are_found_or_an_even_choice_of_them(file):
     finder = PointFinder(read := Read(file), np.zeros(3))
-    rows, count = finder.find(5000, PointFilter((("intensity", 7, 7),)))
+    rows, count = finder.find_points(5000, PointFilter((("intensity", 7, 7),)))
     assert len(rows) == count == 1000
     assert set(file.values("intensity", rows).tolist()) == {7}
     assert len(read.blocks) == 100
-    rows, count = finder.find(5000, PointFilter((("intensity", 0, 49),)))
+    rows, count = finder.find_points(5000, PointFilter((("intensity", 0, 49),)))
     assert count == 50_000
     assert 2000 < len(rows) <= 5000
     assert (np.diff(rows) > 0).all()
     assert np.histogram(rows, 10, (0, 100_000))[0].min() > 150
     read.blocks.clear()
-    rows, count = finder.find(5000, PointFilter((("intensity", 95, 99),)), ((995, 2000),))
+    rows, count = finder.find_points(5000, PointFilter((("intensity", 95, 99),)), ((995, 2000),))
     assert (len(rows), count, read.blocks) == (500, 500, {99})  # nothing else is read
-    assert len(finder.find(5000, PointFilter((("intensity", 200, 300),)))[0]) == 0
+    assert len(finder.find_points(5000, PointFilter((("intensity", 200, 300),)))[0]) == 0
 
 
 @pytest.mark.parametrize("parallel", [False, True])
 def test_a_camera_finds_what_is_before_it_and_reads_no_block_behind_it_again(file, parallel):
     finder = PointFinder(read := Read(file), np.zeros(3))
     eye = along_y(90.0, parallel)
-    rows, count = finder.find(20_000, camera=eye)
+    rows, count = finder.find_points(20_000, camera=eye)
     assert count == 100_000
     assert len(read.blocks) == 100
     assert file.values("y", rows).min() > 90
     assert 9000 < len(rows) < 10_200
     read.blocks.clear()
-    fewer, _ = finder.find(4000, camera=eye)
+    fewer, _ = finder.find_points(4000, camera=eye)
     assert len(read.blocks) < 12
     assert 2000 < len(fewer) <= 4000
 
@@ -847,7 +847,9 @@ def test_a_search_that_nobody_waits_for_is_given_up(file):
     asked = iter([False] * 5 + [True])
     finder = PointFinder(read := Read(file), np.zeros(3))
     with pytest.raises(ClientDisconnected):
-        finder.find(5000, PointFilter((("intensity", 7, 7),)), is_disconnected=lambda: next(asked))
+        finder.find_points(
+            5000, PointFilter((("intensity", 7, 7),)), is_disconnected=lambda: next(asked)
+        )
     assert len(read.blocks) == 5
 
 
@@ -855,4 +857,4 @@ def test_points_that_are_nowhere_are_not_found(tmp_path):
     local = np.ones((1000, 3))
     local[::2, 0] = np.nan
     finder = PointFinder(CloudFile(write(tmp_path / "a.ply", local)), np.zeros(3))
-    assert finder.find(1000)[0].tolist() == list(range(1, 1000, 2))
+    assert finder.find_points(1000)[0].tolist() == list(range(1, 1000, 2))

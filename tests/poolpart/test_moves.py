@@ -346,6 +346,6 @@ def test_a_worker_that_is_killed_while_it_moves(nannies, wait_until, monkeypatch
     # Those of B that had ended are lost with their worker, and wait for the next one.
     assert parts["A"].shrink(1)
     records = [record for _, record in nannies.gather(tasks)]
-    assert not any(record.misplaced for record in records)
+    assert not any(record.is_misplaced for record in records)
     nannies.restart()
     wait_until(lambda: sorted(map(str, declared(nannies).values())) == ["{'A': 1}", "{'B': 1}"])

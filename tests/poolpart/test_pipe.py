@@ -957,7 +957,7 @@ def test_requests_of_a_client_that_has_left_change_nothing(client, make_pipe):
 
     async def request(dask_scheduler=None):
         handlers = dask_scheduler.handlers
-        common = {"names": [pipe.name], "asker": "gone", "seconds": 0.0}
+        common = {"names": [pipe.name], "client_id": "gone", "seconds": 0.0}
         return (
             handlers[PUT](**common, items=[dumps("lost")], unbounded=False),
             await handlers[TAKE](**common),

@@ -40,7 +40,7 @@ from lidarpool.datasets.job_table import JobRow
 from lidarpool.identity.sealed import seal_json, unseal_json
 from lidarpool.report.campaign_output import verify_dataset
 from lidarpool.run.progress import Progress
-from lidarsim.errors import explained
+from lidarsim.errors import explain_os_errors
 from lidarsim.io.storage import Storage
 
 BASE = """
@@ -579,7 +579,7 @@ def full_disk(slots, tmp_path_factory):
     def fail(self: DataSet, row: JobRow, *arguments: Any, **more: Any) -> JobRow:
         made = write(self, row, *arguments, **more)
         if row.number:
-            with explained(f"Job {row.name} cannot be written"):
+            with explain_os_errors(f"Job {row.name} cannot be written"):
                 raise OSError(28, "No space left on device")
         return made
 

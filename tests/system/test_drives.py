@@ -101,7 +101,7 @@ def test_the_drive_of_three_sensors_and_ten_actors_can_be_made(tmp_path):
     built = prepare(Scenario.load(tmp_path / "city-drive.yaml"))
     scene = built.scene
     survey = built.survey
-    assert [carried.name for carried in survey.carried] == ["roof", "left", "right"]
+    assert [carried.name for carried in survey.mounted_sensors] == ["roof", "left", "right"]
     assert len(scene.actors) == 10
     assert 15e6 < survey.ray_count < 15.2e6
     for actor in scene.actors:

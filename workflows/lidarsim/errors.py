@@ -123,16 +123,16 @@ def as_sentence(advice: str) -> str:
     return f"{advice[:1].upper()}{advice[1:].rstrip('.')}."
 
 
-def unreadable(subject: object, error: Exception, advice: str = "") -> str:
+def unreadable_message(subject: object, error: Exception, advice: str = "") -> str:
     """Return an error message for a file that cannot be read.
 
     `error` may be an exception of any class. The advice, if any, follows as a second sentence.
 
     Examples
     --------
-    >>> unreadable("vlp16.yaml", KeyError("lasers"))
+    >>> unreadable_message("vlp16.yaml", KeyError("lasers"))
     "vlp16.yaml cannot be read: 'lasers' is missing."
-    >>> unreadable("a.stl", CutShortError("line 7 is the last"), "export it again")
+    >>> unreadable_message("a.stl", CutShortError("line 7 is the last"), "export it again")
     'a.stl is truncated: line 7 is the last. Export it again.'
     """
     failure = "is truncated" if isinstance(error, CutShortError) else "cannot be read"
@@ -141,7 +141,7 @@ def unreadable(subject: object, error: Exception, advice: str = "") -> str:
 
 
 @contextmanager
-def explained(failure: str, advice: str = "") -> Iterator[None]:
+def explain_os_errors(failure: str, advice: str = "") -> Iterator[None]:
     """Convert an OSError raised in the context into a LidarError.
 
     The message consists of the failure, the reason and the advice. If a file does not exist, the
@@ -160,7 +160,7 @@ def explained(failure: str, advice: str = "") -> Iterator[None]:
 
 
 @contextmanager
-def converted(failure: str) -> Iterator[None]:
+def convert_errors(failure: str) -> Iterator[None]:
     """Convert any exception raised in the context into a LidarError.
 
     Use this context for input files, whose readers and libraries raise exceptions of many classes.
@@ -181,7 +181,7 @@ def converted(failure: str) -> Iterator[None]:
 
 
 @contextmanager
-def prefixed(subject: object) -> Iterator[None]:
+def prefix_errors(subject: object) -> Iterator[None]:
     """Add a prefix such as "leg 3: " to the message of a LidarError raised in the context."""
     try:
         yield
@@ -197,14 +197,14 @@ class Mistakes:
         self.lines: list[str] = []
 
     @contextmanager
-    def noted(self) -> Iterator[None]:
+    def collect(self) -> Iterator[None]:
         """Collect a LidarError raised in the context instead of propagating it."""
         try:
             yield
         except LidarError as error:
             self.lines.append(str(error))
 
-    def tell(self) -> None:
+    def raise_if_any(self) -> None:
         """Raise a LidarError with one line per distinct error, if any errors were collected."""
         lines = list(dict.fromkeys(self.lines))
         if len(lines) > MAX_MISTAKES:

@@ -54,7 +54,7 @@ def did_you_mean_each(words: Sequence[str], candidates: Iterable[str]) -> str:
         return ""
     suggestions = ", ".join(f"{name!r} for {word!r}" for word, name in pairs.items())
     changed = [word for word, name in pairs.items() if factor_between(word, name) is not None]
-    units = f" Convert the units of {joined(changed)}." if changed else ""
+    units = f" Convert the units of {join_names(changed)}." if changed else ""
     return f" Did you mean {suggestions}?{units}"
 
 
@@ -100,8 +100,8 @@ def name_hint(pattern: str, names: Sequence[str]) -> str:
         if folded in close or (len(word) > 1 and word in folded):
             similar_entries += listed_group
     if similar_entries:
-        return f" Similar names: {listed(similar_entries, 8)}."
-    return f" Available names: {listed(entries, 8) or 'none'}."
+        return f" Similar names: {list_names(similar_entries, 8)}."
+    return f" Available names: {list_names(entries, 8) or 'none'}."
 
 
 _LAST_NUMBER = re.compile(r"[\s._-]*\d+$")
@@ -134,13 +134,13 @@ def plural(number: float, noun: str, plural_noun: str = "") -> str:
     return f"{number:,} {noun if number == 1 else plural_noun or noun + 's'}"
 
 
-def rounded(number: float, digits: int = 3) -> str:
+def format_rounded(number: float, digits: int = 3) -> str:
     """Format a number with `digits` significant digits, without an exponent if it is large.
 
     Examples
     --------
-    >>> rounded(99.96), rounded(99.96, 2), rounded(1234.5), rounded(0.00123456)
-    ('100', '100', '1,230', '0.00123')
+    >>> format_rounded(99.96, 2), format_rounded(1234.5), format_rounded(0.00123456)
+    ('100', '1,230', '0.00123')
     """
     text = f"{number:,.{digits}g}"
     return f"{float(text):,.0f}" if "e+" in text and abs(number) < _EXPONENT_FROM else text
@@ -257,25 +257,25 @@ def remove_common_prefix(names: Sequence[str]) -> list[str]:
     return shorter if all(shorter) else list(names)
 
 
-def joined(names: Sequence[str]) -> str:
+def join_names(names: Sequence[str]) -> str:
     """Join names with commas and a final "and".
 
     Examples
     --------
-    >>> joined(["x", "y", "z"])
+    >>> join_names(["x", "y", "z"])
     'x, y and z'
     """
     return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 
-def alternatives(names: Sequence[str]) -> str:
+def join_alternatives(names: Sequence[str]) -> str:
     """Join alternatives with commas and a final "or".
 
     A quoted alternative may itself be such an enumeration.
 
     Examples
     --------
-    >>> alternatives(["'even' or 'gaussian'", "a number", "None"])
+    >>> join_alternatives(["'even' or 'gaussian'", "a number", "None"])
     "'even', 'gaussian', a number or None"
     """
     *others, last = names
@@ -283,12 +283,12 @@ def alternatives(names: Sequence[str]) -> str:
     return " or ".join(filter(None, [", ".join(flat), last]))
 
 
-def listed(names: Sequence[str], max_names: int = 3) -> str:
+def list_names(names: Sequence[str], max_names: int = 3) -> str:
     """Join the first names and append the number of remaining names.
 
     Examples
     --------
-    >>> listed(["a", "b", "c", "d", "e"])
+    >>> list_names(["a", "b", "c", "d", "e"])
     'a, b, c and 2 more'
     """
     further = len(names) - max_names

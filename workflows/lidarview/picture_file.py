@@ -26,7 +26,7 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.simplified import SimplifiedScene, cut_masks
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import number_positions
-from lidarsim.words import plural, rounded
+from lidarsim.words import format_rounded, plural
 
 PICTURE_FILE = "pictures.npz"
 
@@ -141,7 +141,7 @@ class PictureContent:
         sensors = sensor_positions(survey)
         positions = [sensor.positions for sensor in sensors]
         drawn = SimplifiedScene.from_scene(cut_masks(scene), near_positions=positions)
-        wavelength_nm = survey.carried[0].sensor.optics.wavelength_nm  # the first sensor
+        wavelength_nm = survey.mounted_sensors[0].sensor.optics.wavelength_nm  # the first sensor
         kinds = scene.surface_kinds
         materials = MaterialTable.build(survey.materials, kinds, wavelength_nm, scene.has_voxels)
         content = cls(
@@ -180,7 +180,7 @@ class PictureContent:
                 return words
         words += f" and {plural(actors, 'actor')}" if actors else ""
         duration_s = self.duration_ns / 1e9
-        return f"{words}, at {rounded(duration_s / 2)} s of {rounded(duration_s)} s"
+        return f"{words}, at {format_rounded(duration_s / 2)} s of {format_rounded(duration_s)} s"
 
     @property
     def models(self) -> str:
@@ -404,7 +404,7 @@ def sensor_positions(survey: Survey) -> list[SensorPositions]:
     path = survey.path
     sensors: list[SensorPositions] = []
     first = 0
-    for carried, steps in zip(survey.carried, survey.steps_each, strict=True):
+    for carried, steps in zip(survey.mounted_sensors, survey.steps_each, strict=True):
         stop = first + steps * path.stations
         scans: Iterable[int] = range(first, stop, steps)  # the first scan at each station
         if path.moves:
@@ -445,5 +445,5 @@ def _sampled(actor: Actor, duration_ns: float, count: int) -> Actor:
     # The animation may depend on the distance along the trajectory. The sampled trajectory lacks
     # the part before the survey.
     missing_s = actor.seconds(times[:1])[0] - sampled.seconds(times[:1])[0]
-    mesh = replace(actor.mesh, animation=animation.pictured)
+    mesh = replace(actor.mesh, animation=animation.for_pictures)
     return replace(sampled, mesh=mesh, offset_s=actor.offset_s + float(missing_s[0]))

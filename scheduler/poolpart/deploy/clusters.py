@@ -206,7 +206,7 @@ def pop_bounds(name: str, options: dict[str, Any]) -> JobBounds | None:
             "`workers`."
         )
     minimum, maximum = adapt
-    return JobBounds.validated(name, minimum, maximum, IDLE_S if idle_s is None else idle_s)
+    return JobBounds.from_user_values(name, minimum, maximum, IDLE_S if idle_s is None else idle_s)
 
 
 class _JobStarter:

@@ -154,7 +154,7 @@ class Lender:
 
     # -- demand for slots --------------------------------------------------------------
 
-    def slots_wanted(self) -> bool:
+    def has_slot_requests(self) -> bool:
         """Return whether any task waits for slots, or has to get its own slots or thread back."""
         return bool(self._nested or self._returning or self._rejoining)
 
@@ -164,15 +164,15 @@ class Lender:
         This is the case if the task has lent its slots before and the worker has more slots than
         threads. Dask counts a task that has seceded as long-running until it ends, even after it
         has rejoined the worker's threads. Therefore, a nested task may have started in a free slot
-        and wait for the thread of this task. It does not wait for slots, so `slots_wanted` does not
-        include it.
+        and wait for the thread of this task. It does not wait for slots, so `has_slot_requests`
+        does not include it.
         """
         slots = sum(count_slots(self.worker, name)[1] for name in loan.slots)
         return loan.key in self._lent and slots > threads_of(self.worker)
 
     def _notify(self) -> None:
         """If slots are needed, wake the threads that lend their slots on demand."""
-        if self.slots_wanted():
+        if self.has_slot_requests():
             for waiter in tuple(self.waiters):
                 waiter.set()
 
@@ -286,7 +286,7 @@ class _WaitHooks:
         try:
             # The worker's event loop records a demand before it sets the waiters. Since this thread
             # adds its waiter before it checks the demand, no demand is missed.
-            while not (waiter.is_set() or lender.slots_wanted() or lender.lends_at_once(loan)):
+            while not (waiter.is_set() or lender.has_slot_requests() or lender.lends_at_once(loan)):
                 waiter.wait(_CHECK_EVERY_S)
                 if lender.worker.status is Status.closed:
                     return

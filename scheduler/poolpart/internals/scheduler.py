@@ -334,7 +334,7 @@ def set_worker_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[a
         if not closing and (removed := dask_worker.plugins.pop(name, None)):
             removed.teardown(dask_worker)
 
-    async def tell(address: str) -> None:
+    async def update_worker(address: str) -> None:
         with suppress(OSError, RuntimeError):  # `Scheduler.broadcast` would print these errors
             if plugin is None:
                 await call_worker(scheduler, address, remove)
@@ -346,7 +346,7 @@ def set_worker_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[a
     else:
         scheduler.worker_plugins[name] = plugin
     # The requests are independent, so that a stopped worker does not delay the others.
-    return [asyncio.ensure_future(tell(address)) for address in scheduler.workers]
+    return [asyncio.ensure_future(update_worker(address)) for address in scheduler.workers]
 
 
 # -- handlers for the requests of pipes ---------------------------------------------------

@@ -201,7 +201,7 @@ class Result(RunResult):
             f"{self.survey_seconds:.1f} s)",
         )
         names = ", ".join(("x", "y", "z", *(column.name for column in self.points.table)))
-        yield "cloud", f"{plural(len(self.points), 'point')}{self.thinned}: {names}"
+        yield "cloud", f"{plural(len(self.points), 'point')}{self.thinning_note}: {names}"
         if self.plan is not None:
             free = "collision-free" if self.plan.collision_free else "not collision-free"
             yield (

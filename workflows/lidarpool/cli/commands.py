@@ -144,7 +144,7 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
                 from ..run.options import RunOptions
                 from . import run_command  # noqa: F401
                 from .terminal import Terminal
-            steps.mark(steps.COMMAND)
+            steps.record_step(steps.COMMAND)
             set_logs(verbose)
             run_settings: dict[str, Any] = {}
             if cluster is not None:
@@ -400,7 +400,7 @@ def merge(
     points = report["points"] if "points" in report else report["totals"]["points"]
     jobs = f"{plural(report['jobs']['done'], 'job')}, " if "jobs" in report else ""
     lines = [*screen.notes(report["notes"]), f"{jobs}{plural(points, 'point')} in {out}"]
-    shared.show({"folder": str(out), **report}, lines, as_json)
+    shared.print_results({"folder": str(out), **report}, lines, as_json)
     screen.exit_if_warned(strict=strict)
 
 
@@ -445,7 +445,7 @@ def doctor(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
             f"{plural(len(worker.gpus), 'GPU')}"
         )
     lines.append(advice_line(figures))
-    shared.show(figures, lines, as_json)
+    shared.print_results(figures, lines, as_json)
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:

@@ -14,7 +14,7 @@ from distributed import Client
 
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
-from lidarsim.words import format_scan_counts, listed, plural, rounded
+from lidarsim.words import format_rounded, format_scan_counts, list_names, plural
 
 from ..identity.job_errors import summarize_errors
 from ..report.output import SurveyOutput
@@ -259,8 +259,8 @@ def _scene_lines(figures: dict[str, Any]) -> Iterator[str]:
 def _survey_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
     sensor = job.survey.sensor
     pattern = f"{sensor.channels:,} per firing"
-    if len(job.survey.carried) > 1:
-        pattern = f"{len(job.survey.carried)} sensors"
+    if len(job.survey.mounted_sensors) > 1:
+        pattern = f"{len(job.survey.mounted_sensors)} sensors"
     elif sensor.period is not None and sensor.cycle != "frame":
         pattern = f"{sensor.period:,} x {sensor.channels:,} per {sensor.cycle}"
     path = f"from {plural(figures['poses'], 'pose')}"
@@ -273,7 +273,7 @@ def _survey_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
     yield f"performance {'; '.join(of_sensors)}"
     for name, unseen in figures["unseen"].items():
         by_sensor = f"by {name}, " * bool(name)
-        yield f"unseen      {by_sensor}{plural(len(unseen), 'object')}: {listed(unseen)}"
+        yield f"unseen      {by_sensor}{plural(len(unseen), 'object')}: {list_names(unseen)}"
 
 
 def _drive_lines(drive: dict[str, Any]) -> Iterator[str]:
@@ -303,8 +303,10 @@ def _return_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
         rays = f", {returns.subrays} sub-rays per beam" if returns.subrays > 1 else ""
         yield f"returns     {returns.mode} of each pulse{rays}"
     if extinction := survey.extinction(survey.sensor):
-        light = f"{rounded(100 * math.exp(-100 * extinction))} % of the light returns from 50 m"
-        yield f"air         extinction {rounded(1000 * extinction)}/km: {light}"
+        light = (
+            f"{format_rounded(100 * math.exp(-100 * extinction))} % of the light returns from 50 m"
+        )
+        yield f"air         extinction {format_rounded(1000 * extinction)}/km: {light}"
     if estimate := figures["estimate"]:
         without = survey.faults and 2 * estimate["rays"] < survey.ray_count
         yield (

@@ -133,18 +133,20 @@ def play(
     with ExitStack() as stack:
         with terminal.status("reading the source", logged=False):
             needs = kind.format_of(bridge_settings)
-            played = stack.enter_context(open_source(source, needs, of_mesh, terminal.tell))
+            played = stack.enter_context(open_source(source, needs, of_mesh, terminal.report))
         sweeps = played.sweeps
         start_at_ns = 0
         if now:
             start_at_ns = time.time_ns() + _NOW_NS
             sweeps = replace(sweeps, start_ns=start_at_ns - round(float(sweeps.begins_ns.min())))
         bridge_options = BridgeOptions(to, played.period_ns if loop else 0, bridge_settings)
-        bridge = kind(sweeps, schedule, bridge_options, terminal.tell)
+        bridge = kind(sweeps, schedule, bridge_options, terminal.report)
         with _summary_at_end(lambda: bridge.summary), bridge:
             bridge.show_content(played.content)
             click.echo(f"ready: {bridge.description}. Press Ctrl-C to stop.")
-            play_sweeps(played, bridge, schedule, terminal.tell, loop=loop, start_at_ns=start_at_ns)
+            play_sweeps(
+                played, bridge, schedule, terminal.report, loop=loop, start_at_ns=start_at_ns
+            )
 
 
 def _play_recording(
@@ -157,9 +159,9 @@ def _play_recording(
     terminal = Terminal()
     recording = PcapRecording(path)
     for note in recording.notes:
-        terminal.tell(note)
+        terminal.report(note)
     streams = recorded_streams(recording, to, settings.get("api", ()))
-    transmitter = Transmitter(streams, terminal.tell, settings.get("lateness"))
+    transmitter = Transmitter(streams, terminal.report, settings.get("lateness"))
     with _summary_at_end(lambda: transmitter.summary), transmitter:
         click.echo(f"ready: {transmitter.description}. Press Ctrl-C to stop.")
         play_recording(recording, transmitter, schedule, loop=loop)

@@ -317,7 +317,7 @@ def view(
 
         show_jobs(JobList(data_sets[0]), port=port, browser=not no_browser)
         return
-    reading = {"keep_noise": keep_noise, "of_mesh": of_mesh, "tell": _print_note}
+    reading = {"keep_noise": keep_noise, "of_mesh": of_mesh, "report": _print_note}
     with ExitStack() as stack:
         files = (CLOUD, PICTURE_FILE, SWEEPS_FILE)
         folders = [stack.enter_context(local_result(result, files)) for result in results]
@@ -420,7 +420,7 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None
     comparison = compared(a, b, **settings)
     page = next(path for path in comparison.save(out) if path.suffix == ".html")
     lines = [repr(comparison), f"page     {click.format_filename(page)}"]
-    options.show(comparison.figures, lines, as_json)
+    options.print_results(comparison.figures, lines, as_json)
 
 
 @click.command()
@@ -470,4 +470,4 @@ def fit(
     keep_freed_memory()
     fitted_sensor = fitted(recording, pose=[*pose] or None, **settings)
     lines = [repr(fitted_sensor), *map(click.format_filename, fitted_sensor.save(out))]
-    options.show(fitted_sensor.figures, lines, as_json)
+    options.print_results(fitted_sensor.figures, lines, as_json)

@@ -45,7 +45,7 @@ from ..scenario.job import Job
 from ..scenario.plausibility import plausibility_warnings
 from ..scenario.prepare import PreparedScenario, prepare
 from ..scenario.scenario import Scenario
-from .shared_options import show
+from .shared_options import print_results
 from .terminal import Terminal
 
 
@@ -77,7 +77,7 @@ def run_scenario(
         check_backend_here(options.backend)
     with terminal.status("reading the scene", logged=False):
         prepared = prepare(scenario)
-    timeline.mark(timeline.SCENE)
+    timeline.record_step(timeline.SCENE)
     for warning in plausibility_warnings(prepared):
         terminal.warn(warning)
     if shard is None:
@@ -99,7 +99,7 @@ def run_scenario(
         "use lidarpool merge"
     )
     figures = {"folder": str(out), "shard": str(shard), "points": points}
-    show(figures, [*terminal.notes(result.notes), line], terminal.as_json)
+    print_results(figures, [*terminal.notes(result.notes), line], terminal.as_json)
 
 
 def _run_survey(
@@ -116,17 +116,17 @@ def _run_survey(
     """
     job = prepared.job
     for note in advice(prepared):
-        terminal.tell(note)
+        terminal.report(note)
     jobs = SingleJob(job, title=prepared.scenario.title)
     output = SurveyOutput(out, job.survey, job.outputs, extent or "page", prepared.scenario)
     with page_of(jobs, options.live) as page:
         result, report = run_survey(jobs, options, output, terminal, page, compare)
         lines = _result_lines(out, result, job, report, terminal)
-        show(summarize_report(out, report), lines, terminal.as_json)
-        timeline.mark(timeline.SUMMARY)
+        print_results(summarize_report(out, report), lines, terminal.as_json)
+        timeline.record_step(timeline.SUMMARY)
         if options.live and options.stay:
             with local_result(out, [CLOUD]) as folder:
-                page.stay(folder / CLOUD)
+                page.keep_open(folder / CLOUD)
 
 
 def run_campaign(
@@ -163,10 +163,10 @@ def run_campaign(
             f"{plural(run.points, 'point')} in the data set ({run.seconds:.1f} s)",
             f"data set in {click.format_filename(str(out))}; see its README.md",
         ]
-        show(figures, lines, terminal.as_json)
-        timeline.mark(timeline.SUMMARY)
+        print_results(figures, lines, terminal.as_json)
+        timeline.record_step(timeline.SUMMARY)
         if options.live and options.stay:
-            page.stay()
+            page.keep_open()
     if run.failed:
         raise LidarError(describe_failures(run))
 
@@ -256,7 +256,7 @@ def _result_lines(
         f"{plural(result.rays, 'ray')}, {plural(result.hit_count, 'hit')}"
         f"{f' ({hits_elsewhere:,} not on a surface)' if hits_elsewhere > 0 else ''}, "
         f"{plural(len(result.points), 'point')} in the cloud{_objects_with_points(report)}"
-        f"{result.thinned} ({result.backend}, {result.survey_seconds:.1f} s)"
+        f"{result.thinning_note} ({result.backend}, {result.survey_seconds:.1f} s)"
     )
     if (plan := result.plan) is not None:
         outcome = "no collision-free path was found"

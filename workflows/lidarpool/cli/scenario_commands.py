@@ -243,9 +243,9 @@ def check(
     except LidarError as error:
         if as_json:
             reasons = {"reasons": [str(error)], "notes": [], "warnings": []}
-            options.show({"can_run": False, **reasons}, (), True)
+            options.print_results({"can_run": False, **reasons}, (), True)
         raise
-    options.show(figures, lines, as_json)
+    options.print_results(figures, lines, as_json)
     subject = "scenario" if number is None else "job"
     if figures["reasons"]:
         reasons = figures["reasons"]
@@ -419,18 +419,18 @@ def points(cloud: Path, out: Path, overwrite: bool, **settings: Any) -> None:
     """  # noqa: D301 - Click requires the character \b
     from ..scenario.point_scene import points_to_scene
 
-    def tell(note: str) -> None:
+    def report(note: str) -> None:
         click.echo(f"note: {note}", err=True)
 
     def make() -> Scene:
-        made = points_to_scene(cloud, tell=tell, **settings)
+        made = points_to_scene(cloud, report=report, **settings)
         place = made.scene
         if made.gap_note:
-            tell(f"{cloud}: {made.gap_note}")
+            report(f"{cloud}: {made.gap_note}")
         if place.epsg is not None:
-            tell(f"{out} uses the coordinate system of {cloud}, EPSG:{place.epsg}")
+            report(f"{out} uses the coordinate system of {cloud}, EPSG:{place.epsg}")
         if out.suffix.lower() != ".glb" and (place.has_colors.any() or place.material_names):
-            tell(
+            report(
                 f"{out} cannot store the colors and classes of {cloud}. Write a .glb file to "
                 "keep them."
             )

@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage, is_url
 from lidarsim.schema.vocabulary import BACKENDS, UNITS_M
 
@@ -271,7 +271,7 @@ def _check_combination(settings: Mapping[str, Any], file: Path | None, files: Tl
             "of an encrypted cluster, such as tls://host:8786."
         )
     for pem in filter(None, files):
-        with explained(f"{pem} cannot be read"):
+        with explain_os_errors(f"{pem} cannot be read"):
             input_size(pem)
 
 
@@ -305,7 +305,7 @@ def world_lines(epsg: int | None, origin: Sequence[float]) -> Iterator[str]:
     yield f"world       {system}{moved}"
 
 
-def show(figures: Mapping[str, Any], lines: Iterable[str], as_json: bool) -> None:
+def print_results(figures: Mapping[str, Any], lines: Iterable[str], as_json: bool) -> None:
     """Print results as a JSON document or as lines of text."""
     if as_json:
         lines = [json.dumps(figures, indent=1, allow_nan=False, default=str)]

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lidarsim.errors import LidarError
-from lidarsim.words import joined, plural, printable
+from lidarsim.words import join_names, plural, printable
 
 from . import completion
 from . import shared_options as options
@@ -43,14 +43,14 @@ _MIN_REACHABLE_SHARE = 0.25  # a target with a smaller reachable share causes a 
 def _parse_percentage(text: str) -> float:
     """Parse a percentage such as 95% or 95."""
     try:
-        share = float(text.removesuffix("%")) / 100
+        fraction = float(text.removesuffix("%")) / 100
     except ValueError:
-        share = math.nan
-    if not (0.01 <= share <= 1):
+        fraction = math.nan
+    if not (0.01 <= fraction <= 1):
         raise click.BadParameter(
             f"{text!r} is not a valid percentage. Expected a value from 1% to 100%, such as 95%."
         )
-    return share
+    return fraction
 
 
 @click.command(context_settings={"show_default": True})
@@ -214,7 +214,7 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
     terminal = Terminal(quiet=as_json)
     prepared, notes = _prepared_with_notes(scenario, terminal)
     with terminal.status("computing the visibility from all candidate positions"):
-        plan = plan_stations(prepared.scene.georeferenced((0, 0, 0)), sensor, **settings)
+        plan = plan_stations(prepared.scene.with_world_origin((0, 0, 0)), sensor, **settings)
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / PLAN_FILE
     file.write_text(
@@ -231,7 +231,7 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
         shortfalls += _target_notes(plan, prepared)
     figures = _plan_figures(plan, prepared, sensor.model, [*notes, *shortfalls])
     note_lines = map("note: {}".format, shortfalls)
-    options.show(
+    options.print_results(
         figures, chain(_plan_lines(plan, prepared, settings["targets"]), note_lines), as_json
     )
     if not as_json:
@@ -250,8 +250,8 @@ def _reject_planning_options(scene: Path, settings: dict[str, Any]) -> None:
     }
     if unused := [f"`{name}`" for name, value in chosen.items() if value is not None]:
         raise click.UsageError(
-            f"{joined(unused)} cannot be used with `--cloud`, because the stations and the sensor "
-            f"are those in {scene}."
+            f"{join_names(unused)} cannot be used with `--cloud`, because the stations and the "
+            f"sensor are those in {scene}."
         )
 
 
@@ -279,7 +279,7 @@ def _show_coverage(
     recording = open_recording(cloud)
     terminal = Terminal(quiet=as_json)
     prepared, notes = _prepared_with_notes(scenario, terminal)
-    if len(prepared.survey.carried) > 1:
+    if len(prepared.survey.mounted_sensors) > 1:
         raise LidarError(
             "`--cloud` requires a scenario with a single sensor, but the scenario has several."
         )
@@ -288,7 +288,7 @@ def _show_coverage(
     with terminal.status("finding points near the reachable surfaces"):
         coverage = survey_coverage(
             prepared.scene,
-            prepared.survey.carried[0].sensor,
+            prepared.survey.mounted_sensors[0].sensor,
             positions,
             clouds,
             targets=targets,
@@ -312,7 +312,7 @@ def _show_coverage(
     )
     table = _object_lines(prepared.scene.names, coverage)
     note_lines = map("note: {}".format, recording.omission_notes)
-    options.show(figures, chain([head], table, note_lines), as_json)
+    options.print_results(figures, chain([head], table, note_lines), as_json)
 
 
 def _station_positions(prepared: PreparedScenario) -> Floats:
@@ -321,9 +321,9 @@ def _station_positions(prepared: PreparedScenario) -> Floats:
     The result has shape (s, 3).
     """
     path = prepared.survey.path
-    mount = prepared.survey.carried[0].mount
+    mount = prepared.survey.mounted_sensors[0].mount
     poses = [path.pose(number, 0.0).compose(mount) for number in range(path.stations)]
-    return prepared.scene.georeferenced((0, 0, 0)).origin + [pose.position for pose in poses]
+    return prepared.scene.with_world_origin((0, 0, 0)).origin + [pose.position for pose in poses]
 
 
 def _coverage_figures(coverage: SurveyCoverage, prepared: PreparedScenario) -> dict[str, Any]:
@@ -364,26 +364,26 @@ def _prepared_with_notes(
         prepared = prepare(scenario, plans=False)
     notes = advice(replace(prepared, placement=SensorPlacement(())))
     for note in notes:
-        terminal.tell(note)
+        terminal.report(note)
     if problem := prepared.job.location_warning:
         terminal.warn(problem)
     return prepared, [*notes, *terminal.warnings]
 
 
 def _target_phrase(targets: Sequence[str]) -> str:
-    return f" of {joined(targets)}" if targets else ""
+    return f" of {join_names(targets)}" if targets else ""
 
 
 def _target_notes(plan: StationPlan, prepared: PreparedScenario) -> Iterator[str]:
     """Yield a note if one object accounts for most of the reachable area."""
     reachable_m2 = plan.reachable_m2
     largest = int(reachable_m2.argmax())
-    share = float(reachable_m2[largest] / reachable_m2.sum())
-    if share > _DOMINANT_SHARE and (reachable_m2 > 0).sum() > 1:
+    fraction = float(reachable_m2[largest] / reachable_m2.sum())
+    if fraction > _DOMINANT_SHARE and (reachable_m2 > 0).sum() > 1:
         yield (
-            f"{printable(prepared.scene.names[largest])} accounts for {share:.0%} of the reachable "
-            "area, so it largely determines the stations. To cover other objects, select them with "
-            "`--target`"
+            f"{printable(prepared.scene.names[largest])} accounts for {fraction:.0%} of the "
+            "reachable area, so it largely determines the stations. To cover other objects, select "
+            "them with `--target`"
         )
 
 
@@ -404,7 +404,7 @@ def _unreachable_notes(
         more = len(few) - _SHOWN_OBJECTS
         shown = few if more <= 0 else [*few[:_SHOWN_OBJECTS], f"little of {more:,} others"]
         yield (
-            f"Only {joined(shown)} {'is' if len(few) == 1 else 'are'} reachable from the "
+            f"Only {join_names(shown)} {'is' if len(few) == 1 else 'are'} reachable from the "
             f"{positions}, and the coverage does not count the rest. The rest is hidden, out of "
             "range or outside the field of view, or its angle of incidence exceeds `--slant`"
         )
@@ -477,8 +477,8 @@ def _plan_figures(
         "places": len(plan.candidates),
         "spacing_m": plan.spacing_m,
         "stations": [
-            {"position": [round(float(part), 3) for part in position], "coverage": float(share)}
-            for position, share in zip(plan.stations, plan.coverage, strict=True)
+            {"position": [round(float(part), 3) for part in position], "coverage": float(fraction)}
+            for position, fraction in zip(plan.stations, plan.coverage, strict=True)
         ],
         "objects": _object_figures(names, plan),
         "epsg": prepared.survey.epsg,
@@ -498,12 +498,12 @@ def _plan_lines(
         f"m²{_target_phrase(targets)} are reachable (within range, field of view and slant)"
     )
     yield "station        x          y          z   covered     added"
-    previous_share = 0.0
+    previous_fraction = 0.0
     rows = zip(plan.stations.tolist(), plan.coverage.tolist(), strict=True)
-    for number, ((x, y, z), share) in enumerate(rows, 1):
-        gain = share - previous_share
-        yield f"{number:7} {x:10,.2f} {y:10,.2f} {z:10,.2f} {share:9.1%} {gain:9.1%}"
-        previous_share = share
+    for number, ((x, y, z), fraction) in enumerate(rows, 1):
+        gain = fraction - previous_fraction
+        yield f"{number:7} {x:10,.2f} {y:10,.2f} {z:10,.2f} {fraction:9.1%} {gain:9.1%}"
+        previous_fraction = fraction
     yield from _object_lines(names, plan)
     blind = int((plan.targets & (plan.reachable_m2 == 0)).sum())
     if blind:

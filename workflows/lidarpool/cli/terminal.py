@@ -46,7 +46,7 @@ class Terminal(Screen):
         console = Console(file=self._stream) if self._stream else None
         return console if console and console.is_terminal and not console.is_dumb_terminal else None
 
-    def tell(self, words: str) -> None:
+    def report(self, words: str) -> None:
         """Print a note."""
         if self._stream:
             self._stream.write(f"note: {words}\n")
@@ -74,7 +74,7 @@ class Terminal(Screen):
         """
         console = self.console
         if logged and console is None and self._stream:
-            _tell(self._stream, words)
+            _report(self._stream, words)
         with nullcontext() if console is None else console.status(words):
             yield
 
@@ -102,7 +102,7 @@ class Terminal(Screen):
             yield PlainLines(self._stream) if self._stream else lambda progress: None
 
     @contextmanager
-    def starting(
+    def start_cluster(
         self, cluster: AbstractContextManager[Client], words: str, *, shares_terminal: bool = False
     ) -> Iterator[Client]:
         """Show a status message until the cluster has started, and yield its client.
@@ -118,7 +118,7 @@ class Terminal(Screen):
             yield client
 
 
-def _tell(stream: Any, line: str) -> None:
+def _report(stream: Any, line: str) -> None:
     stream.write(f"{time.strftime('%H:%M:%S')}  {line}\n")
 
 
@@ -139,7 +139,7 @@ class WrittenLines:
         if elapsed_s >= self._next and completed < total:
             min_s, max_s = PLAIN_EVERY_S
             self._next = elapsed_s + min(max(min_s, elapsed_s / 10), max_s)
-            _tell(self.stream, f"{name}  {completed:,} of {total:,} {unit}")
+            _report(self.stream, f"{name}  {completed:,} of {total:,} {unit}")
 
 
 class PlainLines:
@@ -163,7 +163,7 @@ class PlainLines:
             self._waiting_reason = reason
             jobs = f"{progress.jobs_done:,} jobs" if progress.jobs else ""
             ready = jobs or f"{progress.collected:,} scans"
-            _tell(self.stream, f"run  {reason or 'continues'}, {ready} are done")
+            _report(self.stream, f"run  {reason or 'continues'}, {ready} are done")
         due = elapsed_s >= self._next
         if due:
             min_s, max_s = PLAIN_EVERY_S
@@ -183,7 +183,7 @@ class PlainLines:
             pace = self._paces[stage].text(elapsed_s, count, total)
             if total and count == total and stage not in self._completed:
                 self._completed.add(stage)
-                _tell(self.stream, f"{stage}  done: {stage_summary} in {elapsed_s:.1f} s")
+                _report(self.stream, f"{stage}  done: {stage_summary} in {elapsed_s:.1f} s")
             elif due and count < total:
                 line = f"{stage}  {count:,} of {total:,} {unit}  {pace}"
-                _tell(self.stream, line.rstrip())
+                _report(self.stream, line.rstrip())

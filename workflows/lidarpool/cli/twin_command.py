@@ -91,13 +91,15 @@ def twin(
         FinishedSteps(steps).remove()
     keep_freed_memory()
 
-    def tell(line: str) -> None:
+    def report(line: str) -> None:
         if not as_json:
             click.echo(f"{line} …", err=True)
 
     with nullcontext() if scheduler is None else connect_client(scheduler, files) as client:
-        built = build(recording, client=client, folder=steps, resume=resume, tell=tell, **settings)
+        built = build(
+            recording, client=client, folder=steps, resume=resume, report=report, **settings
+        )
     paths = [click.format_filename(path) for path in built.save(out)]
     scenario = shlex.quote(str(out / SCENARIO_FILE))
     following = f"next: lidarpool run {scenario} [--sensor MODEL]"
-    options.show(built.figures, [repr(built), *paths, following], as_json)
+    options.print_results(built.figures, [repr(built), *paths, following], as_json)

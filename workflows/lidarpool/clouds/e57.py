@@ -120,7 +120,7 @@ def _write_scan(
 ) -> None:
     from .e57_writer import NORMAL_FIELDS
 
-    positions = sweeps.compensated(sweep, points)
+    positions = sweeps.compensate_motion(sweep, points)
     x, y, z = positions.T.copy()
     data = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
     if "intensity" in points.columns:
@@ -189,11 +189,11 @@ def _open_e57(source: RecordingSource) -> Recording:
         # A column of equal values takes no space in the file, regardless of the number of points.
         total = Allowance(size, _THIN, in_parts=True)
         for header in headers:
-            total.take(_bytes_of_scan(header))
+            total.reserve(_bytes_of_scan(header))
         scale = _scale(headers)
 
         def read(number: int) -> Sweep:
-            Allowance(size, _THIN).take(_bytes_of_scan(headers[number]))
+            Allowance(size, _THIN).reserve(_bytes_of_scan(headers[number]))
             file, lock = files()
             with lock:  # a file cannot have two readers
                 return _read_scan(file, file.get_header(number), number, scale)

@@ -25,13 +25,13 @@ _LINES = 1 << 40  # number of line numbers that are reserved for each station
 
 def flight_lines(survey: Survey) -> StraightLines | None:
     """Return the flight lines of an airborne survey, or None if there are none."""
-    airborne = any(isinstance(mounted.sensor, LineSensor) for mounted in survey.carried)
+    airborne = any(isinstance(mounted.sensor, LineSensor) for mounted in survey.mounted_sensors)
     if not (airborne and survey.path.moves):
         return None
     count = int(min(survey.duration_ns / 1e9 / _SAMPLE_S, _MAX_SAMPLES)) + 2
     times_ns = np.linspace(0.0, survey.duration_ns, count)
     positions, _ = survey.path.poses(0, times_ns)
-    lines = StraightLines.find(times_ns / 1e9, positions)
+    lines = StraightLines.from_trajectory(times_ns / 1e9, positions)
     return lines if len(lines.starts_s) else None
 
 
@@ -48,7 +48,7 @@ def summarize_flight_lines(survey: Survey) -> dict[str, float] | None:
         return None
     spans = [
         firing_span_s(mounted.sensor, steps)
-        for mounted, steps in zip(survey.carried, survey.steps_each, strict=True)
+        for mounted, steps in zip(survey.mounted_sensors, survey.steps_each, strict=True)
         if isinstance(mounted.sensor, LineSensor)
     ]
     scanned = lines.seconds_within(spans)
@@ -213,7 +213,7 @@ class FlightLines:
             rows = np.flatnonzero(sweeps.sensor == sensor)
             if lidar.lines is not None and len(sweeps.knots) and sweeps.stations == 1:
                 begins_s = sweeps.begins_ns[rows] / 1e9
-                lines = StraightLines.find(begins_s, sweeps.pose.positions[rows])
+                lines = StraightLines.from_trajectory(begins_s, sweeps.pose.positions[rows])
                 # Sweeps in a turn belong to the previous line.
                 line = np.searchsorted(lines.starts_s, begins_s, "right") - 1
                 source[rows] = np.maximum(line, 0)
@@ -231,8 +231,8 @@ def _level(moves: Floats, axes: Floats) -> Floats:
         Directions to use for rows without a movement, with shape (k, 3) or (3,). Vertical axes are
         replaced by the x axis.
     """
-    stands = np.hypot(moves[:, 0], moves[:, 1]) < _MIN_STEP_M
-    ahead = np.where(stands[:, None], axes, moves) * (1.0, 1.0, 0.0)
+    is_stationary = np.hypot(moves[:, 0], moves[:, 1]) < _MIN_STEP_M
+    ahead = np.where(is_stationary[:, None], axes, moves) * (1.0, 1.0, 0.0)
     lengths = np.linalg.norm(ahead, axis=1)
     ahead[lengths < 1e-9] = (1.0, 0.0, 0.0)
     return np.asarray(ahead / np.where(lengths < 1e-9, 1.0, lengths)[:, None])

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from lidarsim.errors import LidarError, MissingFileError, as_sentence, explained
+from lidarsim.errors import LidarError, MissingFileError, as_sentence, explain_os_errors
 from lidarsim.io.storage import WRITING, Storage, is_url
 
 LAST_FILE = "report.json"  # written last, so a result that contains this file is complete
@@ -54,12 +54,14 @@ def result_folder(output: Path | Storage) -> Iterator[Path]:
     missing_folders = [
         path for path in (folder, *folder.parents) if not path.exists()
     ]  # innermost first
-    with explained(f"Cannot write to the folder {folder}", "specify another folder with `--out`"):
+    with explain_os_errors(
+        f"Cannot write to the folder {folder}", "specify another folder with `--out`"
+    ):
         try:
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 lock = _lock(folder)
-            Storage.at(folder).tidy(deep=False)
+            Storage.at(folder).remove_unfinished(deep=False)
         except BlockingIOError as error:
             raise LidarError(
                 f"Another run or export is using the folder {folder}. Wait until it has "
@@ -105,7 +107,7 @@ def local_result(output: Path | Storage, names: Sequence[str]) -> Iterator[Path]
         if not isinstance(output, Storage):
             yield folder
             return
-        with explained(f"{output.url} cannot be read"):
+        with explain_os_errors(f"{output.url} cannot be read"):
             sizes = output.sizes()
             if LAST_FILE not in sizes:
                 raise LidarError(
@@ -136,7 +138,7 @@ def upload(path: Path, output: Path | Storage) -> str:
     if not isinstance(output, Storage):
         return str(path)
     url = output.path(path.name)
-    with explained(f"{url} cannot be written"):
+    with explain_os_errors(f"{url} cannot be written"):
         output.discard(path.name)
         output.put(path, path.name)
     return url

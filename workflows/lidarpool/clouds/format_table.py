@@ -105,7 +105,7 @@ def _row_of_plugin(plugin: Plugin) -> FormatRow:
 
     cloud_format = plugin.load(type)
     if not issubclass(cloud_format, CloudFormat):
-        raise plugin.lacks("a subclass of lidarpool.plugins.CloudFormat")
+        raise plugin.missing_field_error("a subclass of lidarpool.plugins.CloudFormat")
     row = cloud_format.row
     if "/" in row.file or row.file in _FILES:
         raise LidarError(
@@ -113,7 +113,9 @@ def _row_of_plugin(plugin: Plugin) -> FormatRow:
             "format. Set `file` to a unique file or folder name."
         )
     if row.file and (missing := sorted(cloud_format.__abstractmethods__)):
-        raise plugin.lacks(f"{cloud_format.__module__}.{cloud_format.__name__}.{missing[0]}")
+        raise plugin.missing_field_error(
+            f"{cloud_format.__module__}.{cloud_format.__name__}.{missing[0]}"
+        )
     return replace(row, plugin=plugin)
 
 

@@ -94,7 +94,7 @@ class ImageFolder(MultiFileFormat):
     @classmethod
     def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
         """Return the name of the archive that contains the images."""
-        folders = job.cached("folders", lambda: cls._folders_of(job.sweeps, job.entry))
+        folders = job.get_or_compute("folders", lambda: cls._folders_of(job.sweeps, job.entry))
         return [_file(job.sweeps, folders, sweep)]
 
     @classmethod

@@ -48,7 +48,7 @@ class JobReader:
         self._cache: dict[str, Any] = {}
         self._copies: Path | None = None
 
-    def cached(self, key: str, make: Callable[[], T]) -> T:
+    def get_or_compute(self, key: str, make: Callable[[], T]) -> T:
         """Return the cached value for a key, computing it with `make` on the first call."""
         if key not in self._cache:
             self._cache[key] = make()

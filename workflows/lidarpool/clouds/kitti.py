@@ -100,7 +100,7 @@ class KITTI(MultiFileFormat):
         folder = self.sequences[sweeps.sensor[number]]
         name = f"{sweeps.numbers[number]:06}"
         rows = np.empty((len(points), 4), "<f4")
-        rows[:, :3] = sweeps.compensated(number, points)
+        rows[:, :3] = sweeps.compensate_motion(number, points)
         rows[:, 3] = kitti_intensity(points)
         labels = (points["object"].astype("<u4") + 1) << 16 | points["class"]
         files: dict[str, FileContent] = {
@@ -159,7 +159,7 @@ class KITTI(MultiFileFormat):
     @classmethod
     def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
         """Return the names of the point file and the label file."""
-        names = job.cached("sequences", lambda: _names(job.sweeps, job.entry))
+        names = job.get_or_compute("sequences", lambda: _names(job.sweeps, job.entry))
         folder = f"sequences/{names[job.sweeps.sensor[sweep]]}"
         number = f"{job.sweeps.numbers[sweep]:06}"
         return [f"{folder}/velodyne/{number}.bin", f"{folder}/labels/{number}.label"]

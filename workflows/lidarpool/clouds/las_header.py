@@ -62,7 +62,7 @@ def open_las(path: Path) -> Iterator[Any]:
                 raise CutShortError(
                     f"its header declares {header.point_count:,} points, but it contains fewer"
                 )
-            Allowance(size, _SMALLER).take(announced if header.are_points_compressed else 0)
+            Allowance(size, _SMALLER).reserve(announced if header.are_points_compressed else 0)
             try:
                 yield reader
             except Exception as error:  # only the message of a lazrs error identifies its cause

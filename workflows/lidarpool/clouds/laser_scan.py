@@ -32,7 +32,7 @@ def is_planar(sensor: Sensor) -> bool:
 
 def has_planar_sensors(survey: Survey) -> bool:
     """Return whether a survey has at least one 2D scanner."""
-    return any(is_planar(carried.sensor) for carried in survey.carried)
+    return any(is_planar(carried.sensor) for carried in survey.mounted_sensors)
 
 
 def has_laser_scans(sweeps: Sweeps) -> bool:

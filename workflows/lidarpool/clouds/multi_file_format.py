@@ -112,7 +112,7 @@ class MultiFileFormat(CloudFormat):
             written |= {span: result for span, result in results if result}
         writer.stop()
         self.finish(storage, (written.get(span, (0, [])) for span in spans))
-        storage.tidy()
+        storage.remove_unfinished()
 
     def write_range(self, storage: Storage, first: int, stop: int) -> WrittenRange:
         """Write the files of a range of pieces, holding one piece in memory at a time.

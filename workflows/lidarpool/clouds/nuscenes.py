@@ -103,7 +103,7 @@ class NuScenes(MultiFileFormat):
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, FileContent], Boxes]:
         """Return the point file and the label file of a sweep, and the sweep's boxes."""
-        inside = self.sweeps.compensated(number, points)
+        inside = self.sweeps.compensate_motion(number, points)
         intensity = np.clip(points["intensity"], 0, 1) * 255
         rows = np.empty((len(points), 5), "<f4")
         rows[:, :3] = inside
@@ -166,7 +166,7 @@ class NuScenes(MultiFileFormat):
     def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
         """Return the name of the point file and, if classes have names, of the label file."""
         sweeps = job.sweeps
-        names = job.cached(
+        names = job.get_or_compute(
             "names",
             lambda: _files(sweeps, _channels(sweeps), _samples(sweeps)[1], job.entry),
         )

@@ -245,7 +245,7 @@ class _OSIMessages:
             number_of_valid_detections=len(points),
             sensor_id=sensor,
         )
-        positions = sweeps.compensated(sweep, points)
+        positions = sweeps.compensate_motion(sweep, points)
         detections = _field(_HEADER, header.to_binary()) + encode_detections(positions, points)
         return _EncodedMessage(message, _field(_FEATURE_DATA, _field(_LIDAR_SENSOR, detections)))
 

@@ -41,7 +41,7 @@ class PacketCapture(CloudFormat):
         Raises LidarError if packets are not supported for a sensor.
         """
         names: dict[str, None] = {}
-        for carried, returns in zip(survey.carried, survey.returns_each, strict=True):
+        for carried, returns in zip(survey.mounted_sensors, survey.returns_each, strict=True):
             encoder = encoder_of(PacketSource(carried.sensor, returns.mode, carried.name))
             names |= dict.fromkeys(encoder.columns)
         return (*names,)

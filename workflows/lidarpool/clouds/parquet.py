@@ -100,12 +100,14 @@ class Parquet(MultiFileFormat):
         import pyarrow as pa
         import pyarrow.dataset
 
-        table = job.cached("table", lambda: _dataset(job.storage, cls.path_of_job(job.entry)))
+        table = job.get_or_compute(
+            "table", lambda: _dataset(job.storage, cls.path_of_job(job.entry))
+        )
         first, stop = job.sweeps.scans[sweep : sweep + 2].tolist()
         scan = pyarrow.dataset.field("scan")
         in_range = (scan >= first) & (scan < stop)
-        allowance = group_allowance(job.cached("size", lambda: _size_of(table)))
-        cache = job.cached("groups", dict[tuple[str, int], Any])
+        allowance = group_allowance(job.get_or_compute("size", lambda: _size_of(table)))
+        cache = job.get_or_compute("groups", dict[tuple[str, int], Any])
         groups = [
             _group(group, allowance, cache)
             for file in table.get_fragments(in_range)

@@ -38,7 +38,7 @@ def check_groups(groups: Iterable[Any], columns: Sequence[str], size: int) -> No
     LidarError
         If the rows require far more memory than the size of the files suggests.
     """
-    Allowance(size, _ADVICE, in_parts=True).take(sum(_bytes_of(g, columns) for g in groups))
+    Allowance(size, _ADVICE, in_parts=True).reserve(sum(_bytes_of(g, columns) for g in groups))
 
 
 def group_allowance(size: int) -> Allowance:
@@ -51,7 +51,7 @@ def group_allowance(size: int) -> Allowance:
 
 def read_group(group: Any, columns: Sequence[str], allowance: Allowance) -> Any:
     """Read columns of a row group, or raise LidarError if they exceed the allowance."""
-    allowance.take(_bytes_of(group, columns))
+    allowance.reserve(_bytes_of(group, columns))
     # Data loaders already use several worker processes, so more threads would not help.
     return group.to_table(columns=list(columns), use_threads=False)
 

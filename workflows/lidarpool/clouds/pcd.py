@@ -56,7 +56,7 @@ class PCD(MultiFileFormat):
     def _fields(self, number: int, points: Cloud, *, as_fired: bool) -> list[tuple[str, AnyArray]]:
         """Return the names and values of a sweep's fields, as fired or compensated."""
         sweeps = self.sweeps
-        positions_of = sweeps.as_fired if as_fired else sweeps.compensated
+        positions_of = sweeps.as_fired if as_fired else sweeps.compensate_motion
         columns_of = sweeps.columns_as_fired if as_fired else sweeps.columns_compensated
         positions = positions_of(number, points).T.astype(np.float32)
         fields: list[tuple[str, AnyArray]] = [*zip("xyz", positions, strict=True)]

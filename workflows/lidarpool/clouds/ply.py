@@ -70,7 +70,7 @@ class PLY(CloudFormat):
     def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
         """Read the points of a sweep in a data set with all columns."""
         name = cls.path_of_job(job.entry)
-        file = job.cached("cloud", lambda: CloudFile(job.local(name)))
+        file = job.get_or_compute("cloud", lambda: CloudFile(job.local(name)))
         first, stop = (file.row_of(scan) for scan in job.sweeps.scans[sweep : sweep + 2])
         cloud = next(file.chunks(max(1, stop - first), first), None)
         if cloud is None or first == stop:

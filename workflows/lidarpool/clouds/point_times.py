@@ -97,7 +97,7 @@ class PointTimes(NamedTuple):
             return None
         return since_s + first_s
 
-    def note(self, name: str) -> str:
+    def clock_note(self, name: str) -> str:
         """Return a note if the times come from a different clock, or an empty string."""
         if self.clock is not PointClock.OTHER:
             return ""

@@ -29,7 +29,7 @@ from lidarsim.scene.files.noise_points import NOISE_CLASSES, OmittedPoints, usab
 from lidarsim.scene.files.pcd import split_rgb
 from lidarsim.scene.files.stated_system import Meters, StatedSystem, stated_meters
 from lidarsim.sweeps.sweeps import Sweeps
-from lidarsim.words import did_you_mean, joined, plural
+from lidarsim.words import did_you_mean, join_names, plural
 
 from ..identity.fingerprint import fingerprint
 from ..processes.per_process import PerProcess
@@ -235,7 +235,7 @@ class Recording:
     def omission_notes(self) -> list[str]:
         """Notes about points that were omitted from the items read so far."""
         totals = np.sum([(0, 0), *self._omitted.values()], axis=0).tolist()
-        note = OmittedPoints(*totals).note()
+        note = OmittedPoints(*totals).omission_note()
         return [f"{self.name}: {note}"] if note else []
 
     def poses(self, numbers: Iterable[int]) -> Floats | None:
@@ -581,12 +581,12 @@ def choose(name: str, kind: str, names: Iterable[str], chosen: str | None) -> st
         return available[0]
     if chosen is not None and chosen in available:
         return chosen
-    contents = f"It contains the {kind} {joined(available)}." if available else ""
+    contents = f"It contains the {kind} {join_names(available)}." if available else ""
     if available == [""]:
         contents = f"Its {kind} have no names and cannot be selected."
     if not available:
         raise LidarError(f"{name} contains no {kind}. Record at least one.")
     if chosen is None:
-        raise SeveralSensorsError(f"{name} contains the {kind} {joined(available)}.", available)
+        raise SeveralSensorsError(f"{name} contains the {kind} {join_names(available)}.", available)
     hint = did_you_mean(chosen, available)
     raise LidarError(f"{name} does not contain {chosen!r}.{hint} {contents}")

@@ -71,7 +71,7 @@ class RRD(CloudFormat):
             log.show_surroundings(surroundings)
             sequence = SweepSequence(self.sweeps)
             for sweep, points in enumerate(self.sweeps.points(self.cloud)):
-                log.show_sweep(sequence.show(sweep, points))
+                log.show_sweep(sequence.shown_sweep(sweep, points))
 
 
 @contextmanager
@@ -244,6 +244,6 @@ def _colors(positions: Floats32, columns: dict[str, AnyArray]) -> Bytes:
     else:
         values = positions[:, 2]
         limits = _HEIGHT_LIMITS_M
-    shares = np.clip((values - limits[0]) / (limits[1] - limits[0]), 0, 1)
+    fractions = np.clip((values - limits[0]) / (limits[1] - limits[0]), 0, 1)
     table = np.round(TURBO * 255).astype(np.uint8)
-    return table[(shares * (len(table) - 1)).astype(np.intp)]
+    return table[(fractions * (len(table) - 1)).astype(np.intp)]

@@ -185,7 +185,7 @@ class SweepSequence:
             FramePose(VEHICLE, self._frames[number], *mount) for number, mount in enumerate(mounts)
         ]
 
-    def show(self, sweep: int, points: Cloud) -> ShownSweep:
+    def shown_sweep(self, sweep: int, points: Cloud) -> ShownSweep:
         """Convert a sweep, given its number and its points."""
         sweeps = self.sweeps
         sensor = sweeps.sensor[sweep]
@@ -194,7 +194,7 @@ class SweepSequence:
             stamp_ns=self.start_ns + sweeps.stamp_ns(sweep),
             topic=points_topic(sweeps.sensors[sensor], self._frames[sensor]),
             frame=self._frames[sensor],
-            positions=sweeps.compensated(sweep, points).astype(np.float32),
+            positions=sweeps.compensate_motion(sweep, points).astype(np.float32),
             columns=viewer_columns(sweeps.columns_compensated(sweep, points)),
             transforms=self._transforms(sweep),
             boxes=ActorBoxes.from_points(sweeps, sweep, points) if sweeps.actors else None,

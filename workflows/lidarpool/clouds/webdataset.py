@@ -199,7 +199,7 @@ def _offsets(job: JobReader) -> Ints:
         with open_archive(job.storage.path(name), partial(job.storage.read, name)) as arrays:
             return arrays["at"]
 
-    return job.cached("offsets", read)
+    return job.get_or_compute("offsets", read)
 
 
 def _npy(array: AnyArray) -> bytes:

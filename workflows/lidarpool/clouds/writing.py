@@ -16,14 +16,14 @@ import numpy as np
 
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.environment.extras import install_command
-from lidarsim.errors import LidarError, MissingFileError, explained
+from lidarsim.errors import LidarError, MissingFileError, explain_os_errors
 from lidarsim.io.storage import Storage, flush
 from lidarsim.schema.checks import check_fields
 from lidarsim.schema.declared import FileSection, about
 from lidarsim.schema.value_texts import one_line
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps
-from lidarsim.words import alternatives, joined
+from lidarsim.words import join_alternatives, join_names
 from lidarview.picture_file import PictureContent
 
 from ..columns.parts import StoredCloud
@@ -118,7 +118,7 @@ class ExportSpec(FileSection):
                 such = " formats that store single sweeps:" * (option == "compensated_actors")
                 raise LidarError(
                     f"The format {self.format} does not support `{option}`. It can only be set "
-                    f"for{such} {joined(choices)}."
+                    f"for{such} {join_names(choices)}."
                 )
         self.cloud_format.check_options(self)
 
@@ -192,7 +192,9 @@ class ExportSpec(FileSection):
         )
         notes = [f"{self.title} cannot store {unsupported}"] if unsupported else []
         if replaced:
-            notes.append(f"{self.title} stores {joined(strengths)} instead of {joined(replaced)}")
+            notes.append(
+                f"{self.title} stores {join_names(strengths)} instead of {join_names(replaced)}"
+            )
         notes += [
             (
                 f"{self.title} can store {name} only if classes have names. Set `classes: {{1: "
@@ -234,7 +236,7 @@ class ExportSpec(FileSection):
         return []
 
     @property
-    def installed(self) -> bool:
+    def is_installed(self) -> bool:
         """Whether the packages that the format requires are installed in this environment."""
         return not self.row.missing_packages
 
@@ -243,7 +245,9 @@ class ExportSpec(FileSection):
         if missing := self.row.missing_packages:
             needs = [f"lidarpool[{self.row.extra}]"] if self.row.extra else missing
             command = install_command(*needs)
-            raise LidarError(f"The format {self.format} requires {joined(missing)}. Run {command}.")
+            raise LidarError(
+                f"The format {self.format} requires {join_names(missing)}. Run {command}."
+            )
 
     def check(self, path: Path, cloud: CloudLike, *, overwrite: bool = False) -> None:
         """Raise LidarError unless `write` can write the cloud to a path."""
@@ -263,7 +267,7 @@ class ExportSpec(FileSection):
             has_layouts = self.cloud_format.supports("layout")
             with_layout = f" with the layout {self.layout}" if has_layouts else ""
             entry = f"`output: {{write: [{self._entry}]}}`"
-            lacks = joined(missing)
+            lacks = join_names(missing)
             columns = "column" if len(missing) == 1 else "columns"
             raise LidarError(
                 f"The format {self.format}{with_layout} requires the {columns} {lacks}, which the "
@@ -323,7 +327,7 @@ class ExportSpec(FileSection):
             If a package or column is missing, or if the file exists or cannot be written.
         """
         full_scale: float | None = None
-        with explained(f"{path} cannot be written"):
+        with explain_os_errors(f"{path} cannot be written"):
             self.check(path, cloud, overwrite=overwrite)
             with staging(path.parent) as staging_folder:
                 # The file has its final name, because bags contain the name of their file.
@@ -350,7 +354,7 @@ class ExportSpec(FileSection):
         """
         file = self.row.file
         folder = Storage(storage.path(file))
-        with explained(f"{folder} cannot be written"):
+        with explain_os_errors(f"{folder} cannot be written"):
             try:
                 output = self.cloud_format(cloud, self.configure_sweeps(sweeps))
                 assert isinstance(output, MultiFileFormat)
@@ -461,7 +465,7 @@ def save_cloud(
     if name is None:
         raise LidarError(
             f"{path} has the extension {path.suffix!r}, which does not belong to any supported "
-            f"format. Use {alternatives([*_ENDINGS])}, or set `format`."
+            f"format. Use {join_alternatives([*_ENDINGS])}, or set `format`."
         )
     if precision_m is not None and not 0 < precision_m < np.inf:
         raise LidarError(f"`precision_m` is {precision_m}; it must be a positive length in meters.")
@@ -476,7 +480,7 @@ def save_cloud(
     )
     sweeps = Sweeps.unknown() if cloud.sweeps is None else cloud.sweeps()
     sweeps = replace(sweeps, precision_m=precision_m or sweeps.precision_m)
-    with explained(f"{path} cannot be written"):
+    with explain_os_errors(f"{path} cannot be written"):
         if path.is_dir():
             raise LidarError(f"{path} is a folder. Remove it, or use another path.")
     if cloud.sweeps is None and spec.cloud_format.by_sweep:

@@ -240,7 +240,7 @@ class StoredCloud(CloudDisplay):
         return (SCAN, *columns)
 
     @property
-    def recorded(self) -> bool:
+    def has_waveforms(self) -> bool:
         """Whether the cloud contains waveforms."""
         return any(column.name == WAVEFORM for column in self.columns)
 

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 
-from lidarsim.errors import explained
+from lidarsim.errors import explain_os_errors
 from lidarsim.numerics.arrays import AnyArray, Floats
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.words import plural
@@ -77,7 +77,9 @@ class Comparison:
         path = Path(folder)
         with (
             result_folder(path),
-            explained(f"The comparison cannot be written to {path}", "free some disk space"),
+            explain_os_errors(
+                f"The comparison cannot be written to {path}", "free some disk space"
+            ),
             staging(path) as staged,
         ):
             pages = {"distances": draw_distances(self), "above": draw_above(self)}
@@ -130,9 +132,9 @@ def draw_ranges(comparison: Comparison) -> Page:
     range_scale = _range_scale(images)
     limit = _residual_limit(comparison)
     residual_scale = Normalize(-limit, limit)
-    share = layout.image_height / layout.page_height
+    fraction = layout.image_height / layout.page_height
     for number, words in enumerate(("A", "B", "A − B")):
-        frame = (LEFT, layout.image_bottom(number), RIGHT - LEFT, share)
+        frame = (LEFT, layout.image_bottom(number), RIGHT - LEFT, fraction)
         axes = page.chart(frame, ylabel="elevation, °")
         if number < 2:
             colors = _range_colors(images, number, range_scale)
@@ -143,9 +145,9 @@ def draw_ranges(comparison: Comparison) -> Page:
         _show_image(axes, images, colors)
         page.heading(axes, words)
     ramp = np.linspace(0, 1, 256)
-    frame = (0.862, layout.image_bottom(1), 0.014, 2 * share + layout.gap / layout.page_height)
+    frame = (0.862, layout.image_bottom(1), 0.014, 2 * fraction + layout.gap / layout.page_height)
     page.color_bar(theme.apply_colormap(theme.RANGE_COLORS, ramp), range_scale, "range, m", frame)
-    frame = (0.862, layout.bottom / layout.page_height, 0.014, share)
+    frame = (0.862, layout.bottom / layout.page_height, 0.014, fraction)
     page.color_bar(theme.apply_colormap(RESIDUAL_COLORS, ramp), residual_scale, "A − B, mm", frame)
     return page
 
@@ -159,14 +161,14 @@ def _range_scale(images: RangeImages) -> LogNorm:
 def _range_colors(images: RangeImages, index: int, scale: LogNorm) -> AnyArray:
     ranges = np.nan_to_num(images.ranges[index], nan=1.0)
     colors = theme.apply_colormap(theme.RANGE_COLORS, scale(ranges).filled(0))
-    colors[~images.returned[index]] = NO_RETURN
+    colors[~images.return_masks[index]] = NO_RETURN
     return colors
 
 
 def _residual_colors(images: RangeImages, scale: Normalize) -> AnyArray:
     """Return the pixel colors of the residual image, including those of cells without a return."""
     residual = images.ranges[0] - images.ranges[1]
-    in_a, in_b = images.returned
+    in_a, in_b = images.return_masks
     colors = theme.apply_colormap(RESIDUAL_COLORS, scale(1000 * np.nan_to_num(residual)).data)
     colors[~in_a & ~in_b] = NO_RETURN
     colors[in_a & ~in_b] = ONLY_A
@@ -264,8 +266,8 @@ def _draw_ring_gaps(page: Page, axes: Axes, rings: Sequence[Mapping[str, Any]]) 
     counts = np.array([[ring["no_return"][name] for name in CELLS] for ring in rings])
     style: dict[str, Any] = {"ms": _marker_size(page, rings), "mew": 0, "lw": 0.6 * page.unit}
     for color, state, label in ((A_COLOR, 1, "A"), (B_COLOR, 2, "B")):
-        share = 100 * (counts[:, 0] + counts[:, state]) / counts.sum(axis=1)
-        axes.plot(share, elevation, "o-", color=color, label=label, **style)
+        fraction = 100 * (counts[:, 0] + counts[:, state]) / counts.sum(axis=1)
+        axes.plot(fraction, elevation, "o-", color=color, label=label, **style)
     axes.set_xlim(left=min(0, axes.get_xlim()[0]))
     _draw_legend(page, axes)
 
@@ -287,11 +289,11 @@ def draw_distances(comparison: Comparison) -> Page:
         xscale="log",
         ylim=(0, 101),
     )
-    shares = np.linspace(0, 1, 1001)
+    fractions = np.linspace(0, 1, 1001)
     labels = ("A to B", "B to A")
     for values, color, label in zip(comparison.distances, (A_COLOR, B_COLOR), labels, strict=True):
-        quantiles = np.quantile(values, shares).clip(MIN_DISTANCE_M)
-        axes.plot(quantiles, 100 * shares, color=color, lw=1.4 * page.unit, label=label)
+        quantiles = np.quantile(values, fractions).clip(MIN_DISTANCE_M)
+        axes.plot(quantiles, 100 * fractions, color=color, lw=1.4 * page.unit, label=label)
     max_m = max(float(np.quantile(values, 0.999)) for values in comparison.distances)
     right_m = max(2 * max_m, 0.01)
     axes.set_xlim(MIN_DISTANCE_M, right_m)

@@ -62,7 +62,7 @@ class RangeImages:
         return self.images[:, 0]
 
     @property
-    def returned(self) -> tuple[Bools, Bools]:
+    def return_masks(self) -> tuple[Bools, Bools]:
         """Masks of the cells that have a return in A and in B.
 
         Each mask has shape (r, c).
@@ -118,8 +118,8 @@ class _PolarSweep:
         offsets = np.searchsorted(index[order], np.arange(len(rings) + 1))
         counts = np.diff(offsets)
         lower, middle, upper = (
-            elevation[order][offsets[:-1] + (share * (counts - 1)).astype(np.intp)]
-            for share in (0.25, 0.5, 0.75)
+            elevation[order][offsets[:-1] + (fraction * (counts - 1)).astype(np.intp)]
+            for fraction in (0.25, 0.5, 0.75)
         )
         if np.median(upper - lower) > max(_TILT_DEG, _spacing(middle) / 2):
             raise LidarError(

@@ -123,13 +123,15 @@ def compare(
         if sweeps:
             pairs = _choose_pairs(pairs, sweeps)
         elif len(pairs) < max(first.count, second.count):
-            comparing.note(
+            comparing.add_note(
                 f"A has {plural(first.count, 'sweep')} and B has {second.count:,}. Matching "
                 f"by {match} results in {plural(len(pairs), 'pair')}"
             )
         comparing.pairs = pairs
         if {first.compensated, second.compensated} == {True, False}:
-            comparing.note(_motion_note(*sorted((first, second), key=lambda r: not r.compensated)))
+            comparing.add_note(
+                _motion_note(*sorted((first, second), key=lambda r: not r.compensated))
+            )
         budget = MAX_VALUES // len(pairs)
         for number_a, number_b in pairs:
             sweep_a, sweep_b = (
@@ -148,7 +150,7 @@ def compare(
     points_a = comparing.read_cloud(first, max_points)
     points_b = comparing.read_cloud(second, max_points)
     if max(len(points_a), len(points_b)) > MAX_VALUES:
-        comparing.note(f"distances are measured from {MAX_VALUES:,} points of each cloud")
+        comparing.add_note(f"distances are measured from {MAX_VALUES:,} points of each cloud")
     comparing.add_points(points_a, points_b, MAX_VALUES)
     return comparing.result()
 
@@ -194,8 +196,8 @@ def _pair_sweeps(a: Recording, b: Recording, match: str) -> list[tuple[int, int]
         if pairs:
             order = np.argsort(times_a)
             sorted_times = times_a[order]
-            middles = (sorted_times[1:] + sorted_times[:-1]) / 2
-            nearest_a = order[np.searchsorted(middles, times_b)]
+            midpoints = (sorted_times[1:] + sorted_times[:-1]) / 2
+            nearest_a = order[np.searchsorted(midpoints, times_b)]
             period = np.median(np.diff(times_b)) if len(times_b) > 1 else 1e8
             close = np.flatnonzero(np.abs(times_a[nearest_a] - times_b) <= period / 2)
             pairs = [(int(nearest_a[number]), int(number)) for number in close]
@@ -263,24 +265,24 @@ class _Comparing:
         # observed, so its count is 0.
         self.ray_counts = np.zeros(4, np.int64)
 
-    def note(self, text: str) -> None:
+    def add_note(self, text: str) -> None:
         if text not in self.notes:
             self.notes.append(text)
 
     def read_cloud(self, recording: Recording, max_points: int) -> Sweep:
         """Read a cloud in world coordinates, evenly subsampled to about `max_points` points."""
         count = recording.point_count
-        share = 1.0 if count is None else min(1.0, max_points / max(count, 1))
+        fraction = 1.0 if count is None else min(1.0, max_points / max(count, 1))
         parts = []
         for number in range(recording.count):
             part = compared_in_world(recording, number)
-            if share < 1:
-                part = part.select(even_indices(len(part), round(share * len(part))))
+            if fraction < 1:
+                part = part.select(even_indices(len(part), round(fraction * len(part))))
             parts.append(part)
-        if share == 1 or not parts:
+        if fraction == 1 or not parts:
             return Sweep.concatenate(parts)
-        self.note(
-            f"{100 * share:.3g} % of the {count:,} points in {recording.name} are compared, "
+        self.add_note(
+            f"{100 * fraction:.3g} % of the {count:,} points in {recording.name} are compared, "
             "sampled evenly. Distances to this cloud are therefore overestimated"
         )
         return Sweep.concatenate(parts)
@@ -291,7 +293,7 @@ class _Comparing:
         At most `budget` cells and points of each sweep are compared.
         """
         if max(len(a), len(b)) > budget:
-            self.note(
+            self.add_note(
                 f"at most {budget:,} points and cells of each sweep are compared, sampled evenly"
             )
         if len(a) and len(b):
@@ -344,7 +346,7 @@ class _Comparing:
             self.without_images[str(error)] += 1
         if images is not None:
             for note in (*rings_note(first, a), *rings_note(second, b), *images.notes):
-                self.note(note)
+                self.add_note(note)
             self._add_image_cells(images, budget)
         elif rays is not None:
             self._add_rays(rays, budget)
@@ -378,7 +380,7 @@ class _Comparing:
         The masks `in_a` and `in_b` mark returns. Both have shape (k,).
         """
         rows = images.cell_rows
-        returned_a, returned_b = images.returned
+        returned_a, returned_b = images.return_masks
         rows_of_neither, _ = np.nonzero(~returned_a & ~returned_b)
         rows_of_states = (
             rows_of_neither,
@@ -572,10 +574,10 @@ def _scores(precision: float | None, recall: float | None) -> dict[str, float | 
 
 def _distance_quantiles(values: Floats) -> dict[str, Any]:
     """Return the mean and quantiles of distances in meters."""
-    shares = {"median_m": 0.5, "p90_m": 0.9, "p95_m": 0.95, "p99_m": 0.99, "max_m": 1.0}
-    quantiles = np.quantile(values, list(shares.values())).tolist()
+    fractions = {"median_m": 0.5, "p90_m": 0.9, "p95_m": 0.95, "p99_m": 0.99, "max_m": 1.0}
+    quantiles = np.quantile(values, list(fractions.values())).tolist()
     return {
         "points": len(values),
         "mean_m": float(values.mean()),
-        **dict(zip(shares, quantiles, strict=True)),
+        **dict(zip(fractions, quantiles, strict=True)),
     }

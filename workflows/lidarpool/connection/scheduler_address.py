@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from lidarsim.errors import LidarError, MissingFileError, converted, explained
+from lidarsim.errors import LidarError, MissingFileError, convert_errors, explain_os_errors
 from lidarsim.io.input_files import read_input_text
 
 from .tls_files import TlsFiles
@@ -33,7 +33,7 @@ def is_scheduler_file(given: str) -> bool:
 
 
 def read_scheduler_file(
-    path: Path, wait_s: float = 0.0, tell: Callable[[str], None] = lambda text: None
+    path: Path, wait_s: float = 0.0, report: Callable[[str], None] = lambda text: None
 ) -> str:
     """Read the scheduler address from a file that ``dask scheduler --scheduler-file`` wrote.
 
@@ -43,7 +43,7 @@ def read_scheduler_file(
         Path of the scheduler file.
     wait_s
         Maximum time to wait for a file that does not exist yet, in seconds.
-    tell
+    report
         Function that is called with a message for the user before waiting.
 
     Raises
@@ -53,7 +53,7 @@ def read_scheduler_file(
     """
     deadline = time.monotonic() + wait_s
     if wait_s and not path.exists():
-        tell(f"waiting for the scheduler file {path}")
+        report(f"waiting for the scheduler file {path}")
     was_found = False
     while True:
         found = path.exists()
@@ -76,9 +76,9 @@ def _read(path: Path) -> str:
             f"`dask scheduler --scheduler-file {path}`, or increase `--startup-timeout`."
         )
     failure = f"The scheduler file {path} cannot be read"
-    with explained(failure):
+    with explain_os_errors(failure):
         text = read_input_text(path)
-    with converted(failure):
+    with convert_errors(failure):
         address = json.loads(text)["address"]
         check_address(address)
     return str(address)

@@ -22,7 +22,7 @@ import numpy as np
 
 from lidarsim._version import __version__
 from lidarsim.columns.cloud import CloudLike
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.archives import pack_arrays
 from lidarsim.io.named_files import leads_outside
 from lidarsim.io.storage import Storage
@@ -199,7 +199,7 @@ class DataSet:
         spec.check_columns(cloud)
         storage = listing or Listing.from_storage(self.storage)
         boxes: list[Boxes] = []
-        with explained(f"Job {name} cannot be written to {storage}"):
+        with explain_os_errors(f"Job {name} cannot be written to {storage}"):
             output = spec.cloud_format(cloud, spec.configure_sweeps(sweeps), entry)
             if isinstance(output, MultiFileFormat):
                 details = _write_pieces(output, storage)
@@ -237,7 +237,7 @@ class DataSet:
 
         Raises LidarError if the storage is not writable.
         """
-        with explained(f"{self.storage} cannot be written"):
+        with explain_os_errors(f"{self.storage} cannot be written"):
             storage = Listing.from_storage(self.storage)
             failed = (row for row in rows if not row.done)
             deque(
@@ -262,9 +262,9 @@ class DataSet:
         LidarError
             If a job's files differ from its manifest, or if the storage is not writable.
         """
-        with explained(f"{self.storage} cannot be written"):
+        with explain_os_errors(f"{self.storage} cannot be written"):
             self.storage.remove([INDEX_FILE])
-            self.storage.tidy()
+            self.storage.remove_unfinished()
             with self.storage.writing(INDEX_FILE) as file:
                 index = SealedWriter(file)
                 head: dict[str, Any] = {"lidarpool": __version__, "version": VERSION}

@@ -145,12 +145,12 @@ class DataSetStatistics:
         self._unset: Counter[str] = Counter()  # {name: jobs in which the quantity is not set}
         self._digest = hashlib.sha256()
         for row in jobs:
-            self.add(row)
+            self.add_job(row)
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_digest": None}  # hash objects cannot be pickled
 
-    def add(self, row: JobRow) -> None:
+    def add_job(self, row: JobRow) -> None:
         """Add the table row of a job to the statistics."""
         self.jobs += 1
         for name, column in self._per_job.items():
@@ -196,7 +196,7 @@ class DataSetStatistics:
         return self._digest.hexdigest()
 
     @property
-    def varied(self) -> list[VariedQuantity]:
+    def varied_quantities(self) -> list[VariedQuantity]:
         """Each varied quantity, with its values in all jobs."""
         return [self._varied(name) for name in self._values]
 
@@ -249,7 +249,7 @@ class DataSetStatistics:
         """Yield statistics of each varied quantity as a dictionary for JSON."""
         is_done = ~self.failures
         points = self.per_job("points")
-        for varied in self.varied:
+        for varied in self.varied_quantities:
             has_value = is_done & np.isfinite(varied.values)
             values = varied.known_values
             figures: dict[str, Any] = {"name": varied.name, "jobs": len(values)}

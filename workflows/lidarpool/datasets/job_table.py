@@ -29,11 +29,11 @@ from typing import IO, Any
 import numpy as np
 
 from lidarsim.columns.cloud import Cloud, CloudLike
-from lidarsim.errors import LidarError, as_sentence, explained
+from lidarsim.errors import LidarError, as_sentence, explain_os_errors
 from lidarsim.io.input_files import open_input
 from lidarsim.io.named_files import is_plain
 from lidarsim.io.storage import Storage
-from lidarsim.words import joined, printable
+from lidarsim.words import join_names, printable
 
 Value = bool | int | float | str
 
@@ -142,7 +142,7 @@ class Tally:
     (3, {2: 1, 6: 2})
     >>> again = Tally()
     >>> for piece in cloud.chunks(2):
-    ...     again.add(piece)
+    ...     again.add_points(piece)
     >>> again.sha256 == tally.sha256
     True
     """
@@ -157,10 +157,10 @@ class Tally:
         """Compute the tally of an entire cloud."""
         tally = cls()
         for chunk in cloud.chunks():
-            tally.add(chunk)
+            tally.add_points(chunk)
         return tally
 
-    def add(self, chunk: Cloud) -> None:
+    def add_points(self, chunk: Cloud) -> None:
         """Add the next chunk of points.
 
         Raises LidarError if its columns differ from those of earlier chunks.
@@ -229,7 +229,7 @@ def write_table(
     LidarError
         If a row has a value that is not listed in `names`, or if the table cannot be written.
     """
-    with explained(
+    with explain_os_errors(
         f"The job table cannot be written to {storage}",
         "free some disk space, or check the permissions of the folder",
     ):
@@ -262,7 +262,7 @@ def read_table(storage: Storage, checksum: Sequence[int] | None = None) -> Itera
         numbers do not increase, or if a row does not match the header.
     """
     with ExitStack() as stack:
-        with explained(f"{storage.path(TABLE_FILE)} cannot be read", WRITE_AGAIN):
+        with explain_os_errors(f"{storage.path(TABLE_FILE)} cannot be read", WRITE_AGAIN):
             if storage.is_local:
                 path = storage.local(TABLE_FILE)
             else:
@@ -320,7 +320,7 @@ def _columns(
         if unknown := [name for name in row.values if name not in kinds]:
             raise LidarError(
                 f"Job {row.name} has a value for {unknown[0]!r}, which is not a varied "
-                f"quantity. The varied quantities are {joined(names) or 'none'}."
+                f"quantity. The varied quantities are {join_names(names) or 'none'}."
             )
         classes.update(row.classes)
         for name, value in row.values.items():

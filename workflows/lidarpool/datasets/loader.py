@@ -26,7 +26,7 @@ from lidarsim.io.archives import open_archive
 from lidarsim.io.storage import Storage
 from lidarsim.schema.checks import check_list, check_number
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
-from lidarsim.words import did_you_mean, joined, plural
+from lidarsim.words import did_you_mean, join_names, plural
 
 from ..clouds.boxes import Boxes
 from ..clouds.cloud_format import Entry
@@ -372,7 +372,7 @@ def _check_known(label: str, requested: Sequence[str], available: Any, storage: 
     for name in requested:
         if name not in available:
             hint = (
-                f" The {label}s are {joined(names)}."
+                f" The {label}s are {join_names(names)}."
                 if names
                 else f" None of its {label}s has a name."
             )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-from lidarsim.words import listed
+from lidarsim.words import list_names
 
 _NUMBER = re.compile(r"\bjob \d+: ")  # prefix with which an error message names its job
 _VALUES = "\nThe values of the job are "  # text that introduces the varied values in a message
@@ -34,6 +34,6 @@ def summarize_errors(errors: Iterable[tuple[str, str]], max_jobs: int = 5) -> li
     lines = []
     for reason, jobs in values_by_job.items():
         job_values = next(iter(jobs.values())) if len(jobs) == 1 else ""
-        line = f"{'jobs' if len(jobs) > 1 else 'job'} {listed([*jobs], max_jobs)}: {reason}"
+        line = f"{'jobs' if len(jobs) > 1 else 'job'} {list_names([*jobs], max_jobs)}: {reason}"
         lines.append(f"{line}{_VALUES.replace(chr(10), ' ')}{job_values}" if job_values else line)
     return lines

@@ -18,7 +18,7 @@ class CpuShare:
         self._due_at = 0.0
 
     @property
-    def due(self) -> bool:
+    def is_due(self) -> bool:
         """Whether the activity may run now."""
         return self.wait_s <= 0
 

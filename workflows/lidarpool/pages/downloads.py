@@ -11,4 +11,6 @@ DOWNLOADS = ("ply", "las", "parquet")  # formats that a page offers
 
 def downloads() -> DownloadFormats:
     """Return the download formats whose required packages are installed, with their writer."""
-    return DownloadFormats([name for name in DOWNLOADS if ExportSpec(name).installed], save_cloud)
+    return DownloadFormats(
+        [name for name in DOWNLOADS if ExportSpec(name).is_installed], save_cloud
+    )

@@ -15,7 +15,7 @@ import numpy as np
 
 from lidarsim.io.storage import Storage
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
-from lidarsim.words import plural, rounded
+from lidarsim.words import format_rounded, plural
 from lidarview.viewer.point_selection import ScanOrderedPoints
 from lidarview.viewer.result_views import wait_for_interrupt
 from lidarview.viewer.server import Answer, Arguments, announce_page, page_server
@@ -153,4 +153,4 @@ def _format_value(value: Value | None) -> str:
         return ""
     if isinstance(value, bool):
         return str(value).lower()
-    return rounded(value, 4) if isinstance(value, float) else str(value)
+    return format_rounded(value, 4) if isinstance(value, float) else str(value)

@@ -54,7 +54,7 @@ class JobViews:
         The points of the first job are always read. Those of other jobs are only read if the CPU
         share permits it.
         """
-        watched = time.monotonic() - self._requested_at <= WATCHED_S and self.reading.due
+        watched = time.monotonic() - self._requested_at <= WATCHED_S and self.reading.is_due
         if self.jobs and not (is_only or watched):
             return
         with self.reading.use(READ_EVERY_S):

@@ -7,7 +7,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Any
 
-from lidarsim.words import rounded
+from lidarsim.words import format_rounded
 
 from ..datasets.job_table import JobRow, Value
 
@@ -39,7 +39,7 @@ class RecentJobs:
             self._list_at = time_s + LIST_EVERY_S
             self.under_way = under_way()
 
-    def end(self, row: JobRow, opens: bool) -> None:
+    def add_ended_job(self, row: JobRow, opens: bool) -> None:
         """Count a job that has ended, and move it from the running jobs to the ended jobs.
 
         `opens` states whether the page can open the job.
@@ -84,5 +84,5 @@ class RecentJobs:
 
     def _format_values(self, values: Mapping[str, Value | None]) -> list[str]:
         shown = ("" if (value := values.get(name)) is None else value for name in self._names)
-        words = (rounded(value, 4) if isinstance(value, float) else value for value in shown)
+        words = (format_rounded(value, 4) if isinstance(value, float) else value for value in shown)
         return [str(value).lower() if isinstance(value, bool) else str(value) for value in words]

@@ -33,23 +33,23 @@ class Charts:
         self._drawn = 0
         self._svg = ""
 
-    def add(self, row: JobRow) -> None:
+    def add_job(self, row: JobRow) -> None:
         """Add the table row of a job to the statistics."""
         with self._lock:
-            self._figures.add(row)
+            self._figures.add_job(row)
 
     def version(self, over: bool) -> int:
-        """Return how many jobs the charts would include if `drawn` were called now.
+        """Return how many jobs the charts would include if `draw` were called now.
 
         The number only changes if the charts are due to be drawn again.
         """
         with self._lock:
             jobs = self._figures.jobs
             done_count = self._figures.done
-        is_due = self._share.due and done_count
+        is_due = self._share.is_due and done_count
         return jobs if over or (is_due and jobs < self._count) else self._drawn
 
-    def drawn(self, over: bool) -> str:
+    def draw(self, over: bool) -> str:
         """Return the charts as HTML elements, redrawing them if an update is due."""
         with self._drawing:
             if self.version(over) != self._drawn:

@@ -59,11 +59,11 @@ class LiveJob:
         self._making = threading.Lock()
         self._all_read = False  # whether all parts were read
         self._end_version = 0  # incremented at the end of the run to make the page reload
-        self.add(under_way.parts.ordered)
+        self.add_receipts(under_way.parts.ordered)
 
     # -- called by the run --------------------------------------------------------------
 
-    def add(self, receipts: Sequence[Receipt]) -> None:
+    def add_receipts(self, receipts: Sequence[Receipt]) -> None:
         """Record that parts have been stored, without reading them."""
         with self._lock:
             self._waiting += [part.name for part in receipts]

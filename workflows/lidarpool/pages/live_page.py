@@ -62,7 +62,7 @@ class LivePage(RunPage):
 
     # -- called by the run --------------------------------------------------------------
 
-    def begun(self, job: StoredJob) -> None:
+    def on_survey_start(self, job: StoredJob) -> None:
         """Show the only job of a run, including scans that were committed earlier."""
         if job.committed_text:
             self._status.progress = job.progress()
@@ -80,7 +80,7 @@ class LivePage(RunPage):
 
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
         """Record parts that the only job has committed."""
-        self._views.jobs[0].add(receipts)
+        self._views.jobs[0].add_receipts(receipts)
 
     def on_frame(self, frame: ScanFrame) -> None:
         """Record a frame to be shown. Frames are skipped if many arrive at once."""
@@ -107,12 +107,12 @@ class LivePage(RunPage):
             self._status.state = "running"
         self._loads.poll()
 
-    def ended(self, row: JobRow) -> None:
+    def on_job_end(self, row: JobRow) -> None:
         """Count a job that has ended, and move it from the running jobs to the ended jobs."""
-        self._listed.end(row, opens=row.done and self._views.opens_written)
-        self._charts.add(row)
+        self._listed.add_ended_job(row, opens=row.done and self._views.opens_written)
+        self._charts.add_job(row)
 
-    def look(self, row: JobRow, job: StoredJob) -> None:
+    def on_job_written(self, row: JobRow, job: StoredJob) -> None:
         """Read the points of a job if a browser displays points and the CPU limit permits it."""
         self._views.read(row, job, is_only=self._count == 1)
 
@@ -127,7 +127,7 @@ class LivePage(RunPage):
         self._loads.clear()
         self._status.finish(seconds, None if result is None else len(result.points))
 
-    def stay(self, cloud: Path | None = None) -> None:
+    def keep_open(self, cloud: Path | None = None) -> None:
         """Keep the page open until Ctrl-C is pressed or a user stops it.
 
         The points of a survey are read from the written `cloud`, because the parts have been
@@ -149,7 +149,7 @@ class LivePage(RunPage):
                 self._views.request_newest()
             return self._news(), {}
         if question == "charts":
-            return {"svg": self._charts.drawn(self._status.over)}, {}
+            return {"svg": self._charts.draw(self._status.over)}, {}
         match = re.fullmatch(r"(?:job/(\d+)/)?(\w+)", question)
         if match is None:
             raise KeyError(question)
@@ -170,7 +170,7 @@ class LivePage(RunPage):
         points = {"points": (progress and progress.points) or self._listed.sums["points"]}
         if question == "news":
             reading = self._views.reading
-            if reading.due and not self._status.over:
+            if reading.is_due and not self._status.over:
                 with reading.use():
                     job.gather()
             header, arrays = job.news()

@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from lidarscenes.files.formats import ROBOTS
-from lidarsim.errors import LidarError, MissingFileError, explained
+from lidarsim.errors import LidarError, MissingFileError, explain_os_errors
 from lidarsim.io.input_files import open_input
 from lidarsim.io.storage import Storage
 from lidarsim.scene.files.mesh_formats import format_of
@@ -34,7 +34,7 @@ _HEADER_BYTES = 1 << 16  # maximum size of a .ply header, which names the elemen
 def is_data_set(place: Path | Storage) -> bool:
     """Return whether a folder or URL contains a complete or incomplete data set of jobs."""
     if isinstance(place, Storage):
-        with explained(f"{place.url} cannot be read"):
+        with explain_os_errors(f"{place.url} cannot be read"):
             return INDEX_FILE in place.entries()
     return not (place / CLOUD).exists() and (
         (place / INDEX_FILE).exists() or (place / ".jobs").is_dir()
@@ -65,7 +65,7 @@ def open_view(
     *,
     keep_noise: bool = False,
     of_mesh: Mapping[str, Any] = MappingProxyType({}),
-    tell: Callable[[str], None] = lambda note: None,
+    report: Callable[[str], None] = lambda note: None,
     on_part: OnPart = lambda *_: None,
 ) -> View:
     """Open a result, cloud, recording, exported file or folder, mesh or scenario.
@@ -78,7 +78,7 @@ def open_view(
         Whether to include points that a cloud marks as withheld or classifies as noise.
     of_mesh
         Unit and up axis of a mesh.
-    tell
+    report
         Function that is called with each note on a scene.
     on_part
         Function that is called with each part of a cloud from another program.
@@ -94,7 +94,7 @@ def open_view(
         )
     title = f"{path.resolve().name} - lidarpool"
     if _is_previewed(path):
-        return _preview(path, of_mesh, tell)
+        return _preview(path, of_mesh, report)
     if of_mesh:
         raise LidarError(
             f"{path} is not a mesh. Remove `--{next(iter(of_mesh)).replace('_', '-')}`, which "
@@ -129,7 +129,7 @@ def _is_previewed(path: Path) -> bool:
         return True
     if suffix == ".ply":
         return _has_faces(path)
-    with explained(f"{path} cannot be read"):
+    with explain_os_errors(f"{path} cannot be read"):
         if suffix == ".asc" and not is_text_raster(path):
             return False
     mesh_format = format_of(path)
@@ -187,10 +187,10 @@ def growing_view(path: Path, *, keep_noise: bool = False) -> ProgressiveView | N
     )
 
 
-def _preview(path: Path, of_mesh: Mapping[str, Any], tell: Callable[[str], None]) -> View:
+def _preview(path: Path, of_mesh: Mapping[str, Any], report: Callable[[str], None]) -> View:
     from .preview import scenario_view
 
-    return scenario_view(path, of_mesh, tell)
+    return scenario_view(path, of_mesh, report)
 
 
 def _has_faces(path: Path) -> bool:

@@ -34,7 +34,7 @@ _PREVIEW = "This preview was simulated before the run and shows the first sweep 
 def scenario_view(
     path: Path,
     of_mesh: Mapping[str, Any] = MappingProxyType({}),
-    tell: Callable[[str], None] = lambda note: None,
+    report: Callable[[str], None] = lambda note: None,
 ) -> View:
     """Return a preview of a scenario, of a campaign's first job, or of a mesh file.
 
@@ -44,7 +44,7 @@ def scenario_view(
         File of the scenario, campaign or mesh. A mesh is scanned as by `lidarpool run`.
     of_mesh
         Options of `mesh_data` for a mesh.
-    tell
+    report
         Function that is called with each note on the scene.
 
     Raises
@@ -61,7 +61,7 @@ def scenario_view(
     else:
         prepared = prepare(_with_materials(Scenario.load(path, of_mesh)))
         for line in advice(prepared):
-            tell(line)
+            report(line)
         job = prepared.job
     return job_preview(job, note, f"{path.resolve().name} - lidarpool")
 

@@ -29,7 +29,7 @@ from lidarsim.numerics.arrays import AnyArray, AnyFloats, Floats
 from lidarsim.scene.scene import Scene
 from lidarsim.schema.checks import check_items
 from lidarsim.simulator import Scanner
-from lidarsim.words import rounded
+from lidarsim.words import format_rounded
 from lidarview.picture_file import PictureContent, SensorPositions
 from lidarview.viewer.point_selection import InMemoryPoints
 from lidarview.viewer.server import (
@@ -144,7 +144,7 @@ class ScannerPage(ScannerView):
 
 
 def _name(scanner: Scanner) -> str:
-    return scanner.survey.carried[0].name
+    return scanner.survey.mounted_sensors[0].name
 
 
 @dataclass(eq=False)
@@ -161,7 +161,7 @@ class _Sensor:
     def positions(self) -> SensorPositions:
         """Positions of the sensor during its recent sweeps."""
         rows = np.array(self.trail or [(0.0, *self.pose.position)])
-        (mounted,) = self.scanner.survey.carried
+        (mounted,) = self.scanner.survey.mounted_sensors
         return SensorPositions(
             rows[:, 0] * 1e9, rows[:, 1:], True, mounted.name, mounted.sensor.model
         )
@@ -207,7 +207,7 @@ class SweepFeed:
                 "a list."
             )
         sensor = self._sensors[names.index(name)]
-        placed = pose_at(pose, time_ns).compose(scanner.survey.carried[0].mount)
+        placed = pose_at(pose, time_ns).compose(scanner.survey.mounted_sensors[0].mount)
         now_s = time.monotonic() - self._started
         with self._lock:
             sensor.cloud = cloud
@@ -261,7 +261,8 @@ class SweepFeed:
             moments = [*self._moments]
             now_s = self._sensors[0].trail[-1][0] if self._sensors[0].trail else 0.0
         if len(moments) > 1:
-            rate = f"{rounded((len(moments) - 1) / max(moments[-1] - moments[0], 1e-9))} sweeps/s"
+            rate_hz = (len(moments) - 1) / max(moments[-1] - moments[0], 1e-9)
+            rate = f"{format_rounded(rate_hz)} sweeps/s"
         return {
             "state": f"sweep {self._count:,}" if self._count else "waiting for the first sweep",
             "over": False,
@@ -288,7 +289,7 @@ class SweepFeed:
         if not self._count:
             return 0
         view = self.view
-        if self._shown < self._count and self._share.due:
+        if self._shown < self._count and self._share.is_due:
             self._shown = self._count
             now = time.monotonic()
             keep_scales = now < self._scales_until

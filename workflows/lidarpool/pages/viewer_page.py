@@ -64,14 +64,14 @@ class ViewerPage(RunPage):
         self._survey: SurveyFeed | None = None  # feed of the only job
         self._share = CpuShare(READING_SHARE)
 
-    def begun(self, job: StoredJob) -> None:
+    def on_survey_start(self, job: StoredJob) -> None:
         """Show the only job of the run."""
         self._survey = SurveyFeed(job, self._viewer)
 
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
         """Record parts that the only job has committed."""
         if self._survey is not None:
-            self._survey.add(receipts)
+            self._survey.add_receipts(receipts)
 
     def on_frame(self, frame: ScanFrame) -> None:
         """Record that a scan of the only job, and all earlier scans, have been stored."""
@@ -85,12 +85,12 @@ class ViewerPage(RunPage):
         if self._survey is not None:
             self._survey.show_path()
 
-    def look(self, row: JobRow, job: StoredJob) -> None:
+    def on_job_written(self, row: JobRow, job: StoredJob) -> None:
         """Show a finished job of a campaign before its parts are deleted."""
-        if self._share.due:
+        if self._share.is_due:
             with self._share.use(SHOW_EVERY_S), suppress(LidarError):
                 reader = SweepReader(job)
-                reader.add(job.parts.ordered)
+                reader.add_receipts(job.parts.ordered)
                 self._viewer.show_surroundings(reader.surroundings())
                 count = len(reader.sequence.sweeps)
                 for sweep in np.unique(np.linspace(0, count - 1, JOB_SWEEPS).astype(int)).tolist():
@@ -109,7 +109,7 @@ class ViewerPage(RunPage):
         if self._survey is not None:
             self._survey.stop()
 
-    def stay(self, cloud: Path | None = None) -> None:
+    def keep_open(self, cloud: Path | None = None) -> None:
         """Keep the viewer open until Ctrl-C is pressed."""
         click.echo(f"{self._viewer.description}. Press Ctrl-C to stop.", err=True)
         wait_for_interrupt()
@@ -138,7 +138,7 @@ class SweepReader:
         self._lock = threading.Lock()
         self._last: tuple[str, Cloud] | None = None  # most recently read part
 
-    def add(self, receipts: Sequence[Receipt]) -> None:
+    def add_receipts(self, receipts: Sequence[Receipt]) -> None:
         """Record that parts have been stored, without reading them."""
         with self._lock:
             self._parts |= {receipt.first: receipt for receipt in receipts}
@@ -165,7 +165,7 @@ class SweepReader:
             ]
         clouds = [self._read(part.name) for part in sorted(parts, key=lambda part: part.first)]
         selected = [cloud[(start <= cloud["scan"]) & (cloud["scan"] < stop)] for cloud in clouds]
-        return self.sequence.show(sweep, Cloud.concatenate(selected))
+        return self.sequence.shown_sweep(sweep, Cloud.concatenate(selected))
 
     def _read(self, name: str) -> Cloud:
         if self._last is None or self._last[0] != name:
@@ -188,15 +188,15 @@ class SurveyFeed:
         self._share = CpuShare(READING_SHARE)
         self._has_surroundings = threading.Event()
         self._has_path = False
-        self.add(job.parts.ordered)
+        self.add_receipts(job.parts.ordered)
         self._thread = threading.Thread(target=self._send_sweeps, name="viewer", daemon=True)
         self._thread.start()
 
     # -- called by the run --------------------------------------------------------------
 
-    def add(self, receipts: Sequence[Receipt]) -> None:
+    def add_receipts(self, receipts: Sequence[Receipt]) -> None:
         """Record that parts have been stored, without reading them."""
-        self._reader.add(receipts)
+        self._reader.add_receipts(receipts)
 
     def finish_scan(self, scan: int) -> None:
         """Record that a scan and all earlier scans have been stored."""
@@ -240,7 +240,7 @@ class SurveyFeed:
             self._viewer.show_surroundings(self._reader.surroundings())
         self._has_surroundings.set()
         while not self._ended.wait(_WAIT_S):
-            while self._waiting and self._share.due and not self._ended.is_set():
+            while self._waiting and self._share.is_due and not self._ended.is_set():
                 with self._share.use():
                     self._send_next()
 

@@ -20,9 +20,9 @@ def segment_distances(first: Floats, last: Floats, centers: Floats) -> Floats:
     to_center = centers[None, :, :] - first[:, None, :]
     reach = to_center[..., 0] * direction[:, None, 0] + to_center[..., 1] * direction[:, None, 1]
     # A segment of length 0 has a reach of 0, so any nonzero divisor selects its only point.
-    share = np.clip(reach / np.where(squared > 0, squared, 1.0)[:, None], 0.0, 1.0)
-    gap_x = to_center[..., 0] - share * direction[:, None, 0]
-    gap_y = to_center[..., 1] - share * direction[:, None, 1]
+    fraction = np.clip(reach / np.where(squared > 0, squared, 1.0)[:, None], 0.0, 1.0)
+    gap_x = to_center[..., 0] - fraction * direction[:, None, 0]
+    gap_y = to_center[..., 1] - fraction * direction[:, None, 1]
     return np.asarray(np.sqrt(gap_x**2 + gap_y**2))
 
 

@@ -364,7 +364,7 @@ def _choose_rows(
     covered = np.zeros(len(area), np.bool_)
     gain = np.array([area[row].sum() for row in visible])
     chosen: list[int] = []
-    shares: list[float] = []
+    fractions: list[float] = []
     while len(chosen) < max_rows and not covered.all():
         best = int(gain.argmax())
         if chosen and gain[best] < min_gain:
@@ -374,10 +374,10 @@ def _choose_rows(
         gain -= np.array([area[new[row[new]]].sum() for row in visible])
         gain[best] = -np.inf
         chosen.append(best)
-        shares.append(1.0 if covered.all() else float(area[covered].sum()))
-        if shares[-1] >= max_share:
+        fractions.append(1.0 if covered.all() else float(area[covered].sum()))
+        if fractions[-1] >= max_share:
             break
-    return _Choice(chosen, shares, covered)
+    return _Choice(chosen, fractions, covered)
 
 
 def _default_spacing_m(scene: Scene) -> float:

@@ -148,8 +148,8 @@ def _spreads(groups: int, widest: float) -> Floats:
     widest = max(_MIN_LAST_SPREAD, widest)
     if groups == 1:
         return np.array([widest])
-    share = np.arange(groups) / (groups - 1)
-    return _MIN_SPREAD + (widest - _MIN_SPREAD) * share * share
+    fraction = np.arange(groups) / (groups - 1)
+    return _MIN_SPREAD + (widest - _MIN_SPREAD) * fraction * fraction
 
 
 def _scatter_paths(corners: int, particles: int, spreads: Floats, randoms: Randoms) -> Floats32:

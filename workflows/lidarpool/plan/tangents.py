@@ -214,10 +214,10 @@ def _open_arcs(
     overlaps = np.sqrt((gaps**2).sum(axis=1)) < radii + radii[circle]
     overlaps[circle] = False
     overlaps[:2] = False
-    middles = np.arctan2(gaps[overlaps, 1], gaps[overlaps, 0])
+    midpoints = np.arctan2(gaps[overlaps, 1], gaps[overlaps, 0])
     blocked = np.zeros(len(angles), bool)
     # The index -1 is correct: an angle before the first contact point lies on the last arc.
-    blocked[np.searchsorted(angles, middles) - 1] = True
+    blocked[np.searchsorted(angles, midpoints) - 1] = True
     arc_angles = np.diff(angles, append=angles[0] + 2 * np.pi)
     return [
         (arc, (arc + 1) % len(angles), float(arc_angles[arc]))

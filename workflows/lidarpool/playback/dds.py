@@ -22,7 +22,7 @@ from rosbags.interfaces import Nodetype
 
 from lidarsim.environment.ports import port_number
 from lidarsim.errors import LidarError
-from lidarsim.words import joined, shorten_name
+from lidarsim.words import join_names, shorten_name
 
 from ..clouds.ros.messages import LATCHED_TOPICS, RosMessage, message_store
 
@@ -85,7 +85,7 @@ class Network:
         interfaces = {_interface_to(peer) for peer in peers} or {LOOPBACK}
         if len(interfaces) > 1:
             raise LidarError(
-                f"The addresses {joined(hosts)} of `--to` are reached through different "
+                f"The addresses {join_names(hosts)} of `--to` are reached through different "
                 f"network interfaces ({', '.join(sorted(interfaces))}). Specify addresses in "
                 "a single network."
             )

@@ -16,7 +16,7 @@ from lidarsim.packets.send import LOOPBACK, Lateness
 from lidarsim.packets.sweep_packets import Packets
 from lidarsim.schema.checks import check_number, check_type
 from lidarsim.simulator import Scanner
-from lidarsim.words import joined
+from lidarsim.words import join_names
 
 from ..processes.fork_server import keep_freed_memory
 from .schedule import BEHIND, BEHIND_S, Prefetcher, Schedule, casting_threads
@@ -96,8 +96,8 @@ def play(
     if missing := [name for name in packets.columns if name not in names]:
         columns = "column" if len(missing) == 1 else "columns"
         raise LidarError(
-            f"Packets require the {columns} {joined(missing)}, which the scanner does not compute. "
-            "Create the scanner with columns=Packets(sensor).columns."
+            f"Packets require the {columns} {join_names(missing)}, which the scanner does not "
+            "compute. Create the scanner with columns=Packets(sensor).columns."
         )
     streams = sensor_streams([packets.encoder], [to], [api] if api else [])
     sweeps = _sweeps(scanner, trajectory, duration_s)
@@ -144,13 +144,13 @@ def _send_all(
 
     def deadlines_ns(due_ns: Ints) -> Ints:
         """Convert packet times to deadlines. The schedule starts with the first datagrams."""
-        if not schedule.started:
+        if not schedule.is_started:
             schedule.start(float(due_ns.min()), _START_NS)
         return schedule.deadlines_ns(due_ns)
 
     for number, start_s, points in sweeps:
         groups = packets.encode(points, number=number)
-        if not schedule.started:
+        if not schedule.is_started:
             if ready is not None:
                 ready(f"ready: {transmitter.description}")
         elif note is not None and schedule.late_s(start_s * 1e9) > BEHIND_S:

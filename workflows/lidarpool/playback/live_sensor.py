@@ -70,7 +70,7 @@ class PacketsBridge(Bridge):
         """Pass the packets of a sweep to the sending process."""
         number = int(self.sweeps.sensor[sweep])
         encoder = self._encoders[number]
-        shots = self._shots(encoder, sweep, points).shifted(shift_ns)
+        shots = self._shots(encoder, sweep, points).shift_times(shift_ns)
         self._transmitter.sender.send(number, encoder.encode(shots), self.schedule.deadlines_ns)
 
     def finish(self) -> None:

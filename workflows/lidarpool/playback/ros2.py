@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
-from lidarsim.words import joined, plural
+from lidarsim.words import join_names, plural
 
 from ..clouds.frame_names import survey_start_ns
 from ..clouds.ros.layouts import MessageLayout
@@ -67,7 +67,7 @@ class Ros2Bridge(Bridge):
     def description(self) -> str:
         """Domain and network interface of the topics."""
         network = self._publisher.network
-        peers = f", with the peers {joined(network.peers)}" if network.peers else ""
+        peers = f", with the peers {join_names(network.peers)}" if network.peers else ""
         return f"ROS 2 topics in domain {network.domain} on {network.address}{peers}"
 
     def prepare(self, sweep: int, points: Cloud) -> None:

@@ -45,7 +45,7 @@ class Schedule:
         self._origin_ns: float | None = None  # clock time at survey time 0
 
     @property
-    def started(self) -> bool:
+    def is_started(self) -> bool:
         """Whether the schedule has started."""
         return self._origin_ns is not None
 

@@ -86,7 +86,7 @@ def open_source(
     source: Path | Storage,
     needs: ExportSpec | None = None,
     of_mesh: Mapping[str, Any] = MappingProxyType({}),
-    tell: Callable[[str], None] = lambda note: None,
+    report: Callable[[str], None] = lambda note: None,
 ) -> Iterator[PlaybackSource]:
     """Open a result, scenario, campaign or mesh file for playback.
 
@@ -98,7 +98,7 @@ def open_source(
         Format whose columns the cloud of a scenario must have.
     of_mesh
         Options of `mesh_data` for a mesh file.
-    tell
+    report
         Function that is called with each note on the scene.
 
     Raises
@@ -117,7 +117,7 @@ def open_source(
                     f"{source} contains packets. Play it with `--as packets`, or specify a "
                     "result or a scenario."
                 )
-            yield _simulated_sweeps(scenario_job(source, needs, of_mesh, tell), stack)
+            yield _simulated_sweeps(scenario_job(source, needs, of_mesh, report), stack)
             return
         if of_mesh:
             raise LidarError(
@@ -157,12 +157,12 @@ def scenario_job(
     path: Path,
     needs: ExportSpec | None = None,
     of_mesh: Mapping[str, Any] = MappingProxyType({}),
-    tell: Callable[[str], None] = lambda note: None,
+    report: Callable[[str], None] = lambda note: None,
 ) -> Job:
     """Return the job of a scenario or mesh file, or a campaign's first job.
 
     The cloud has the columns that the format `needs` requires, instead of those for the formats
-    that the scenario writes. For `of_mesh` and `tell`, see `open_source`.
+    that the scenario writes. For `of_mesh` and `report`, see `open_source`.
     """
     if path.suffix.lower() in (".yaml", ".yml") and not of_mesh and is_campaign(path):
         campaign = CampaignSpec.load(path)
@@ -177,7 +177,7 @@ def scenario_job(
     output = OutputSection(write=() if needs is None else (needs,))
     prepared = prepare(scenario.model_copy(update={"output": output}), plans=False)
     for note in advice(prepared):
-        tell(note)
+        report(note)
     return prepared.job
 
 

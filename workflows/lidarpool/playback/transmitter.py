@@ -10,11 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import Self
 
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.packets.encoders import PacketEncoder
 from lidarsim.packets.send import LOOPBACK, ReceiverAddress, Sender, check_reachable
 from lidarsim.packets.service import Destination, Service
-from lidarsim.words import did_you_mean, joined
+from lidarsim.words import did_you_mean, join_names
 
 # Returns the interface of a sensor (see `PacketEncoder.service`).
 MakeService = Callable[[str, Destination, Callable[[Destination], None]], Service | None]
@@ -55,7 +55,7 @@ class Stream:
         ports = " and ".join(map(str, self.ports))
         return f"{words}, port {ports}" if ports else words
 
-    def to(self, receiver: ReceiverAddress) -> Stream:
+    def with_destination(self, receiver: ReceiverAddress) -> Stream:
         """Return a copy of the stream that has a new destination.
 
         The port of the receiver is that of the returns. Ports of other kinds of datagrams are
@@ -119,7 +119,7 @@ def streams_to(streams: Sequence[Stream], to: Sequence[str], api: Sequence[str])
     for number, stream in enumerate(streams):
         name = stream.name
         moved = replace(
-            stream.to(receivers.get(name, ReceiverAddress(LOOPBACK))),
+            stream.with_destination(receivers.get(name, ReceiverAddress(LOOPBACK))),
             address=interfaces.get(name, _loopback_address(number, stream.has_own_address)),
             api_given=name in interfaces,
         )
@@ -146,7 +146,7 @@ def _parse_addresses(
         if separator and name not in names:
             raise LidarError(
                 f"{option} {text} refers to the sensor {name!r}, which does not "
-                f"exist.{did_you_mean(name, names)} The sensors are {joined(names)}."
+                f"exist.{did_you_mean(name, names)} The sensors are {join_names(names)}."
             )
         parsed = ReceiverAddress.parse(address)
         for sensor in [name] if separator else names:
@@ -226,7 +226,7 @@ class Transmitter:
         """
         file = self._lateness_file
         if file is not None:
-            with explained(f"{file} cannot be written"):
+            with explain_os_errors(f"{file} cannot be written"):
                 text = json.dumps(self.sender.lateness.to_json(), indent=1) + "\n"
                 file.write_text(text, encoding="utf-8")
 

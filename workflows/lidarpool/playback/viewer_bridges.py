@@ -59,7 +59,7 @@ class ViewerBridge(Bridge):
 
         With `--loop`, its times are `shift_ns` later than in the survey.
         """
-        shown = self._sequence.show(sweep, points)
+        shown = self._sequence.shown_sweep(sweep, points)
         times = {name: getattr(shown, name) + shift_ns for name in ("start_ns", "stamp_ns")}
         self._viewer.show_sweep(replace(shown, **times))
 

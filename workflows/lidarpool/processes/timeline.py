@@ -1,7 +1,7 @@
 """Timeline of a command, which records when each step ends.
 
-Steps are always recorded, even if the timeline is not shown, because `mark` takes only about one
-microsecond.
+Steps are always recorded, even if the timeline is not shown, because `record_step` takes only about
+one microsecond.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Timeline:
         self._started = time.time() - _age_s()
         self.steps: list[TimelineStep] = []
 
-    def mark(self, name: str) -> None:
+    def record_step(self, name: str) -> None:
         """Record that a step ends now, unless a step with the same name was recorded before."""
         if all(step.name != name for step in self.steps):
             self.steps.append(TimelineStep(name, time.time() - self._started))
@@ -137,7 +137,7 @@ class Timeline:
         path.touch()
 
         def show() -> None:
-            self.mark(EXIT)
+            self.record_step(EXIT)
             path.write_text(self.page(command), encoding="utf-8")
             if sys.stderr is not None:
                 sys.stderr.write(self.table())
@@ -146,4 +146,4 @@ class Timeline:
 
 
 timeline = Timeline()
-mark = timeline.mark
+record_step = timeline.record_step

@@ -155,9 +155,9 @@ class Alignment:
         if times_s is None:
             return points, origins
         compensated = np.empty_like(points)
-        for rows, step, shares in self._split_by_step(number, times_s):
-            compensated[rows] = step.compensate(points[rows], shares)
-            origins[rows] = shares[:, None] * step.translation
+        for rows, step, fractions in self._split_by_step(number, times_s):
+            compensated[rows] = step.compensate(points[rows], fractions)
+            origins[rows] = fractions[:, None] * step.translation
         return compensated, origins
 
     def points_as_fired(self, sweep: Sweep, number: int) -> tuple[Floats, FiringPoses] | None:
@@ -173,9 +173,9 @@ class Alignment:
         pose = self.poses[number]
         offsets = np.zeros((len(sweep), 3))
         turns = np.zeros((len(sweep), 3))
-        for rows, step, shares in self._split_by_step(number, times_s):
-            offsets[rows] = shares[:, None] * (pose[:3, :3] @ step.translation)
-            turns[rows] = shares[:, None] * step.rotation
+        for rows, step, fractions in self._split_by_step(number, times_s):
+            offsets[rows] = fractions[:, None] * (pose[:3, :3] @ step.translation)
+            turns[rows] = fractions[:, None] * step.rotation
         quaternions = Rotation.from_rotvec(turns).as_quat().T
         poses = FiringPoses(pose[:3, 3], pose[:3, :3], offsets.T, quaternions)
         return self._calibrated(sweep), poses
@@ -255,8 +255,8 @@ class AlignedSweeps:
         step, step_s = self.alignment.step(number)
         # Without motion compensation, motion does not cause gaps between points.
         is_compensated = self.alignment.motion is Motion.COMPENSATED
-        share = self.alignment.sweep_s / step_s if is_compensated else 0.0
-        moved_m = share * float(np.linalg.norm(step.translation))
+        fraction = self.alignment.sweep_s / step_s if is_compensated else 0.0
+        moved_m = fraction * float(np.linalg.norm(step.translation))
         sweep = self.recorded.read(number)
         elevation_rad = self.recorded.elevation_rad
         lost, gap_range_m = lost_pulses(sweep, elevation_rad, self.coverage, moved_m)

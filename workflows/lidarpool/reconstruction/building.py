@@ -21,7 +21,7 @@ from lidarsim._version import __version__
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.sweep import Sweep
 from lidarsim.environment.extras import require_package
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.motion.rotations import quaternions_of
 from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
@@ -153,7 +153,9 @@ class Twin:
         path = Path(folder)
         with (
             result_folder(path),
-            explained(f"The reconstruction cannot be written to {path}", "free some disk space"),
+            explain_os_errors(
+                f"The reconstruction cannot be written to {path}", "free some disk space"
+            ),
             staging(path) as staged,
         ):
             write_scene(staged / SCENE_FILE, self.scene)
@@ -238,7 +240,7 @@ def twin(
     client: Client | None = None,
     folder: str | Path | None = None,
     resume: bool = False,
-    tell: Callable[[str], None] | None = None,
+    report: Callable[[str], None] | None = None,
 ) -> Twin:
     """Reconstruct the static scene of a recording, so that the scene can be scanned again.
 
@@ -275,7 +277,7 @@ def twin(
         temporary folder is used.
     resume
         Whether to continue with the finished steps in the folder.
-    tell
+    report
         Function that is called with a line for each step.
 
     Returns
@@ -309,13 +311,13 @@ def twin(
         reason = " ".join(recorded.notes) or f"{recorded.recording.name} has no rings."
         raise LidarError(f"{reason} Specify its sensor, for example `--model livox/mid360`.")
     track = None if trajectory is None else Path(trajectory)
-    tell = tell or (lambda line: None)
+    report = report or (lambda line: None)
     with ExitStack() as stack:
         if folder is None:
             folder = stack.enter_context(TemporaryDirectory(prefix="lidarpool-"))
         made_of = (_fingerprint_inputs(recorded, track), voxel_m)
-        steps = FinishedSteps.begin(Path(folder), made_of, resume=resume)
-        built = _Building(recorded, base, voxel_m, steps, client, tell).twin(track)
+        steps = FinishedSteps.create_or_resume(Path(folder), made_of, resume=resume)
+        built = _Building(recorded, base, voxel_m, steps, client, report).twin(track)
         steps.remove()
     return built
 
@@ -362,13 +364,13 @@ class _Building:
     voxel_m: float
     steps: FinishedSteps
     client: Client | None
-    tell: Callable[[str], None]
+    report: Callable[[str], None]
 
     def twin(self, trajectory: Path | None) -> Twin:
         recorded = self.recorded
-        self.tell(f"estimating the poses of {plural(recorded.count, 'sweep')}")
+        self.report(f"estimating the poses of {plural(recorded.count, 'sweep')}")
         poses = self._find_poses(trajectory)
-        self.tell(f"poses {poses.source}; determining the motion compensation of the points")
+        self.report(f"poses {poses.source}; determining the motion compensation of the points")
         first = first_alignment(recorded, poses)
         submaps = split_into_submaps(first.poses[:, :3, 3])
         counting = np.concatenate([submap.own_numbers for submap in submaps])
@@ -395,7 +397,7 @@ class _Building:
         def find() -> tuple[RecordedPoses]:
             return (find_poses(self.recorded, trajectory),)
 
-        (poses,) = self.steps.once(_POSES, find)
+        (poses,) = self.steps.run_once(_POSES, find)
         return poses._replace(
             source=str(poses.source), share=float(poses.share), first_s=float(poses.first_s)
         )
@@ -403,7 +405,7 @@ class _Building:
     def _align_submaps(
         self, run: MapFunction, task: BuildTask, submaps: Sequence[Submap]
     ) -> Alignment:
-        self.tell(f"aligning the sweeps in {plural(len(submaps), 'submap')}")
+        self.report(f"aligning the sweeps in {plural(len(submaps), 'submap')}")
         tasks = [
             SubmapTask(task.recorded, task.alignment, submap, task.mapped) for submap in submaps
         ]
@@ -415,11 +417,11 @@ class _Building:
     ) -> _Built:
         sizes = [len(task.recorded.read(int(one.numbers[0]))) for one in submaps]
         count = sum(sizes) / len(sizes) * sum(len(one.own_numbers) for one in submaps)
-        share = STATIONARY_DOTS / max(count, 1.0)
-        tasks = [replace(task, submap=one, drawn_share=share) for one in submaps]
+        fraction = STATIONARY_DOTS / max(count, 1.0)
+        tasks = [replace(task, submap=one, drawn_share=fraction) for one in submaps]
         parts = []
         for number, part in enumerate(self.steps.each(_BUILD, run, build_submap, tasks), 1):
-            self.tell(f"built {number} of {plural(len(submaps), 'submap')}")
+            self.report(f"built {number} of {plural(len(submaps), 'submap')}")
             surfels, _, *others = part
             parts.append(_BuiltSubmap(surfels, *others))
         return _Built(parts, submaps)
@@ -432,7 +434,7 @@ class _Building:
         """Fit the sensor's response and noise, and assemble the twin."""
         recorded = self.recorded
         alignment = sweeps.alignment
-        self.tell("fitting the sensor model")
+        self.report("fitting the sensor model")
         some = even_indices(len(built.parts), _RESPONSE_SUBMAPS).tolist()
         response = fit_response(
             [self._load_observations(index) for index in some],
@@ -471,7 +473,7 @@ class _Building:
         }
         if response is not None:
             meshes = {
-                index: colored(
+                index: color_by_reflectance(
                     mesh,
                     response.reflectances(self._load_observations(index), surfel_centers(mesh)),
                 )
@@ -767,7 +769,7 @@ def _median(values: Floats) -> float | None:
     return float(np.median(known)) if len(known) else None
 
 
-def colored(mesh: SceneMesh, reflectances: Reflectances | None) -> SceneMesh:
+def color_by_reflectance(mesh: SceneMesh, reflectances: Reflectances | None) -> SceneMesh:
     """Color the surfels of a mesh according to their reflectances."""
     if reflectances is None:
         return mesh

@@ -155,8 +155,8 @@ def _cells(sweep: AlignedSweep, sweeps: AlignedSweeps) -> tuple[Ints, tuple[int,
         elevation = elevations(sweep.points)
         low, high = np.quantile(elevation, (0, 1))
         row_count = _ROWS
-        share = (high - elevation) / max(high - low, 1e-9)
-        row = (share * _ROWS).astype(np.int64).clip(0, _ROWS - 1)
+        fraction = (high - elevation) / max(high - low, 1e-9)
+        row = (fraction * _ROWS).astype(np.int64).clip(0, _ROWS - 1)
     # If there were more columns than pulses per ring, the image would have empty stripes.
     column_count = min(_COLUMNS, int(np.bincount(row).max()))
     turns = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi) + 0.5

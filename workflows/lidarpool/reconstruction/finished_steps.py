@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidarsim._version import __version__
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 
 from ..identity.fingerprint import fingerprint
 
@@ -40,7 +40,7 @@ class FinishedSteps:
     folder: Path
 
     @classmethod
-    def begin(cls, folder: Path, made_of: object, *, resume: bool) -> FinishedSteps:
+    def create_or_resume(cls, folder: Path, made_of: object, *, resume: bool) -> FinishedSteps:
         """Create the folder, or open an existing one with results of the same inputs.
 
         Parameters
@@ -73,7 +73,7 @@ class FinishedSteps:
                     "lidarpool. Start again with `--overwrite`."
                 )
             return cls(folder)
-        with explained(f"Cannot write to {folder.parent}", "choose another folder"):
+        with explain_os_errors(f"Cannot write to {folder.parent}", "choose another folder"):
             folder.mkdir(parents=True, exist_ok=True)
             _replace(file, lambda path: path.write_text(json.dumps(own), encoding="utf-8"))
         return cls(folder)
@@ -99,7 +99,7 @@ class FinishedSteps:
                 self._save(step, index, next(results))
             yield self.load(step, index)
 
-    def once(self, step: TwinStep, call: Callable[[], tuple[Any, ...]]) -> tuple[Any, ...]:
+    def run_once(self, step: TwinStep, call: Callable[[], tuple[Any, ...]]) -> tuple[Any, ...]:
         """Load the results of a step that runs once, calling `call` if it has not run yet."""
         if not self._file(step, 0).exists():
             self._save(step, 0, call())
@@ -128,7 +128,7 @@ class FinishedSteps:
             with path.open("wb") as file:
                 np.savez(file, **arrays)
 
-        with explained(f"Cannot write to {self.folder}", "free some disk space"):
+        with explain_os_errors(f"Cannot write to {self.folder}", "free some disk space"):
             _replace(self._file(step, index), write)
 
 

@@ -61,7 +61,7 @@ class HeldOutRays:
         )
 
     @property
-    def returned(self) -> Bools:
+    def return_mask(self) -> Bools:
         """Mask of the rays that have a recorded return.
 
         The array has shape (n,).
@@ -81,11 +81,11 @@ class HeldOutRays:
             for low, high in pairwise(_RANGES_M)
         ]
         return {
-            "all": self._figures(self.returned),
+            "all": self._figures(self.return_mask),
             "stationary": self._figures(self.standing),
             "by_range": [row for row in classes if row["rays"]],
             "by_sweep": [
-                {"sweep": int(number)} | self._figures(self.returned & (self.sweep == number))
+                {"sweep": int(number)} | self._figures(self.return_mask & (self.sweep == number))
                 for number in np.unique(self.sweep)
             ],
             "points": self._points(0, np.inf),
@@ -101,7 +101,7 @@ class HeldOutRays:
 
     def _points_by_ring(self) -> float:
         """Return the typical relative error of the simulated point count of a ring."""
-        recorded = np.bincount(self.ring, self.returned)
+        recorded = np.bincount(self.ring, self.return_mask)
         simulated = np.bincount(self.ring, np.isfinite(self.simulated_m))
         known = recorded > 0
         return float(np.median(np.abs(simulated[known] / recorded[known] - 1)))
@@ -112,7 +112,7 @@ class HeldOutRays:
         F1 is the harmonic mean of precision and recall of missing returns. Return None if no pulse
         was lost in the recording.
         """
-        recorded = ~self.returned
+        recorded = ~self.return_mask
         if not recorded.any():
             return None
         simulated = np.isnan(self.simulated_m)

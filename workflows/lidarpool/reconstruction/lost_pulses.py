@@ -154,11 +154,11 @@ class _Gaps(NamedTuple):
         lost = np.where(is_gap, steps - 1, 0)
         before = np.arange(len(self.ring)).repeat(lost)
         number = np.arange(len(before)) - (np.cumsum(lost) - lost).repeat(lost)
-        share = (number + 1) / (lost[before] + 1)
-        azimuth = self.azimuth[before] + share * self.gap_rad[before]
+        fraction = (number + 1) / (lost[before] + 1)
+        azimuth = self.azimuth[before] + fraction * self.gap_rad[before]
         elevation = self.elevation[before]
-        elevation = elevation + share * (self.elevation[self.following[before]] - elevation)
-        return _Lost(azimuth, elevation, self.ring[before], self._ranges(before, share))
+        elevation = elevation + fraction * (self.elevation[self.following[before]] - elevation)
+        return _Lost(azimuth, elevation, self.ring[before], self._ranges(before, fraction))
 
     def _ranges(self, before: Ints, share: Floats) -> Floats:
         """Interpolate the ranges within the gaps that begin at the returns `before`.

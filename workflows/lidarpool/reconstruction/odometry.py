@@ -97,7 +97,7 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
             f"{sweeps.recording.name} contains an invalid pose for sweep {number}. Pass the "
             "poses with `--trajectory`."
         )
-    share = 0.0
+    fraction = 0.0
     first_s = 0.0
     # In recordings with one file per sweep, many files state the same default pose, such as
     # VIEWPOINT in PCD files.
@@ -109,7 +109,7 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
     else:
         poses = _register_sweeps(sweeps)
         source = "from registration"
-        share = 0.5
+        fraction = 0.5
         first_s = 0.0 if sweeps.point_times is None else sweeps.point_times.first_s
         steps_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
         if len(steps_m) and steps_m.max() > _MAX_STEP_M:
@@ -120,7 +120,7 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
                 "Pass the poses with `--trajectory`."
             )
     located = RecordedPoses.in_world(poses, times_s, source)
-    return located._replace(share=share, first_s=first_s)
+    return located._replace(share=fraction, first_s=first_s)
 
 
 def _read_poses(sweeps: RecordedSweeps, trajectory: Path, times_s: Floats) -> tuple[Floats, Floats]:

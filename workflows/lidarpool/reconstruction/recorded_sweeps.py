@@ -117,7 +117,7 @@ class RecordedSweeps:
         """Notes for the user about information that is missing from the recording."""
         notes = [self.rings.note]
         if self.point_times is not None and self.stamps_s is not None and not self.is_compensated:
-            notes.append(self.point_times.note(self.recording.name))
+            notes.append(self.point_times.clock_note(self.recording.name))
         return [note for note in notes if note]
 
     @property

@@ -44,9 +44,9 @@ class IntensityModel(StrEnum):
         """Return the relative intensities of surfaces that have equal reflectance."""
         if self is IntensityModel.COMPENSATED:
             return np.ones(len(range_m))
-        return self.simulated(range_m, cosine)
+        return self.white_intensities(range_m, cosine)
 
-    def simulated(self, range_m: AnyFloats, cosine: AnyFloats) -> Floats:
+    def white_intensities(self, range_m: AnyFloats, cosine: AnyFloats) -> Floats:
         """Return the intensities that a simulation stores for white surfaces.
 
         Energies correspond to the simulated column `intensity`. Intensities that are compensated
@@ -144,7 +144,7 @@ class Reflectances:
 
         The array has shape (n,), and is NaN for rays that hit nothing.
         """
-        law = self.response.model.simulated(hits.distance_m, hits.cosine)
+        law = self.response.model.white_intensities(hits.distance_m, hits.cosine)
         intensities = np.full(len(sweep.points), np.nan)
         intensities[hits.rays] = self.surfels[hits.surfel] * law * self.response.scale
         return intensities
@@ -191,7 +191,7 @@ def fit_response(
     white = max(float(np.quantile(reflectance, _WHITE_SHARE)), 1e-6 * best.brightest)
     typical = float(np.nanmedian(best.reflectance)) / white
     simulated = (reflectance / white).clip(_MIN_REFLECTANCE, 1.0)
-    simulated *= best.model.simulated(observations.range_m, observations.cosine)
+    simulated *= best.model.white_intensities(observations.range_m, observations.cosine)
     scale = float(best.intensity.sum() / simulated.sum())
     by_range, by_incidence, by_ring = best.factors
     return Response(

@@ -182,7 +182,7 @@ def compare_held_out_sweeps(
     mapped = np.intersect1d(submap.numbers, task.mapped).tolist()
     surface_map, reflectances = build_map_with_reflectances(sweeps, mapped, task.voxel_m)
     rays = simulate_held_out(sweeps, surface_map, reflectances, stationary, compared)
-    with_points = np.unique(rays.sweep[rays.returned])
+    with_points = np.unique(rays.sweep[rays.return_mask])
     if not len(with_points):
         return rays, None
     drawn = int(with_points[len(with_points) // 2])

@@ -44,17 +44,17 @@ class VoxelPlanes:
             return None
         _, neighbors = cKDTree(means).query(means, _NEIGHBORS)
         around = means[neighbors]
-        middles = around.mean(axis=1)
-        around -= middles[:, None]
+        centers = around.mean(axis=1)
+        around -= centers[:, None]
         covariances = np.einsum("nki,nkj->nij", around, around) / _NEIGHBORS
         variances, axes = np.linalg.eigh(covariances)
         flat = _is_plane(variances)
         if not flat.any():
             return None
         normals = axes[flat, :, 0]
-        middles = middles[flat]
+        centers = centers[flat]
         thickness_m = float(np.sqrt(np.median(np.maximum(variances[flat, 0], 0))))
-        return cls(middles, normals, cKDTree(middles), thickness_m)
+        return cls(centers, normals, cKDTree(centers), thickness_m)
 
     def distances(self, points: Floats, max_m: float) -> tuple[Floats, Ints, Bools]:
         """Return the signed distance between each point and its nearest plane.

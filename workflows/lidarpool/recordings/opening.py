@@ -11,7 +11,7 @@ from lidarsim.errors import LidarError, MissingFileError
 from lidarsim.scene.files.cloud_formats import SCAN_READERS
 from lidarsim.schema.checks import check_choice
 from lidarsim.schema.vocabulary import UNITS_M
-from lidarsim.words import joined
+from lidarsim.words import join_names
 
 from ..clouds.format_table import format_of_path
 from ..clouds.recording import Recording, RecordingSource, SeveralSensorsError, open_cloud
@@ -121,7 +121,7 @@ def open_recording(
     if unit is not None and path.suffix.lower() not in _UNIT_SUFFIXES:
         raise LidarError(
             f"{name} is always in meters. Remove the unit {unit!r}, which can only be set for "
-            f"{joined(_UNIT_SUFFIXES)} files."
+            f"{join_names(_UNIT_SUFFIXES)} files."
         )
     recording = _open_path(RecordingSource(path, name, sensor, intensity, unit))
     return replace(recording, noise_classes=None) if keep_noise else recording

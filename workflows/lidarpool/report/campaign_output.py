@@ -16,9 +16,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from lidarsim.errors import LidarError, explained, message_of
+from lidarsim.errors import LidarError, explain_os_errors, message_of
 from lidarsim.io.storage import Storage
-from lidarsim.words import listed, plural
+from lidarsim.words import list_names, plural
 
 from ..clouds.folder import LAST_FILE, check_exists, result_folder
 from ..clouds.format_table import DATA_SETS, load_format
@@ -149,7 +149,7 @@ class DataSetOutput:
             return FinishedDataSet(note=f"{CAMPAIGN_FILE} was damaged and has been recreated")
         shard = str(self.campaign.shard)
         if record["shards"] != [shard]:
-            held = listed([*map(describe_shard, record["shards"])]) or "no shards"
+            held = list_names([*map(describe_shard, record["shards"])]) or "no shards"
             raise LidarError(
                 f"{storage} contains {held}, but this run is {describe_shard(shard)}. Specify "
                 "another folder with `--out`."
@@ -166,7 +166,7 @@ class DataSetOutput:
     def _check_finished(self, record: Mapping[str, Any]) -> FinishedDataSet:
         """Read the job rows of a finished data set, and validate its jobs."""
         storage = self.dataset.storage
-        with explained(f"{storage} cannot be read"):
+        with explain_os_errors(f"{storage} cannot be read"):
             seconds = known_seconds(storage)
             rows = sorted(
                 (replace(row, seconds=seconds.get(row.number)) for row, _ in self.dataset.rows()),
@@ -183,9 +183,9 @@ class DataSetOutput:
 
     def report_complete(self, complete: FinishedDataSet) -> CampaignRun:
         """Report that the data set is complete, and return its totals."""
-        self.screen.tell(f"{self.dataset.storage} is already complete")
+        self.screen.report(f"{self.dataset.storage} is already complete")
         for row in complete.rows:
-            self.page.ended(row)
+            self.page.on_job_end(row)
         notes = (*self._warn_of_empty_jobs(complete.rows),)
         sums = CampaignRun.from_rows(complete.rows, time.monotonic() - self.begun_at, notes=notes)
         self.page.finish(sums.seconds)
@@ -226,19 +226,19 @@ class DataSetOutput:
             wrong = _check_jobs(self.dataset, store.rows(), options.verify, self.campaign)
         if not store.committed_text:
             self.campaign.check_files()
-        retried = store.db.failed() if options.retry_failed else ()
-        store.forget([*wrong, *retried])
+        retried = store.db.failed_jobs() if options.retry_failed else ()
+        store.reset_jobs([*wrong, *retried])
         if wrong:
-            store.notes.append(f"these jobs are run again: {listed([*wrong.values()])}")
+            store.notes.append(f"these jobs are run again: {list_names([*wrong.values()])}")
         for row in store.rows():
-            self.page.ended(row)
+            self.page.on_job_end(row)
 
     def _adopt_finished_jobs(self, store: RunStore) -> None:
         """Add finished jobs to a run store whose database was lost."""
         names = {row.name for row in store.rows()}
         rows: list[JobRow] = []
         seconds = known_seconds(self.dataset.storage)  # available if only the record was damaged
-        with explained(f"{self.dataset.storage} cannot be read"):
+        with explain_os_errors(f"{self.dataset.storage} cannot be read"):
             for row, made_with in self.dataset.rows(names):
                 if made_with.get("identity") != store.made_with["identity"]:
                     continue
@@ -259,7 +259,7 @@ class DataSetOutput:
         if untimed := [row.name for row in store.rows() if row.done and row.seconds is None]:
             notes += (
                 "the casting times of these jobs are unknown, because a run was interrupted before "
-                f"their results were recorded: {listed(untimed)}",
+                f"their results were recorded: {list_names(untimed)}",
             )
         sums = CampaignRun.from_rows(
             store.rows(),
@@ -299,7 +299,7 @@ class DamagedRecordError(LidarError):
 
 def write_record(storage: Storage, record: Mapping[str, Any]) -> None:
     """Write CAMPAIGN_FILE with a checksum."""
-    with explained(f"{storage} cannot be written"):
+    with explain_os_errors(f"{storage} cannot be written"):
         storage.write(CAMPAIGN_FILE, seal_json(record))
 
 
@@ -393,7 +393,7 @@ def write_shared_files(
 
     campaign = record["campaign"]
     storage = dataset.storage
-    with explained(f"{storage} cannot be written"):
+    with explain_os_errors(f"{storage} cannot be written"):
         storage.remove([INDEX_FILE])  # contains the checksum of the table that is replaced next
     write_table(storage, campaign["names"], rows)
     # The record is written after the table, so it never lists shards that the table lacks.
@@ -426,7 +426,7 @@ def _check_jobs(
     wrong = dict[int, str]()
     # {(name, hash) of an input file: names of the jobs created from it}
     jobs_of_file: dict[tuple[str, str], list[str]] = {}
-    with explained(f"{dataset.storage} cannot be read"):
+    with explain_os_errors(f"{dataset.storage} cannot be read"):
         for row, (manifest, difference) in dataset.check_jobs(rows, contents=contents):
             if campaign is not None and row.number not in campaign.numbers:
                 share = f" in total and this run is shard {campaign.shard}"
@@ -447,7 +447,7 @@ def _check_jobs(
         if (name, digest) not in current_files and name in dict(current_files):
             raise LidarError(
                 f"These jobs in {dataset.storage} were created from a different version of "
-                f"{name}: {listed(jobs)}. Restore that version, or specify another folder "
+                f"{name}: {list_names(jobs)}. Restore that version, or specify another folder "
                 "with `--out`."
             )
     return wrong
@@ -476,7 +476,7 @@ def verify_dataset(storage: Storage, number: int | None = None) -> str:
     wrong |= _check_jobs(dataset, rows, True)
     if wrong:
         raise LidarError(
-            f"{storage} is damaged: {listed([*wrong.values()])}. To run these jobs again, "
+            f"{storage} is damaged: {list_names([*wrong.values()])}. To run these jobs again, "
             "pass the campaign with `--verify`."
         )
     return f"{storage} is intact, with {plural(len(rows), 'job')}"
@@ -539,8 +539,8 @@ def _remove_dataset(storage: Storage, run_folder: Storage) -> None:
     """
     begun = CAMPAIGN_FILE in storage.sizes() or FILE in run_folder.sizes()
     files = list_dataset_files(storage, begun=begun)
-    with explained(f"{storage} cannot be removed"):
-        storage.tidy()
+    with explain_os_errors(f"{storage} cannot be removed"):
+        storage.remove_unfinished()
         # INDEX_FILE, which marks the data set as finished, is removed first. CAMPAIGN_FILE, which
         # identifies the folder as a data set, is removed last.
         storage.prune(sorted(files, key=lambda name: (name == CAMPAIGN_FILE, name != INDEX_FILE)))

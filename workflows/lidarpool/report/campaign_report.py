@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarview.render.picture_page import Page
 
@@ -81,7 +81,7 @@ def write_card(
     LidarError
         If a file cannot be written, or if the name of a split is not a valid file name.
     """
-    with explained(
+    with explain_os_errors(
         f"The card of the data set cannot be written to {storage}", "free some disk space"
     ):
         storage.remove([LAST_FILE])

@@ -14,7 +14,7 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import TABLE, Z, names_by_value
 from lidarsim.numerics.arrays import Bools, Floats, Indices
 from lidarsim.numerics.even_samples import even_indices
-from lidarsim.words import plural, rounded, shorten_name
+from lidarsim.words import format_rounded, plural, shorten_name
 from lidarview.render import theme
 from lidarview.render.coloring import make_coloring
 from lidarview.render.picture_page import FONT, Page, label_logarithms
@@ -58,7 +58,7 @@ def draw_varied(figures: DataSetStatistics) -> Page | None:
     labels, the one whose groups of jobs differ most in their mean number of points. Return None if
     there are no varied quantities or no jobs.
     """
-    drawable = [varied for varied in figures.varied if len(varied.known_values)]
+    drawable = [varied for varied in figures.varied_quantities if len(varied.known_values)]
     if not drawable:
         return None
     scales = [varied.merge_rare_labels() for varied in drawable[:MAX_VARIED]]
@@ -359,9 +359,9 @@ def _adjoining_bars(groups: Sequence[Floats]) -> Floats:
     """
     lowest = np.array([values.min() for values in groups])
     highest = np.array([values.max() for values in groups])
-    middles = (highest[:-1] + lowest[1:]) / 2
-    left = np.concatenate([lowest[:1], middles])
-    right = np.concatenate([middles, highest[-1:]])
+    midpoints = (highest[:-1] + lowest[1:]) / 2
+    left = np.concatenate([lowest[:1], midpoints])
+    right = np.concatenate([midpoints, highest[-1:]])
     return np.stack([left, right, np.full(len(groups), np.nan)], axis=1)
 
 
@@ -417,7 +417,8 @@ def draw_sweep(sweep: Sweep, names: Mapping[int, str]) -> Page:
     classes = None if sweep.classes is None else sweep.classes[rows]
     known = [(name, value) for name, value in sweep.values.items() if value is not None]
     values = [
-        f"{name} {rounded(value, 4) if isinstance(value, float) else shorten_name(str(value))}"
+        f"{name} "
+        f"{format_rounded(value, 4) if isinstance(value, float) else shorten_name(str(value))}"
         for name, value in known[:MAX_VALUES]
     ]
     page.title(

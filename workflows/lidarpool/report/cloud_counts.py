@@ -70,7 +70,7 @@ class CloudCounts:
         self._origin = origin
         self._squares = GridCounts(_SQUARES)
 
-    def add(self, columns: Mapping[str, AnyArray]) -> None:
+    def add_points(self, columns: Mapping[str, AnyArray]) -> None:
         """Add the columns of at least one point, as {column name: values}.
 
         The values have shape (n,).
@@ -105,7 +105,7 @@ class CloudCounts:
         Intermediate arrays have the same length, so batches of about 10⁵ points stay in the CPU
         cache.
         """
-        self._squares.add(cells[0], cells[1])
+        self._squares.add_points(cells[0], cells[1])
 
     def merge(self, other: CloudCounts) -> None:
         """Add the statistics of other points in the same cloud.
@@ -221,7 +221,7 @@ class GridCounts:
                 self.coarsen()
         self.box = cell_box
 
-    def add(self, x: Ints32, y: Ints32) -> None:
+    def add_points(self, x: Ints32, y: Ints32) -> None:
         """Add points, given their cells along each axis.
 
         Both arrays have shape (n,). The points must lie within the box passed to `widen`.

@@ -76,7 +76,7 @@ class _PartWriter:
         is_first = not offset
         self.counts.widen(cell_box)
         for columns in read_blocks(self._points.storage, name, row_count, self._memory):
-            self.counts.add(columns)
+            self.counts.add_points(columns)
             self.counts.add_positions([columns[axis.name] for axis in AXES])
             rows_in_block = len(columns[AXES[0].name])
             if not self._file.has_layout:

@@ -11,10 +11,10 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from lidarsim.errors import LidarError, MissingFileError, Mistakes, as_sentence, explained
+from lidarsim.errors import LidarError, MissingFileError, Mistakes, as_sentence, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.schema.checks import check_list, check_type
-from lidarsim.words import listed
+from lidarsim.words import list_names
 
 from ..clouds.folder import LAST_FILE, check_exists, output_destination, result_folder
 from ..columns.parts import part_name
@@ -150,12 +150,12 @@ def merge(
     shard_folders = list[_ShardFolder]()
     mistakes = Mistakes()
     for storage in shard_storages.values():
-        with mistakes.noted():
+        with mistakes.collect():
             shard_folders.append(_read_folder(storage))
     if not shard_storages:
         mistakes.lines = ["There are no shards to merge. Specify the folders of the shards."]
     if not (partial and shard_folders):
-        mistakes.tell()
+        mistakes.raise_if_any()
     if "scenario_source" in shard_folders[0].record:
         return _merge_survey(shard_folders, target, partial, scenario, screen)
     with result_folder(target), screen.status("merging the data set"):
@@ -197,7 +197,7 @@ def _read_folder(storage: Storage) -> _ShardFolder:
     Raise LidarError if the folder contains no finished shard.
     """
     check_exists(storage, "specify the output folder of `lidarpool run --shard`")
-    with explained(f"{storage} cannot be read"):
+    with explain_os_errors(f"{storage} cannot be read"):
         files = storage.sizes()
         run = storage.below(RUN_FOLDER)
         if {CAMPAIGN_FILE, INDEX_FILE, LAST_FILE} <= files.keys():
@@ -297,7 +297,7 @@ def _check_same_run(
                     f"Shard {shard} is in both {other.storage} and {folder.storage}. Specify only "
                     "one of these folders."
                 )
-    mistakes.tell()
+    mistakes.raise_if_any()
 
 
 def _collect_notes(shard_folders: Sequence[_ShardFolder], *, partial: bool) -> list[str]:
@@ -308,7 +308,7 @@ def _collect_notes(shard_folders: Sequence[_ShardFolder], *, partial: bool) -> l
     notes = [*dict.fromkeys(note for folder in shard_folders for note in folder.notes)]
     if not (missing := _missing_shards(shard_folders)):
         return notes
-    message = f"{_MISSING_NOTE}{listed([*map(str, missing)], MAX_NAMED)}"
+    message = f"{_MISSING_NOTE}{list_names([*map(str, missing)], MAX_NAMED)}"
     if partial:
         return [*notes, message]
     advice = "Specify their folders as well"
@@ -321,7 +321,7 @@ def _collect_notes(shard_folders: Sequence[_ShardFolder], *, partial: bool) -> l
 
 def _missing_or_damaged(names: Sequence[str]) -> str:
     return (
-        f"These files are missing or damaged: {listed(names, MAX_NAMED)}. Run their shards "
+        f"These files are missing or damaged: {list_names(names, MAX_NAMED)}. Run their shards "
         "again with `--resume`, or campaigns with `--verify`, and merge again."
     )
 
@@ -361,7 +361,7 @@ def _merge_dataset(
             return map(JobRow.from_json, db.job_rows())
 
         damaged = list[str]()
-        with explained(f"{target} cannot be merged"):
+        with explain_os_errors(f"{target} cannot be merged"):
             seconds = dict[int, float]()
             if earlier:  # casting times may be missing after an interrupted merge
                 seconds |= known_seconds(target)
@@ -422,8 +422,8 @@ def _add_rows(
         if not shard_folder.has(number):
             raise LidarError(
                 f"{path} belongs to job {number}, which is not in shard "
-                f"{listed([*map(str, shard_folder.shards)])} of {shard_folder.run_size:,} jobs. "
-                "Move the file elsewhere, and merge again."
+                f"{list_names([*map(str, shard_folder.shards)])} of {shard_folder.run_size:,} "
+                "jobs. Move the file elsewhere, and merge again."
             )
         if number in added:
             raise LidarError(
@@ -431,7 +431,7 @@ def _add_rows(
                 "manifests elsewhere, and merge again."
             )
         added.add(number)
-        if row.done or not db.ended(number):
+        if row.done or not db.has_ended(number):
             row = replace(row, seconds=seconds.get(number))
             batch.append((number, bool(row.error), asdict(row)))
         if len(batch) == _BATCH_ROWS:
@@ -476,7 +476,7 @@ def _missing_manifests(shard_folders: Sequence[_ShardFolder], db: RunDatabase) -
         for folder in shard_folders
         for numbers in folder.ranges
         for number in numbers
-        if not db.ended(number)
+        if not db.has_ended(number)
     ]
 
 
@@ -540,7 +540,7 @@ def _copy_points(
         """Copy a part and return its receipt, or return None if the part is missing or damaged."""
         name = part_name(mark, 0, part_file.first, part_file.stop)
         with (
-            explained(f"{source.path(part_file.name)} cannot be copied"),
+            explain_os_errors(f"{source.path(part_file.name)} cannot be copied"),
             suppress(FileNotFoundError),
         ):
             store.storage.copy_from(source, part_file.name, name)

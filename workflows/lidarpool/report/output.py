@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from lidarsim.columns.table import optional_columns
 from lidarsim.environment.interrupts import defer_interrupts
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage, flush
 from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.schema.vocabulary import PICTURES
@@ -111,7 +111,7 @@ def run_survey(
                     result = replace(result, notes=(*result.notes, note))
                 if not output.in_pieces:
                     connection.close()
-                    timeline.mark(timeline.STOPPED)
+                    timeline.record_step(timeline.STOPPED)
                 return output.publish(folder, result, store, screen, connection.cluster, cloud)
 
 
@@ -171,7 +171,7 @@ class SurveyOutput:
             "Specify another folder with `--out`, or replace the result with `--overwrite` "
             "(`overwrite=True` in Python)."
         )
-        with explained(f"{target} cannot be read"):
+        with explain_os_errors(f"{target} cannot be read"):
             try:
                 entries = set(storage.entries())
             except NotADirectoryError:
@@ -297,7 +297,7 @@ class SurveyOutput:
         if workers is not None and isinstance(self.target, Storage):
             sent = [entry for entry in self.formats if entry.has_many_files]
         with (
-            explained(
+            explain_os_errors(
                 f"The result cannot be written to {self.target}",
                 "free some disk space, or specify another folder with `--out`",
             ),
@@ -307,7 +307,7 @@ class SurveyOutput:
             sweeps = _write_sweeps(staged, result, sweeps)
             points = _points_with_progress(result, CLOUD, show)
             counts = _write_cloud(staged / CLOUD, points, sweeps, result, growing)
-            timeline.mark(timeline.CLOUD_WRITTEN)
+            timeline.record_step(timeline.CLOUD_WRITTEN)
             others = [entry for entry in self.formats if entry not in sent]
             full_scales = _write_formats(others, staged, result, sweeps, workers, show)
             if workers and sent:
@@ -316,7 +316,7 @@ class SurveyOutput:
                     points = _points_with_progress(result, output_format.row.file, show)
                     output_format.write_to_storage(target, points, sweeps, workers)
             if workers:
-                result = workers.recorded(result)
+                result = workers.with_range_tasks(result)
             report = make_report(result, counts)
             for output_format in self.formats:
                 report["notes"] += output_format.notes(result.points, sweeps, self._requested)
@@ -325,7 +325,7 @@ class SurveyOutput:
             if self.extent != "cloud":
                 self._write_page(result, report, counts, staged, show)
             _write_report(staged, report, further)
-            timeline.mark(timeline.REPORT_WRITTEN)
+            timeline.record_step(timeline.REPORT_WRITTEN)
             if isinstance(self.target, Storage):
                 if not sent:
                     _remove_earlier(target, further, earlier)
@@ -334,7 +334,7 @@ class SurveyOutput:
                     on_written()
             else:
                 _move_into_place(staged, folder, report["files"], earlier, on_written)
-        timeline.mark(timeline.IN_PLACE)
+        timeline.record_step(timeline.IN_PLACE)
         return report
 
     def _write_page(
@@ -368,7 +368,7 @@ def _write_cloud(
 
     Returns the statistics of the cloud.
     """
-    with explained(f"{path} cannot be written"):
+    with explain_os_errors(f"{path} cannot be written"):
         counts = None if growing is None else growing.finish(path, points)
         return counts or write_cloud(path, points, sweeps, result.scene)
 
@@ -405,13 +405,13 @@ def _points_with_progress(result: RunResult, file: str, show: WritingProgress) -
     count = len(result.points)
     read_count = 0
 
-    def tell(increment: int) -> None:
+    def report(increment: int) -> None:
         nonlocal read_count
         read_count = min(read_count + increment, count)  # points may be read twice
         show(file, read_count, count, "points")
 
-    tell(0)
-    return replace(result.points, report=tell)
+    report(0)
+    return replace(result.points, report=report)
 
 
 def _write_sweeps(staged: Path, result: RunResult, sweeps: Sweeps) -> Sweeps:

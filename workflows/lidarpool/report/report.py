@@ -136,7 +136,7 @@ def _describe_parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
         _describe_sensor(mounted.sensor)
         | {"returns": asdict(returns), "noise": asdict(mounted.noise or survey.noise)}
         | ({"unseen": list(mounted.unseen)} if mounted.unseen else {})
-        for mounted, returns in zip(survey.carried, survey.returns_each, strict=True)
+        for mounted, returns in zip(survey.mounted_sensors, survey.returns_each, strict=True)
     ]
     return {
         "objects": len(scene.object_names),
@@ -147,7 +147,7 @@ def _describe_parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
         "sensor": sensors[0],
         "sensors": {
             mounted.name: sensor
-            for mounted, sensor in zip(survey.carried, sensors, strict=True)
+            for mounted, sensor in zip(survey.mounted_sensors, sensors, strict=True)
             if mounted.name
         },
         "actors": [actor.name for actor in scene.actors],

@@ -19,12 +19,12 @@ from matplotlib.patheffects import withStroke
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import TABLE, X, Y, Z
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.schema.vocabulary import PICTURES
-from lidarsim.words import alternatives, did_you_mean, plural
+from lidarsim.words import did_you_mean, join_alternatives, plural
 from lidarview.picture_file import PictureContent, PlannedPath, PlanningPicture, moving_positions
 from lidarview.render import theme
 from lidarview.render.coloring import add_composed_columns
@@ -108,13 +108,13 @@ def draw_pictures(
             advice = did_you_mean(name, PICTURES) or f" Available pictures: {', '.join(PICTURES)}."
             raise LidarError(f"There is no picture {name!r}.{advice}")
         if name not in makers:
-            why = f"the cloud has no column {alternatives(_LIGHT)}"
+            why = f"the cloud has no column {join_alternatives(_LIGHT)}"
             if name == "path":
                 why = "no path was planned in its run"
             elif shown.coordinates == "sensor":
                 why = "its points are in sensor coordinates"
             raise LidarError(f"The picture {name!r} cannot be drawn, because {why}.")
-    with explained(f"The folder {folder} cannot be created", "specify another folder"):
+    with explain_os_errors(f"The folder {folder} cannot be created", "specify another folder"):
         Path(folder).mkdir(parents=True, exist_ok=True)
     names = only or [*makers]
     for number, name in enumerate(names):
@@ -262,8 +262,8 @@ def max_deviation(path: Floats, other: Floats) -> float:
     distances = np.full(len(positions), np.inf)
     for start, stop in itertools.pairwise(other):
         way = stop - start
-        share = ((positions - start) @ way / max(float(way @ way), 1e-300)).clip(0, 1)
-        nearest = start + share[:, None] * way
+        fraction = ((positions - start) @ way / max(float(way @ way), 1e-300)).clip(0, 1)
+        nearest = start + fraction[:, None] * way
         distances = np.minimum(distances, np.linalg.norm(positions - nearest, axis=1))
     return float(distances.max())
 
@@ -358,7 +358,7 @@ def draw_stations(plan: StationPlan) -> Page:
     """Draw the scene of a station plan, coloring each pixel by its visibility."""
     shot = take_shot(plan.scene, plan.stations)
     page = Page(SIZE)
-    axes = page.show(shot, _classify_by_coverage(shot, plan).paint(COLORS, 0.6))
+    axes = page.draw_view(shot, _classify_by_coverage(shot, plan).paint(COLORS, 0.6))
     page.number_sensors(axes, shot)
     names = ["covered", "not covered", "not reachable"]
     names += ["not a target"] * (not plan.targets.all())

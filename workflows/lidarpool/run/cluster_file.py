@@ -132,14 +132,14 @@ class ClusterFile(BaseModel):
         return f"{self.cluster.rpartition('.')[2]}: {total}, {partitions}"
 
     @contextmanager
-    def start(self, tell: Callable[[str], object]) -> Iterator[SpecCluster]:
+    def start(self, report: Callable[[str], object]) -> Iterator[SpecCluster]:
         """Start the cluster and its workers, and stop them at the end of the context.
 
         Workers may still be waiting in the queue of a batch system when the body starts.
 
         Parameters
         ----------
-        tell
+        report
             Function that is called with messages about failing workers.
 
         Raises
@@ -164,7 +164,7 @@ class ClusterFile(BaseModel):
             with _capture_ssh_output(ssh_lines):
                 cluster = factory(**arguments)
                 try:
-                    start_partitions(cluster, partitions, tell)
+                    start_partitions(cluster, partitions, report)
                 except BaseException:
                     cluster.close()
                     raise

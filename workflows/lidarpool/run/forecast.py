@@ -34,7 +34,7 @@ from lidarsim.simulator.memory import (
 )
 from lidarsim.simulator.sampling import sample_survey
 from lidarsim.survey.survey import Survey
-from lidarsim.words import joined
+from lidarsim.words import join_names
 from poolpart import Pool
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
@@ -102,7 +102,7 @@ def forecast(
     mistakes = Mistakes()
     notes: list[str] = []
     warnings: list[str] = []
-    with mistakes.noted():
+    with mistakes.collect():
         notes += _folder_notes(folder)
     occupied = bool(notes)  # an unfinished run
     if refuse is not None:
@@ -112,7 +112,7 @@ def forecast(
             notes.append(str(error).rstrip("."))
             occupied = True
     for file_format in job.outputs:
-        with mistakes.noted():
+        with mistakes.collect():
             file_format.check_installed()
     cluster = _cluster_of(job, options, client, mistakes, notes)
     backend = cluster.backend
@@ -150,7 +150,7 @@ def forecast(
         "warnings": warnings,
         "objects": len(scene.object_names),
         "triangles": scene.triangles,
-        "masked": list(scene.masked),
+        "masked": list(scene.masked_objects),
         "performance": _performance(survey),  # {sensor name: "ideal" or "datasheet"}
         "unseen": _unseen(job),  # {sensor name: names of objects that are hidden from the sensor}
         # In scenario coordinates. Adding `world.origin` results in world coordinates.
@@ -191,12 +191,12 @@ def _cluster_of(
     memory = 0
     if (file := options.cluster) is not None:
         present = file.slots
-        with mistakes.noted():
+        with mistakes.collect():
             file.require(required)
     elif client is not None:
         held = [worker.resources for worker in Pool.from_client(client)]
         present = {name: int(sum(slots.get(name, 0) for slots in held)) for name in required}
-        with mistakes.noted():
+        with mistakes.collect():
             pool, casting, backend, _ = find_workers(client, required, options.backend)
             check_workers(job, options, backend, casting)
             memory = min((worker.memory for worker in casting if worker.memory), default=0)
@@ -209,7 +209,7 @@ def _cluster_of(
             LIDAR: required[LIDAR],  # one worker with as many threads
         }
         memory = MEMORY_LIMIT
-        with mistakes.noted():
+        with mistakes.collect():
             check_backend_here(options.backend)
             usable = [name for name, reason in available_backends().items() if not reason]
             backend = usable[0] if options.backend == "auto" else options.backend
@@ -285,14 +285,14 @@ def _shortages(
 def _performance(survey: Survey) -> dict[str, str]:
     """Describe whether each sensor is ideal or corresponds to its data sheet, keyed by name."""
     performance = {}
-    pairs = zip(survey.carried, survey.noise_each, survey.returns_each, strict=True)
+    pairs = zip(survey.mounted_sensors, survey.noise_each, survey.returns_each, strict=True)
     for carried, noise, returns in pairs:
         sensor = carried.sensor
         words = "ideal" if sensor.noise is None else "datasheet"
         unchanged_noise = replace(sensor.noise or Noise(), seed=noise.seed)
         changed = ["noise"] * (noise != unchanged_noise)
         changed += ["returns"] * (returns != (sensor.returns or Returns()))
-        performance[carried.name] = words + f" except for {joined(changed)}" * bool(changed)
+        performance[carried.name] = words + f" except for {join_names(changed)}" * bool(changed)
     return performance
 
 
@@ -302,7 +302,7 @@ def _unseen(job: Job) -> dict[str, list[str]]:
     Sensors that see all objects are omitted.
     """
     scene = job.scene
-    pairs = zip(job.survey.carried, unseen_objects(scene, job.survey), strict=True)
+    pairs = zip(job.survey.mounted_sensors, unseen_objects(scene, job.survey), strict=True)
     names = scene.object_names
     return {
         carried.name: [names[row] for row in np.flatnonzero(mask)]
@@ -325,7 +325,7 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
     traveled_m = np.append(0.0, np.linalg.norm(np.diff(positions, axis=0), axis=1).cumsum())
     lines = flight_lines(survey)
     sensors = []
-    for carried, steps in zip(survey.carried, survey.steps_each, strict=True):
+    for carried, steps in zip(survey.mounted_sensors, survey.steps_each, strict=True):
         sensor = carried.sensor
         firings = sensor.firings(steps - 1)[1]
         rate_hz = getattr(sensor.head, "rate_hz", None)
@@ -388,7 +388,7 @@ def _rest_bytes(job: Job, points: int, planners: int) -> int:
     # Chunks of points are merged, written and read again.
     chunk_bytes = 6 * (_point_bytes(job) + 24) * min(points, CHUNK_POINTS)
     shown_triangles = scene.kept_triangles + DRAWN_TRIANGLES
-    if not scene.masked:  # masked triangles are divided into more triangles
+    if not scene.masked_objects:  # masked triangles are divided into more triangles
         shown_triangles = min(scene.triangles, shown_triangles)
     driver = 2 * SCENE_TRIANGLE * shown_triangles + INSTANCE * len(scene.instances or ())
     driver += chunk_bytes + SCAN_BYTES * job.survey.scan_count

@@ -65,7 +65,7 @@ def describe_inputs(scene: Scene, survey: Survey, planning: Planning | None) -> 
             "size": " x ".join(f"{side:.6g}" for side in size_m) + " m",
         }
     }
-    for carried in survey.carried:
+    for carried in survey.mounted_sensors:
         path = f"sensors.{carried.name}" if carried.name else "sensor"
         values[path] = declared_values(carried, Mounted) | declared_values(carried.sensor, Sensor)
         values[path] |= {"model": carried.sensor.name or "grid", "name": None, "sensor": None}

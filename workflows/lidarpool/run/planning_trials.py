@@ -41,7 +41,7 @@ class TrialRunner:
         self._locate_tasks()
 
     @property
-    def finished(self) -> bool:
+    def is_finished(self) -> bool:
         """True if all trials have finished."""
         return len(self.trials) == self.planning.trials
 

@@ -189,7 +189,7 @@ class Screen:
         self._on_progress = on_progress
         self.warnings: list[str] = []
 
-    def tell(self, words: str) -> None:
+    def report(self, words: str) -> None:
         """Log a message for the user."""
         logger.info(words)
 
@@ -219,7 +219,7 @@ class Screen:
             local_progress_bars() if self._on_progress is None else nullcontext(self._on_progress)
         )
 
-    def starting(
+    def start_cluster(
         self, cluster: AbstractContextManager[Client], words: str, *, shares_terminal: bool = False
     ) -> AbstractContextManager[Client]:
         """Return a context manager that starts a cluster and displays this activity.

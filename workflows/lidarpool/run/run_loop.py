@@ -18,7 +18,7 @@ from typing import Any
 
 from lidarsim.errors import LidarError
 from lidarsim.simulator.memory import MB, scans_that_fit
-from lidarsim.words import listed, plural
+from lidarsim.words import list_names, plural
 
 from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
@@ -120,7 +120,7 @@ class RunLoop:
         cluster = self._cluster
         pipeline = self._pipeline
         try:
-            with cluster.partitions_page(), cluster.stopping(self._stop):
+            with cluster.partitions_page(), cluster.stop_on_error(self._stop):
                 pipeline.open()
                 self._loop(first, show)
                 pipeline.finish()
@@ -130,7 +130,7 @@ class RunLoop:
             self._remover.shutdown()
         self._save()
         self._store.save(force=True)
-        self._store.tidy()
+        self._store.remove_orphaned_parts()
         tasks_beside = [beside.tasks for beside in (self._writer, self._trials) if beside]
         books = [pipeline.book, *(tasks.book for tasks in tasks_beside)]
         self._store.notes += pipeline.notes
@@ -139,7 +139,7 @@ class RunLoop:
         if self._writer is not None and (lost := sorted(pipeline.dispatcher.lost_workers)):
             self._store.notes.append(
                 f"{plural(len(lost), 'worker')} died, left or stopped responding "
-                f"({listed(lost)}). Batches that were cast or sent again: {replayed:,}"
+                f"({list_names(lost)}). Batches that were cast or sent again: {replayed:,}"
             )
         if self._writer is not None and self._writer.hidden:
             storage = self._writer.dataset.storage
@@ -166,12 +166,14 @@ class RunLoop:
         pipeline = self._pipeline
         started = time.monotonic()
         self._begin(first)  # and its trials
-        timeline.mark(timeline.FIRST_BATCH)
+        timeline.record_step(timeline.FIRST_BATCH)
         # The stages on LIDAR run until the end, so their workers do not have to accept new tasks.
         watch = self._cluster.watch([GPU, OTHER] if self._trials else [GPU], lasting=[LIDAR])
         shown_at = saved_at = float("-inf")
         tasks_beside = [beside.tasks for beside in (self._writer, self._trials) if beside]
-        while not (pipeline.stages.ended and (self._trials is None or "planning" in self._times)):
+        while not (
+            pipeline.stages.has_ended and (self._trials is None or "planning" in self._times)
+        ):
             self._step_jobs(started, watch)
             self._step_planning(started, watch)
             now_s = time.monotonic()
@@ -182,7 +184,7 @@ class RunLoop:
             if now_s - shown_at >= PROGRESS_EVERY_S or self._finished:
                 shown_at = now_s
                 self._show_progress(show, now_s - started)
-            if pipeline.stages.ended:
+            if pipeline.stages.has_ended:
                 time.sleep(PLANNING_PAUSE_S)
             else:
                 pipeline.wait(future.key for tasks in tasks_beside for future in tasks.running)
@@ -201,7 +203,7 @@ class RunLoop:
         at which the loop started.
         """
         pipeline = self._pipeline
-        if pipeline.stages.closed:
+        if pipeline.stages.is_closing:
             return
         self._admit()
         news = pipeline.step(self._scans_to_come)
@@ -215,27 +217,27 @@ class RunLoop:
             elif self._writer is None:
                 self._only_committed = True
             else:
-                self._writer.add(self._write_request(job))
+                self._writer.queue_job(self._write_request(job))
         error_of_all = self._write()
         self._commit()
         if error_of_all is not None:
             raise error_of_all
         if pipeline.progress:
-            timeline.mark(timeline.FIRST_RECEIPT)
+            timeline.record_step(timeline.FIRST_RECEIPT)
         if self._finished:
             pipeline.close()
             self._times["survey"] = time.monotonic() - started
-            timeline.mark(timeline.LAST_RECEIPT)
-            watch.forget([GPU, LIDAR])
+            timeline.record_step(timeline.LAST_RECEIPT)
+            watch.remove_partitions([GPU, LIDAR])
 
     def _step_planning(self, started: float, watch: Watch) -> None:
         if self._trials is None or "planning" in self._times:
             return
         self._trials.step()
-        if self._trials.finished:
+        if self._trials.is_finished:
             self._times["planning"] = time.monotonic() - started
-            timeline.mark(timeline.PLANNED)
-            watch.forget([OTHER])
+            timeline.record_step(timeline.PLANNED)
+            watch.remove_partitions([OTHER])
 
     def _save(self) -> None:
         if self._trials is not None and (only_job := self._store.only_job) is not None:
@@ -370,7 +372,7 @@ class RunLoop:
         jobs_left = len(self._store.jobs.numbers) - self._store.db.ended_count
         limit = self._cluster.options.batch_mb * MB
         on_device = self._cluster.backend == "cuda"
-        self._jobs[job.number] = self._pipeline.begin(
+        self._jobs[job.number] = self._pipeline.add_job(
             stored.committed,
             job.scene,
             job.survey,
@@ -412,10 +414,10 @@ class RunLoop:
         self._rows = []
         if not rows:
             return
-        ended = self._store.end(rows)  # excludes jobs that could not be created
+        ended = self._store.commit_jobs(rows)  # excludes jobs that could not be created
         for row in rows:
             self._jobs.pop(row.number, None)
-            self._page.ended(row)
+            self._page.on_job_end(row)
         self._remover.submit(self._remove, ended)
 
     def _remove(self, ended: Sequence[tuple[JobRow, StoredJob]]) -> None:
@@ -423,6 +425,6 @@ class RunLoop:
         for row, job in ended:
             with suppress(LidarError, OSError):  # leftover files are harmless
                 if row.done:
-                    self._page.look(row, job)
+                    self._page.on_job_written(row, job)
             with suppress(LidarError, OSError):
                 self._store.storage.remove([part.name for part in job.parts.ordered])

@@ -20,11 +20,11 @@ class RunPage:
     """Interface of the live page of a run.
 
     The methods of this base class do nothing. They are called in the thread of the run and must
-    return immediately, except for `look`, which is called in the thread that removes the parts of
-    ended jobs.
+    return immediately, except for `on_job_written`, which is called in the thread that removes the
+    parts of ended jobs.
     """
 
-    def begun(self, job: StoredJob) -> None:
+    def on_survey_start(self, job: StoredJob) -> None:
         """Show the job of a survey, including any results from an earlier run."""
 
     def follow(self, partitions: Mapping[str, Partition], dataset: DataSet | None = None) -> None:
@@ -60,10 +60,10 @@ class RunPage:
             If a user of the page has stopped the run.
         """
 
-    def ended(self, row: JobRow) -> None:
+    def on_job_end(self, row: JobRow) -> None:
         """Show a job that has ended in this run or in an earlier run."""
 
-    def look(self, row: JobRow, job: StoredJob) -> None:
+    def on_job_written(self, row: JobRow, job: StoredJob) -> None:
         """Read the points of a finished job before its parts are deleted."""
 
     def finish(self, seconds: float, result: RunResult | None = None) -> None:
@@ -72,7 +72,7 @@ class RunPage:
         The parts may be removed afterwards.
         """
 
-    def stay(self, cloud: Path | None = None) -> None:
+    def keep_open(self, cloud: Path | None = None) -> None:
         """Keep the page open until the user closes it.
 
         Points are read from the written file `cloud`.

@@ -76,7 +76,7 @@ class RunResult:
     replayed: int = 0
 
     @property
-    def thinned(self) -> str:
+    def thinning_note(self) -> str:
         """Clause about omitted points, which follows the number of points in messages.
 
         The clause is empty if all points are kept.

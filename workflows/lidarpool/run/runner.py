@@ -48,7 +48,7 @@ def cast_to_store(
     ):
         committed = cast(store, connection, listener)
         result = committed.result(screen)
-        store.keep(scenario_source, result.notes)
+        store.close_with_points(scenario_source, result.notes)
         page.finish(result.seconds, result)
         return result
 
@@ -118,10 +118,10 @@ def cast(
     page = listener.page
     maker: JobProducer | None = None  # only for campaigns
     if dataset is not None:
-        remaining = (number for number in store.jobs.numbers if not store.db.ended(number))
+        remaining = (number for number in store.jobs.numbers if not store.db.has_ended(number))
         maker = JobProducer(store.jobs, remaining, dataset.columns)
     if store.only_job is not None:
-        page.begun(store.only_job)
+        page.on_survey_start(store.only_job)
     with nullcontext() if maker is None else closing(maker):
         first = _first_job(store, maker, page)
         if first is None:
@@ -142,8 +142,8 @@ def _first_job(store: RunStore, maker: JobProducer | None, page: RunPage) -> Job
     if maker is None:
         only_job = store.only_job
         assert only_job is not None, "a run without a job maker is a survey"
-        return None if only_job.complete else only_job.job
+        return None if only_job.is_complete else only_job.job
     while isinstance(entry := maker.pop(wait=True), JobRow):
-        store.end([entry])
-        page.ended(entry)
+        store.commit_jobs([entry])
+        page.on_job_end(entry)
     return entry

@@ -90,7 +90,7 @@ class SweepStream:
         screen = Screen()
         if options.starts_workers:
             check_backend_here(options.backend)
-        waiting = WaitTimer(options.startup_timeout_s, screen.tell)
+        waiting = WaitTimer(options.startup_timeout_s, screen.report)
         with open_client(options, {GPU: 1}, waiting, screen) as client:
             try:
                 with closing(_Casting(self, client, waiting)) as casting:
@@ -257,7 +257,7 @@ class _Casting:
         options = self._stream.options
         try:
             check_workers(job, options, self._backend, self._workers)
-            _, scene_name = self._casting.add(job.number, job.scene, job.survey)
+            _, scene_name = self._casting.register_job(job.number, job.scene, job.survey)
         except JobError as error:
             self._warn_of_failure(job.name, error)
             return True

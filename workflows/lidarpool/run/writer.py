@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from distributed import Reschedule
 
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import TEMPORARY, Storage
 from lidarsim.sweeps.sweeps import Sweeps
 from poolpart.fetch import fetch_available
@@ -136,7 +136,7 @@ class DataSetWriter:
         self._probe_name = f"{TEMPORARY}dataset-{mark[:8]}"
         dataset_probe = storage, self._probe_name, mark.encode()
         self._probes: Sequence[Probe] = (dataset_probe, (store.storage, *parts_probe))
-        with explained(f"{storage} cannot be written"):
+        with explain_os_errors(f"{storage} cannot be written"):
             storage.prepare()
             storage.write(self._probe_name, mark.encode())
         self._waiting = deque[WriteRequest]()
@@ -152,7 +152,7 @@ class DataSetWriter:
         yield from (job.row for jobs in self.tasks.running.values() for job in jobs)
         yield from (job.row for job in (*self._driver_writes.values(), *self._waiting))
 
-    def add(self, files: WriteRequest) -> None:
+    def queue_job(self, files: WriteRequest) -> None:
         """Queue a job for writing."""
         if not self._waiting:
             self._due_at = time.monotonic() + GATHER_S
@@ -311,7 +311,7 @@ class LidarWorkers:
                 running.clear()
         return written
 
-    def recorded(self, result: RunResult) -> RunResult:
+    def with_range_tasks(self, result: RunResult) -> RunResult:
         """Return a copy of a result that includes the tasks that wrote ranges of files."""
         return replace(result, stages=(*result.stages, *self._tasks.book.stages.values()))
 
@@ -334,6 +334,6 @@ def _fetch_writer(key: str) -> RangeWriter:
 def _write_range(key: str, span: PieceRange) -> tuple[Range | None, TaskRecord]:
     """Write a range on a worker, and return its result with the record of the task."""
     recorder = Recorder(EXPORT, LIDAR)
-    with explained(f"The worker {recorder.finish().worker} cannot write the output"):
+    with explain_os_errors(f"The worker {recorder.finish().worker} cannot write the output"):
         written_range = _fetch_writer(key)(span)
     return written_range, recorder.finish(span[1] - span[0])

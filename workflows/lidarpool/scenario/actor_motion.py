@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BeforeValidator, Strict, model_validator
 
 from lidarscenes.files.formats import ROBOTS
-from lidarsim.errors import LidarError, prefixed
+from lidarsim.errors import LidarError, prefix_errors
 from lidarsim.io.time_units import TimeUnit, seconds_of
 from lidarsim.motion.rotations import quaternions_of, rotations_of
 from lidarsim.motion.trajectory import CLOCK_S, Beyond, InstrumentPose, Pose, Track
@@ -98,7 +98,7 @@ class MountedSensorSection(SensorSection):
         about("number of time steps (scans) of the sensor (default: from the survey)", 120),
     ] = None
 
-    def mounted(
+    def mounted_sensor(
         self,
         path: ResolvePath,
         mount: Pose,
@@ -108,10 +108,10 @@ class MountedSensorSection(SensorSection):
     ) -> Mounted:
         """Return the sensor on its platform, with its start and time steps.
 
-        The parameters are those of `SensorSection.mounted`. Raise LidarError if a file cannot be
-        used.
+        The parameters are those of `SensorSection.mounted_sensor`. Raise LidarError if a file
+        cannot be used.
         """
-        mounted = super().mounted(path, mount, noise, returns, name)
+        mounted = super().mounted_sensor(path, mount, noise, returns, name)
         sensor = mounted.sensor
         if self.start_s:
             sensor = replace(sensor, start_ns=self.start_s * 1e9)
@@ -453,7 +453,7 @@ class ActorSection(DeformingSection):
         if self.trajectory is None:
             assert platform_track is not None, "guaranteed by the validation of the scenario"
             return platform_track
-        with prefixed(f"actor {self.name!r}"):
+        with prefix_errors(f"actor {self.name!r}"):
             return self.trajectory.track(
                 path, support, start_s, name=self.name, without_angles=without_angles
             )

@@ -16,13 +16,13 @@ from lidarsim.media.weather import FOG_LIDAR_RATIO_SR
 from lidarsim.motion.headings import CORNER_M
 from lidarsim.motion.trajectory import Track, presence_ns
 from lidarsim.scene.files.mesh_formats import format_of
-from lidarsim.scene.files.meshfile import written_by_lidarpool
+from lidarsim.scene.files.meshfile import is_written_by_lidarpool
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor.optics import TWO_RETURNS
 from lidarsim.simulator.steps.particles import WeatherStep
 from lidarsim.simulator.steps.step_list import setup_of
 from lidarsim.survey.survey import START_FROM, Survey
-from lidarsim.words import format_as_scenario, listed, plural, rounded
+from lidarsim.words import format_as_scenario, format_rounded, list_names, plural
 
 from .georeference import missing_epsg_note
 from .prepare import PreparedScenario
@@ -102,7 +102,7 @@ def unlabeled_notes(scene: Scene, survey: Survey) -> list[str]:
         (
             f"points are labeled by class, but {len(without):,} of "
             f"{plural(len(scene.names), 'static object')} "
-            f"{'have' if without[1:] else 'has'} no class ({listed(without, 3)}). Their points "
+            f"{'have' if without[1:] else 'has'} no class ({list_names(without, 3)}). Their points "
             "have class 0. Set `class` in `materials`, or name class 0 in `classes`; see "
             "docs/how-to/labels.md"
         )
@@ -128,7 +128,7 @@ def _unnamed_classes(survey: Survey) -> Iterator[str]:
         noun = "classes" if unnamed[1:] else "class"
         names = ", ".join(f"{number}: …" for number in unnamed)
         yield (
-            f"{noun} {listed([*map(str, unnamed)])} of materials or actors "
+            f"{noun} {list_names([*map(str, unnamed)])} of materials or actors "
             f"{'have' if unnamed[1:] else 'has'} no name. Add `{{{names}}}` to `classes`"
         )
 
@@ -166,14 +166,15 @@ def _size_note(prepared: PreparedScenario, side: float) -> str:
         else f"the format of {name} prescribes meters, so"
     )
     return (
-        f"{assumed} the scene is {rounded(side, 5)} m long. If this is wrong, set the `unit` of "
-        f"the file in `scene.files` (possibly {unit}), or pass `--unit {unit}` with a mesh file"
+        f"{assumed} the scene is {format_rounded(side, 5)} m long. If this is wrong, set the "
+        f"`unit` of the file in `scene.files` (possibly {unit}), or pass `--unit {unit}` with a "
+        "mesh file"
     )
 
 
 def _lacks_unit(path: Path) -> bool:
     row = format_of(path)
-    return row is not None and row.unitless and not written_by_lidarpool(path)
+    return row is not None and row.unitless and not is_written_by_lidarpool(path)
 
 
 def _color_note(prepared: PreparedScenario) -> str:
@@ -181,7 +182,7 @@ def _color_note(prepared: PreparedScenario) -> str:
     scene = prepared.scene
     if not prepared.scenario.needs_colors:
         return ""
-    if not scene.colored:
+    if not scene.all_colors:
         return (
             "a column or `reflectance: texture` uses colors, but no object of the scene has "
             "colors, so all surfaces are gray"
@@ -239,7 +240,9 @@ def _single_returns(prepared: PreparedScenario) -> Iterator[str]:
     False alarms are ignored, although they are also returns.
     """
     survey = prepared.survey
-    setups = [setup_of(prepared.scene, survey, number) for number in range(len(survey.carried))]
+    setups = [
+        setup_of(prepared.scene, survey, number) for number in range(len(survey.mounted_sensors))
+    ]
     single = [
         setup
         for setup in setups
@@ -252,8 +255,8 @@ def _single_returns(prepared: PreparedScenario) -> Iterator[str]:
     reporting = single[0].reporting
     has_divergence = reporting.divergence_mrad or single[0].sensor.optics.divergence_mrad
     divergence = "" if has_divergence else ", divergence_mrad: 3"
-    names = [survey.carried[setup.number].name for setup in single]
-    of_sensors = f" of {listed(names)}" if all(names) else ""
+    names = [survey.mounted_sensors[setup.number].name for setup in single]
+    of_sensors = f" of {list_names(names)}" if all(names) else ""
     yield (
         f"the returns mode{of_sensors} is {reporting.mode}, but a pulse never has a second return, "
         "because each beam is a single ray that hits one surface. Set `returns: {subrays: 7"
@@ -273,12 +276,12 @@ def _dark_fog(survey: Survey) -> Iterator[str]:
         return
     without = [
         carried
-        for carried, noise in zip(survey.carried, survey.noise_each, strict=True)
+        for carried, noise in zip(survey.mounted_sensors, survey.noise_each, strict=True)
         if noise.detection_range_m is None
     ]
     if without:
         names = [carried.name for carried in without]
-        of_sensors = f" of {listed(names)}" if all(names) else ""
+        of_sensors = f" of {list_names(names)}" if all(names) else ""
         yield (
             "fog attenuates light but causes no returns, because "
             f"`noise.detection_range_m`{of_sensors} is not set. Set it to the range at 10 % "
@@ -295,12 +298,12 @@ def _heading_notes(without_angles: Mapping[str, bool]) -> Iterator[str]:
         return
     names = [*without_angles]
     note = (
-        f"the trajectory of {listed(names)} has no angles, so its poses are level and face the "
+        f"the trajectory of {list_names(names)} has no angles, so its poses are level and face the "
         "direction of travel"
     )
     if names[1:]:
         note = (
-            f"the trajectories of {listed(names)} have no angles, so their poses are level and "
+            f"the trajectories of {list_names(names)} have no angles, so their poses are level and "
             "face the direction of travel"
         )
     if any(without_angles.values()):
@@ -333,7 +336,7 @@ def _timing_notes(prepared: PreparedScenario) -> Iterator[str]:
     for number, (_, starts, _) in enumerate(survey.sweeps_each):
         for index, fault in survey.sensor_faults(number, "frozen").items():
             if not fault.is_active(starts).any():
-                sensor = survey.carried[number].name or "the sensor"
+                sensor = survey.mounted_sensors[number].name or "the sensor"
                 yield (
                     f"`faults[{index}]` does not freeze {sensor}, because no sweep starts during "
                     "the fault"
@@ -345,7 +348,7 @@ def _timing_notes(prepared: PreparedScenario) -> Iterator[str]:
         animation = actor.mesh.animation
         if animation and not animation.repeat and actor.seconds(end)[0][0] > animation.duration_s:
             yield (
-                f"the animation of {actor.name} ends after {rounded(animation.duration_s)} s, "
-                "before the end of the survey, and its last pose is kept. To repeat the animation, "
-                "set `repeat: true`"
+                f"the animation of {actor.name} ends after {format_rounded(animation.duration_s)} "
+                "s, before the end of the survey, and its last pose is kept. To repeat the "
+                "animation, set `repeat: true`"
             )

@@ -308,7 +308,7 @@ class CampaignSpec:
             f"{self._jobs.message_prefix(path) or f'{self.command}: '}{not_found(path)}"
             for path in missing
         ]
-        mistakes.tell()
+        mistakes.raise_if_any()
 
     @cached_property
     def identity(self) -> dict[str, str]:

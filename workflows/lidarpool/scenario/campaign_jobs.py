@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 from pydantic_core import to_json
 
-from lidarsim.errors import LidarError, Mistakes, prefixed
+from lidarsim.errors import LidarError, Mistakes, prefix_errors
 from lidarsim.io.input_files import open_input
 from lidarsim.io.textfile import read_text
 from lidarsim.scene.files.mesh_formats import plugin_of
-from lidarsim.schema.section_fields import dotted
-from lidarsim.schema.value_texts import shown
+from lidarsim.schema.section_fields import format_path
+from lidarsim.schema.value_texts import format_value
 from lidarsim.words import plural
 
 from ..clouds.format_table import check_all_returns
@@ -154,7 +154,7 @@ class FunctionJobs(JobSource):
             if not isinstance(name, str) or not isinstance(plain, Value | None):
                 raise LidarError(
                     "The values of a job must be numbers, text, True or False, and their names "
-                    f"must be text, but job {number} has {{{name!r}: {shown(plain)}}}."
+                    f"must be text, but job {number} has {{{name!r}: {format_value(plain)}}}."
                 )
             values[name] = plain
         survey = job.survey
@@ -176,7 +176,7 @@ class FunctionJobs(JobSource):
 
         Raise LidarError if the function fails or does not return a job.
         """
-        with prefixed(f"job {number}"):
+        with prefix_errors(f"job {number}"):
             try:
                 job = self._make(number, JobRandom(self._seed, number, "make").generator())
             except LidarError:
@@ -186,7 +186,8 @@ class FunctionJobs(JobSource):
                 raise LidarError(message) from error
             if not isinstance(job, Job):
                 raise LidarError(
-                    f"the function must return a Job(scene, survey), but returned {shown(job)}."
+                    "the function must return a Job(scene, survey), but returned "
+                    f"{format_value(job)}."
                 )
         return job
 
@@ -204,13 +205,13 @@ class ScenarioJobs(JobSource):
         files: set[Path] = set()
         fingerprints: list[str] = []
         for path in paths:
-            with mistakes.noted():
+            with mistakes.collect():
                 if is_campaign(path):
                     raise LidarError(f"{path} is a campaign with its own jobs. Run it separately.")
                 scenario = Scenario.load(path)
                 fingerprints.append(_fingerprint(scenario))
                 files.update(scenario.files)
-        mistakes.tell()
+        mistakes.raise_if_any()
         self.files = files
         self.identity = {"scenarios": fingerprint(fingerprints)}
         self._names = _unique_names([path.stem for path in paths])
@@ -261,16 +262,16 @@ class SampledJobs(JobSource):
         self._bases: list[_Base] = []
         tables: dict[Any, list[Any]] = {}  # {(file, annotation, ignored columns): rows}
         for name in section.base:
-            with mistakes.noted(), prefixed(path):
+            with mistakes.collect(), prefix_errors(path):
                 file = path.parent / Path(name).expanduser()
                 if is_campaign(file):
                     raise LidarError(f"base must be a scenario, but {name!r} is a campaign.")
                 label = f"vary for {file.name}" if section.base[1:] else "vary"
                 self._bases.append(_Base(file, section.vary, tables, label))
-        mistakes.tell()
+        mistakes.raise_if_any()
         for base in self._bases:
             base.check(self._source, mistakes)
-        mistakes.tell()
+        mistakes.raise_if_any()
         self.files = {path for base in self._bases for path in base.files}
         # {path of a field with `each`: number of consecutive jobs with the same value}
         self._strides: dict[str, int] = {}
@@ -384,12 +385,12 @@ class _Base:
         self.files: dict[Path, Scenario] = {}  # {file that a job may read: scenario that names it}
         mistakes = Mistakes()
         for text, choice in vary.items():
-            with mistakes.noted(), prefixed(label):
+            with mistakes.collect(), prefix_errors(label):
                 self._steps[text], kind = find_field(self.scenario, text)
                 if choice.sample is None:
                     continue
                 self.table_files[text] = table = self.scenario.path(choice.sample.file)
-                with prefixed(text):
+                with prefix_errors(text):
                     ignore = choice.sample.ignore
                     if (key := (table, repr(kind), ignore)) not in tables:
                         tables[key] = read_rows(table, kind, ignore)
@@ -400,9 +401,9 @@ class _Base:
                         raise LidarError(
                             f"count allows up to {max_rows:,} rows, but {table} has only {rows}."
                         )
-        with mistakes.noted(), prefixed(label):
+        with mistakes.collect(), prefix_errors(label):
             self._check_disjoint()
-        mistakes.tell()
+        mistakes.raise_if_any()
 
     def _check_disjoint(self) -> None:
         """Raise LidarError if two varied paths overlap.
@@ -460,16 +461,16 @@ class _Base:
     def _invalid_values(self, text: str) -> Iterator[str]:
         """Yield a line for each value that is not valid at a path in the base scenario."""
         choice = self._vary[text]
-        field = dotted([key for key, _ in self._steps[text]])
+        field = format_path([key for key, _ in self._steps[text]])
         for value in () if choice.sample else choice.limit_values:
             try:
                 self.with_values({text: value}, "")
             except LidarError as error:
                 lines = str(error).replace("\n  ", " ")  # join the continuation lines of a list
                 message = lines.partition("\n")[0].removeprefix(": ")
-                value_line = f"{text} can be {shown(value)}"
-                invalid = f"{field} cannot be {shown(value)}."
-                start, _, end = message.partition(f", but is {shown(value)}.")
+                value_line = f"{text} can be {format_value(value)}"
+                invalid = f"{field} cannot be {format_value(value)}."
+                start, _, end = message.partition(f", but is {format_value(value)}.")
                 if start.startswith(f"{field} must ") and start != message:
                     requirement = start.removeprefix(f"{field} ")
                     yield f"{value_line}, but {requirement}.{end}{choice.hint(requirement)}"

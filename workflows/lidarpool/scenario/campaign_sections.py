@@ -45,7 +45,7 @@ from lidarsim.schema.declared import (
     UnitShare,
     about,
     accept_short_form,
-    allowed,
+    describe_allowed,
     is_text,
     not_allowed_error,
     require_one_of,
@@ -53,7 +53,7 @@ from lidarsim.schema.declared import (
 from lidarsim.schema.error_sentences import convert_validation_errors
 from lidarsim.schema.section_fields import sections_in
 from lidarsim.schema.value_texts import one_line
-from lidarsim.words import did_you_mean_each, format_yaml_list, joined, printable
+from lidarsim.words import did_you_mean_each, format_yaml_list, join_names, printable
 
 from ..clouds.format_table import DATA_SETS, LAYOUTS
 from ..clouds.writing import ExportSpec
@@ -120,10 +120,10 @@ class JobRandom:
     def log_uniform(self, minimum: float, maximum: float) -> float:
         """Draw a number whose logarithm is uniformly distributed."""
         log_minimum, log_maximum = (_EXACT.ln(Decimal(limit)) for limit in (minimum, maximum))
-        share = _as_fraction(self.bits(53))
+        fraction = _as_fraction(self.bits(53))
         number = _EXACT.exp(
             _EXACT.add(
-                log_minimum, _EXACT.multiply(share, _EXACT.subtract(log_maximum, log_minimum))
+                log_minimum, _EXACT.multiply(fraction, _EXACT.subtract(log_maximum, log_minimum))
             )
         )
         return _clip(_round(float(number)), minimum, maximum)
@@ -201,7 +201,7 @@ Options = Annotated[
     Annotated[Several[Any], Field(min_length=1)]
     | Annotated[dict[Text, Any], Field(min_length=1)]
     | None,
-    allowed("a list of values, or a mapping of names to values"),
+    describe_allowed("a list of values, or a mapping of names to values"),
 ]
 Weight = Annotated[float, Field(ge=0, le=1e9)]
 
@@ -225,8 +225,8 @@ class NormalDistribution(Section):
     def _check_limits(self) -> NormalDistribution:
         """Raise ValueError if numbers would overflow or the limits exclude nearly all of them."""
         if self.limits is not None:
-            lower_share, upper_share = map(NormalDist(self.mean, self.std).cdf, self.limits)
-            if upper_share - lower_share < MIN_SHARE:
+            lower_fraction, upper_fraction = map(NormalDist(self.mean, self.std).cdf, self.limits)
+            if upper_fraction - lower_fraction < MIN_SHARE:
                 raise ValueError(
                     f"`limits` must include at least {MIN_SHARE:.0%} of the distribution."
                 )
@@ -562,14 +562,14 @@ class Splits:
 
     def __init__(self, shares: Mapping[str, float], seed: int) -> None:
         self._seed = seed
-        exact = {name: Fraction(str(share)) for name, share in shares.items()}
+        exact = {name: Fraction(str(fraction)) for name, fraction in shares.items()}
         total = sum(exact.values())
-        exact = {name: share / total for name, share in exact.items()}
-        size = min(lcm(*(share.denominator for share in exact.values())), self.MAX_BLOCK)
+        exact = {name: fraction / total for name, fraction in exact.items()}
+        size = min(lcm(*(fraction.denominator for fraction in exact.values())), self.MAX_BLOCK)
         self._block: list[str] = []
         cumulative = Fraction(0)
-        for name, share in exact.items():
-            cumulative += share
+        for name, fraction in exact.items():
+            cumulative += fraction
             self._block += [name] * (round(cumulative * size) - len(self._block))
 
     def __call__(self, number: int) -> str:
@@ -635,7 +635,7 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
     rows = []
     for line, cells in table.rows:
         source = f"{path}, line {line}"
-        with mistakes.noted(), convert_validation_errors(model, source):
+        with mistakes.collect(), convert_validation_errors(model, source):
             if len(cells) > len(table.header):
                 raise LidarError(
                     f"{source}: The line has {len(cells)} cells, but the header has "
@@ -643,7 +643,7 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
                 )
             values = [cell for index, cell in enumerate(cells) if index not in ignored]
             rows.append(_validate_row(adapter, dict(zip(names, values, strict=False))))
-    mistakes.tell()
+    mistakes.raise_if_any()
     return rows
 
 
@@ -682,7 +682,7 @@ def _check_columns(names: Sequence[str], model: Any) -> None:
     if unknown:
         noun = "columns" if unknown[1:] else "column"
         pronoun = "them" if unknown[1:] else "it"
-        shown = joined([printable(name) for name in unknown])
+        shown = join_names([printable(name) for name in unknown])
         raise ValueError(
             f"it contains the unknown {noun} {shown}.{did_you_mean_each(unknown, fields)} Rename "
             f"{pronoun}, or set `ignore: {format_yaml_list(unknown)}`. The available columns are "

@@ -206,7 +206,7 @@ def _poses_above_floor(scene: Scene, position: Floats) -> tuple[Pose, ...]:
     floor, ceiling = floor_and_ceiling(scene, x, y)
     heights = [*_HEIGHTS_M]
     if floor + heights[-1] > ceiling - _CEILING_CLEARANCE_M:
-        heights = [(ceiling - floor) * share for share in (0.25, 0.5, 0.75)]
+        heights = [(ceiling - floor) * fraction for fraction in (0.25, 0.5, 0.75)]
     return tuple(Pose((x, y, float(floor + height))) for height in heights)
 
 

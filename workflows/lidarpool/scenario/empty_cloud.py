@@ -10,7 +10,7 @@ from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.scene import Scene
 from lidarsim.simulator.sampling import sample_ranges
 from lidarsim.survey.survey import Survey
-from lidarsim.words import joined, plural, rounded
+from lidarsim.words import format_rounded, join_names, plural
 
 from ..datasets.job_table import JobRow
 from .default_poses import outside_view_hint
@@ -38,7 +38,7 @@ def empty_cloud_reason(scene: Scene, survey: Survey, scans: range | None = None)
         Scans that were simulated (default: all).
     """
     # Poses in the reason are in the coordinates of the scenario.
-    scene = scene.georeferenced((0, 0, 0))
+    scene = scene.with_world_origin((0, 0, 0))
     if survey.scan_count == 0 or (scans is not None and not len(scans)):
         return "no scan was cast"
     if scene.triangles > MAX_TRIANGLES:
@@ -46,15 +46,15 @@ def empty_cloud_reason(scene: Scene, survey: Survey, scans: range | None = None)
     ranges = sample_ranges(scene, survey, scans)
     if not len(ranges):
         faults = "faults, " * bool(survey.faults)
-        unseen = "unseen, " * any(carried.unseen for carried in survey.carried)
-        poses_note = outside_view_hint(scene, survey.carried[0])
+        unseen = "unseen, " * any(carried.unseen for carried in survey.mounted_sensors)
+        poses_note = outside_view_hint(scene, survey.mounted_sensors[0])
         return (
             f"no ray hits a surface at any distance. Check {unseen}{faults}poses and units. "
             f"{_start_position(scene, survey)}. {poses_note}"
         )
     limits = [*dict.fromkeys(_limits(survey, ranges))]
     if not limits:
-        suspects = joined([*_effects(survey)]) or "the surfaces"
+        suspects = join_names([*_effects(survey)]) or "the surfaces"
         return (
             f"rays hit surfaces at ranges from {_span(ranges)}, but no return is reported. "
             f"Check {suspects}"
@@ -78,8 +78,8 @@ def empty_jobs_warning(empty: Sequence[JobRow], reason: str) -> str:
 
 def _limits(survey: Survey, ranges: Floats) -> Iterator[str]:
     """Yield clauses about the sensors' range limits if these exclude all surfaces."""
-    lower = [carried.sensor.min_range_m for carried in survey.carried]
-    upper = [carried.sensor.max_range_m for carried in survey.carried]
+    lower = [carried.sensor.min_range_m for carried in survey.mounted_sensors]
+    upper = [carried.sensor.max_range_m for carried in survey.mounted_sensors]
     too_close = ranges < min(lower)
     too_far = ranges > max(upper)
     if not (too_close | too_far).all():
@@ -104,7 +104,7 @@ def _effects(survey: Survey) -> Iterator[str]:
         yield "noise.dropout"
     if survey.faults:
         yield "faults"
-    if survey.extinction(survey.carried[0].sensor):
+    if survey.extinction(survey.mounted_sensors[0].sensor):
         yield "weather"
     if survey.materials:
         yield "materials"
@@ -113,7 +113,7 @@ def _effects(survey: Survey) -> Iterator[str]:
 
 
 def _span(ranges: Floats) -> str:
-    return f"{rounded(np.min(ranges), 4)} to {rounded(np.max(ranges), 4)} m"
+    return f"{format_rounded(np.min(ranges), 4)} to {format_rounded(np.max(ranges), 4)} m"
 
 
 def _start_position(scene: Scene, survey: Survey) -> str:

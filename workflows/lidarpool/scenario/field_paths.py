@@ -10,7 +10,7 @@ from pydantic import BaseModel
 from lidarsim.errors import LidarError
 from lidarsim.schema.field_advice import owner_of_file, owners_by_level
 from lidarsim.schema.section_fields import fields_by_name, fields_of, is_section, sections_in
-from lidarsim.words import did_you_mean, listed, plural, shorten_name
+from lidarsim.words import did_you_mean, list_names, plural, shorten_name
 
 from .scenario import Scenario
 
@@ -135,7 +135,7 @@ def _match_name(names: Sequence[str], path_parts: Sequence[str], path: str) -> t
         if (name := ".".join(path_parts[:part_count])) in names:
             return name, part_count
     hint = did_you_mean(path_parts[0], names) or (
-        f" Available names: {listed(names, 5)}." if names else ""
+        f" Available names: {list_names(names, 5)}." if names else ""
     )
     raise LidarError(f"{path} of the base has no entry {path_parts[0]!r}.{hint}")
 

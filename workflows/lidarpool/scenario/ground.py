@@ -210,9 +210,9 @@ def _step_times(track: Track) -> Floats:
             f"The trajectory is {distances_m.sum() / 1000:,.0f} km long, but the limit for "
             f"following surfaces is {MAX_STEPS * STEP_M / 1000:,.0f} km."
         )
-    shares = np.concatenate([np.arange(n) / n for n in steps.tolist()])
+    fractions = np.concatenate([np.arange(n) / n for n in steps.tolist()])
     segments = np.repeat(np.arange(len(steps)), steps)
-    times = track.times_s[segments] + shares * np.diff(track.times_s)[segments]
+    times = track.times_s[segments] + fractions * np.diff(track.times_s)[segments]
     return np.append(times, track.times_s[-1])
 
 

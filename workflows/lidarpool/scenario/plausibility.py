@@ -18,7 +18,7 @@ from lidarsim.scene.scene import Scene
 from lidarsim.sensor.sensor import LineSensor
 from lidarsim.simulator.casting.visibility import static_key, unseen_objects, without_objects
 from lidarsim.survey.survey import Survey
-from lidarsim.words import format_as_scenario, printable, rounded
+from lidarsim.words import format_as_scenario, format_rounded, printable
 
 from .default_poses import (
     as_yaml_line,
@@ -91,7 +91,7 @@ def plausibility_warnings(prepared: PreparedScenario) -> list[str]:
     Default poses are not checked. Unless the scene has too many triangles, a few thousand rays are
     cast.
     """
-    scene = prepared.scene.georeferenced((0, 0, 0))  # in the coordinates of the scenario
+    scene = prepared.scene.with_world_origin((0, 0, 0))  # in the coordinates of the scenario
     survey = prepared.survey
     chosen = prepared.scenario.poses is None and prepared.scenario.trajectory is None
     samples = [] if chosen else _sample_positions(survey)
@@ -117,7 +117,7 @@ def plausibility_warnings(prepared: PreparedScenario) -> list[str]:
 def _sample_positions(survey: Survey) -> list[_SensorPosition]:
     """Return sample positions of all sensors in local coordinates."""
     path = survey.path
-    mounts = [*enumerate(carried.mount for carried in survey.carried)]
+    mounts = [*enumerate(carried.mount for carried in survey.mounted_sensors)]
     if path.moves:
         times = np.linspace(0, min(path.duration_ns, survey.duration_ns), _POSITIONS)
         stations = [(0, time) for time in times.tolist()]
@@ -199,7 +199,7 @@ def _exit_advice(
         if (free := seen.find_free_position(first.position)) is not None:
             return _free_pose_hint(scene, survey, first, free)
         if body.is_whole_scene:
-            return f". {outside_view_hint(scene, survey.carried[0])}"
+            return f". {outside_view_hint(scene, survey.mounted_sensors[0])}"
     lower, upper = (", ".join(f"{x:,.2f}" for x in corner) for corner in body.bounds + scene.origin)
     return f". The body extends from ({lower}) to ({upper})"
 
@@ -252,7 +252,7 @@ def _bad_positions(
     first = samples[int(is_bad.argmax())]
     x, y, z = first.position + scene.origin
     share = f" at {is_bad.sum()} of {len(is_bad)} tested positions, first" * (not is_bad.all())
-    time = f", {rounded(first.time_ns / 1e9, 4)} s after the start" * moves
+    time = f", {format_rounded(first.time_ns / 1e9, 4)} s after the start" * moves
     return f"{share} at ({x:,.3f}, {y:,.3f}, {z:,.3f}){time}"
 
 
@@ -292,15 +292,16 @@ def _visible_range_m(
 
 def _noise_warnings(survey: Survey, visible_range_m: float) -> Iterator[str]:
     """Yield warnings about noise that is greater than a tenth of the range."""
-    for carried, noise in zip(survey.carried, survey.noise_each, strict=True):
+    for carried, noise in zip(survey.mounted_sensors, survey.noise_each, strict=True):
         range_m = min(carried.sensor.max_range_m, visible_range_m)
         name = f" of {carried.name}" * bool(carried.name)
         for field in ("range_m", "range_at_threshold_m", "channel_bias_m", "warm_up_m"):
             value = float(np.max(np.abs(getattr(noise, field))))
             if value > NOISE_SHARE * range_m:
                 yield (
-                    f"`noise.{field}`{name} is {rounded(value, 4)} m, which is more than a tenth "
-                    f"of the range ({rounded(range_m, 4)} m). Check that it is in meters"
+                    f"`noise.{field}`{name} is {format_rounded(value, 4)} m, which is more than a "
+                    f"tenth of the range ({format_rounded(range_m, 4)} m). Check that it is in "
+                    "meters"
                 )
         if noise.range_per_m > NOISE_SHARE:
             yield (
@@ -335,7 +336,7 @@ def _is_airborne(
 
     A platform is airborne if it carries a line scanner or is high above the ground.
     """
-    if any(isinstance(carried.sensor, LineSensor) for carried in survey.carried):
+    if any(isinstance(carried.sensor, LineSensor) for carried in survey.mounted_sensors):
         return True
     heights = positions[:, 2] - scene.bounds[1, 2]
     if surroundings is not None and len(positions):
@@ -354,21 +355,21 @@ def _speed_warnings(motion: _Motion, *, is_airborne: bool) -> Iterator[str]:
     if (speeds > limit_m_s).any():
         fastest = int(speeds.argmax())
         yield (
-            f"the platform moves at {rounded(speeds[fastest], 4)} m/s at {_time(motion, fastest)}, "
-            f"but platforms {medium} do not exceed {limit_m_s:g} m/s. Check the units of positions "
-            "and times"
+            f"the platform moves at {format_rounded(speeds[fastest], 4)} m/s at "
+            f"{_time(motion, fastest)}, but platforms {medium} do not exceed {limit_m_s:g} m/s. "
+            "Check the units of positions and times"
         )
     if (rates > MAX_RATE_DEG_S).any():
         fastest = int(rates.argmax())
         yield (
-            f"the platform rotates at {rounded(rates[fastest], 4)} degrees per second at "
+            f"the platform rotates at {format_rounded(rates[fastest], 4)} degrees per second at "
             f"{_time(motion, fastest)}, but platforms do not exceed {MAX_RATE_DEG_S:g} degrees per "
             "second. Check the times, and the units and the order of angles or quaternions"
         )
 
 
 def _time(motion: _Motion, row: int) -> str:
-    return f"{rounded(motion.times_ns[row] / 1e9, 4)} s"
+    return f"{format_rounded(motion.times_ns[row] / 1e9, 4)} s"
 
 
 def _up_axis_warnings(motion: _Motion, lowest_m: float) -> Iterator[str]:
@@ -389,9 +390,9 @@ def _up_axis_warnings(motion: _Motion, lowest_m: float) -> Iterator[str]:
         and extent_m[flat_axis] < _FLAT * extent_m[2]
     ):
         yield (
-            f"the trajectory extends over {rounded(extent_m[2], 4)} m along z, but only over "
-            f"{rounded(extent_m[flat_axis])} m along {'xy'[flat_axis]}. Positions must be in "
-            f"meters with z up. Check whether {'xy'[flat_axis]} is the up axis of its file"
+            f"the trajectory extends over {format_rounded(extent_m[2], 4)} m along z, but only "
+            f"over {format_rounded(extent_m[flat_axis])} m along {'xy'[flat_axis]}. Positions must "
+            f"be in meters with z up. Check whether {'xy'[flat_axis]} is the up axis of its file"
         )
 
 
@@ -403,14 +404,14 @@ def _orientation_warnings(motion: _Motion) -> Iterator[str]:
     quaternions = quaternions_of(motion.rotations)
     w_first = _MeanOrientation.measure(motion, matrices(quaternions[:, [1, 2, 3, 0]]))
     tilted = as_read.level <= _TILTED
-    is_w_first = as_read.level <= _LEVEL < w_first.level and not w_first.askew
-    if not (tilted or as_read.askew or is_w_first):
+    is_w_first = as_read.level <= _LEVEL < w_first.level and not w_first.is_askew
+    if not (tilted or as_read.is_askew or is_w_first):
         return
     faults = []
     if tilted or is_w_first:
         tilt = np.degrees(np.arccos(np.clip(as_read.level, -1, 1)))
         faults.append(f"the z axis of the platform is tilted by {tilt:.0f} degrees from vertical")
-    if as_read.askew:
+    if as_read.is_askew:
         faults.append(
             f"the platform constantly faces {abs(as_read.angle_deg):.0f} degrees to the "
             f"{'left' if as_read.angle_deg > 0 else 'right'} of its direction of travel"
@@ -434,7 +435,7 @@ class _MeanOrientation(NamedTuple):
     constancy: float  # constancy of that angle, from 0 to 1; 0 if the platform hardly moves
 
     @property
-    def askew(self) -> bool:
+    def is_askew(self) -> bool:
         """Whether the platform constantly faces away from its direction of travel."""
         return self.constancy > _CONSTANT and abs(self.angle_deg) > _ASKEW_DEG
 

@@ -12,7 +12,7 @@ import numpy as np
 from lidarsim.columns.column_names import COLORS, NORMALS, ORIGINS, STRENGTHS, columns_for
 from lidarsim.columns.sweep import Columns, Sweep
 from lidarsim.environment.extras import reading
-from lidarsim.errors import LidarError, as_sentence, explained, prefixed
+from lidarsim.errors import LidarError, as_sentence, explain_os_errors, prefix_errors
 from lidarsim.io.allowance import bytes_of, memory
 from lidarsim.io.input_files import check_input
 from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Floats32, Ints
@@ -39,7 +39,7 @@ _QUANTITIES = (_CLASS, *_INTENSITIES, COLORS, NORMALS, ORIGINS)  # standard name
 def read_points(
     path: Path,
     unit: str | None,
-    tell: Callable[[str], None],
+    report: Callable[[str], None],
     *,
     epsg: int | None = None,
     keep_noise: bool = False,
@@ -64,7 +64,7 @@ def read_points(
         A file with an extension in `point_suffixes()`.
     unit
         Unit of x, y and z, which overrides the unit that the file states.
-    tell
+    report
         Function that is called with notes on converted units, and on skipped points and columns.
     epsg
         Code of the coordinate system to which the points are transformed. By default, the
@@ -88,27 +88,27 @@ def read_points(
             f"{path} has the extension {path.suffix or '(none)'}, but point clouds must have one "
             f"of these extensions: {' '.join(point_suffixes())}."
         )
-    with explained(f"{path} cannot be read"), prefixed(path):
+    with explain_os_errors(f"{path} cannot be read"), prefix_errors(path):
         if not check_input(path):
             raise LidarError("it is empty (0 bytes).")
     recording = cloud_format.open(RecordingSource(path, str(path), as_stored=True))
     with reading(str(path)):
         content = _read_scans(recording, keep_noise)
-        if note := content.omitted.note():
-            tell(f"{path}: {note}")
-        to_meters, placed_epsg = _to_meters(path, recording, content.points, unit, epsg, tell)
+        if note := content.omitted.omission_note():
+            report(f"{path}: {note}")
+        to_meters, placed_epsg = _to_meters(path, recording, content.points, unit, epsg, report)
         points = _convert_points(content.points, to_meters)
     _check_points(path, points, content.omitted)
     for line in (*recording.notes, *(f"{path} {note}" for note in points.notes)):
-        tell(line)
+        report(line)
     if content.no_returns:
-        tell(
+        report(
             f"{plural(content.no_returns, 'point')} of {path} at the origin "
             f"{'was' if content.no_returns == 1 else 'were'} skipped as pulses without a return"
         )
     if points.skipped:
         names = ", ".join(map(printable, points.skipped))
-        tell(f"{path} has data that surfels cannot store, which were skipped: {names}")
+        report(f"{path} has data that surfels cannot store, which were skipped: {names}")
     return points, placed_epsg
 
 
@@ -124,7 +124,7 @@ def vectors(points: Sweep, names: Sequence[str]) -> AnyArray | None:
 
 def _check_points(path: Path, points: Sweep, omitted: OmittedPoints) -> None:
     """Raise LidarError if there are too few points or a coordinate is implausibly large."""
-    if len(points) < MIN_POINTS and (note := omitted.note()):
+    if len(points) < MIN_POINTS and (note := omitted.omission_note()):
         raise LidarError(
             f"{path} must have at least {MIN_POINTS} usable points, but has {len(points)}: {note}."
         )
@@ -251,11 +251,11 @@ def _to_meters(
     points: Sweep,
     unit: str | None,
     epsg: int | None,
-    tell: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> tuple[Callable[[Floats], Floats], int | None]:
     """Return a function that converts positions to true meters, and the resulting EPSG code.
 
-    The code is None if the coordinate system of the converted positions is unknown. `tell` is
+    The code is None if the coordinate system of the converted positions is unknown. `report` is
     called with notes on the conversion. Positions have shape (n, 3).
     """
     finite = points.points[np.isfinite(points.points).all(axis=1)]
@@ -285,7 +285,7 @@ def _to_meters(
         if recording.system is not None and unit is None and meters == METERS:
             placed_epsg = recording.system.epsg_in_meters
     for note in notes:
-        tell(f"{path} {note}")
+        report(f"{path} {note}")
     return convert, placed_epsg
 
 

@@ -27,7 +27,7 @@ from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.schema.checks import check_choice
 from lidarsim.schema.vocabulary import UNITS_M
-from lidarsim.words import plural, rounded
+from lidarsim.words import format_rounded, plural
 
 from ..open3d_access.open3d_module import load_open3d
 from .point_files import MIN_POINTS, NO_CLASS, POINT_BYTES, read_points, vectors
@@ -59,7 +59,7 @@ def scene_from_points(
     epsg: int | None = None,
     keep_noise: bool = False,
     color: Literal["rgb", "intensity"] | None = None,
-    tell: Callable[[str], None] = warn,
+    report: Callable[[str], None] = warn,
 ) -> Scene:
     """Convert a point cloud, such as a scan of a real site, to a scene of surfels.
 
@@ -100,7 +100,7 @@ def scene_from_points(
         Source of the surfel colors: "rgb" for red, green and blue, or "intensity" for gray levels
         from the mean intensities, where the 99th percentile is white. By default, red, green and
         blue are used if the file contains them.
-    tell
+    report
         Function that is called with notes on converted units, skipped points and discarded data. By
         default, the notes are logged as warnings.
 
@@ -129,7 +129,7 @@ def scene_from_points(
         epsg=epsg,
         keep_noise=keep_noise,
         color=color,
-        tell=tell,
+        report=report,
     ).scene
 
 
@@ -154,7 +154,7 @@ class PointScene(NamedTuple):
     @property
     def gap_note(self) -> str:
         """Note about returns that are lost in gaps between points, or an empty string."""
-        larger_m = rounded(2 * self.voxel_m, 2)
+        larger_m = format_rounded(2 * self.voxel_m, 2)
         advice = f"To close gaps, increase `--voxel-m` (`voxel_m` in Python), such as to {larger_m}"
         if self.loss is None:
             return (
@@ -179,7 +179,7 @@ def points_to_scene(
     epsg: int | None,
     keep_noise: bool,
     color: str | None,
-    tell: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> PointScene:
     """Convert a point cloud to a scene, and estimate the fraction of lost returns.
 
@@ -188,8 +188,8 @@ def points_to_scene(
     for name, value in (("voxel_m", voxel_m), ("size", size)):
         if value is not None and not 0 < value < np.inf:
             raise LidarError(f"{name} must be a positive number, but is {value}.")
-    points, placed_epsg = read_points(path, unit, tell, epsg=epsg, keep_noise=keep_noise)
-    points = _select_color(path, points, color, tell)
+    points, placed_epsg = read_points(path, unit, report, epsg=epsg, keep_noise=keep_noise)
+    points = _select_color(path, points, color, report)
     surfels = _compute_surfels(path, points, voxel_m, size)
     loss = None
     if (scanners := vectors(points, ORIGINS)) is not None:
@@ -214,7 +214,7 @@ class _Surfels(NamedTuple):
 
 
 def _select_color(
-    path: Path, points: Sweep, color: str | None, tell: Callable[[str], None]
+    path: Path, points: Sweep, color: str | None, report: Callable[[str], None]
 ) -> Sweep:
     """Return points that have either colors or intensities, but not both.
 
@@ -226,34 +226,34 @@ def _select_color(
         quantity = "colors" if color == "rgb" else "intensities"
         raise LidarError(f"`color` cannot be {color!r}, because {path} has no {quantity}.")
     if points.classes is not None:
-        _note_unknown(path, "class", points.classes == NO_CLASS, "have no material", tell)
+        _note_unknown(path, "class", points.classes == NO_CLASS, "have no material", report)
     if not any(present.values()):
         return points
     color = color or next(name for name, is_present in present.items() if is_present)
     if all(present.values()):
         other, choice = ("intensities", "intensity") if color == "rgb" else ("colors", "rgb")
-        tell(
+        report(
             f"the {other} of {path} are not stored, because a surfel has a single color. To use "
             f"them, set `color` to {choice}"
         )
     if color == "rgb":
-        _note_unknown(path, "color", np.isnan(columns["red"]), _GRAY, tell)
+        _note_unknown(path, "color", np.isnan(columns["red"]), _GRAY, report)
         columns.pop("intensity", None)
     else:
-        _note_unknown(path, "intensity", np.isnan(columns["intensity"]), _GRAY, tell)
+        _note_unknown(path, "intensity", np.isnan(columns["intensity"]), _GRAY, report)
         columns = {name: values for name, values in columns.items() if name not in COLORS}
     return points.replace(columns=columns)
 
 
 def _note_unknown(
-    path: Path, quantity: str, unknown: Bools, outcome: str, tell: Callable[[str], None]
+    path: Path, quantity: str, unknown: Bools, outcome: str, report: Callable[[str], None]
 ) -> None:
     """Notify the user if some points lack a quantity.
 
     The mask `unknown` has shape (n,).
     """
     if count := int(unknown.sum()):
-        tell(
+        report(
             f"{path}: {count:,} of {plural(len(unknown), 'point')} have no {quantity}. Surfels of "
             f"such points {outcome}."
         )

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidarscenes.robots.robot import Robot
-from lidarsim.errors import LidarError, Mistakes, prefixed
+from lidarsim.errors import LidarError, Mistakes, prefix_errors
 from lidarsim.media.materials import (
     Material,
     SurfaceKinds,
@@ -136,7 +136,7 @@ def prepare(
     """
     with scenario.explain_missing_files():
         _check_sensors(scenario)
-        static = read_static_scene(scenario) if cache is None else cache.find(scenario)
+        static = read_static_scene(scenario) if cache is None else cache.get_scene(scenario)
         return _prepare(scenario, static, plans, columns, fields)
 
 
@@ -161,19 +161,19 @@ def _prepare(
     mistakes = Mistakes()
     planning = None
     if plans:
-        with mistakes.noted(), prefixed(scenario.source):
+        with mistakes.collect(), prefix_errors(scenario.source):
             planning = _build_planning(scenario, scene)
-    with mistakes.noted(), prefixed(scenario.source):
+    with mistakes.collect(), prefix_errors(scenario.source):
         materials = _materials(scenario, findings, scene, vehicles)
         job = Job(
-            scene=scene.georeferenced(scenario.world.origin),
+            scene=scene.with_world_origin(scenario.world.origin),
             survey=_build_survey(survey_parts, materials, columns),
             planning=planning,
             # PLY files are always written.
             outputs=tuple(entry for entry in scenario.output.write if entry.format != "ply"),
             **fields,
         )
-    mistakes.tell()
+    mistakes.raise_if_any()
     return PreparedScenario(scenario, job, survey_parts.placement, findings)
 
 
@@ -197,9 +197,9 @@ def _survey_parts(shapes: ShapeLoader, static: StaticScene) -> _SurveyParts:
     scene = static.scene
     findings = shapes.findings
     epsg = _common_epsg(scenario, findings)
-    with prefixed(scenario.source):
+    with prefix_errors(scenario.source):
         if scenario.world.epsg is not None:  # fail before files of moving objects are read
-            check_epsg(scenario.world.epsg, scene.georeferenced(scenario.world.origin))
+            check_epsg(scenario.world.epsg, scene.with_world_origin(scenario.world.origin))
         track = _platform_track(shapes, static.support)
         sensors = _mounted_sensors(shapes)
     placement: SensorPlacement | None = None
@@ -272,7 +272,7 @@ def _build_traffic(
     scenario = survey_parts.scenario
     if scenario.traffic is None:
         return []
-    with prefixed(scenario.source):
+    with prefix_errors(scenario.source):
         # The duration does not depend on the materials.
         duration_s = _build_survey(survey_parts, []).duration_ns / 1e9
         track_or_poses = survey_parts.track_or_poses
@@ -323,9 +323,9 @@ def _check_sensors(scenario: Scenario) -> None:
     are not read again.
     """
     sections: Mapping[str, SensorSection] = scenario.sensors or {"": scenario.sensor}
-    with prefixed(scenario.source):
+    with prefix_errors(scenario.source):
         for name, section in sections.items():
-            section.mounted(scenario.path, CENTER, scenario.noise, scenario.returns, name)
+            section.mounted_sensor(scenario.path, CENTER, scenario.noise, scenario.returns, name)
 
 
 def _mounted_sensors(shapes: ShapeLoader) -> list[Mounted]:
@@ -335,7 +335,7 @@ def _mounted_sensors(shapes: ShapeLoader) -> list[Mounted]:
     noise = scenario.noise
     returns = scenario.returns
     return [
-        section.mounted(path, _mount_pose(section, shapes), noise, returns, name)
+        section.mounted_sensor(path, _mount_pose(section, shapes), noise, returns, name)
         for name, section in sections.items()
     ]
 
@@ -364,7 +364,7 @@ def _mount_pose(section: SensorSection, shapes: ShapeLoader) -> Pose:
             f"{mount.link!r}.{name_hint(mount.link, links)}"
         )
     ((entry, robot),) = matching_robots
-    with prefixed(f"actor {entry.name!r}"):
+    with prefix_errors(f"actor {entry.name!r}"):
         path = robot.path(mount.link, **_joint_arguments(entry, scenario))
     if path.moves:
         file = None if entry.joints is None else entry.joints.file
@@ -396,14 +396,14 @@ def _build_actors(
     """
     scenario = shapes.scenario
     actors = list[Actor]()
-    with prefixed(scenario.source):
+    with prefix_errors(scenario.source):
         without_angles = shapes.findings.without_angles
         trajectories = [
             entry.track(scenario.path, support, track, without_angles) for entry in scenario.actors
         ]
     for entry, trajectory in zip(scenario.actors, trajectories, strict=True):
         if entry.robot:
-            with prefixed(f"{scenario.source}: actor {entry.name!r}"):
+            with prefix_errors(f"{scenario.source}: actor {entry.name!r}"):
                 actors += _robot_actors(entry, shapes.load_robot(entry.robot), trajectory, shapes)
         else:
             offset_s = 0.0 if entry.animation is None else entry.animation.offset_s
@@ -428,7 +428,9 @@ def _robot_actors(
             "on it"
         )
     joints = _joint_arguments(entry, shapes.scenario)
-    return robot.actors(trajectory, name=entry.name, without=sensor_links, tell=add_note, **joints)
+    return robot.actors(
+        trajectory, name=entry.name, without=sensor_links, report=add_note, **joints
+    )
 
 
 def _traffic_actors(

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from pydantic import PrivateAttr, ValidationError
 
 from lidarsim.columns.table import COLORS
-from lidarsim.errors import LidarError, Mistakes, prefixed
+from lidarsim.errors import LidarError, Mistakes, prefix_errors
 from lidarsim.io.input_files import not_found
 from lidarsim.io.yamlfile import read_yaml
 from lidarsim.media.materials import ClassNames, Material
@@ -24,7 +24,7 @@ from lidarsim.motion.trajectory_files import list_trajectory_files
 from lidarsim.scene.files.mesh_formats import endings, format_of
 from lidarsim.schema.declared import Several, Text, about, accept_text
 from lidarsim.schema.error_sentences import convert_validation_errors
-from lidarsim.schema.section_fields import FieldPath, dotted, fields_of, is_section
+from lidarsim.schema.section_fields import FieldPath, fields_of, format_path, is_section
 from lidarsim.sensor.models import plugin_model_file
 from lidarsim.survey.faults import Fault
 from lidarsim.survey.survey import MAX_SENSORS, CloudOptions, StepCount
@@ -327,10 +327,10 @@ class Scenario(Section):
             mistakes.lines.append(f"{self._source}: {reason}")
         for section in self.sensors.values() or (self.sensor,):
             if section.calibration is None:
-                with mistakes.noted(), self.explain_missing_files(), prefixed(self._source):
-                    mounted = section.mounted(self.path, CENTER, self.noise, self.returns)
+                with mistakes.collect(), self.explain_missing_files(), prefix_errors(self._source):
+                    mounted = section.mounted_sensor(self.path, CENTER, self.noise, self.returns)
                     (mounted.returns or self.returns).divergence(mounted.sensor.optics)
-        mistakes.tell()
+        mistakes.raise_if_any()
 
     def _contradictions(self) -> Iterator[str]:
         """Yield a sentence for each contradiction between fields."""
@@ -455,7 +455,7 @@ class Scenario(Section):
                 for line in str(error).splitlines()
                 if not any(str(path) in line for path in missing)
             ]
-            mistakes.tell()
+            mistakes.raise_if_any()
 
     @property
     def object_entries(self) -> tuple[CopiesSection | ActorSection, ...]:
@@ -512,7 +512,7 @@ def _find_file_field(section: Any, is_file: Callable[[str], bool]) -> str:
     """
     for path, text in _iter_strings(section):
         if path[-1] in _FILE_FIELDS and is_file(text):
-            return dotted(path)
+            return format_path(path)
     return ""
 
 

@@ -624,7 +624,7 @@ class SensorSection(Section):
         """Whether the model is a file provided by the user."""
         return self.model is not None and self.model.endswith(MODEL_FILES)
 
-    def mounted(
+    def mounted_sensor(
         self,
         path: ResolvePath,
         mount: Pose,

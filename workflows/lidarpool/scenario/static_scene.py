@@ -16,7 +16,7 @@ import numpy as np
 from lidarscenes.files.formats import ROBOTS
 from lidarscenes.robots.robot import Robot
 from lidarscenes.robots.urdf import load_robot
-from lidarsim.errors import LidarError, Mistakes, message_of, prefixed
+from lidarsim.errors import LidarError, Mistakes, message_of, prefix_errors
 from lidarsim.io.tables import NUMBERS, Quantity, read_table
 from lidarsim.io.textfile import read_text
 from lidarsim.motion.pose_columns import (
@@ -39,7 +39,7 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.scene.transform import Transform, affine
 from lidarsim.scene.wheels import animate_wheels
-from lidarsim.words import joined, plural
+from lidarsim.words import join_names, plural
 
 from .ground import SupportSurfaces
 from .scenario import Scenario
@@ -137,15 +137,15 @@ class SceneCache:
         self._objects = _LeastRecentlyUsedCache[_StaticObjects](max_scenes)
         self._scenes = _LeastRecentlyUsedCache[StaticScene](max_scenes)
 
-    def find(self, scenario: Scenario) -> StaticScene:
+    def get_scene(self, scenario: Scenario) -> StaticScene:
         """Return the static scene of a scenario, reading its files if it is not cached."""
         key = _cache_key(scenario)
         if scenario.scene.ground is None:
-            return self._scenes.find(key, lambda: read_static_scene(scenario))
-        static = self._objects.find(key, lambda: _read_objects(scenario))
+            return self._scenes.get_or_create(key, lambda: read_static_scene(scenario))
+        static = self._objects.get_or_create(key, lambda: _read_objects(scenario))
         ground = _build_ground(scenario, static)
         rectangle = ground.vertices.tobytes()
-        return self._scenes.find((key, rectangle), lambda: _static_scene(static, ground))
+        return self._scenes.get_or_create((key, rectangle), lambda: _static_scene(static, ground))
 
 
 class _LeastRecentlyUsedCache(Generic[Value]):
@@ -155,7 +155,7 @@ class _LeastRecentlyUsedCache(Generic[Value]):
         self._max_count = max_count
         self._values = dict[object, Value]()
 
-    def find(self, key: object, make: Callable[[], Value]) -> Value:
+    def get_or_create(self, key: object, make: Callable[[], Value]) -> Value:
         """Return the value for a key, creating it if it is not cached."""
         value = self._values.pop(key) if key in self._values else make()
         self._values[key] = value  # dictionaries are ordered, so the most recent value is the last
@@ -222,7 +222,7 @@ def _read_objects(scenario: Scenario) -> _StaticObjects:
     moving: list[Actor] = []
     mistakes = Mistakes()
     for entry in section.files:
-        with mistakes.noted():
+        with mistakes.collect():
             objects = shapes.read_objects(entry)
             meshes += objects.static
             moving += objects.actors
@@ -230,7 +230,7 @@ def _read_objects(scenario: Scenario) -> _StaticObjects:
                 findings.classes[entry.file] = objects.classes
             if system := _file_crs(entry, objects):
                 findings.systems.append(system)
-    mistakes.tell()
+    mistakes.raise_if_any()
     meshes = resolve_same_names(meshes, section.same_names, findings.notes.append)
     if section.copies:
         meshes += _place_copies(shapes, meshes)
@@ -307,7 +307,7 @@ class ShapeLoader:
                 lambda line: self.findings.notes.append(f"{path} moves {line}")
             )
             if wheels is not None:
-                with prefixed(path):
+                with prefix_errors(path):
                     objects = (*animate_wheels(objects, wheels, self.findings.notes.append),)
             mesh = meshes[key] = join_meshes(name, objects)
             if animation is not None and mesh.animation is not None:
@@ -322,7 +322,7 @@ class ShapeLoader:
         """
         if entry not in self._robots:
             path = self.scenario.path(entry.file)
-            tell = self.findings.notes.append
+            report = self.findings.notes.append
             colors = self.scenario.needs_colors
             name_materials = self.scenario.needs_material_names
             robot = load_robot(
@@ -331,7 +331,7 @@ class ShapeLoader:
                 colors=colors,
                 materials=name_materials,
                 assets=self._assets_folder(entry),
-                tell=tell,
+                report=report,
             )
             self._robots[entry] = robot
             self.findings.sources[entry.file] = robot.summary
@@ -349,7 +349,7 @@ class ShapeLoader:
         """
         scenario = self.scenario
         findings = self.findings
-        with prefixed(scenario.source):
+        with prefix_errors(scenario.source):
             transform = entry.transform()
         if entry.file.lower().endswith(ROBOTS):
             return self._stationary_robot(entry, transform)
@@ -366,7 +366,7 @@ class ShapeLoader:
             materials=scenario.needs_material_names,
             assets=self._assets_folder(entry),
             animation=animation,
-            tell=findings.notes.append,
+            report=findings.notes.append,
             axes=findings.remarks.append,
         )
         findings.sources.setdefault(entry.file, objects.summary)
@@ -379,17 +379,19 @@ class ShapeLoader:
         if refused_fields := sorted(entry.model_fields_set - _ROBOT_FIELDS):
             raise LidarError(
                 f"{self.scenario.path(entry.file)} is a robot, which is always in meters with z "
-                f"up. Remove {joined([f'`{name}`' for name in refused_fields])}."
+                f"up. Remove {join_names([f'`{name}`' for name in refused_fields])}."
             )
         robot = self.load_robot(entry)
-        tell = self.findings.notes.append
+        report = self.findings.notes.append
         if robot.moving:
-            tell(
+            report(
                 f"all joints of {entry.file} are at zero. To move them, add the robot as an actor "
                 "with `joints`"
             )
-        links = Objects((), robot.actors(tell=tell)).at_start(lambda _: None)
-        return Objects(tuple(o.moved(o.name, transform.linear, transform.offset) for o in links))
+        links = Objects((), robot.actors(report=report)).at_start(lambda _: None)
+        return Objects(
+            tuple(o.affine_transform(o.name, transform.linear, transform.offset) for o in links)
+        )
 
 
 def _place_copies(
@@ -410,15 +412,15 @@ def _place_copies(
     copies: list[SceneInstance] = []
     mistakes = Mistakes()
     for number, entry in enumerate(section.copies):
-        with mistakes.noted():
+        with mistakes.collect():
             mesh = shapes.load_mesh(entry)
-            with prefixed(f"{scenario.source}: scene.copies[{number}]"):
+            with prefix_errors(f"{scenario.source}: scene.copies[{number}]"):
                 instances = place_copies(entry, mesh, support, scenario.path)
             if entry.file is not None:
                 words = f", {plural(len(instances), 'copy', 'copies')}"
                 shapes.findings.sources[entry.file.file] += words
             copies += instances
-    mistakes.tell()
+    mistakes.raise_if_any()
     return copies
 
 
@@ -445,12 +447,12 @@ def _footprints(scenario: Scenario) -> list[Floats]:
     footprints = _copy_extents(scenario.scene)
     poses = [*(scenario.poses or ()), *(entry.at for entry in scenario.actors if entry.at)]
     footprints.append(np.reshape([pose.position[:2] for pose in poses], (-1, 2)))
-    with prefixed(scenario.source):
+    with prefix_errors(scenario.source):
         if scenario.trajectory is not None:
             footprints.append(scenario.trajectory.footprint(scenario.path))
         for entry in scenario.actors:
             if entry.trajectory is not None:
-                with prefixed(f"actor {entry.name!r}"):
+                with prefix_errors(f"actor {entry.name!r}"):
                     footprints.append(entry.trajectory.footprint(scenario.path))
     return footprints
 

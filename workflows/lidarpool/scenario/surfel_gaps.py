@@ -49,7 +49,7 @@ def expected_loss(positions: Floats, scanners: Floats, corners: Floats) -> float
     if not 0 < len(stations) <= MAX_SCANNERS:
         return None
     rng = np.random.default_rng(0)
-    shares = [np.zeros(0)]
+    fractions = [np.zeros(0)]
     for number, scanner in enumerate(stations):
         rows = known[owner.ravel() == number]
         count = max(1, round(_SAMPLE * len(rows) / len(known)))
@@ -57,8 +57,8 @@ def expected_loss(positions: Floats, scanners: Floats, corners: Floats) -> float
         tree = _search_tree(_normalize(surfels.mean(axis=1)))
         for rays in _rays_between(positions[rows] - scanner, count, rng):
             nearest = _nearest(tree, rays.directions.reshape(-1, 3), min(_SURFELS, len(surfels)))
-            shares.append(1 - rays.covered_by(surfels[nearest]).mean(axis=1))
-    lost = np.concatenate(shares)
+            fractions.append(1 - rays.covered_by(surfels[nearest]).mean(axis=1))
+    lost = np.concatenate(fractions)
     return float(lost.mean()) if len(lost) >= _MIN_NEIGHBORHOODS else None
 
 

@@ -20,7 +20,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from lidarsim.errors import LidarError, message_of, prefixed
+from lidarsim.errors import LidarError, message_of, prefix_errors
 from lidarsim.io.allowance import Allowance
 from lidarsim.io.input_files import input_size, open_input
 from lidarsim.io.time_units import SECONDS, TimeUnit, are_plausible, seconds_of
@@ -353,14 +353,14 @@ class _PassageCollector:
             return
         if not self._filter.matches(attributes["id"]):
             if attributes["id"] not in self.left_out:
-                self._allowance.take(_TRAVELER_BYTES)
+                self._allowance.reserve(_TRAVELER_BYTES)
             self.left_out.add(attributes["id"])
             return
         passage = self._passage(tag, attributes)
         if self.time_s <= self._first_s:  # the previous rows are not needed
             del passage.times_s[:], passage.rows[:]
         else:
-            self._allowance.take(_ROW_BYTES)
+            self._allowance.reserve(_ROW_BYTES)
         identity = attributes["id"]
         named = f"{tag} {identity!r}"
         row = [_parse_number(named, key, attributes[key]) for key in _ROW[:3]]
@@ -376,7 +376,7 @@ class _PassageCollector:
         last_step, passage = self.travelers.get(traveler, (-2, None))
         # SUMO omits vehicles while they are teleported.
         if passage is None or last_step < self.step - 1:
-            self._allowance.take(_TRAVELER_BYTES + len(attributes["id"]))
+            self._allowance.reserve(_TRAVELER_BYTES + len(attributes["id"]))
             passage = SumoPassage(attributes["id"], attributes.get("type") or tag)
             self.passages.append(passage)
         self.travelers[traveler] = self.step, passage
@@ -429,7 +429,7 @@ def read_fcd(
     try:
         allowance = Allowance(input_size(path), "Simulate a shorter time, or fewer vehicles")
         collector = _PassageCollector(section, first_s, travelers, allowance)
-        with prefixed(path):
+        with prefix_errors(path):
             collector.collect(_iter_elements(path), last_s)
     except (OSError, EOFError, zlib.error, ValueError, KeyError, expat.ExpatError) as error:
         raise LidarError(
@@ -470,7 +470,7 @@ def _iter_elements(path: Path) -> Iterator[tuple[str, Mapping[str, str]]]:
         content: BufferedIOBase = gzip.GzipFile(fileobj=file) if is_packed else file
         for _ in parse_pieces(parser, iter(partial(content.read, PIECE_BYTES), b"")):
             if is_packed:
-                allowance.take(PIECE_BYTES + _ELEMENT_BYTES * len(elements))
+                allowance.reserve(PIECE_BYTES + _ELEMENT_BYTES * len(elements))
             yield from elements
             elements.clear()
 
@@ -589,9 +589,9 @@ def build_traffic_actors(
         tracks = _passage_tracks(passage, section, mesh, support, start_s)
         named = replace(mesh, name=f"{entry.name or passage.kind} ({passage.name})")
         # Different animation offsets keep the actors of an entry from walking in step.
-        share = zlib.crc32(passage.name.encode()) / 2**32
+        fraction = zlib.crc32(passage.name.encode()) / 2**32
         offset_s = 0.0 if entry.animation is None else entry.animation.offset_s
-        offset_s += 0.0 if mesh.animation is None else share * mesh.animation.duration_s
+        offset_s += 0.0 if mesh.animation is None else fraction * mesh.animation.duration_s
         actors += [(Actor(named, piece, offset_s), entry) for piece in tracks]
         if len(actors) > MAX_ACTORS:
             raise LidarError(

@@ -106,7 +106,7 @@ class _ExternalScannerView(ScannerView):
     def __init__(self, viewer: Viewer, scanner: Scanner) -> None:
         super().__init__(scanner)
         self._viewer = viewer
-        name = scanner.survey.carried[0].name
+        name = scanner.survey.mounted_sensors[0].name
         surroundings = Surroundings(
             Surface.from_scene(scanner.scene),
             start_ns=time.time_ns(),
@@ -168,7 +168,7 @@ class Rerun(_ExternalScannerView):
 def _sweep_for_viewers(scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> ShownSweep:
     """Convert a scanner's sweep to a form that viewers can show, with frames and boxes."""
     scene = scanner.scene
-    (mounted,) = scanner.survey.carried
+    (mounted,) = scanner.survey.mounted_sensors
     vehicle = pose_at(pose, time_ns)
     sensor = vehicle.compose(mounted.mount)
     positions = cloud.positions.astype(np.float64)
@@ -202,7 +202,7 @@ def _boxes(scanner: Scanner, cloud: Cloud, poses: list[Pose], time_ns: float) ->
     actors = scene.actors
     bounds = np.array([actor.bounds for actor in actors])
     rotations = np.array([pose.rotation_matrix for pose in poses])
-    middles = (rotations @ bounds.mean(axis=1)[..., None])[..., 0]
+    local_centers = (rotations @ bounds.mean(axis=1)[..., None])[..., 0]
     positions = np.array([pose.position for pose in poses]) + scene.origin
     hit_actors = cloud["object"].astype(np.int64) - len(scene.names)
     counts = np.bincount(hit_actors[hit_actors >= 0], minlength=len(actors))
@@ -210,7 +210,7 @@ def _boxes(scanner: Scanner, cloud: Cloud, poses: list[Pose], time_ns: float) ->
     return ActorBoxes(
         names=names,
         types=[actor_type(name) for name in names],
-        centers=positions + middles,
+        centers=positions + local_centers,
         quaternions=quaternions_of(rotations),
         sizes=np.ptp(bounds, axis=1),
         points=counts.tolist(),

@@ -113,7 +113,7 @@ def read_cityjson(data: bytes, path: Path, options: ReadOptions) -> Content:
         is_single = path.suffix.lower() != ".jsonl"
         return iter([data]) if is_single else filter(bytes.strip, io.BytesIO(data))
 
-    allowance.take(max(map(_unpacked_bytes, lines()), default=0))  # one line at a time
+    allowance.reserve(max(map(_unpacked_bytes, lines()), default=0))  # one line at a time
     city = None
     for line in lines():
         document = json.loads(line)
@@ -280,7 +280,7 @@ class _CityFile:
         """Triangulate polygons, and return the triangles and the owner of each triangle."""
         corners = np.concatenate(polygons.corners)
         sizes = np.array(polygons.sizes, np.int64)
-        self._allowance.take(100 * len(corners))
+        self._allowance.reserve(100 * len(corners))
         # Polygons do not share corners here, so each corner identifies the polygon of a triangle.
         simple = triangulate(points[corners], np.arange(len(corners)), sizes)
         polygon = np.searchsorted(np.cumsum(sizes), simple[:, 0], side="right")

@@ -164,7 +164,7 @@ class _Document:
             )
         matrix = matrix.reshape(4, 4)
         return [
-            mesh.moved(mesh.name, matrix[:3, :3], matrix[:3, 3])
+            mesh.affine_transform(mesh.name, matrix[:3, :3], matrix[:3, 3])
             for mesh in self._geometry(self._target(skin, "geometry"), bound)
         ]
 
@@ -305,7 +305,7 @@ class _Document:
         columns = [names.index(axis) for axis in "XYZ" if axis in names]
         if len(columns) != 3:
             return rows[:, :3]
-        self._allowance.take(24 * len(rows))
+        self._allowance.reserve(24 * len(rows))
         return rows[:, columns]
 
     def _rows(self, source: Element) -> Floats:

@@ -128,7 +128,7 @@ def read_ifc(data: bytes, path: Path, options: ReadOptions) -> Content:
     }
     shapes = _Shapes(options, allowance)
     building: dict[str, Any] = {}
-    with closing(child.frames(path, request, lambda _, size: allowance.take(size))) as frames:
+    with closing(child.frames(path, request, lambda _, size: allowance.reserve(size))) as frames:
         for frame, arrays in frames:
             match frame["what"]:
                 case "schema":

@@ -211,13 +211,13 @@ class Building:
         The color is None if it is not stated.
         """
         color = style.get_color()
-        shares = [color.r(), color.g(), color.b()]
+        rgb = [color.r(), color.g(), color.b()]
         transparency = style.transparency
         number = style.instance_id()
         name = getattr(self._file.by_id(number), "Name", None) if number > 0 else None
         return {
             "name": name or "",
-            "color": shares if np.isfinite(shares).all() else None,
+            "color": rgb if np.isfinite(rgb).all() else None,
             "transparency": transparency if np.isfinite(transparency) else 0.0,
         }
 

@@ -252,7 +252,7 @@ class _LocalSystem:
     unit_m: float
 
     @property
-    def note(self) -> str:
+    def conversion_note(self) -> str:
         """Note on the conversion to meters, or an empty string if the unit is the meter."""
         if self.unit_m == 1:
             return ""
@@ -763,7 +763,7 @@ def _notes(source: _Source, path: Path) -> list[str]:
             "are assumed"
         )
     if source.local is not None:
-        notes += [source.local.note] if source.local.note else []
+        notes += [source.local.conversion_note] if source.local.conversion_note else []
     elif source.crs is None:
         notes.append(
             "does not specify a coordinate system. Coordinates in meters are assumed. To add a "

@@ -174,7 +174,7 @@ class _Package:
                 "is compressed with a method other than Deflate, which is not supported. Export "
                 "it again with Deflate"
             )
-        self._allowance.take(entry.file_size)
+        self._allowance.reserve(entry.file_size)
         with self._archive.open(entry) as file:
             while piece := file.read(PIECE_BYTES):
                 yield piece
@@ -255,20 +255,20 @@ class _Model:
             raise MeshFileError(f"contains <{tag}>, which is not supported. Export it as triangles")
 
     def _begin_group(self, attributes: dict[str, str]) -> None:
-        self._allowance.take(_OBJECT_BYTES)
+        self._allowance.reserve(_OBJECT_BYTES)
         self._group = self._groups.setdefault(attributes["id"], [])
         self._names_of_group = self._names.setdefault(attributes["id"], [])
 
     def _add_color(self, attributes: dict[str, str]) -> None:
         """Add a color and its name to the current group."""
-        self._allowance.take(_COLOR_BYTES)
+        self._allowance.reserve(_COLOR_BYTES)
         color = attributes.get("displaycolor", attributes.get("color", ""))
         match = _COLOR.fullmatch(color)
         self._group.append(bytes.fromhex(match[1]) if match else GRAY.tobytes())
         self._names_of_group.append(attributes.get("name", ""))
 
     def _begin_object(self, attributes: dict[str, str]) -> None:
-        self._allowance.take(_OBJECT_BYTES)
+        self._allowance.reserve(_OBJECT_BYTES)
         self._object = _MeshObject(attributes.get("name", ""))
         self._object.default_property = attributes.get("pid", ""), attributes.get("pindex", "0")
         self.objects[attributes["id"]] = self._object
@@ -308,7 +308,7 @@ class _Model:
 
     def _placement(self, attributes: dict[str, Any]) -> _Placement:
         """Read a component or a build item."""
-        self._allowance.take(_OBJECT_BYTES)
+        self._allowance.reserve(_OBJECT_BYTES)
         path = next((v for k, v in attributes.items() if k.rpartition(":")[2] == "path"), "")
         matrix = np.eye(4)
         if "transform" in attributes:

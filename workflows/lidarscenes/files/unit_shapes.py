@@ -9,6 +9,6 @@ from lidarsim.scene.shapes import capsule, cylinder
 
 SIDES = 64  # sides of a circle, which deviate from it by at most 0.12 % of the radius
 
-UNIT_BOX = box("box", (1, 1, 1)).moved("box", np.eye(3), np.array([0, 0, -0.5]))
+UNIT_BOX = box("box", (1, 1, 1)).affine_transform("box", np.eye(3), np.array([0, 0, -0.5]))
 UNIT_BALL = capsule(1, 0, SIDES, "sphere")
 UNIT_CYLINDER = cylinder(1, 1, SIDES, "cylinder")

@@ -99,7 +99,7 @@ def _contents(
     for frame, arrays in frames:
         match frame["what"]:
             case "image" | "material":
-                materials.add(frame, arrays)
+                materials.add_frame(frame, arrays)
             case "mesh":
                 meshes[frame["number"]] = _polygon_mesh(frame, arrays, allowance, materials)
             case "shape":
@@ -121,7 +121,7 @@ def _frames(path: Path, options: ReadOptions, allowance: Allowance) -> Generator
         """
         if frame["what"] == "image":
             allowance.grow(size)
-        allowance.take(size)
+        allowance.reserve(size)
 
     child = ReaderProcess(
         Path(__file__).with_name("usd_child.py"),
@@ -153,7 +153,7 @@ def _polygon_mesh(
 ) -> list[SceneMesh]:
     """Return polygons as a list with one mesh, or an empty list if there are no triangles."""
     name = frame["name"]
-    allowance.take(24 * len(arrays[2]) + 4 * 8 * len(arrays[1]))
+    allowance.reserve(24 * len(arrays[2]) + 4 * 8 * len(arrays[1]))
     sizes, corners, points, holes = arrays[:4]
     sizes = sizes.astype(np.int64)
     corners = corners.astype(np.int64)
@@ -166,7 +166,7 @@ def _polygon_mesh(
     vertices = points.reshape(-1, 3).astype(np.float64)
     try:
         if "materials" in frame:
-            allowance.take(15 * 8 * len(corners))
+            allowance.reserve(15 * 8 * len(corners))
             pieces = material_pieces(frame, arrays, vertices, (sizes, corners, solid), materials)
         else:
             outlines = corners[np.repeat(solid, sizes)]
@@ -202,7 +202,9 @@ def _plain_shape(frame: dict[str, Any]) -> SceneMesh | None:
         return None
     if kind == "Cube":
         edge = size["size"]
-        return box(name, (edge, edge, edge)).moved(name, np.eye(3), np.array([0, 0, -edge / 2]))
+        return box(name, (edge, edge, edge)).affine_transform(
+            name, np.eye(3), np.array([0, 0, -edge / 2])
+        )
     if kind == "Plane":
         sides = ("width", "length") if axis == 2 else ("length", "width")
         x, y = (size[side] / 2 for side in sides)
@@ -260,7 +262,7 @@ def _content(
         if part.meshes:
             shared = [item.mesh for item in part.meshes if isinstance(item, SceneInstance)]
             # Actors cannot have instances, so their triangles are copied.
-            allowance.take(sum(80 * len(mesh.faces) for mesh in shared))
+            allowance.reserve(sum(80 * len(mesh.faces) for mesh in shared))
             rotations = matmul(poses[:, :, :3], inverse(scale))
             times = (motion[:, 0] - frame["start"]) / frame["rate_hz"]
             if not (np.abs(times) < _LATEST_S).all():

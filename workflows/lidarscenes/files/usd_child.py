@@ -150,7 +150,7 @@ class StageNodes:
                 node[1] = self._mesh(prim)
         if prim.IsInstance():
             moves = not inherited.still and self._any_below(prim.GetPrototype(), _transform_varies)
-            instance = str(prim.GetPath()) if moves else self._looks.inherited(prim)
+            instance = str(prim.GetPath()) if moves else self._looks.inherited_material(prim)
             inherited = inherited._replace(instance=instance)
         for child in prim.GetFilteredChildren(Usd.TraverseInstanceProxies(_SHOWN)):
             self._add_child(node, child, inherited)
@@ -336,10 +336,14 @@ def _poses_up_to(
     step = stop.code - start.code
     if not depth:
         return [stop]
-    for share in _PROBES:
-        pose = _TimedPose(prim, start.code + share * step)
-        offset = pose.matrix[:3, 3] - (1 - share) * start.matrix[:3, 3] - share * stop.matrix[:3, 3]
-        rotation = Gf.Slerp(share, start.rotation, stop.rotation)
+    for fraction in _PROBES:
+        pose = _TimedPose(prim, start.code + fraction * step)
+        offset = (
+            pose.matrix[:3, 3]
+            - (1 - fraction) * start.matrix[:3, 3]
+            - fraction * stop.matrix[:3, 3]
+        )
+        rotation = Gf.Slerp(fraction, start.rotation, stop.rotation)
         cosine = abs(Gf.Dot(rotation, pose.rotation))
         if not (np.abs(offset).max() <= max_offset and cosine >= math.cos(_MAX_ANGLE_RAD / 2)):
             middle = _TimedPose(prim, start.code + step / 2)
@@ -367,7 +371,7 @@ class MaterialReader:
         self._materials: dict[Any, tuple[int | None, list[str]]] = {}
         self._numbers_by_content: dict[str, int] = {}  # {description of a material: number}
 
-    def inherited(self, instance: Any) -> Any:
+    def inherited_material(self, instance: Any) -> Any:
         """Return the material and color that the prims in an instance inherit, or None."""
         if not (self._masks or self._colors or self._names_materials):
             return None

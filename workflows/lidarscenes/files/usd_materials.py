@@ -133,7 +133,7 @@ class UsdMaterials:
         self._mask = cache_with_errors(self._read_mask)
         self.notes = MaskNotes()
 
-    def add(self, frame: dict[str, Any], arrays: list[AnyArray]) -> None:
+    def add_frame(self, frame: dict[str, Any], arrays: list[AnyArray]) -> None:
         """Store the frame of an image or material."""
         if frame["what"] == "material":
             self._materials[frame["number"]] = frame

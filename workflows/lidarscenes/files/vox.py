@@ -46,7 +46,9 @@ def read_vox(data: bytes, path: Path, options: ReadOptions) -> Content:
     indices = table.indices[full].astype(np.int64)
     first = indices.min(axis=0)
     stop = indices.max(axis=0) + 1
-    Allowance(len(data), "use larger voxels or a smaller part").take(4 * int(np.prod(stop - first)))
+    Allowance(len(data), "use larger voxels or a smaller part").reserve(
+        4 * int(np.prod(stop - first))
+    )
     densities = np.zeros(stop - first, np.float32)
     densities[tuple((indices - first).T)] = table.densities[full]
     grid = table.grid

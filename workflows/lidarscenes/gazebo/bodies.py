@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
-from lidarsim.errors import LidarError, prefixed
+from lidarsim.errors import LidarError, prefix_errors
 from lidarsim.io.allowance import Allowance
 from lidarsim.io.input_files import read_input
 from lidarsim.numerics.arrays import Floats
@@ -116,12 +116,12 @@ class BodyReader:
         self.notes.check_children(element)
         frames = body.frames
         for link in element.findall("link"):
-            with prefixed(f"link {_name(link)!r}"):
+            with prefix_errors(f"link {_name(link)!r}"):
                 name = frames.define(_name(link), read_pose(link), frames.root)
             body.links.append(Link(name, link, source))
         for frame in element.findall("frame"):
             attached = printable(frame.get("attached_to", "")) or frames.root
-            with prefixed(f"frame {_name(frame)!r}"):
+            with prefix_errors(f"frame {_name(frame)!r}"):
                 frames.define(_name(frame), read_pose(frame), attached)
         for joint in element.findall("joint"):
             child = joint.find("child")
@@ -130,7 +130,7 @@ class BodyReader:
                 frames.define(_name(joint), read_pose(joint), printable(link_name) or frames.root)
         nested = [*self._nested(body, element, source)]
         for name, child_body, _ in nested:
-            with prefixed(f"model {name!r}"):
+            with prefix_errors(f"model {name!r}"):
                 body.children.append(PlacedModel(name, child_body, frames.matrix(name)))
 
     def _nested(
@@ -140,7 +140,7 @@ class BodyReader:
         for child in element:
             if child.tag == "model":
                 name = _name(child)
-                with prefixed(f"model {name!r}"):
+                with prefix_errors(f"model {name!r}"):
                     nested = self.model(child, source)
                     yield self._define(body, name, nested, child, child)
             elif child.tag == "include":
@@ -157,7 +157,7 @@ class BodyReader:
             return
         include_name = printable(include.findtext("name") or "")
         name = include_name or _name(included.element) or short_name(uri)
-        with prefixed(f"model {name!r}"):
+        with prefix_errors(f"model {name!r}"):
             nested = self.model(included.element, included.source)
             posed = include if include.find("pose") is not None else included.element
             if include.get("merge") in ("true", "1"):

@@ -12,7 +12,7 @@ from lidarsim.motion.rotations import matrices, rotations_of
 from lidarsim.numerics.arrays import Floats
 from lidarsim.numerics.vectors import matmul, norm
 from lidarsim.scene.transform import affine, inverse_pose
-from lidarsim.schema.value_texts import shown
+from lidarsim.schema.value_texts import format_value
 from lidarsim.words import did_you_mean, printable
 
 MAX_NUMBER = 1e8  # largest number in a file, except in poses
@@ -61,9 +61,9 @@ def parse_numbers(
     is_small = np.abs(values) <= MAX_NUMBER  # also False for NaN
     if len(values) != count or not (is_small.all() or of_any_size):
         expected = "a finite number" if count == 1 else f"{count} finite numbers"
-        raise LidarError(f"{subject} is {shown(text)}; it must be {expected}.")
+        raise LidarError(f"{subject} is {format_value(text)}; it must be {expected}.")
     if at_least is not None and (values < at_least).any():
-        raise LidarError(f"{subject} is {shown(text)}; it must not be below {at_least:g}.")
+        raise LidarError(f"{subject} is {format_value(text)}; it must not be below {at_least:g}.")
     return values
 
 
@@ -98,7 +98,7 @@ def read_matrix(pose: Element) -> Floats:
     if is_quaternion:
         size = norm(values[3:])
         if not size > _MIN_NORM:
-            raise LidarError(f"<pose> is {shown(text)}, whose quaternion has zero length.")
+            raise LidarError(f"<pose> is {format_value(text)}, whose quaternion has zero length.")
         x, y, z, w = values[3:] / size
         return affine(matrices(np.array([[x, y, z, w]]))[0], values[:3])
     angles = values[3:] if pose.get("degrees") in ("true", "1") else np.degrees(values[3:])

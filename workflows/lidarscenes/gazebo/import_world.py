@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.errors import LidarError, explained, unreadable
+from lidarsim.errors import LidarError, explain_os_errors, unreadable_message
 from lidarsim.io.input_files import read_input
 from lidarsim.scene.files.scene_graph import MeshFileError, ReadOptions
 from lidarsim.scene.object_names import unique_names
@@ -121,14 +121,14 @@ def _loaded(world: Path, assets: Sequence[Path]) -> World:
 
     Raises LidarError if the file cannot be read.
     """
-    with explained("it cannot be read"):
+    with explain_os_errors("it cannot be read"):
         data = read_input(world)
     try:
         return load_world(data, world, _folders(world, assets))
     except MeshFileError as error:
         raise LidarError(f"it {error}.") from error
     except ValueError as error:
-        raise LidarError(unreadable("it", error)) from error
+        raise LidarError(unreadable_message("it", error)) from error
 
 
 def _materials(world: World) -> dict[str, Any]:

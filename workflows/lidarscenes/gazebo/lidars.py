@@ -9,11 +9,11 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.errors import LidarError, prefixed
+from lidarsim.errors import LidarError, prefix_errors
 from lidarsim.numerics.vectors import matmul
-from lidarsim.words import did_you_mean, listed, printable
+from lidarsim.words import did_you_mean, list_names, printable
 
-from ..writers.lidar_scenario import Lidar, rounded
+from ..writers.lidar_scenario import Lidar, round_value
 from .bodies import scoped_name
 from .frames import child_numbers, parse_numbers, read_pose
 from .notes import unknown_children
@@ -61,7 +61,7 @@ def find_lidars(world: World) -> Iterator[GazeboLidar]:
         for element in lidar_elements(link.link.element):
             name = printable(element.get("name", "")) or "lidar"
             full_name = scoped_name((*link.path, name))
-            with prefixed(f"sensor {full_name!r}"):
+            with prefix_errors(f"sensor {full_name!r}"):
                 yield GazeboLidar(_lidar(element, link, name, full_name), read_mask(element))
 
 
@@ -83,7 +83,7 @@ def _unknown_elements(element: Element, figures: Element) -> Iterator[str]:
     parents += [child for scan in scans for name in _SCANS for child in scan.findall(name)]
     parents += [*figures.findall("range"), *figures.findall("noise"), *element.findall("noise")]
     if unknown := dict.fromkeys(tag for parent in parents for tag in unknown_children(parent)):
-        yield f"elements that SDFormat does not define ({listed([*unknown], _MAX_NAMES)})"
+        yield f"elements that SDFormat does not define ({list_names([*unknown], _MAX_NAMES)})"
 
 
 def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lidar:
@@ -104,13 +104,13 @@ def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lid
     data: dict[str, Any] = {
         "name": f"{full_name} of Gazebo",
         "sources": {"all": "the world's <sensor>"},
-        "rate_hz": rounded(rate_hz),
+        "rate_hz": round_value(rate_hz),
         **_directions(figures),
     }
     ranges = figures.find("range")
     resolution_m = 0.0 if ranges is None else child_numbers(ranges, "resolution", 1, "0").item()
     if resolution_m > 0:
-        data["optics"] = {"resolution_m": rounded(resolution_m)}
+        data["optics"] = {"resolution_m": round_value(resolution_m)}
     data |= _noise(element, figures, unsupported)
     if element.get("type") in _COLLISION_LIDARS:
         unsupported.append(
@@ -163,9 +163,9 @@ def _scan(figures: Element, name: str, samples: str) -> _Scan:
 def _directions(figures: Element) -> dict[str, Any]:
     """Return the fields of a data file that describe the ray directions."""
     vertical = _scan(figures, "vertical", "1")
-    elevations: Any = [rounded(vertical.first_deg)]
+    elevations: Any = [round_value(vertical.first_deg)]
     if vertical.samples > 1:
-        limits = {"first": rounded(vertical.first_deg), "last": rounded(vertical.last_deg)}
+        limits = {"first": round_value(vertical.first_deg), "last": round_value(vertical.last_deg)}
         elevations = {**limits, "count": vertical.samples}
     horizontal = _scan(figures, "horizontal", "640")
     step_deg = horizontal.step_deg
@@ -174,11 +174,11 @@ def _directions(figures: Element) -> dict[str, Any]:
         count -= 1  # the last sample repeats the first
     fields: dict[str, Any] = {"firings_per_turn": count}
     if count == 1 or count * step_deg > _FULL_TURN - _SLACK_DEG:
-        fields["zero_deg"] = rounded(horizontal.first_deg)
+        fields["zero_deg"] = round_value(horizontal.first_deg)
     else:  # the last firing is one step before the end of the scan line
         width_deg = count * step_deg
-        fields["zero_deg"] = rounded(horizontal.first_deg + width_deg / 2)
-        fields["mirror"] = {"motion": "sawtooth", "width_deg": rounded(width_deg)}
+        fields["zero_deg"] = round_value(horizontal.first_deg + width_deg / 2)
+        fields["mirror"] = {"motion": "sawtooth", "width_deg": round_value(width_deg)}
     return {**fields, "beams": {"elevation_deg": elevations}}
 
 
@@ -207,4 +207,4 @@ def _noise(element: Element, figures: Element, unsupported: list[str]) -> dict[s
         if is_used and child_numbers(noise, name, 1, "0").item():
             unsupported.append(words)
     sigma_m = child_numbers(noise, "stddev", 1, "0", at_least=0).item()
-    return {"performance": {"range_m": rounded(sigma_m)}} if sigma_m and kind != "none" else {}
+    return {"performance": {"range_m": round_value(sigma_m)}} if sigma_m and kind != "none" else {}

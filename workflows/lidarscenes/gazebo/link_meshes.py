@@ -10,7 +10,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.errors import LidarError, prefixed
+from lidarsim.errors import LidarError, prefix_errors
 from lidarsim.io.allowance import Allowance
 from lidarsim.io.input_files import read_input
 from lidarsim.numerics.vectors import matmul
@@ -22,7 +22,7 @@ from lidarsim.scene.files.scene_graph import ReadOptions
 from lidarsim.scene.masks import MaskError
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
-from lidarsim.words import listed, printable
+from lidarsim.words import list_names, printable
 
 from ..files.dae import read_dae
 from .appearance import FULL_RETRO, Appearance, read_appearance
@@ -77,7 +77,7 @@ class LinkMeshes:
         """
         key = (id(link.element), scale)
         if key not in self._links:
-            with prefixed(f"link {link.name!r}"):
+            with prefix_errors(f"link {link.name!r}"):
                 self._links[key] = self._read_link(body, link, name, scale)
         return self._links[key]
 
@@ -104,7 +104,7 @@ class LinkMeshes:
 
     def _flags_of(self, shape: Element, name: str) -> int:
         """Return a visual's visibility flags, and add a note if no lidar sees it."""
-        with prefixed(f"visual {printable(shape.get('name', ''))!r}"):
+        with prefix_errors(f"visual {printable(shape.get('name', ''))!r}"):
             flags = read_flags(shape)
         if not flags:
             self.notes.invisible[name] = None
@@ -125,7 +125,7 @@ class LinkMeshes:
     ) -> list[SceneMesh]:
         """Return the meshes of a visual or collision shape in link coordinates."""
         self.notes.check_children(shape)
-        with prefixed(f"{shape.tag} {printable(shape.get('name', ''))!r}"):
+        with prefix_errors(f"{shape.tag} {printable(shape.get('name', ''))!r}"):
             retro = _retro(link.element, shape)
             if retro > FULL_RETRO:
                 self.notes.bright[name] = None
@@ -142,8 +142,8 @@ class LinkMeshes:
         linear = matrix[:3, :3] * np.array(scale)
         moved = []
         for part in parts:
-            self.allowance.take(part.vertices.nbytes + part.faces.nbytes)
-            placed = part.moved(part.name, linear, matrix[:3, 3])
+            self.allowance.reserve(part.vertices.nbytes + part.faces.nbytes)
+            placed = part.affine_transform(part.name, linear, matrix[:3, 3])
             moved.append(self.with_appearance(placed, appearance))
         return moved
 
@@ -189,7 +189,7 @@ class LinkMeshes:
             meshes = self._part(meshes, part, uri)
         if not scale.all():
             return []
-        return [mesh.moved(mesh.name, np.diag(scale), np.zeros(3)) for mesh in meshes]
+        return [mesh.affine_transform(mesh.name, np.diag(scale), np.zeros(3)) for mesh in meshes]
 
     def _part(self, meshes: list[SceneMesh], part: Element, uri: str) -> list[SceneMesh]:
         """Return the meshes that a <submesh> selects, centered if <center> is true."""
@@ -199,7 +199,7 @@ class LinkMeshes:
         chosen = [mesh for mesh in meshes if mesh.name == name]
         chosen = chosen or [mesh for mesh in meshes if mesh.name.lower() == name.lower()]
         if not chosen:
-            names = listed([mesh.name for mesh in meshes], 4)
+            names = list_names([mesh.name for mesh in meshes], 4)
             self.notes.unread_files[f"submesh {name!r} of {printable(uri)}"] = (
                 f"the file contains {names}"
             )
@@ -207,7 +207,7 @@ class LinkMeshes:
         if (part.findtext("center") or "").strip() in ("true", "1"):
             bounds = np.concatenate([mesh.bounds for mesh in chosen])
             middle = (bounds.min(axis=0) + bounds.max(axis=0)) / 2
-            return [mesh.moved(mesh.name, np.eye(3), -middle) for mesh in chosen]
+            return [mesh.affine_transform(mesh.name, np.eye(3), -middle) for mesh in chosen]
         return chosen
 
     def _height_map(self, shape: Element, source: Source) -> list[SceneMesh]:
@@ -275,7 +275,7 @@ class LinkMeshes:
             colors=self.options.colors,
             materials=self.options.materials,
             assets=self._asset_folders(file),
-            tell=lambda line: self.notes.of_meshes.setdefault(_without_path(line, file.path)),
+            report=lambda line: self.notes.of_meshes.setdefault(_without_path(line, file.path)),
         )
         return [mesh.flat() if isinstance(mesh, SceneInstance) else mesh for mesh in meshes]
 
@@ -295,7 +295,7 @@ class LinkMeshes:
             raise LidarError(f"{file.path.name} {printable(str(error))}.") from error
         flat = [item.flat() if isinstance(item, SceneInstance) else item for item in content.meshes]
         unit = (content.unit_m or 1.0) * np.eye(3)
-        return [mesh.moved(mesh.name, unit, np.zeros(3)) for mesh in flat]
+        return [mesh.affine_transform(mesh.name, unit, np.zeros(3)) for mesh in flat]
 
     def _asset_folders(self, file: Source) -> list[Path]:
         """Return the folders that may contain a mesh file's images, its model's textures first."""

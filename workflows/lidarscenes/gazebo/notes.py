@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from xml.etree.ElementTree import Element
 
-from lidarsim.words import listed, plural, printable
+from lidarsim.words import list_names, plural, printable
 
 _MAX_NAMES = 12  # maximum number of names in a note
 
@@ -84,7 +84,7 @@ class Notes:
     def remote_lines(self) -> Iterator[str]:
         """Yield a phrase on models that are too far away, unless there are none."""
         if self.remote:
-            names = listed([*self.remote], _MAX_NAMES)
+            names = list_names([*self.remote], _MAX_NAMES)
             yield (
                 "models that are more than 1,000 km away or whose position is not a number "
                 f"({names})"
@@ -99,7 +99,7 @@ class Notes:
         if self.unknown:
             yield (
                 "contains elements that are not supported and were skipped: "
-                f"{listed([*self.unknown], _MAX_NAMES)}"
+                f"{list_names([*self.unknown], _MAX_NAMES)}"
             )
         for links, reason in (
             (self.without_visuals, "without visuals, whose collision shapes were skipped"),
@@ -108,7 +108,7 @@ class Notes:
             (self.bright, "with a <laser_retro> above 255, which was limited to 255"),
         ):
             if links:
-                yield f"contains links {reason}: {listed([*links])}"
+                yield f"contains links {reason}: {list_names([*links])}"
         yield from (f"contains {line}, which were skipped" for line in self.remote_lines())
         yield from self.further
         yield from _first_lines([*self.of_meshes])
@@ -120,7 +120,7 @@ def _line(noun: str, names: Counter[str]) -> Iterator[str]:
         count = plural(len(names), f"missing {noun}")
         uses = f" in {names.total():,} places" if names.total() > len(names) else ""
         outcome = "It was skipped" if len(names) == 1 else "They were skipped"
-        yield f"refers to {count}{uses}: {listed([*names], _MAX_NAMES)}. {outcome}"
+        yield f"refers to {count}{uses}: {list_names([*names], _MAX_NAMES)}. {outcome}"
 
 
 def _first_lines(lines: Iterable[str], max_lines: int = 3) -> Iterator[str]:

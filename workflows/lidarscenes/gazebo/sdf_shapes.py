@@ -46,7 +46,7 @@ def _sizes(shape: Element, name: str, count: int, default: str = "") -> Floats:
 def _scaled(mesh: SceneMesh, factors: Sequence[float] | Floats) -> SceneMesh | None:
     """Return a mesh that is scaled along the axes, or None if a factor is zero."""
     scale = np.asarray(factors, np.float64)
-    return mesh.moved(mesh.name, np.diag(scale), np.zeros(3)) if scale.all() else None
+    return mesh.affine_transform(mesh.name, np.diag(scale), np.zeros(3)) if scale.all() else None
 
 
 def _box(shape: Element) -> SceneMesh | None:
@@ -211,10 +211,10 @@ def height_map_mesh(shape: Element, image: Path, allowance: Allowance) -> SceneM
     rows, columns = values.shape
     if min(rows, columns) < 2 or not size[:2].all():
         raise LidarError("a <heightmap> has no area.")
-    shares = values / max(float(values.max()), 1e-9)
+    fractions = values / max(float(values.max()), 1e-9)
     x = np.linspace(-size[0] / 2, size[0] / 2, columns)
     y = np.linspace(size[1] / 2, -size[1] / 2, rows)
-    grid = np.stack([*np.meshgrid(x, y), shares * size[2]], axis=-1).reshape(-1, 3)
+    grid = np.stack([*np.meshgrid(x, y), fractions * size[2]], axis=-1).reshape(-1, 3)
     numbers = np.arange(rows * columns).reshape(rows, columns)
     upper_left = numbers[:-1, :-1].ravel()
     lower_left = numbers[1:, :-1].ravel()

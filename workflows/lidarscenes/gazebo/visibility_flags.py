@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from xml.etree.ElementTree import Element
 
-from lidarsim.errors import LidarError, prefixed
-from lidarsim.schema.value_texts import shown
+from lidarsim.errors import LidarError, prefix_errors
+from lidarsim.schema.value_texts import format_value
 from lidarsim.words import printable
 
 LIDARS = ("gpu_lidar", "lidar", "gpu_ray", "ray")  # sensor types
@@ -50,7 +50,7 @@ def distinct_masks(links: Iterable[Element]) -> tuple[int, ...]:
     masks = set()
     for link in links:
         for sensor in lidar_elements(link):
-            with prefixed(f"sensor {printable(sensor.get('name', ''))!r}"):
+            with prefix_errors(f"sensor {printable(sensor.get('name', ''))!r}"):
                 masks.add(read_mask(sensor))
     return tuple(sorted(masks))
 
@@ -65,5 +65,7 @@ def _bits(element: Element, name: str) -> int:
     except ValueError:
         bits = -1
     if not 0 <= bits <= ALL_BITS:
-        raise LidarError(f"<{name}> is {shown(text)}; it must be an integer from 0 to {ALL_BITS}.")
+        raise LidarError(
+            f"<{name}> is {format_value(text)}; it must be an integer from 0 to {ALL_BITS}."
+        )
     return bits

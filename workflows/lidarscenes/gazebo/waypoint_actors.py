@@ -7,7 +7,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.errors import LidarError, prefixed
+from lidarsim.errors import LidarError, prefix_errors
 from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.files.scene_graph import PlacedNode, RigidPart
@@ -37,7 +37,7 @@ def read_actors(world: Element, source: Source, meshes: LinkMeshes, notes: Notes
     for element in world.findall("actor"):
         notes.check_children(element)
         name = printable(element.get("name", "")) or "actor"
-        with prefixed(f"actor {name!r}"):
+        with prefix_errors(f"actor {name!r}"):
             mesh = _skin(element, source, meshes)
             if mesh is None:
                 continue
@@ -61,7 +61,7 @@ def _skin(actor: Element, source: Source, meshes: LinkMeshes) -> SceneMesh | Non
     if not parts or not scale:
         return None
     joined = join_meshes("skin", parts)
-    return joined.moved("skin", scale * np.eye(3), np.zeros(3))
+    return joined.affine_transform("skin", scale * np.eye(3), np.zeros(3))
 
 
 def _waypoints(actor: Element, name: str, notes: Notes) -> tuple[Floats, Floats]:

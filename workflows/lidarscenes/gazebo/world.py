@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.errors import prefixed
+from lidarsim.errors import prefix_errors
 from lidarsim.io.allowance import Allowance
 from lidarsim.numerics.arrays import Floats
 from lidarsim.numerics.vectors import matmul
@@ -29,7 +29,7 @@ from lidarsim.scene.files.scene_graph import (
 )
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.schema.declared import about
-from lidarsim.words import listed, printable
+from lidarsim.words import list_names, printable
 
 from ..files.lenient_xml import parse_lenient_xml
 from .appearance import read_appearance
@@ -128,7 +128,7 @@ class World:
             outermost = matrix if outermost is None else outermost
             scale = state.scales.get(path[0], _NO_SCALE)
             for link in instance.body.links:
-                with prefixed(f"model {scoped_name(path)[:80]!r}, link {link.name!r}"):
+                with prefix_errors(f"model {scoped_name(path)[:80]!r}, link {link.name!r}"):
                     in_model = instance.body.frames.matrix(link.name)
                 placed = matmul(matrix, in_model)
                 link_path = (*path, link.name)
@@ -157,7 +157,9 @@ def read_sdf(data: bytes, path: Path, options: ReadOptions) -> Content:
     content = build_content(world, options)[0]
     if not content.meshes and not content.moving:
         missing = [*world.notes.missing_models, *world.notes.missing_files]
-        reason = f". It refers to missing models or files: {listed(missing, 12)}" if missing else ""
+        reason = (
+            f". It refers to missing models or files: {list_names(missing, 12)}" if missing else ""
+        )
         if world.notes.without_visuals:
             reason += ". Its links have collision shapes. To read them, set geometry: collision"
         reason += "".join(f". It contains {line}" for line in world.notes.remote_lines())
@@ -258,7 +260,7 @@ def _roads(world: World, meshes: LinkMeshes) -> Iterator[PlacedNode]:
     for road in world.element.findall("road"):
         world.notes.check_children(road)
         name = printable(road.get("name", "")) or "road"
-        with prefixed(f"road {name!r}"):
+        with prefix_errors(f"road {name!r}"):
             mesh: SceneMesh | None = road_mesh(road)
             if mesh is not None:
                 mesh = meshes.with_appearance(mesh, read_appearance(road, 0.0))
@@ -277,7 +279,7 @@ def _state_of(world: Element) -> _State:
     state.deleted = {printable(name.text or "") for name in element.findall("deletions/name")}
     for path, entry in _state_entries(element, ()):
         name = scoped_name(path)
-        with prefixed(f"state of {name[:80]!r}"):
+        with prefix_errors(f"state of {name[:80]!r}"):
             pose = entry.find("pose")
             if pose is not None and (pose.text or "").strip():
                 state.poses[name] = read_matrix(pose)

@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.errors import LidarError, explained, prefixed
+from lidarsim.errors import LidarError, explain_os_errors, prefix_errors
 from lidarsim.io.input_files import read_input
 from lidarsim.io.named_files import is_inside
 from lidarsim.io.xmlfile import xml_root
@@ -112,7 +112,7 @@ def _root(path: Path) -> Element:
     Raises LidarError if the file is not a HELIOS++ document.
     """
     try:
-        with explained(f"{path} cannot be read"):
+        with explain_os_errors(f"{path} cannot be read"):
             root = xml_root(read_file(path))
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise LidarError(f"{path} is not valid XML: {error}.") from error
@@ -129,7 +129,7 @@ def read_file(path: Path) -> bytes:
 
     Raises LidarError if the file cannot be read or does not fit into memory.
     """
-    with explained(f"{path} cannot be read"), prefixed(path):
+    with explain_os_errors(f"{path} cannot be read"), prefix_errors(path):
         return read_input(path)
 
 
@@ -176,10 +176,10 @@ def read_rotation(element: Element | None) -> Floats:
     return total
 
 
-def rounded(values: Floats | float | Sequence[float]) -> list[float] | float:
+def round_values(values: Floats | float | Sequence[float]) -> list[float] | float:
     """Round numbers to 12 significant digits for a scenario, and set tiny values to zero."""
     array = np.asarray(values, np.float64)
     if array.ndim:
-        return [rounded(value) for value in array.tolist()]  # type: ignore[misc]
+        return [round_values(value) for value in array.tolist()]  # type: ignore[misc]
     value = array.item()
     return float(f"{value:.12g}") if abs(value) > 1e-9 else 0.0

@@ -21,10 +21,10 @@ from lidarsim.io.input_files import read_input
 from lidarsim.io.xmlfile import xml_root
 from lidarsim.motion.trajectory import Pose
 from lidarsim.survey.survey import MAX_SENSORS
-from lidarsim.words import did_you_mean, listed
+from lidarsim.words import did_you_mean, list_names
 
 from ..writers.lidar_scenario import SCENARIO_FILE
-from .files import Assets, read_number, rounded
+from .files import Assets, read_number, round_values
 from .scanner_xml import Device, HeliosScanner, make_device, read_channels, unsupported_features
 from .survey_xml import AHEAD, returns_section
 
@@ -122,7 +122,7 @@ def _element(files: Assets, reference: _Reference) -> Element:
         names = [*by_id]
         raise LidarError(
             f"it has {len(elements)} scanners. Select one, for example "
-            f"{reference.file.name}#{names[0]}. Its scanners are {listed(names, _MAX_NAMES)}."
+            f"{reference.file.name}#{names[0]}. Its scanners are {list_names(names, _MAX_NAMES)}."
         )
     return elements[0]
 
@@ -177,7 +177,7 @@ def _merged(devices: dict[str, Device]) -> dict[str, Device]:
         "elevation_deg": [_only(table.get("elevation_deg", 0.0)) for table in tables],
         "azimuth_deg": [_only(table.get("azimuth_deg", 0.0)) for table in tables],
     }
-    heights = rounded(starts[:, 2] - starts[0, 2])
+    heights = round_values(starts[:, 2] - starts[0, 2])
     if np.any(heights):
         beams["origin_m"] = [[0.0, 0.0, height] for height in np.atleast_1d(heights).tolist()]
     merged = replace(first, data=shared | {"beams": beams})
@@ -219,7 +219,7 @@ def _write(
         content: dict[str, Any] = {"scene": "seed", "sensor": only}
     else:
         content = {"scene": "seed", "sensors": entries}
-    if accuracy_m := rounded(first.number("accuracy_m")):
+    if accuracy_m := round_values(first.number("accuracy_m")):
         content["noise"] = {"range_m": accuracy_m}
     waveforms = first.child("FWFSettings")
     if waveforms is not None or first.number("maxNOR"):
@@ -242,13 +242,13 @@ def _entry(file: str, mounted: Device) -> dict[str, Any]:
     mount: dict[str, Any] = {
         name: angle
         for name in ("yaw_deg", "pitch_deg", "roll_deg")
-        if (angle := rounded(getattr(pose, name)))
+        if (angle := round_values(getattr(pose, name)))
     }
-    if any(position := rounded(pose.position)):  # type: ignore[arg-type]
+    if any(position := round_values(pose.position)):  # type: ignore[arg-type]
         mount = {"position": position, **mount}
     entry: dict[str, Any] = {"model": file}
     if min_range_m:
-        entry["min_range_m"] = rounded(min_range_m)
+        entry["min_range_m"] = round_values(min_range_m)
     if np.isfinite(max_range_m):
-        entry["max_range_m"] = rounded(max_range_m)
+        entry["max_range_m"] = round_values(max_range_m)
     return {**entry, "mount": mount} if mount else entry

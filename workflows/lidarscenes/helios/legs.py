@@ -15,13 +15,13 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.errors import LidarError, prefixed
+from lidarsim.errors import LidarError, prefix_errors
 from lidarsim.io.time_units import seconds_of
 from lidarsim.motion.rotations import quaternions_of
 from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.transform import rotation_about
 
-from .files import Assets, read_file, read_flag, read_number, read_vector, rounded
+from .files import Assets, read_file, read_flag, read_number, read_vector, round_values
 
 _SPEED = 70.0  # default speed in m/s
 _BETWEEN_S = 0.001  # time in which the platform turns on the spot or moves to the next leg
@@ -42,7 +42,7 @@ class Leg:
     longest_s: float  # maximum duration; infinite without a limit
 
     @property
-    def active(self) -> bool:
+    def is_active(self) -> bool:
         """Whether the scanner is active during the leg."""
         return read_flag(self.scanner, "active", True)
 
@@ -73,7 +73,7 @@ class HeliosTrajectory:
         if self.rows.shape[1] == 5:
             names = ("time_s", "position", "yaw_deg")
             rows = ((r[0], r[1:4], r[4]) for r in self.rows)
-            points = [dict(zip(names, map(rounded, row), strict=True)) for row in rows]
+            points = [dict(zip(names, map(round_values, row), strict=True)) for row in rows]
             return {"points": points}, {}
         text = io.StringIO()
         np.savetxt(text, self.rows, "%.9g")
@@ -89,7 +89,7 @@ def read_legs(
     """
     legs = []
     for index, element in enumerate(survey.findall("leg")):
-        with prefixed(f"leg {index}"):
+        with prefix_errors(f"leg {index}"):
             platform = assets.read_settings(element.find("platformSettings"), home)
             scanner = assets.read_settings(element.find("scannerSettings"), home)
             position = read_vector(platform)
@@ -127,7 +127,7 @@ def moving_trajectory(legs: Sequence[Leg]) -> HeliosTrajectory:
             yaw = float(np.degrees(np.arctan2(displacement[1], displacement[0])))
         target = position + displacement * (seconds * speed / length)
         rows += [[clock, *position, yaw], [clock + seconds, *target, yaw]]
-        segments.append(LegSegment(leg.number, leg.active, clock, seconds))
+        segments.append(LegSegment(leg.number, leg.is_active, clock, seconds))
         clock = clock + seconds + _BETWEEN_S
         position = target
     if not rows:
@@ -146,7 +146,7 @@ def stationary_trajectory(legs: Sequence[Leg], heads: dict[int, float]) -> Helio
     segments = []
     clock = 0.0
     for leg in legs:
-        if not leg.active:
+        if not leg.is_active:
             continue
         seconds = min(heads[leg.number] or np.inf, leg.longest_s)
         if seconds == np.inf:
@@ -203,7 +203,7 @@ def _segment_between(leg: Leg, first_s: float, last_s: float) -> LegSegment:
         raise LidarError(
             f"leg {leg.number}: tStart and tEnd are outside the time range of the trajectory."
         )
-    return LegSegment(leg.number, leg.active, float(start - first_s), float(stop - start))
+    return LegSegment(leg.number, leg.is_active, float(start - first_s), float(stop - start))
 
 
 def _platform_rotation(kind: str, roll: float, pitch: float, yaw: float) -> Floats:

@@ -19,7 +19,7 @@ from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.transform import rotation_about
 
-from .files import read_number, read_rotation, read_vector, rounded
+from .files import read_number, read_rotation, read_vector, round_values
 
 _Z = np.array([0.0, 0.0, 1.0])
 # Rotations from the sensor frame to the frame of HELIOS++, for a scan line to both sides, for a
@@ -150,7 +150,9 @@ def make_device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
             "name": scanner.name,
             "sources": {"all": "a HELIOS++ survey and the files that it refers to"},
             **data,
-            "optics": {name: rounded(value) for name, value in _light(scanner, settings).items()},
+            "optics": {
+                name: round_values(value) for name, value in _light(scanner, settings).items()
+            },
         },
         rotation=rotation_about(head.axis, head.start_deg) @ sensor_rotation,
         position=read_vector(emitter),
@@ -316,8 +318,8 @@ class _Line:
         width = self.count * self.step_deg
         mirror = {
             "motion": "sawtooth",
-            "width_deg": rounded(min(width, 360)),
-            "duty": rounded(self.count / self.pulses_per_line),
+            "width_deg": round_values(min(width, 360)),
+            "duty": round_values(self.count / self.pulses_per_line),
         }
         middle = self.first_deg + width / 2
         return _mirror(self.count, self.pulse_hz / self.pulses_per_line, mirror, middle), _LINE
@@ -325,7 +327,7 @@ class _Line:
     def head_sections(self, deg_per_s: float, aim: _Aim) -> dict[str, Any]:
         """Return the sensor section for a rotating head. Each scan line becomes a firing."""
         between_us = 1e6 / self.pulse_hz
-        last = rounded((self.count - 1) * between_us)
+        last = round_values((self.count - 1) * between_us)
         times = {"time_us": {"first": 0, "last": last, "count": self.count}}
         data = {
             "firing_us": _exact_us(self.pulses_per_line, self.pulse_hz),
@@ -341,18 +343,18 @@ class _Line:
         """
         angles = self.first_deg + aim.tilt_deg + self.step_deg * np.arange(self.count)
         if np.abs(angles).max() <= 90 + _SLACK:
-            first, last = (rounded(end) for end in angles[[0, -1]].clip(-90, 90))
+            first, last = (round_values(end) for end in angles[[0, -1]].clip(-90, 90))
             elevations_deg = {"first": first, "last": last, "count": self.count}
-            if not rounded(aim.azimuth_deg):
+            if not round_values(aim.azimuth_deg):
                 return {"elevation_deg": elevations_deg}
-            azimuths_deg = rounded(np.full(self.count, aim.azimuth_deg))
+            azimuths_deg = round_values(np.full(self.count, aim.azimuth_deg))
             return {"elevation_deg": elevations_deg, "azimuth_deg": azimuths_deg}
         angles = (angles + 180) % 360 - 180
         behind = np.abs(angles) > 90
         elevations = np.where(behind, np.copysign(180, angles) - angles, angles)
         return {
-            "elevation_deg": rounded(elevations),
-            "azimuth_deg": rounded(np.where(behind, 180.0, 0.0) + aim.azimuth_deg),
+            "elevation_deg": round_values(elevations),
+            "azimuth_deg": round_values(np.where(behind, 180.0, 0.0) + aim.azimuth_deg),
         }
 
 
@@ -364,7 +366,11 @@ def _mirror(
     The center of the scan lines is at `middle` degrees.
     """
     data: dict[str, Any] = {"axis": "x", "firings_per_turn": firings, "rate_hz": rate_hz}
-    return data | ({"zero_deg": rounded(middle)} if rounded(middle) else {}) | {"mirror": mirror}
+    return (
+        data
+        | ({"zero_deg": round_values(middle)} if round_values(middle) else {})
+        | {"mirror": mirror}
+    )
 
 
 def _oscillating(
@@ -383,14 +389,17 @@ def _oscillating(
             f"{scanner.name} must have a scanAngle_deg above 0 and at least one pulse per scan "
             "line."
         )
-    mirror = {"motion": "triangle", "width_deg": rounded(2 * half_deg)}
+    mirror = {"motion": "triangle", "width_deg": round_values(2 * half_deg)}
     return _mirror(firings, pulse_hz / firings, mirror), _LINE
 
 
 def _fibers(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> ScannerSection:
     """Return the sensor section for adjacent fibers, each of which fires once per scan line."""
     fibers = max(int(scanner.number("numFibers", 1)), 1)
-    mirror = {"motion": "sawtooth", "width_deg": rounded(2 * _half_angle_deg(scanner, settings))}
+    mirror = {
+        "motion": "sawtooth",
+        "width_deg": round_values(2 * _half_angle_deg(scanner, settings)),
+    }
     return _mirror(fibers, pulse_hz / fibers, mirror), _LINE
 
 
@@ -402,7 +411,7 @@ def _cone(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> 
     rate_hz = scanner.number("scanFreqMax_Hz")
     if rate_hz <= 0:
         raise LidarError(f"{scanner.name} must have a scanFreqMax_Hz above 0.")
-    beams = {"elevation_deg": [rounded(90 - _half_angle_deg(scanner, settings))]}
+    beams = {"elevation_deg": [round_values(90 - _half_angle_deg(scanner, settings))]}
     return {"firing_us": _exact_us(1, pulse_hz), "rate_hz": rate_hz, "beams": beams}, _CONE
 
 
@@ -411,9 +420,9 @@ def _prisms(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -
     air = scanner.number("refrIndex_air", 1)
     prisms = [
         {
-            "wedge_deg": rounded(abs(angle)),
-            "index": rounded(scanner.number(f"refrIndex{i}", 1) / air),
-            "rpm": rounded(60 * scanner.number(f"rotorFreq{i}_Hz")),
+            "wedge_deg": round_values(abs(angle)),
+            "index": round_values(scanner.number(f"refrIndex{i}", 1) / air),
+            "rpm": round_values(60 * scanner.number(f"rotorFreq{i}_Hz")),
             "inclined_first": angle > 0,
         }
         for i in (1, 2, 3)
@@ -431,8 +440,8 @@ def _prisms(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -
         elevation = np.arctan2(z, np.hypot(x, y))
         azimuth = np.arctan2(y, x)
         section["beams"] = {
-            "elevation_deg": [rounded(np.degrees(elevation))],
-            "azimuth_deg": [rounded(np.degrees(azimuth))],
+            "elevation_deg": [round_values(np.degrees(elevation))],
+            "azimuth_deg": [round_values(np.degrees(azimuth))],
         }
     return section, _PRISM
 

@@ -14,7 +14,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidarsim.errors import LidarError, prefixed
+from lidarsim.errors import LidarError, prefix_errors
 from lidarsim.io.input_files import read_input_text
 from lidarsim.motion.trajectory import Pose
 from lidarsim.numerics.arrays import Floats
@@ -28,7 +28,7 @@ from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.scene.transform import Transform
 
 from ..procedural.floor import surface_heights
-from .files import Assets, read_file, read_number, read_rotation, rounded
+from .files import Assets, read_file, read_number, read_rotation, round_values
 
 # Makes a mesh with a surfel for each cubic cell that contains points. The arguments are the path of
 # the file, the points (n, 3) in meters, and the edge length of the cells in meters.
@@ -89,7 +89,7 @@ class HeliosPart:
                 share = spectra(values["spectra"])
             kind: dict[str, Any] = {}
             if share is not None:
-                kind["reflectance"] = rounded(np.clip(share, 0, 1))
+                kind["reflectance"] = round_values(np.clip(share, 0, 1))
             if "classification" in values:
                 kind["class"] = int(read_number(values, "classification", 0))
             kinds[name] = kind
@@ -107,13 +107,13 @@ class HeliosPart:
         """Return the meshes of this part in world coordinates."""
         placed = Transform(self.rotation * self.scale, self.offset)
         if (points := self.surfels) is not None:
-            return (points.moved(points.name, placed.linear, placed.offset),)
+            return (points.affine_transform(points.name, placed.linear, placed.offset),)
         return load_meshes(
             self.file,
             up_axis=self.up_axis,
             transform=placed,
             materials=True,
-            tell=lambda _: None,
+            report=lambda _: None,
         )
 
     def entry(self, name: str) -> dict[str, Any]:
@@ -122,9 +122,9 @@ class HeliosPart:
         degrees = (angles.roll_deg, angles.pitch_deg, angles.yaw_deg)
         placement = {
             "up_axis": (self.up_axis, None),
-            "scale": (rounded(self.scale), 1.0),
-            "rotation_deg": (rounded(degrees), [0.0, 0.0, 0.0]),
-            "translation": (rounded(self.offset), [0.0, 0.0, 0.0]),
+            "scale": (round_values(self.scale), 1.0),
+            "rotation_deg": (round_values(degrees), [0.0, 0.0, 0.0]),
+            "translation": (round_values(self.offset), [0.0, 0.0, 0.0]),
         }
         changed = {key: value for key, (value, default) in placement.items() if value != default}
         return {"file": name, **changed}
@@ -148,7 +148,7 @@ class HeliosScene:
         self.parts: list[HeliosPart] = []
         name = f"scene {element.get('id')!r}"
         for index, part in enumerate(element.findall("part")):
-            with prefixed(f"{name}, part {index}"):
+            with prefix_errors(f"{name}, part {index}"):
                 self.parts += self._read(part, f"part {index}")
         if not self.parts:
             raise LidarError(

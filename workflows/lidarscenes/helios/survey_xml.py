@@ -18,7 +18,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import yaml
 
-from lidarsim.errors import LidarError, prefixed
+from lidarsim.errors import LidarError, prefix_errors
 from lidarsim.media.materials import MOR_SHARE
 from lidarsim.motion.trajectory import Pose
 from lidarsim.numerics.arrays import Floats
@@ -28,7 +28,7 @@ from lidarsim.sensor.disc import SUBRAYS
 from lidarsim.survey.survey import MAX_SENSORS
 
 from ..writers.scene_file import write_scene
-from .files import Assets, read_number, read_rotation, read_vector, rounded
+from .files import Assets, read_number, read_rotation, read_vector, round_values
 from .legs import (
     HeliosTrajectory,
     Leg,
@@ -217,8 +217,8 @@ class _Import:
         """Return the devices for each active leg, by leg number and channel."""
         devices = {}
         for leg in legs:
-            with prefixed(f"leg {leg.number}"):
-                if leg.active:
+            with prefix_errors(f"leg {leg.number}"):
+                if leg.is_active:
                     devices[leg.number] = {
                         channel: make_device(scanner, leg.scanner)
                         for channel, scanner in self._scanners.items()
@@ -235,7 +235,7 @@ class _Import:
         mount_rotation = read_rotation(mount)
         mount_position = read_vector(mount)
         positions = {
-            tuple(rounded(mount_position + mounted.position))  # type: ignore[arg-type]
+            tuple(round_values(mount_position + mounted.position))  # type: ignore[arg-type]
             for by_channel in devices.values()
             for mounted in by_channel.values()
         }
@@ -260,15 +260,15 @@ class _Import:
         min_range_m, max_range_m = mounted.range_m
         pose = Pose.from_rotation((0, 0, 0), AHEAD @ mount @ mounted.rotation)
         angles = {
-            name: rounded(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")
+            name: round_values(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")
         }
         return {
             "model": self._file_of(mounted.data),
             "step_deg": step_deg,
-            **({"min_range_m": rounded(min_range_m)} if min_range_m else {}),
-            **({"max_range_m": rounded(max_range_m)} if np.isfinite(max_range_m) else {}),
+            **({"min_range_m": round_values(min_range_m)} if min_range_m else {}),
+            **({"max_range_m": round_values(max_range_m)} if np.isfinite(max_range_m) else {}),
             "mount": {name: angle for name, angle in angles.items() if angle},
-            "start_s": rounded(segment.start_s),
+            "start_s": round_values(segment.start_s),
             "steps": steps,
         }
 
@@ -330,13 +330,15 @@ class _Import:
                 waveform_settings, scanner.number("maxNOR"), scanner.number("pulseLength_ns", 4)
             ),
             "noise": {
-                "range_m": rounded(
+                "range_m": round_values(
                     read_number(detector_settings, "accuracy_m", scanner.number("accuracy_m"))
                 )
             },
             # HELIOS++ defines visibility at a contrast of 2 %.
             "weather": {
-                "visibility_km": rounded(MOR_SHARE * scanner.number("atmosphericVisibility_km", 23))
+                "visibility_km": round_values(
+                    MOR_SHARE * scanner.number("atmosphericVisibility_km", 23)
+                )
             },
         }
         ranges = {"min_range_m": "rangeMin_m", "max_range_m": "rangeMax_m"}
@@ -368,7 +370,7 @@ def waveform(settings: dict[str, str], pulse_ns: float) -> dict[str, Any]:
     if "binSize_ns" not in settings and "winSize_ns" not in settings:
         return {}
     sample_ns = 2 * read_number(settings, "binSize_ns", 0.25)
-    return {"waveform": "peaks", "sample_ns": rounded(min(sample_ns, pulse_ns / 2))}
+    return {"waveform": "peaks", "sample_ns": round_values(min(sample_ns, pulse_ns / 2))}
 
 
 def _dumped(data: dict[str, Any]) -> str:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarsim.errors import LidarError, explained, unreadable
+from lidarsim.errors import LidarError, explain_os_errors, unreadable_message
 from lidarsim.io.input_files import read_input
 from lidarsim.numerics.arrays import Floats
 from lidarsim.numerics.elementary import arctan2, cos, sin
@@ -26,7 +26,7 @@ from lidarsim.scene.transform import affine
 from lidarsim.words import printable
 from lidarsim.worlds.mujoco_bodies import BodySelection, names_of, visible_geoms
 
-from ..writers.lidar_scenario import Lidar, rounded, write_scenario
+from ..writers.lidar_scenario import Lidar, round_value, write_scenario
 from .model_file import MujocoOptions, body_matrix, body_object_names, load_model
 
 _RANGEFINDER = 7  # mjSENS_RANGEFINDER in sensor_type
@@ -107,14 +107,14 @@ def _loaded(path: Path, assets: Sequence[Path]) -> Any:
 
     Raises LidarError if the file cannot be read.
     """
-    with explained("it cannot be read"):
+    with explain_os_errors("it cannot be read"):
         data = read_input(path)
     try:
         return load_model(data, path, _options(path, assets))
     except MeshFileError as error:
         raise LidarError(f"it {error}.") from error
     except ValueError as error:
-        raise LidarError(unreadable("it", error)) from error
+        raise LidarError(unreadable_message("it", error)) from error
 
 
 def _groups(model: Any) -> dict[_Group, list[int]]:
@@ -164,16 +164,18 @@ def _lidar(model: Any, name: str, group: _Group, sites: list[int]) -> Lidar:
     site_names = names_of(model, "site")
     channels = ", ".join(printable(site_names[sites[row]]) for row in order) if sites else ""
     if origins.any():
-        beams["origin_m"] = [[rounded(value) for value in origin] for origin in origins.tolist()]
+        beams["origin_m"] = [
+            [round_value(value) for value in origin] for origin in origins.tolist()
+        ]
     data: dict[str, Any] = {
         "name": f"{name} of MuJoCo",
         "sources": {"channels": f"rangefinders of {channels or 'the pixels, lowest first'}"},
-        "rate_hz": rounded(group.rate_hz),
+        "rate_hz": round_value(group.rate_hz),
         "firings_per_turn": 1,
         "beams": beams,
     }
     if group.noise_m > 0:
-        data["performance"] = {"range_m": rounded(group.noise_m)}
+        data["performance"] = {"range_m": round_value(group.noise_m)}
     root = int(model.body_rootid[group.body])
     return Lidar(
         name=name,
@@ -229,7 +231,7 @@ def _pixel_directions(model: Any, camera: int) -> Floats:
 
 
 def _degrees(angles: Floats) -> list[float]:
-    return [rounded(angle) for angle in np.degrees(angles).tolist()]
+    return [round_value(angle) for angle in np.degrees(angles).tolist()]
 
 
 def _unusable(model: Any, camera: int | None) -> str:

@@ -35,7 +35,7 @@ from lidarsim.scene.object_names import unique_names
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.transform import affine
 from lidarsim.schema.declared import Several, Text, about
-from lidarsim.words import listed, name_hint, printable
+from lidarsim.words import list_names, name_hint, printable
 from lidarsim.worlds.mujoco_bodies import (
     BodySelection,
     create_bodies,
@@ -122,7 +122,7 @@ def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace
             Path(folder),  # MuJoCo writes a log file to it
             hidden=("MUJOCO_",),
         )
-        frames = child.frames(path, request, lambda _, size: allowance.take(size))
+        frames = child.frames(path, request, lambda _, size: allowance.reserve(size))
         with closing(frames):
             frame, arrays = next(frames)
     if frame["what"] == "keyframes":
@@ -254,7 +254,7 @@ def _notes(model: Any, options: ReadOptions) -> list[str]:
     )
     if model.warnings:
         notes.append(
-            f"causes warnings in MuJoCo: {listed([text.strip() for text in model.warnings], 3)}"
+            f"causes warnings in MuJoCo: {list_names([text.strip() for text in model.warnings], 3)}"
         )
     if not options.masks:
         return notes

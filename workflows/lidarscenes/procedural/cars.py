@@ -79,7 +79,7 @@ def car(model: CarModel) -> SceneMesh:
     )
     track = max(half for _, half, _, _ in model.stations) - 0.1
     down = -wheel.vertices[:, 1].min()
-    wheels = [lay_down(wheel).translated(x, y, down) for x in model.axles for y in (-track, track)]
+    wheels = [lay_down(wheel).translate(x, y, down) for x in model.axles for y in (-track, track)]
     return SceneMesh(model.name, *stack_meshes([_body(model), *wheels]))
 
 

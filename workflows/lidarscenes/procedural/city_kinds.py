@@ -23,7 +23,7 @@ class Solid(NamedTuple):
     vertices: Floats
     faces: Ints
 
-    def translated(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Solid:
+    def translate(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Solid:
         """Return a copy that is moved by the given distances."""
         return Solid(self.vertices + np.array([x, y, z]), self.faces)
 
@@ -80,9 +80,9 @@ def _with_plant_room(tower: Solid, floors: int) -> Solid:
     top = floors * FLOOR_M
     return join_solids([
         tower,
-        box(5, 4, 3).translated(1.5, -1, top),
-        box(2, 2, 1.4).translated(-3, 2.5, top),
-        loft(regular_polygon(6, 0.12), [(0, 0), (6, 0)]).translated(3, -1, top + 3),
+        box(5, 4, 3).translate(1.5, -1, top),
+        box(2, 2, 1.4).translate(-3, 2.5, top),
+        loft(regular_polygon(6, 0.12), [(0, 0), (6, 0)]).translate(3, -1, top + 3),
     ])  # fmt: skip
 
 
@@ -94,7 +94,7 @@ def _stepped(floors: int) -> Solid:
     for step, count in enumerate(counts):
         parts.append(loft(rectangle(18, 16), _facade_profile(count, base, 2.0 * step)))
         base += count * FLOOR_M
-    return join_solids([*parts, box(4, 4, 3).translated(0, 0, base)])
+    return join_solids([*parts, box(4, 4, 3).translate(0, 0, base)])
 
 
 def _houses() -> list[Solid]:
@@ -108,12 +108,12 @@ def _houses() -> list[Solid]:
             body = _dwelling(11, 8.5, stories, hip)
             houses.append(
                 join_solids(
-                    [body, *_front(stories), box(0.8, 0.8, 2.6).translated(2.6, 1, _eaves(stories))]
+                    [body, *_front(stories), box(0.8, 0.8, 2.6).translate(2.6, 1, _eaves(stories))]
                 )
             )
             wing = _dwelling(6, 5, max(1, stories - 1), 0.0)
             turned = Solid(wing.vertices[:, [1, 0, 2]] * [-1, 1, 1], wing.faces)
-            houses.append(join_solids([body, *_front(stories), turned.translated(2.4, -6, 0)]))
+            houses.append(join_solids([body, *_front(stories), turned.translate(2.4, -6, 0)]))
     return houses
 
 
@@ -136,12 +136,12 @@ def _dwelling(width: float, depth: float, stories: int, hip: float) -> Solid:
 def _front(stories: int) -> list[Solid]:
     """Return slightly protruding windows for the long sides, and a door with a step."""
     door = [
-        box(1.1, 0.3, 2.1).translated(-1.2, -4.3, 0.3),
-        box(1.8, 1.2, 0.3).translated(-1.2, -4.8, 0),
+        box(1.1, 0.3, 2.1).translate(-1.2, -4.3, 0.3),
+        box(1.8, 1.2, 0.3).translate(-1.2, -4.8, 0),
     ]
     window = box(1.3, 0.25, 1.4)
     positions = itertools.product((-4.0, 1.0, 4.0), (-4.25, 4.25), range(stories))
-    return [*door, *(window.translated(x, y, 1.3 + 2.8 * story) for x, y, story in positions)]
+    return [*door, *(window.translate(x, y, 1.3 + 2.8 * story) for x, y, story in positions)]
 
 
 def _trees(seed: int) -> list[Solid]:
@@ -163,7 +163,7 @@ def _broadleaf(rng: np.random.Generator, height_ratio: float) -> Solid:
     bumps = 1 + rng.uniform(-0.22, 0.22, (len(crown.vertices), 1))
     middle = np.array([0, 0, 2.2 * height_ratio])
     leaves = Solid((crown.vertices - middle) * bumps + middle, crown.faces)
-    return join_solids([trunk, leaves.translated(0, 0, 2)])
+    return join_solids([trunk, leaves.translate(0, 0, 2)])
 
 
 def _conifer(tiers: int) -> Solid:
@@ -191,7 +191,7 @@ def _car(side: list[tuple[float, float]]) -> Solid:
     """Return a car with the given side outline, as (x, z) points in meters."""
     body = lay_down(loft(side, [(-0.85, 0.08), (-0.75, 0), (0.75, 0), (0.85, 0.08)]))
     wheel = lay_down(loft(regular_polygon(8, 0.33), [(-0.12, 0), (0.12, 0)]))
-    wheels = [wheel.translated(x, y, 0.31) for x in (-1.35, 1.35) for y in (-0.8, 0.8)]
+    wheels = [wheel.translate(x, y, 0.31) for x in (-1.35, 1.35) for y in (-0.8, 0.8)]
     return join_solids([body, *wheels])
 
 
@@ -201,8 +201,8 @@ def _lamp() -> Solid:
     return join_solids(
         [
             pole,
-            box(1.6, 0.1, 0.1).translated(0.8, 0, 6.1),
-            box(0.7, 0.3, 0.15).translated(1.6, 0, 6),
+            box(1.6, 0.1, 0.1).translate(0.8, 0, 6.1),
+            box(0.7, 0.3, 0.15).translate(1.6, 0, 6),
         ]
     )
 
@@ -273,7 +273,7 @@ def gable(width: float, depth: float, eaves: float, rise: float, hip: float = 0.
     ridge = [[hip - x, 0, rise], [x - hip, 0, rise]]
     corners = [[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0], *ridge]
     faces = [[0, 1, 5], [0, 5, 4], [2, 3, 4], [2, 4, 5], [1, 2, 5], [3, 0, 4], [0, 2, 1], [0, 3, 2]]
-    return Solid(np.array(corners, dtype=np.float64), np.array(faces)).translated(z=eaves)
+    return Solid(np.array(corners, dtype=np.float64), np.array(faces)).translate(z=eaves)
 
 
 def lay_down(solid: Solid) -> Solid:

@@ -141,11 +141,11 @@ def place_instances(
 
 def _stem(species: Species, root_m: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Return the points and radii of a stem from root to top, in meters."""
-    share = np.linspace(0, 1, _STEM_STEPS)
+    fraction = np.linspace(0, 1, _STEM_STEPS)
     sway = np.cumsum(rng.normal(0, 0.012 * species.height_m, (_STEM_STEPS, 2)), axis=0)
-    sway = (sway - sway[0]) * share[:, None]
-    above = np.column_stack([sway, 0.97 * share * species.height_m])
-    radii = species.trunk_m * (1 - share) ** 0.8 + 0.01
+    sway = (sway - sway[0]) * fraction[:, None]
+    above = np.column_stack([sway, 0.97 * fraction * species.height_m])
+    radii = species.trunk_m * (1 - fraction) ** 0.8 + 0.01
     radii[0] *= 1.35
     flare = [[above[1, 0] / 10, above[1, 1] / 10, 0.06 * species.height_m]]
     points = np.concatenate([[[0, 0, -root_m]], above[:1], flare, above[1:]])
@@ -157,13 +157,13 @@ def _branches(
 ) -> tuple[Floats, Floats]:
     """Return the points and radii of all branches, in meters."""
     n = species.branches
-    share, full_length = _branch_shares(species, rng)
-    height = species.height_m * (species.bare + (0.97 - species.bare) * share)
+    fraction, full_length = _branch_shares(species, rng)
+    height = species.height_m * (species.bare + (0.97 - species.bare) * fraction)
     foot = np.stack([np.interp(height, stem[:, 2], axis) for axis in stem.T], axis=1)
     azimuth = _GOLDEN_ANGLE * np.arange(n) + rng.normal(0, 0.3, n)
     length = full_length * rng.uniform(0.75, 1.08, n)
     lowest, highest = np.radians(species.angle_deg)
-    lean = lowest + (highest - lowest) * share + rng.normal(0, 0.12, n)
+    lean = lowest + (highest - lowest) * fraction + rng.normal(0, 0.12, n)
     points = [foot]
     for step in range(_BRANCH_STEPS):
         tilt = lean - np.radians(species.rise_deg) * step / (_BRANCH_STEPS - 1)
@@ -188,17 +188,17 @@ def _branch_shares(species: Species, rng: np.random.Generator) -> tuple[Floats, 
     steps = np.linspace(0, 1, 50)
     lengths = np.interp(steps, np.linspace(0, 1, len(species.crown)), species.crown)
     below = np.cumsum(lengths**1.5)
-    share = np.interp((np.arange(n) + rng.uniform(0, 1, n)) / n, below / below[-1], steps)
-    return share, np.interp(share, steps, lengths)
+    fraction = np.interp((np.arange(n) + rng.uniform(0, 1, n)) / n, below / below[-1], steps)
+    return fraction, np.interp(fraction, steps, lengths)
 
 
 def _twigs(species: Species, branches: Floats, rng: np.random.Generator) -> Floats:
     """Return both ends of each twig on the outer parts of branches. Shape (n, 2, 3)."""
     n = len(branches)
     m = species.twigs
-    share = np.sort(rng.uniform(0.2, 1, (n, m)), axis=1)
-    share[:, -1] = 1
-    position = share * _BRANCH_STEPS
+    fraction = np.sort(rng.uniform(0.2, 1, (n, m)), axis=1)
+    fraction[:, -1] = 1
+    position = fraction * _BRANCH_STEPS
     step = np.minimum(position.astype(np.int64), _BRANCH_STEPS - 1)
     row = np.arange(n)[:, None]
     begin = branches[row, step]
@@ -206,7 +206,7 @@ def _twigs(species: Species, branches: Floats, rng: np.random.Generator) -> Floa
     foot = begin + (end - begin) * (position - step)[..., None]
     axis = _unit(_unit(end - begin) + 0.75 * rng.normal(size=(n, m, 3)) - [0, 0, species.hang])
     reach = np.linalg.norm(branches[:, -1] - branches[:, 0], axis=1)[:, None]
-    length = np.maximum(0.4, 0.45 * reach * (1.3 - share)) * rng.uniform(0.7, 1.2, (n, m))
+    length = np.maximum(0.4, 0.45 * reach * (1.3 - fraction)) * rng.uniform(0.7, 1.2, (n, m))
     return np.stack([foot, foot + axis * length[..., None]], axis=2).reshape(-1, 2, 3)
 
 

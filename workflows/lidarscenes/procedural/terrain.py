@@ -122,10 +122,10 @@ def _flattest_positions(
     """Return the flattest of several random positions in each cell, and the slope there."""
     number = np.stack(np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij"), axis=-1)
     inside = 0.5 + _MIDDLE * rng.uniform(-0.5, 0.5, (_TRIED, cells * cells, 2))
-    shares = (number.reshape(-1, 2) + inside) / max(cells, 1)
-    height, slope = _ground_at(heights, side_m, shares)
+    fractions = (number.reshape(-1, 2) + inside) / max(cells, 1)
+    height, slope = _ground_at(heights, side_m, fractions)
     best = slope.argmin(axis=0), np.arange(cells * cells)
-    positions = np.column_stack([(shares[best] - 0.5) * side_m, height[best]])
+    positions = np.column_stack([(fractions[best] - 0.5) * side_m, height[best]])
     return positions, slope[best]
 
 

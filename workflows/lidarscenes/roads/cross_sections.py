@@ -267,7 +267,7 @@ def place_stations(
         if surface.is_measured:
             counts = np.maximum(next(surface_counts), 1)
             columns = len(surface.points) + 2
-            allowance.take((int(counts.sum()) + 2 * len(counts)) * columns * bytes_per_point)
+            allowance.reserve((int(counts.sum()) + 2 * len(counts)) * columns * bytes_per_point)
         placed.append(
             surface.intervals.place(np.ceil(counts).astype(np.int64), surface.is_step(sag_m))
         )
@@ -417,10 +417,10 @@ def _twist_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> Floats:
     folded = np.minimum(areas[0] * areas[1], 0) < -_FOLDED_SHARE * largest * largest
     floor = np.where(folded, largest, largest / _MAX_STEEPENING)
     errors = np.zeros_like(volumes)
-    for share in _TWIST_SHARES:
-        area = np.abs((1 - share) * areas[0] + share * areas[1])
+    for fraction in _TWIST_SHARES:
+        area = np.abs((1 - fraction) * areas[0] + fraction * areas[1])
         area = np.maximum(np.maximum(area, floor), 1e-30)
-        errors = np.maximum(errors, 4 * share * (1 - share) * np.abs(volumes / area))
+        errors = np.maximum(errors, 4 * fraction * (1 - fraction) * np.abs(volumes / area))
     return columns.largest_of_cells(np.where(_is_wide(across), errors, 0.0), _FROM_PARTS)
 
 

@@ -201,7 +201,7 @@ class LaneSection:
 
     def _crossings(self, road: Road, intervals: Intervals) -> Floats:
         """Return the distances at which a width becomes negative or a border crosses a kink."""
-        kinks = road.kinks(self.start, self.stop) if road.curved_across else np.zeros(0)
+        kinks = road.kinks(self.start, self.stop) if road.has_curved_sections else np.zeros(0)
         if not len(kinks) and all(
             lane.widths.is_constant and not len(lane.borders) for lane in self.all_lanes
         ):
@@ -397,7 +397,7 @@ class SectionSurface:
         self._lines = self._lines_across()
         # Points (c, k, 3) of all borders, from right to left, if cross sections are straight.
         self._border_points: Floats | None = None
-        if not road.curved_across:
+        if not road.has_curved_sections:
             right = [self.borders[lane.number] for lane in section.lanes[-1][::-1]]
             left = [self.borders[lane.number] for lane in section.lanes[1]]
             self._border_points = self._base(np.stack([*right, self.borders[0], *left]))
@@ -462,9 +462,9 @@ class SectionSurface:
         t_right = columns[right, queries]
         gap = columns[right + 1, queries] - t_right
         within = np.clip(t, columns[0], columns[-1])
-        share = np.where(gap > 0, (within - t_right) / np.where(gap > 0, gap, 1), 0.0)
+        fraction = np.where(gap > 0, (within - t_right) / np.where(gap > 0, gap, 1), 0.0)
         first = self._points[right, stations]
-        inside = first + share[:, None] * (self._points[right + 1, stations] - first)
+        inside = first + fraction[:, None] * (self._points[right + 1, stations] - first)
         return np.asarray(inside + (t - within)[:, None] * frames.side[stations])
 
     @cached_property
@@ -483,7 +483,7 @@ class SectionSurface:
 
     def _lines_across(self) -> Floats:
         """Return ascending t coordinates at which the strips need additional points."""
-        if not self._road.curved_across:
+        if not self._road.has_curved_sections:
             return np.zeros(0)
         borders = np.stack([*self.borders.values()])
         lines = self._road.points_across(
@@ -519,9 +519,9 @@ class SectionSurface:
                 inner = lane.inner_heights.values(self.stations)
                 outer = lane.outer_heights.values(self.stations)
                 width = t[-1] - t[0]
-                share = (t - t[0]) / np.where(width == 0, 1, width)
-                share[-1] = 1
-                base = base + (inner + share * (outer - inner))[..., None] * frames.up
+                fraction = (t - t[0]) / np.where(width == 0, 1, width)
+                fraction[-1] = 1
+                base = base + (inner + fraction * (outer - inner))[..., None] * frames.up
             yield Strip(lane, t, base, self.steps)
 
     def _t_across(self, inner_t: Floats, outer_t: Floats) -> Floats:
@@ -542,7 +542,7 @@ class SectionSurface:
         """
         frames = self.frames
         base = frames.origins + t[..., None] * frames.side
-        if self._road.curved_across:
+        if self._road.has_curved_sections:
             # If heights step at a border, use those on this lane's side of the border.
             lower = np.minimum(t[0], t[-1])
             upper = np.maximum(t[0], t[-1])

@@ -186,7 +186,7 @@ class PlanTable:
         """Add a clothoid, in pieces that turn by at most `_MAX_TURN`."""
         last = clothoid.curvature + clothoid.growth * length
         turn = max(abs(clothoid.curvature), abs(last)) * length
-        self._allowance.take(int(min(turn / _MAX_TURN, 1e15)) * 500)
+        self._allowance.reserve(int(min(turn / _MAX_TURN, 1e15)) * 500)
         count = max(1, ceil(turn / _MAX_TURN))
         piece = clothoid
         for k in range(count):
@@ -277,9 +277,9 @@ def _parameters(cubic: _Cubic, along: Floats) -> Floats:
     sample_indices = np.searchsorted(cubic.distances, along, "right") - 1
     sample_indices = np.clip(sample_indices, 0, len(cubic.distances) - 2)
     gaps = cubic.distances[sample_indices + 1] - cubic.distances[sample_indices]
-    share = np.clip((along - cubic.distances[sample_indices]) / gaps, 0, 1)
+    fraction = np.clip((along - cubic.distances[sample_indices]) / gaps, 0, 1)
     steps = cubic.parameters[sample_indices + 1] - cubic.parameters[sample_indices]
-    return np.asarray(cubic.parameters[sample_indices] + share * steps)
+    return np.asarray(cubic.parameters[sample_indices] + fraction * steps)
 
 
 def _coefficients(shape: Element) -> tuple[Floats, Floats]:

@@ -123,7 +123,7 @@ class Road:
         return LateralShapes(elements) if elements else None
 
     @property
-    def curved_across(self) -> bool:
+    def has_curved_sections(self) -> bool:
         """Whether cross sections of lanes are curved or have kinks."""
         return self.shapes is not None or any(map(len, self.crossfalls.values()))
 
@@ -131,7 +131,7 @@ class Road:
     def is_plain(self) -> bool:
         """Whether the road is a plane wherever its reference line is straight."""
         return not (
-            self.curved_across or self.lane_offset.bent or not self.superelevation.is_constant
+            self.has_curved_sections or self.lane_offset.bent or not self.superelevation.is_constant
         )
 
     @cached_property
@@ -217,9 +217,9 @@ class LateralShapes:
         station_indices = np.clip(np.searchsorted(self.stations, distances, "right") - 1, 0, last)
         following = np.minimum(station_indices + 1, last)
         gaps = np.maximum(self.stations[following] - self.stations[station_indices], 1e-9)
-        share = np.clip((distances - self.stations[station_indices]) / gaps, 0, 1)
+        fraction = np.clip((distances - self.stations[station_indices]) / gaps, 0, 1)
         lower = self._profiles(station_indices, t, pieces)
-        return np.asarray(lower + share * (self._profiles(following, t, pieces) - lower))
+        return np.asarray(lower + fraction * (self._profiles(following, t, pieces) - lower))
 
     def kinks(self, start: float, stop: float) -> Floats:
         """Return the t coordinates at which cubics start.

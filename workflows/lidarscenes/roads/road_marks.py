@@ -114,14 +114,14 @@ def _knots_of(line: _Line, surface: SectionSurface, border: Floats) -> _Knots:
     last = len(s) - 1
     if len(line.starts) == 1 and line.starts[0] <= s[0] and line.stops[0] >= s[-1]:
         stations = np.append(np.arange(last), last - 1)
-        shares = np.append(np.zeros(last), 1.0)
+        fractions = np.append(np.zeros(last), 1.0)
         quads = np.delete(np.arange(last), surface.steps)
     else:
-        stations, shares, quads = _dashed_knots(line, s, surface.steps)
+        stations, fractions, quads = _dashed_knots(line, s, surface.steps)
     middle = border + line.shift
     return _Knots(
         stations=stations,
-        shares=shares,
+        shares=fractions,
         first_t=middle[stations],
         second_t=middle[stations + 1],
         width=line.width,
@@ -142,11 +142,11 @@ def _dashed_knots(line: _Line, s: Floats, steps: Ints) -> tuple[Ints, Floats, In
     stops = _positions(line.stops, s, np.searchsorted(s, line.stops, "left") - 1)
     positions = np.sort(np.concatenate([starts, stops, np.arange(last + 1)]))
     positions = positions[np.append(True, np.diff(positions) > 0)]
-    middles = (positions[1:] + positions[:-1]) / 2
-    dash = np.searchsorted(starts, middles, "right") - 1
-    is_painted = (dash >= 0) & (middles < stops[np.maximum(dash, 0)])
+    midpoints = (positions[1:] + positions[:-1]) / 2
+    dash = np.searchsorted(starts, midpoints, "right") - 1
+    is_painted = (dash >= 0) & (midpoints < stops[np.maximum(dash, 0)])
     if len(steps):
-        is_painted &= ~np.isin(middles.astype(np.int64), steps)
+        is_painted &= ~np.isin(midpoints.astype(np.int64), steps)
     stations = np.minimum(positions.astype(np.int64), last - 1)
     return stations, positions - stations, np.flatnonzero(is_painted)
 
@@ -155,14 +155,14 @@ def _positions(distances: Floats, s: Floats, stations: Ints) -> Floats:
     """Convert distances to fractional station indices."""
     stations = np.minimum(np.maximum(stations, 0), len(s) - 2)
     lengths = np.maximum(s[stations + 1] - s[stations], GAP_M)
-    shares = (distances - s[stations]) / lengths
-    return np.asarray(stations + np.minimum(np.maximum(shares, 0), 1))
+    fractions = (distances - s[stations]) / lengths
+    return np.asarray(stations + np.minimum(np.maximum(fractions, 0), 1))
 
 
 def _points_of(surface: SectionSurface, knots: Sequence[_Knots]) -> Floats:
     """Return points on the right edges of all lines, and then on the left edges. Shape (2q, 3)."""
     station_indices = np.concatenate([entry.stations for entry in knots])
-    shares = np.concatenate([entry.shares for entry in knots])
+    fractions = np.concatenate([entry.shares for entry in knots])
     first_t = np.concatenate([entry.first_t for entry in knots])
     second_t = np.concatenate([entry.second_t for entry in knots])
     half = np.concatenate([np.full(len(entry.stations), entry.width / 2) for entry in knots])
@@ -173,8 +173,8 @@ def _points_of(surface: SectionSurface, knots: Sequence[_Knots]) -> Floats:
         ),
         np.concatenate([first_t - half, first_t + half, second_t - half, second_t + half]),
     )
-    both_shares = np.concatenate([shares, shares])[:, None]
-    points = corners[: 2 * count] + both_shares * (corners[2 * count :] - corners[: 2 * count])
+    both_fractions = np.concatenate([fractions, fractions])[:, None]
+    points = corners[: 2 * count] + both_fractions * (corners[2 * count :] - corners[: 2 * count])
     up = surface.frames.up[np.concatenate([station_indices, station_indices])]
     return np.asarray(points + LIFT_M * up)
 
@@ -279,7 +279,7 @@ def _dashes(
     if space <= 0 or length <= 0:
         return np.array([start]), np.array([stop])
     count = (stop - start) / (length + space)
-    allowance.take(int(min(count, 1e15)) * _BYTES_PER_DASH)
+    allowance.reserve(int(min(count, 1e15)) * _BYTES_PER_DASH)
     starts = start + (length + space) * np.arange(int(count) + 1)
     starts = starts[starts < stop]
     return np.asarray(starts, np.float64), np.asarray(np.minimum(starts + length, stop))

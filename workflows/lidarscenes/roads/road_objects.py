@@ -139,10 +139,10 @@ class ObjectBuilder:
         span = read_non_negative(repeat, "length", 0.0)
         distance = read_non_negative(repeat, "distance", 0.0)
         count = span / distance + 1e-6 if distance > 0 else 0
-        self._allowance.take(int(min(count, 1e15)) * _BYTES_PER_COPY)
+        self._allowance.reserve(int(min(count, 1e15)) * _BYTES_PER_COPY)
         for k in range(int(count) + 1):
-            share = min(1.0, k * distance / span) if span > 0 else 0.0
-            yield base.repeated(repeat, share, read_number(repeat, "s") + k * distance)
+            fraction = min(1.0, k * distance / span) if span > 0 else 0.0
+            yield base.repeat_at(repeat, fraction, read_number(repeat, "s") + k * distance)
 
     def _markings(
         self,
@@ -189,7 +189,7 @@ class ObjectBuilder:
             if last <= first or size <= 0:
                 continue
             count = (last - first) / (dash + space) if dash > 0 and space > 0 else 0.0
-            self._allowance.take(int(min(count, 1e15)) * _BYTES_PER_COPY)
+            self._allowance.reserve(int(min(count, 1e15)) * _BYTES_PER_COPY)
             offsets = first + (dash + space) * np.arange(int(count) + 1)
             offsets = offsets[offsets < last]
             ends = np.minimum(offsets + dash, last) if count else np.array([last])
@@ -259,8 +259,8 @@ class _Rail(NamedTuple):
         start = read_number(repeat, "s")
         stop = min(start + read_non_negative(repeat, "length", 0.0), road.length)
         base = _Placement.from_element(element)
-        first = base.repeated(repeat, 0.0, start)
-        last = base.repeated(repeat, 1.0, stop)
+        first = base.repeat_at(repeat, 0.0, start)
+        last = base.repeat_at(repeat, 1.0, stop)
         if stop <= start or max(first.height, last.height) <= 0:
             return None
         intervals = Intervals.between(start, stop, road.breaks)
@@ -277,13 +277,13 @@ class _Rail(NamedTuple):
 
     def rings(self, stations: RoadStations, frames: RoadFrames) -> Floats:
         """Return the rail's cross sections, clockwise from the lower right. Shape (k, 4, 3)."""
-        share = (stations.s - self.start) / (self.stop - self.start)
+        fraction = (stations.s - self.start) / (self.stop - self.start)
         first = self.first
         last = self.last
-        width = np.maximum(first.wide + share * (last.wide - first.wide), 1e-3)
-        t = first.t + share * (last.t - first.t)
-        lower = first.z + share * (last.z - first.z)
-        upper = lower + (first.height + share * (last.height - first.height))
+        width = np.maximum(first.wide + fraction * (last.wide - first.wide), 1e-3)
+        t = first.t + fraction * (last.t - first.t)
+        lower = first.z + fraction * (last.z - first.z)
+        upper = lower + (first.height + fraction * (last.height - first.height))
         right_side = (t - width / 2)[:, None] * frames.side
         left_side = (t + width / 2)[:, None] * frames.side
         lower_up = lower[:, None] * frames.up
@@ -385,7 +385,7 @@ class _Placement(NamedTuple):
         """Width in meters. For a round object, this is its diameter."""
         return 2 * self.radius if self.radius > 0 else self.width
 
-    def repeated(self, repeat: Element, share: float, s: float) -> _Placement:
+    def repeat_at(self, repeat: Element, share: float, s: float) -> _Placement:
         """Return the placement of a copy at a given fraction of a <repeat>'s length."""
         values = {}
         for name, field in (

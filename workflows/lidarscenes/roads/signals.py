@@ -103,7 +103,7 @@ class SignalBuilder(NamedTuple):
         at = RoadStations.at(np.array([read_number(source, "s")]))
         frames = self.network.frames([road], [at])
         foot = frames.origins[0] + read_number(source, "t") * frames.side[0]
-        if road.curved_across:
+        if road.has_curved_sections:
             t = np.array([read_number(source, "t")])
             foot = foot + road.heights(at, t)[0] * frames.up[0]
         heading = float(arctan2(frames.along[0, 1], frames.along[0, 0]))

@@ -57,8 +57,8 @@ def cylinder(
 
     `sag_m` is the maximum distance between its circle and the polygon.
     """
-    sag_share = min(0.5, sag_m / radius)
-    count = int(np.clip(np.ceil(np.pi / np.sqrt(2 * sag_share)), MIN_SEGMENTS, MAX_SEGMENTS))
+    sag_fraction = min(0.5, sag_m / radius)
+    count = int(np.clip(np.ceil(np.pi / np.sqrt(2 * sag_fraction)), MIN_SEGMENTS, MAX_SEGMENTS))
     sines, cosines = sin_cos(2 * np.pi * np.arange(count) / count)
     ring = np.stack([radius * cosines, radius * sines, np.zeros(count)], axis=1)
     up = np.array([0, 0, height])
@@ -193,9 +193,9 @@ def _clipped(ring: Floats, along: Floats, lower: float, upper: float) -> Floats:
                 clipped.append(corners[k])
                 kept_positions.append(positions[k])
             if (here >= 0) != (ahead >= 0):
-                share = here / (here - ahead)
+                fraction = here / (here - ahead)
                 step = corners[(k + 1) % len(corners)] - corners[k]
-                clipped.append(corners[k] + share * step)
+                clipped.append(corners[k] + fraction * step)
                 kept_positions.append(bound)
         corners = np.array(clipped).reshape(-1, 3)
         positions = np.array(kept_positions)

@@ -76,7 +76,7 @@ class Joint:
     mimic: tuple[str, float, float] | None = None
 
     @property
-    def moves(self) -> bool:
+    def is_movable(self) -> bool:
         """Whether the joint can move and therefore has a value."""
         return self.kind in MOVING
 
@@ -131,7 +131,7 @@ class Robot:
     @cached_property
     def moving(self) -> tuple[str, ...]:
         """Names of the movable joints."""
-        return tuple(joint.name for joint in self.joints.values() if joint.moves)
+        return tuple(joint.name for joint in self.joints.values() if joint.is_movable)
 
     def path(
         self,
@@ -164,7 +164,7 @@ class Robot:
         without: Collection[str] = (),
         ignore: Sequence[str] = (),
         time_unit: TimeUnit | None = None,
-        tell: Callable[[str], None] = _log.warning,
+        report: Callable[[str], None] = _log.warning,
     ) -> tuple[Actor, ...]:
         """Return an actor for each rigid body. The links of a body are fixed to each other.
 
@@ -185,7 +185,7 @@ class Robot:
             Unit of the times in a table file ("s", "ms", "us" or "ns"), if it differs from the unit
             that the header states. Without `time_unit`, times of 1e11 s or more, and times that
             span more than a year, are rejected.
-        tell
+        report
             Function that is called with a warning for each joint whose values exceed its limits.
 
         Raises
@@ -194,7 +194,7 @@ class Robot:
             If the joint values cannot be used.
         """
         check_list("without", without)
-        times_s, values = self._values(joints, ignore, time_unit, tell)
+        times_s, values = self._values(joints, ignore, time_unit, report)
         robot_name = self.name if name is None else name
         return tuple(
             Actor(
@@ -220,13 +220,15 @@ class Robot:
                 if (joint := self.joints.get(link)) is not None:
                     body, matrix = bodies[joint.parent]
                     bodies[link] = (
-                        (link, np.eye(4)) if joint.moves else (body, matmul(matrix, joint.origin))
+                        (link, np.eye(4))
+                        if joint.is_movable
+                        else (body, matmul(matrix, joint.origin))
                     )
                 if (mesh := self.meshes.get(link)) is not None:
                     body, matrix = bodies[link]
                     names.setdefault(body, link)
                     if link not in without:
-                        moved = mesh.moved(link, matrix[:3, :3], matrix[:3, 3])
+                        moved = mesh.affine_transform(link, matrix[:3, :3], matrix[:3, 3])
                         link_meshes.setdefault(body, []).append(moved)
             self._body_meshes[without] = {
                 body: join_meshes(names[body], meshes) for body, meshes in link_meshes.items()
@@ -248,7 +250,7 @@ class Robot:
         matrix = np.eye(4)
         for joint in chain:
             matrix = matmul(matrix, joint.origin)
-            if joint.moves:
+            if joint.is_movable:
                 value = values[joint.name]
                 slides = joint.kind == "prismatic"
                 if np.ptp(value):
@@ -271,7 +273,7 @@ class Robot:
         joints: Joints | None,
         ignore: Sequence[str],
         time_unit: TimeUnit | None,
-        tell: Callable[[str], None] = lambda line: None,
+        report: Callable[[str], None] = lambda line: None,
     ) -> tuple[Floats, dict[str, Floats]]:
         """Return the times in seconds, and the values of each movable joint by name."""
         check_fits("time_unit", time_unit, TimeUnit | None)
@@ -286,7 +288,7 @@ class Robot:
         times = table.pop("time_s", np.zeros(1))
         self._check_table(times, table)
         self._add_missing(table, len(times))
-        self._report_limits(table, tell)
+        self._report_limits(table, report)
         return times, table
 
     def _check_table(self, times: Floats, table: Mapping[str, Floats]) -> None:
@@ -308,7 +310,7 @@ class Robot:
             raise LidarError("The values of time_s must be finite and strictly increasing.")
 
     def _moving_joints(self) -> dict[str, Joint]:
-        return {joint.name: joint for joint in self.joints.values() if joint.moves}
+        return {joint.name: joint for joint in self.joints.values() if joint.is_movable}
 
     def _add_missing(self, table: dict[str, Floats], count: int) -> None:
         """Add values to a table for missing joints, which mimic another joint or are at rest."""
@@ -326,14 +328,14 @@ class Robot:
                 mimicked, factor, offset = joint.mimic
                 table[joint.name] = factor * table[mimicked] + offset
 
-    def _report_limits(self, table: Mapping[str, Floats], tell: Callable[[str], None]) -> None:
+    def _report_limits(self, table: Mapping[str, Floats], report: Callable[[str], None]) -> None:
         """Report joints whose values exceed their limits."""
         for name, joint in self._moving_joints().items():
             lower, upper = joint.limits or (-np.inf, np.inf)
             min_value = table[name].min()
             max_value = table[name].max()
             if min_value < lower - 1e-6 or max_value > upper + 1e-6:
-                tell(
+                report(
                     f"{self.name}: joint {name} has values from {min_value:.4g} to "
                     f"{max_value:.4g}, which exceed its limits of {lower:.4g} to {upper:.4g}."
                 )
@@ -354,7 +356,7 @@ class Robot:
                 exact=True,
             )
             for joint in self.joints.values()
-            if joint.moves
+            if joint.is_movable
         ]
         try:
             table = read_table(
@@ -362,7 +364,7 @@ class Robot:
                 [TIME, *quantities],
                 required=lambda columns: ("time_s",),
                 ignore=ignore,
-                unused=[joint.name for joint in self.joints.values() if not joint.moves],
+                unused=[joint.name for joint in self.joints.values() if not joint.is_movable],
                 time_unit=time_unit,
             )
         except (OSError, ValueError, LidarError) as error:
@@ -444,8 +446,8 @@ class LinkPath:
         moments_s = self._moments_s(times_ns)
         for hinge in self.hinges:
             value = interp(moments_s, self.times_s, hinge.values)
-            motion = motion.transformed(hinge.before).after_hinge(hinge, value)
-        motion = motion.transformed(self.last)
+            motion = motion.transform(hinge.before).after_hinge(hinge, value)
+        motion = motion.transform(self.last)
         return motion.positions.T, motion.rotations.transpose(2, 0, 1)
 
     def velocities(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
@@ -467,10 +469,10 @@ class LinkPath:
         moments_s = self._moments_s(times_ns)
         for hinge in self.hinges:
             value = interp(moments_s, self.times_s, hinge.values)
-            at_hinge = motion.transformed(hinge.before).at_origin()
+            at_hinge = motion.transform(hinge.before).at_origin()
             driven = at_hinge.with_hinge_velocity(hinge, self._slopes(hinge, moments_s))
             motion = driven.after_hinge(hinge, value)
-        motion = motion.transformed(self.last).at_origin()
+        motion = motion.transform(self.last).at_origin()
         return (motion.velocities * within).T, (motion.rates * within).T
 
     def _root_motion(self, station: int, times_ns: Floats, moving: bool) -> _LinkMotion:
@@ -525,7 +527,7 @@ class _LinkMotion(NamedTuple):
     velocities: Floats  # (3, k) m/s
     rates: Floats  # (3, k) angular velocities, rad/s
 
-    def transformed(self, matrix: Floats) -> _LinkMotion:
+    def transform(self, matrix: Floats) -> _LinkMotion:
         """Return the motion of another frame, which has a constant pose in this frame."""
         moved = _product(self.rotations, matrix[:3, :, None])
         return self._replace(positions=self.positions + moved[:, 3], rotations=moved[:, :3])

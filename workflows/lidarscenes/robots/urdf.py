@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element, ParseError
 
 import numpy as np
 
-from lidarsim.errors import LidarError, prefixed
+from lidarsim.errors import LidarError, prefix_errors
 from lidarsim.io.allowance import Allowance
 from lidarsim.io.input_files import read_input
 from lidarsim.io.named_files import is_inside
@@ -34,7 +34,7 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import capsule
 from lidarsim.scene.transform import affine
 from lidarsim.schema.checks import check_fits
-from lidarsim.schema.value_texts import shown
+from lidarsim.schema.value_texts import format_value
 from lidarsim.words import printable
 
 from ..files.unit_shapes import SIDES, UNIT_BALL, UNIT_BOX, UNIT_CYLINDER
@@ -53,7 +53,7 @@ def load_robot(
     colors: bool = False,
     materials: bool = False,
     assets: str | Path | None = None,
-    tell: Callable[[str], None] = warn,
+    report: Callable[[str], None] = warn,
 ) -> Robot:
     """Read a robot from a URDF file, including the visual meshes of its links.
 
@@ -78,7 +78,7 @@ def load_robot(
     assets
         Additional folder from which mesh files, and the files that they refer to, may be read. It
         can be a package or a folder of packages.
-    tell
+    report
         Function that is called with a line of text for content that is omitted.
 
     Raises
@@ -89,10 +89,10 @@ def load_robot(
     path = Path(path)
     check_fits("opacity", opacity, OpacityMode)
     root, size = _read_root(path)
-    with prefixed(path), np.errstate(all="ignore"):  # infinite values are refused later
+    with prefix_errors(path), np.errstate(all="ignore"):  # infinite values are refused later
         name = printable(root.get("name", "")) or path.stem
         links = {_name(element): element for element in _named(root, "link")}
-        joints = _joints(root, links, lambda line: tell(f"{path}: {line}"))
+        joints = _joints(root, links, lambda line: report(f"{path}: {line}"))
         order = _in_order(list(links), joints)
         _check_mimics(joints)
         folders = () if assets is None else (Path(assets).resolve(),)
@@ -104,11 +104,11 @@ def load_robot(
             colors=colors,
             materials=materials,
             assets=folders,
-            tell=tell,
+            report=report,
         )
         meshes = {}
         for link in order:
-            with prefixed(f"link {link!r}"):
+            with prefix_errors(f"link {link!r}"):
                 if parts := list(reader.link_meshes(link, links[link])):
                     meshes[link] = join_meshes(link, parts)
         reader.report_skipped_links()
@@ -147,16 +147,18 @@ def _read_root(path: Path) -> tuple[Element, int]:
     return root, len(data)
 
 
-def _joints(root: Element, links: Collection[str], tell: Callable[[str], None]) -> dict[str, Joint]:
+def _joints(
+    root: Element, links: Collection[str], report: Callable[[str], None]
+) -> dict[str, Joint]:
     """Return a robot's joints, keyed by child link."""
     joints: dict[str, Joint] = {}
     for element in _named(root, "joint"):
-        with prefixed(f"joint {_name(element)!r}"):
+        with prefix_errors(f"joint {_name(element)!r}"):
             child, joint = _joint(element, links)
             if child in joints:
                 raise LidarError(f"link {child!r} is the child of two joints.")
             if joint.kind in HELD[1:]:
-                tell(
+                report(
                     f"joint {joint.name} has the type {joint.kind}, which is not supported. Its "
                     "value is always zero."
                 )
@@ -202,7 +204,7 @@ def _numbers(element: Element | None, name: str, count: int, default: str) -> Fl
         tag = "" if element is None else element.tag
         expected = "a finite number" if count == 1 else f"{count} finite numbers"
         hint = " Expand the file with xacro first." * ("$" in text)
-        raise LidarError(f"{name} of <{tag}> is {shown(text)}; it must be {expected}.{hint}")
+        raise LidarError(f"{name} of <{tag}> is {format_value(text)}; it must be {expected}.{hint}")
     return values
 
 
@@ -221,7 +223,7 @@ def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
     kind = element.get("type", "")
     if kind not in (*MOVING, *HELD):
         raise LidarError(
-            f"its type is {shown(kind)}; it must be one of {', '.join((*MOVING, *HELD))}."
+            f"its type is {format_value(kind)}; it must be one of {', '.join((*MOVING, *HELD))}."
         )
     end_links = []
     for end in ("parent", "child"):
@@ -282,7 +284,7 @@ def _in_order(links: list[str], joints: Mapping[str, Joint]) -> list[str]:
 
 def _check_mimics(joints: Mapping[str, Joint]) -> None:
     """Check that mimicked joints can move, and that no joint mimics itself."""
-    moving = {joint.name: joint.mimic for joint in joints.values() if joint.moves}
+    moving = {joint.name: joint.mimic for joint in joints.values() if joint.is_movable}
     mimicked_joints = {name: [mimic[0]] for name, mimic in moving.items() if mimic is not None}
     for name, (mimicked,) in mimicked_joints.items():
         if mimicked not in moving:
@@ -306,7 +308,7 @@ class _LinkMeshes:
     colors: bool
     materials: bool
     assets: tuple[Path, ...]  # resolved folders from which all files may be read
-    tell: Callable[[str], None]
+    report: Callable[[str], None]
     _files: dict[Path, list[SceneMesh]] = field(default_factory=dict)
     _collide: list[str] = field(default_factory=list)  # links with collision shapes only
     _flat: list[str] = field(default_factory=list)  # links with a shape of size zero
@@ -335,8 +337,8 @@ class _LinkMeshes:
                 self._flat.append(link)
                 continue
             for part in parts:
-                self._allowance.take(part.vertices.nbytes + part.faces.nbytes)
-                mesh = part.moved(part.name, origin[:3, :3] * scale, origin[:3, 3])
+                self._allowance.reserve(part.vertices.nbytes + part.faces.nbytes)
+                mesh = part.affine_transform(part.name, origin[:3, :3] * scale, origin[:3, 3])
                 if color is not None and mesh.colors is None:
                     mesh = replace(mesh, colors=Colors.plain(color, len(mesh.faces)))
                 if self.materials and mesh.materials is None:
@@ -351,7 +353,7 @@ class _LinkMeshes:
         ):
             if links:
                 names = ", ".join(dict.fromkeys(links[:3])) + ", …" * (len(links) > 3)
-                self.tell(f"{self.path} contains links that {reason} and were skipped: {names}.")
+                self.report(f"{self.path} contains links that {reason} and were skipped: {names}.")
 
     def _color(self, visual: Element) -> Bytes | None:
         """Return the color of a visual, or of the robot's material that it names, or None."""
@@ -418,7 +420,7 @@ class _LinkMeshes:
                 colors=self.colors,
                 materials=self.materials,
                 assets=self.assets,
-                tell=self.tell,
+                report=self.report,
             )
             self._allowance.add_file(path)
             self._files[path] = [

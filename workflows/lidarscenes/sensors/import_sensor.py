@@ -8,12 +8,12 @@ from pathlib import Path
 
 import yaml
 
-from lidarsim.errors import LidarError, converted
+from lidarsim.errors import LidarError, convert_errors
 from lidarsim.sensor_files import ray_npz
 from lidarsim.sensor_files.fired_rays import RayList
 from lidarsim.sensor_files.format_table import read_rays
 
-from ..writers.lidar_scenario import SCENARIO_FILE, rounded
+from ..writers.lidar_scenario import SCENARIO_FILE, round_value
 from .omnilidar import ImportedSensor, read_omnilidar
 
 USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
@@ -70,9 +70,9 @@ def _section(rays: RayList) -> dict[str, float | str]:
     min_range_m, max_range_m = rays.range_m
     section: dict[str, float | str] = {"calibration": _RAYS_FILE}
     if min_range_m:
-        section["min_range_m"] = rounded(min_range_m)
+        section["min_range_m"] = round_value(min_range_m)
     if isfinite(max_range_m):
-        section["max_range_m"] = rounded(max_range_m)
+        section["max_range_m"] = round_value(max_range_m)
     return section
 
 
@@ -83,7 +83,7 @@ def _read(path: Path) -> ImportedSensor:
     """
     if path.suffix.lower() in USD_ENDINGS:
         return read_omnilidar(path)
-    with converted("it cannot be read as a sensor file"):
+    with convert_errors("it cannot be read as a sensor file"):
         rays = read_rays(path)
     if rays is None:
         raise LidarError("it contains no rays with azimuths and elevations, or with directions.")

@@ -19,13 +19,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidarsim.environment.extras import install_command
-from lidarsim.errors import LidarError, converted
+from lidarsim.errors import LidarError, convert_errors
 from lidarsim.io.allowance import Allowance, memory_share
 from lidarsim.io.input_files import check_input
 from lidarsim.numerics.arrays import AnyArray, Floats, Ints
 from lidarsim.sensor.optics import Optics
 from lidarsim.sensor_files.fired_rays import RayList, directions_of
-from lidarsim.words import listed, printable
+from lidarsim.words import list_names, printable
 
 from ..files.child_process import ReaderProcess
 from ..files.usd import USD_CORE_BYTES
@@ -91,7 +91,7 @@ def read_omnilidar(path: Path) -> ImportedSensor:
         )
     if sys.platform == "win32":  # memory limits of processes are not supported
         raise LidarError(f"{path} is an OpenUSD file, which is not supported on Windows.")
-    with converted(f"{path} cannot be used as an OmniLidar"):
+    with convert_errors(f"{path} cannot be used as an OmniLidar"):
         return _sensor(_read_prim(path))
 
 
@@ -121,7 +121,7 @@ def _read_prim(path: Path) -> _Prim:
         hidden=("PXR_",),
         environment={"PXR_WORK_THREAD_LIMIT": "1"},
     )
-    with closing(child.frames(path, {}, lambda frame, size: allowance.take(size))) as frames:
+    with closing(child.frames(path, {}, lambda frame, size: allowance.reserve(size))) as frames:
         frame, arrays = next(frames)
     if not frame["prims"]:
         raise ValueError("it has no OmniLidar prim")
@@ -185,7 +185,7 @@ def _states(prim: _Prim) -> list[_State]:
     for name in names:
         fields = {field: prim.arrays.get(f"{_STATE}{name}:{field}") for field in _READ}
         if missing := [field for field, values in fields.items() if values is None]:
-            raise ValueError(f"emitterState:{name} has no {listed(missing)}")
+            raise ValueError(f"emitterState:{name} has no {list_names(missing)}")
         columns = [np.asarray(values, np.float64) for values in fields.values()]
         if len({column.shape for column in columns}) > 1 or not len(columns[0]):
             raise ValueError(
@@ -273,7 +273,7 @@ def _left_out(prim: _Prim, states: list[_State], kind: str) -> list[str]:
         clauses.append(f"several OmniLidar prims (only {prim.paths[0]} is read)")
     fields = {name.rpartition(":")[2] for name in _used_arrays(prim.arrays)}
     if others := sorted(fields - {*_READ, *_OF_NO_RAY}):
-        clauses.append(f"the emitter attributes {listed(others)}")
+        clauses.append(f"the emitter attributes {list_names(others)}")
     if len(states[0].azimuths_deg) > 1:
         clauses.append("channels (a ray list has one channel)")
     clauses += [f"{name} = {value}" for name, value in _unread(prim, kind)]

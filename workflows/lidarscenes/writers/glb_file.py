@@ -84,7 +84,7 @@ class _Writer:
         if key not in self._meshes:
             self._referenced += meshes
             if translated:
-                meshes = [mesh.moved(name, np.eye(3), -self._origin) for mesh in meshes]
+                meshes = [mesh.affine_transform(name, np.eye(3), -self._origin) for mesh in meshes]
             primitives = [primitive for mesh in meshes for primitive in self._primitives(mesh)]
             self._meshes[key] = self._put("meshes", {"name": name, "primitives": primitives})
         node: dict[str, Any] = {"name": name, "mesh": self._meshes[key]}

@@ -146,8 +146,8 @@ def _carrier(lidars: Sequence[Lidar], files: _Files) -> dict[str, Any]:
         sensors[name] = {
             "model": files.name_of(lidar),
             "step_deg": 360,
-            **({"min_range_m": rounded(min_range_m)} if min_range_m else {}),
-            **({"max_range_m": rounded(max_range_m)} if math.isfinite(max_range_m) else {}),
+            **({"min_range_m": round_value(min_range_m)} if min_range_m else {}),
+            **({"max_range_m": round_value(max_range_m)} if math.isfinite(max_range_m) else {}),
             "mount": _pose(mount),
             **({"unseen": list(lidar.unseen)} if lidar.unseen else {}),
         }
@@ -158,9 +158,11 @@ def _carrier(lidars: Sequence[Lidar], files: _Files) -> dict[str, Any]:
 def _pose(matrix: Floats) -> dict[str, Any]:
     """Convert a 4 x 4 matrix to a pose in a scenario."""
     pose = Pose.from_rotation(matrix[:3, 3], matrix[:3, :3])
-    angles = {name: rounded(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")}
+    angles = {
+        name: round_value(getattr(pose, name)) for name in ("yaw_deg", "pitch_deg", "roll_deg")
+    }
     return {
-        "position": [rounded(value) for value in matrix[:3, 3].tolist()],
+        "position": [round_value(value) for value in matrix[:3, 3].tolist()],
         **{name: angle for name, angle in angles.items() if angle},
     }
 
@@ -195,6 +197,6 @@ def _dumped(data: dict[str, Any]) -> str:
     return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
 
 
-def rounded(value: float) -> float:
+def round_value(value: float) -> float:
     """Round a number to 12 significant digits for a file, and set tiny values to zero."""
     return float(f"{value:.12g}") if abs(value) > _ZERO else 0.0

@@ -11,7 +11,7 @@ import trimesh
 from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
-from lidarsim.errors import LidarError, MissingFileError, explained
+from lidarsim.errors import LidarError, MissingFileError, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.scene.files.meshfile import FORMAT_COMMENT
 from lidarsim.scene.scene import Scene
@@ -45,7 +45,7 @@ def write_scene(path: str | Path, scene: Scene) -> Path:
     path = Path(path)
     check_target(path)
     data = _encoded(path.suffix.lower(), scene)
-    with explained(f"{path} cannot be written"):
+    with explain_os_errors(f"{path} cannot be written"):
         Storage.at(path.parent, durable=False).write(path.name, data)
     return path
 

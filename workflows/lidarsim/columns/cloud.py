@@ -19,7 +19,7 @@ from ..environment.notebook import html_picture
 from ..errors import LidarError
 from ..numerics.arrays import AnyArray, AnyFloats
 from ..schema.checks import as_array, check_choice, check_fields
-from ..schema.value_texts import shown
+from ..schema.value_texts import format_value
 from .table import TABLE, Column
 from .waveforms import WAVEFORM, Waveforms
 
@@ -158,9 +158,9 @@ class Cloud(CloudDisplay):
             positions = np.empty(0)
         if positions.ndim != 2:
             raise LidarError(
-                f"A cloud cannot be indexed with {shown(key)}. Select points with a slice such as "
-                "cloud[:100], a mask or a list of row numbers, and a column with its name, such "
-                "as cloud['range']."
+                f"A cloud cannot be indexed with {format_value(key)}. Select points with a slice "
+                "such as cloud[:100], a mask or a list of row numbers, and a column with its name, "
+                "such as cloud['range']."
             )
         columns = {name: array[rows] for name, array in self.columns.items()}
         return Cloud(positions, columns, self.custom_columns, self.sweeps)

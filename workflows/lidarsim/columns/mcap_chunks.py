@@ -60,8 +60,8 @@ def check_chunks(path: Path) -> None:
     # The file is mapped because a bag may be large and only the headers are accessed.
     with open_input(path) as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
         for kind, unpacked_bytes in _unpacked_sizes(data):
-            Allowance(size, _ADVICE).take(unpacked_bytes)
-            totals[kind].take(unpacked_bytes)
+            Allowance(size, _ADVICE).reserve(unpacked_bytes)
+            totals[kind].reserve(unpacked_bytes)
 
 
 def read_metadata(path: Path) -> dict[str, dict[str, str]]:
@@ -119,7 +119,7 @@ def check_packed(path: Path) -> None:
         return
     with open_input(path) as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
         unpacked_bytes = max_unpacked_bytes(data, 0, size)
-    Allowance(size, _ADVICE, in_parts=True).take(unpacked_bytes)
+    Allowance(size, _ADVICE, in_parts=True).reserve(unpacked_bytes)
 
 
 def _records(data: mmap) -> Iterator[tuple[int, int, int]]:

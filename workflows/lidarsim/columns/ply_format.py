@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import LidarError, explained
+from ..errors import LidarError, explain_os_errors
 from ..io.input_files import open_input
 from ..numerics.arrays import AnyArray, Records
 from .table import Column
@@ -129,7 +129,7 @@ def map_rows(path: Path) -> Records:
         If the file cannot be read or is not a complete binary PLY file written by lidarpool.
     """
     try:
-        with explained(f"{path} cannot be read"):
+        with explain_os_errors(f"{path} cannot be read"):
             start, count, dtype = layout(path)
             # An empty file cannot be mapped.
             return np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)

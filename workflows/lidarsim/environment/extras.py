@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 
-from ..errors import LidarError, message_of, prefixed, unreadable
+from ..errors import LidarError, message_of, prefix_errors, unreadable_message
 
 CHECKOUT = "a checkout of lidarpool (docs/install.md#extras)"
 _PARTS = ("./kernels", "./scheduler", "./workflows/lidarsim", ".")  # distributions of a checkout
@@ -56,7 +56,7 @@ def reading(name: str) -> Iterator[None]:
     The message is a single line that starts with the name of the file.
     """
     try:
-        with prefixed(name):
+        with prefix_errors(name):
             yield
     except LidarError:
         raise
@@ -65,4 +65,4 @@ def reading(name: str) -> Iterator[None]:
         reason = message_of(error).rstrip(".")
         raise LidarError(f"{name} cannot be read: {reason}{file}.") from error
     except Exception as error:  # libraries may raise exceptions of any class
-        raise LidarError(unreadable(name, error)) from error
+        raise LidarError(unreadable_message(name, error)) from error

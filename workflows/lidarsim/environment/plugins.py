@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
 from ..errors import LidarError
-from ..words import did_you_mean, joined, printable
+from ..words import did_you_mean, join_names, printable
 
 T = TypeVar("T")
 
@@ -56,14 +56,14 @@ class Plugin:
             )
         return value
 
-    def lacks(self, field: str) -> LidarError:
+    def missing_field_error(self, field: str) -> LidarError:
         """Return the error to raise if the plug-in lacks a field or function."""
         return LidarError(
             f"{self} lacks {field}, which {self.group} requires. Install a different version of "
             f"{self.distribution}."
         )
 
-    def broken(self, error: BaseException) -> LidarError:
+    def import_error(self, error: BaseException) -> LidarError:
         """Return the error to raise if the plug-in cannot be imported."""
         reason = printable(str(error)) or type(error).__name__
         return LidarError(
@@ -80,7 +80,7 @@ def _imported(plugin: Plugin) -> Any:
     try:
         return EntryPoint(plugin.name, plugin.value, plugin.group).load()
     except Exception as error:  # importing a module may raise any exception
-        raise plugin.broken(error) from error
+        raise plugin.import_error(error) from error
 
 
 def plugins_of(group: str) -> Mapping[str, tuple[Plugin, ...]]:
@@ -159,7 +159,7 @@ class PluginTable(Generic[T]):
         if plugin is None:
             raise LidarError(
                 f"Unknown {self._noun} {name!r}.{did_you_mean(name, self.names)} The available "
-                f"names are {joined(self.names)}."
+                f"names are {join_names(self.names)}."
             )
         return self._load(plugin)
 

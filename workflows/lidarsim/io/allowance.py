@@ -40,7 +40,7 @@ class Allowance:
 
     Examples
     --------
-    >>> Allowance(1_500_000, "export it again").take(2_900_000_000)
+    >>> Allowance(1_500_000, "export it again").reserve(2_900_000_000)
     Traceback (most recent call last):
     lidarsim.errors.LidarError: it has 1.43 MiB but would unpack to at \
 least 2.70 GiB, and the limit is 256.00 MiB. Export it again.
@@ -76,7 +76,7 @@ least 2.70 GiB, and the limit is 256.00 MiB. Export it again.
         """Return whether `count` more bytes are within the limit."""
         return self.used_bytes + count <= self.limit
 
-    def take(self, count: int) -> None:
+    def reserve(self, count: int) -> None:
         """Count bytes toward the limit before they are allocated.
 
         Raises

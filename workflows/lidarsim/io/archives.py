@@ -16,7 +16,7 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from ..errors import LidarError, explained, prefixed
+from ..errors import LidarError, explain_os_errors, prefix_errors
 from ..numerics.arrays import AnyArray
 from .allowance import Allowance
 from .checksum import crc32
@@ -168,7 +168,7 @@ def open_archive(
     error messages.
     """
     try:
-        with explained(f"{path} cannot be read"), prefixed(path):
+        with explain_os_errors(f"{path} cannot be read"), prefix_errors(path):
             data = read() if read else read_input(path)
             yield read_arrays(data, Allowance(len(data), _ADVICE))
     except LidarError:
@@ -194,7 +194,7 @@ def read_arrays(data: bytes, allowance: Allowance | None = None) -> dict[str, An
     """
     entries = _entries(io.BytesIO(data))
     if allowance is not None:
-        allowance.take(sum(entry.file_size for entry in entries))
+        allowance.reserve(sum(entry.file_size for entry in entries))
     files = ((entry.filename, _content(data, entry)) for entry in entries)
     return {name.removesuffix(".npy"): read_npy(content, name) for name, content in files}
 

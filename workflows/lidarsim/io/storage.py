@@ -436,7 +436,7 @@ class Storage:
             with suppress(FileNotFoundError), self._remote() as (system, folder):
                 system.rm(f"{folder}/{name}", recursive=True)
 
-    def tidy(self, *, deep: bool = True) -> None:
+    def remove_unfinished(self, *, deep: bool = True) -> None:
         """Remove unfinished files that killed processes left in a local folder.
 
         If `deep` is true, subfolders are cleaned up as well.

@@ -20,13 +20,13 @@ import numpy as np
 
 from ..numerics.arrays import Floats
 from ..words import (
-    alternatives,
     did_you_mean_each,
+    format_rounded,
     format_yaml_list,
-    joined,
+    join_alternatives,
+    join_names,
     matches_pattern,
     printable,
-    rounded,
 )
 from .time_units import SECONDS, TimeUnit, seconds_of
 
@@ -171,7 +171,7 @@ def ignored_columns(names: Sequence[str], ignore: Sequence[str]) -> set[int]:
     if unmatched:
         columns = "columns" if len(unmatched) > 1 else "column"
         raise ValueError(
-            f"ignore contains the unknown {columns} {joined(unmatched)}. The columns are "
+            f"ignore contains the unknown {columns} {join_names(unmatched)}. The columns are "
             f"{_listed(names)}"
         )
     return indices
@@ -331,10 +331,13 @@ def read_table(
     if missing := [repr(name) for name in required_names if name not in names]:
         columns_word = "columns" if len(missing) > 1 else "column"
         raise ValueError(
-            f"it has no {columns_word} {joined(missing)}. Its columns are {_listed(header.cells)}"
+            f"it has no {columns_word} {join_names(missing)}. Its columns are "
+            f"{_listed(header.cells)}"
         )
     values = _numbers(lines, header, names, [*required_names, *(columns or {})])
-    return {name: reader.converted(name, values[:, i]) for i, name in enumerate(reader.assigned)}
+    return {
+        name: reader.convert_units(name, values[:, i]) for i, name in enumerate(reader.assigned)
+    }
 
 
 class _UnitMissingError(ValueError):
@@ -478,8 +481,8 @@ class _ColumnReader:
         ]
         pairs = ", ".join(f"{quantity.name}: {cell}" for quantity, cell in columns)
         return (
-            f"its columns {joined([repr(cell) for _, cell in columns])} have no unit. Rename "
-            f"them to {joined(names)}" + f", or set `columns: {{{pairs}}}`" * self.can_choose
+            f"its columns {join_names([repr(cell) for _, cell in columns])} have no unit. Rename "
+            f"them to {join_names(names)}" + f", or set `columns: {{{pairs}}}`" * self.can_choose
         )
 
     def _unit_missing(self, quantity: Quantity, cell: str) -> _UnitMissingError:
@@ -491,7 +494,7 @@ class _ColumnReader:
         names += [f"{stem}_{other_unit}" for other_unit in other_units]
         return _UnitMissingError(
             f"its column {printable(cell)!r} has no unit. Rename it to "
-            f"{alternatives(names)}{choice}{unit_option}"
+            f"{join_alternatives(names)}{choice}{unit_option}"
         )
 
     def _unit(
@@ -505,7 +508,7 @@ class _ColumnReader:
             return self.time_unit
         if unit is not None:
             if unit not in quantity.units:
-                units_read = alternatives([name or "none" for name in quantity.units])
+                units_read = join_alternatives([name or "none" for name in quantity.units])
                 raise ValueError(
                     f"its column {printable(cell)!r} has the unit {printable(unit)!r}, "
                     f"which is not supported. Convert it to {units_read}"
@@ -530,7 +533,7 @@ class _ColumnReader:
             )
         self.assigned[quantity.name] = index, unit
 
-    def converted(self, name: str, values: Floats) -> Floats:
+    def convert_units(self, name: str, values: Floats) -> Floats:
         """Convert the values of a quantity to its first unit.
 
         Raise ValueError if the unit is ambiguous or implausible.
@@ -545,7 +548,7 @@ class _ColumnReader:
                 names = " or ".join(f"{stem}_{unit_name}" for unit_name in quantity.units)
                 raise ValueError(
                     f"the unit of its column {printable(self.cells[index])!r} is ambiguous, "
-                    f"because its values do not exceed {rounded(largest)}. Rename the "
+                    f"because its values do not exceed {format_rounded(largest)}. Rename the "
                     f"column to {names}"
                 )
         assert unit is not None  # set above

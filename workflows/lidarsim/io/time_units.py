@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import as_sentence
 from ..numerics.arrays import Floats
-from ..words import rounded
+from ..words import format_rounded
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
 # {unit: number of units per second}
@@ -58,7 +58,7 @@ def seconds_of(
     span_s = last_s - first_s
     fault = f"its times range from {first_s:.9g} to {last_s:.9g} s"
     if span_s > _YEAR_S:
-        fault += f", a span of {rounded(span_s / _YEAR_S)} years"
+        fault += f", a span of {format_rounded(span_s / _YEAR_S)} years"
     unit = _probable_unit(times[np.isfinite(times)], stated)
     if unit == stated:
         advice = advice or f"Correct the outliers, or set `time_unit: {unit}`"

@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from ..errors import LidarError, MissingFileError, as_sentence, prefixed
+from ..errors import LidarError, MissingFileError, as_sentence, prefix_errors
 from .allowance import Allowance
 from .input_files import not_found, read_input_text
 
@@ -35,14 +35,14 @@ class _Loader(yaml.SafeLoader):
         """Compose a node, counting every use of an alias toward the allowance."""
         event: Any = self.peek_event()
         used_bytes = self._allowance.used_bytes
-        self._allowance.take(_NODE_BYTES)
+        self._allowance.reserve(_NODE_BYTES)
         node: Any = super().compose_node(parent, index)
         if isinstance(event, yaml.AliasEvent):
             if node not in self._node_bytes:
                 mark: Any = event.start_mark
                 problem = f"{event.anchor!r} contains itself"
                 raise yaml.composer.ComposerError(None, None, problem, mark)
-            self._allowance.take(self._node_bytes[node])
+            self._allowance.reserve(self._node_bytes[node])
         elif event.anchor is not None:
             self._node_bytes[node] = self._allowance.used_bytes - used_bytes
         return node
@@ -102,7 +102,7 @@ def read_yaml(
         does not contain a mapping.
     """
     try:
-        with prefixed(path):
+        with prefix_errors(path):
             content = load_yaml(read_input_text(path))
     except FileNotFoundError as error:
         raise MissingFileError(not_found(path)) from error

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from ..numerics.arrays import Floats
 from ..numerics.elementary import arccos, arcsin, cos, interp, log, sin, sin_cos
-from ..schema.declared import allowed
+from ..schema.declared import describe_allowed
 
 LeafAngles = Literal[
     "spherical", "planophile", "erectophile", "plagiophile", "extremophile", "uniform"
@@ -26,7 +26,9 @@ _ANGLES = 500  # number of leaf angles in the integrals
 
 LeafAngle = Annotated[
     LeafAngles | Annotated[float, Field(ge=0.05, le=20)],
-    allowed(f"one of {', '.join(NAMES)}, or the axis ratio of an ellipsoid from 0.05 to 20"),
+    describe_allowed(
+        f"one of {', '.join(NAMES)}, or the axis ratio of an ellipsoid from 0.05 to 20"
+    ),
 ]
 
 
@@ -91,8 +93,8 @@ def _light_table(leaf_angle: str | float) -> _LightTable:
     """Integrate the projection and the brightness of leaves over all leaf angles."""
     cosine = sin(np.linspace(0, np.pi / 2, _NODES))[:, None]
     angle = (np.arange(_ANGLES, dtype=np.float64) + 0.5) * (np.pi / 2 / _ANGLES)
-    share = leaf_angle_density(leaf_angle, angle)
-    share /= share.sum()
+    fraction = leaf_angle_density(leaf_angle, angle)
+    fraction /= fraction.sum()
     # The cosine of the angle between the light and the normal of a leaf is
     # `constant + amplitude * cos(azimuth)`.
     leaf_sine, leaf_cosine = sin_cos(angle)
@@ -103,8 +105,8 @@ def _light_table(leaf_angle: str | float) -> _LightTable:
     edge_on = arccos(-np.minimum(constant / np.maximum(amplitude, 1e-300), 1))
     mean = (constant * (2 * edge_on - np.pi) + 2 * amplitude * sin(edge_on)) / np.pi
     square = constant**2 + amplitude**2 / 2
-    projected = (mean * share).sum(axis=1)
-    bright = (square * share).sum(axis=1)
+    projected = (mean * fraction).sum(axis=1)
+    bright = (square * fraction).sum(axis=1)
     return _LightTable(cosine[:, 0], projected, bright / projected)
 
 

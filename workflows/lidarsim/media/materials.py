@@ -20,8 +20,15 @@ from ..errors import LidarError
 from ..numerics.arrays import Bools, Floats, Indices, Integers
 from ..numerics.elementary import exp, power
 from ..schema.checks import check_fields
-from ..schema.declared import FileSection, TextOrTexts, UnitShare, about, allowed, scenario_type
-from ..schema.value_texts import one_line, shown
+from ..schema.declared import (
+    FileSection,
+    TextOrTexts,
+    UnitShare,
+    about,
+    describe_allowed,
+    scenario_type,
+)
+from ..schema.value_texts import format_value, one_line
 from ..words import did_you_mean, name_hint
 from .leaves import LeafAngle
 
@@ -61,7 +68,7 @@ def find_class_names_error(names: Mapping[Any, Any]) -> str:
         if not (valid and unique and 0 < len(name) < 100 and name.isprintable()):
             return (
                 "expected whole numbers from 0 to 65535 with unique names, such as {10: car}, "
-                f"but found {shown({number: name})}."
+                f"but found {format_value({number: name})}."
             )
     return ""
 
@@ -120,7 +127,7 @@ class Material(FileSection):
     ] = None
     reflectance: Annotated[
         UnitShare | Literal["texture"] | None,
-        allowed("from 0 to 1, or texture"),
+        describe_allowed("from 0 to 1, or texture"),
         about(
             "fraction of the light that is scattered (default: 0.5, or 0 for glass and perfect "
             "mirrors); texture uses the luminance of the surface color"
@@ -138,7 +145,7 @@ class Material(FileSection):
     ] = "none"
     specular_reflectance: Annotated[
         UnitShare | Literal["fresnel"] | None,
-        allowed("from 0 to 1, or fresnel"),
+        describe_allowed("from 0 to 1, or fresnel"),
         about(
             "fraction of the light not scattered that is reflected specularly at normal incidence, "
             "which causes ghosts; increases toward grazing angles; 1 for a mirror, 0.04 for paint, "
@@ -729,7 +736,7 @@ class MaterialTable:
         return self.refractive_index > 0
 
     @property
-    def textured(self) -> bool:
+    def has_textures(self) -> bool:
         """Whether the reflectance of any surface depends on its color."""
         return bool(self.scale.any())
 
@@ -741,7 +748,7 @@ class MaterialTable:
         kind_indices
             Kind of each surface. Shape (n,).
         luminance
-            Luminance of the color at each hit, which is required if the table is `textured`. Shape
+            Luminance of the color at each hit, which is required if the table has textures. Shape
             (n,).
 
         Returns
@@ -768,7 +775,7 @@ class MaterialTable:
         cosine
             Cosine of the angle of incidence. Shape (n,).
         luminance
-            Luminance of the color at each hit, which is required if the table is `textured`. Shape
+            Luminance of the color at each hit, which is required if the table has textures. Shape
             (n,).
 
         Returns

@@ -302,9 +302,9 @@ class Air(NamedTuple):
         `distance` is in meters, and has shape (n,) like the result. The diameter is infinite at
         distances at which no particle returns the energy.
         """
-        share = energy / (particles.reflectance * self.white_energy(distance))
-        diameter_mm = 1000 * self.beam_diameter(distance) * np.sqrt(share)
-        return np.where(share <= 1, diameter_mm, np.inf)
+        fraction = energy / (particles.reflectance * self.white_energy(distance))
+        diameter_mm = 1000 * self.beam_diameter(distance) * np.sqrt(fraction)
+        return np.where(fraction <= 1, diameter_mm, np.inf)
 
     def particle_rate(self, particles: Particles, energy: float, distance: Floats) -> Floats:
         """Return the number of particles per meter of beam that return at least the given energy.

@@ -13,7 +13,7 @@ from ..columns.bags import opened_bag, read_messages
 from ..errors import LidarError
 from ..numerics.arrays import Floats, Ints
 from ..numerics.vectors import matmul, matvec
-from ..words import did_you_mean, joined, plural
+from ..words import did_you_mean, join_names, plural
 from .navigation import from_geodetic
 from .rotations import quaternions_of
 from .trajectory import Track
@@ -119,7 +119,7 @@ def _choose_label(labels: Sequence[str], topic: str | None) -> str:
         return labels[0]
     if not labels:
         raise LidarError(f"it has no poses. Supported topics are {_READABLE_TYPES}.")
-    available = f"The topics with poses are {joined(labels)}"
+    available = f"The topics with poses are {join_names(labels)}"
     if topic is None:
         raise LidarError(
             f"it has several topics with poses. {available}. Set topic to one of them."
@@ -230,8 +230,8 @@ def _orientations(bag: Reader, kinds: Mapping[str, str], imu: str) -> tuple[Ints
             rows.append([0.0, 0.0, 0.0, orientation.x, orientation.y, orientation.z, orientation.w])
     if len(measured) > 1:
         raise LidarError(
-            f"it has several IMU topics with orientations: {joined([*measured])}. Set topic to the "
-            "names of the NavSatFix and the Imu topic, separated by a space."
+            f"it has several IMU topics with orientations: {join_names([*measured])}. Set topic to "
+            "the names of the NavSatFix and the Imu topic, separated by a space."
         )
     if not measured:
         if imu:

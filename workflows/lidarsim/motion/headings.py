@@ -78,11 +78,11 @@ def _turns_between_legs(times_s: Floats, positions: Floats) -> _Turns:
     arrive = times_s[before + 1]
     leave = times_s[after]
     # Both ends of a leg use the same expressions, so that turns never overlap due to rounding.
-    middles = (times_s[:-1] + times_s[1:]) / 2
+    midpoints = (times_s[:-1] + times_s[1:]) / 2
     is_long = lengths > 2 * CORNER_M * _ROOM
     corner_s = CORNER_M * np.diff(times_s) / np.where(is_long, lengths, 1.0)
-    starts = np.where(is_long[before], arrive - corner_s[before], middles[before])
-    stops = np.where(is_long[after], leave + corner_s[after], middles[after])
+    starts = np.where(is_long[before], arrive - corner_s[before], midpoints[before])
+    stops = np.where(is_long[after], leave + corner_s[after], midpoints[after])
     pauses = after > before + 1
     starts[pauses] = np.where(
         leave - arrive > STATIONARY_TURN_S * _ROOM, leave - STATIONARY_TURN_S, arrive
@@ -165,11 +165,11 @@ class _Stops(NamedTuple):
         first, last = self.yaws.take(row, axis=0).T
         change = last - first
         change = change - 2 * np.pi * np.round(change / (2 * np.pi))
-        share = ((times_s - (stops_s - duration)) / duration).clip(0.0, 1.0)
+        fraction = ((times_s - (stops_s - duration)) / duration).clip(0.0, 1.0)
         # A polynomial whose first and second derivatives are 0 at both ends.
-        progress = share * share * share * (10 - 15 * share + 6 * share * share)
+        progress = fraction * fraction * fraction * (10 - 15 * fraction + 6 * fraction * fraction)
         sine, cosine = sin_cos(first + change * progress)
-        slope = 30 * (share * (1 - share)) * (share * (1 - share))
+        slope = 30 * (fraction * (1 - fraction)) * (fraction * (1 - fraction))
         return Heading(cosine, sine, change * slope / duration)
 
 
@@ -210,8 +210,8 @@ class CurveHeadings:
         steps = np.diff(times_s)
         still: Bools = np.asarray(~knots[1:].any(axis=(0, 1)))
         count = len(steps)
-        shares = np.array([_NEAR_END, 0.5, 1 - _NEAR_END])
-        since = (steps[:, None] * shares).reshape(-1)
+        fractions = np.array([_NEAR_END, 0.5, 1 - _NEAR_END])
+        since = (steps[:, None] * fractions).reshape(-1)
         slopes = evaluate_curve(knots, steps, np.arange(count).repeat(3), since, 1)[1]
         velocities = slopes[:2].T.reshape(count, 3, 2)
         moves = hypot(velocities[..., 0], velocities[..., 1]) > _SAME

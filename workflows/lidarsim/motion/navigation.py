@@ -320,8 +320,8 @@ def _true_samples(path: Trajectory, imu: Imu, gravity_m_s2: float, samples: Ints
     """Return the samples with the given indices that an ideal IMU takes on a trajectory."""
     ends_ns: Floats = np.append(samples, samples[-1] + 1) * 1e9 / imu.rate_hz
     motion = _mounted_motion(path, imu.mount, ends_ns)
-    middles = (ends_ns[1:] + ends_ns[:-1]) / 2
-    halfway = _mounted_motion(path, imu.mount, middles).rotations
+    midpoints = (ends_ns[1:] + ends_ns[:-1]) / 2
+    halfway = _mounted_motion(path, imu.mount, midpoints).rotations
     gravity = np.array([0.0, 0.0, -gravity_m_s2])
     forces = np.diff(motion.velocities, axis=0) * imu.rate_hz - gravity
     rates = _rotation_vectors(motion.rotations[:-1], motion.rotations[1:]) * imu.rate_hz

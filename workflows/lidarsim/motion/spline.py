@@ -161,13 +161,13 @@ def evaluate_curve(
     counts = np.diff(run_starts, append=len(segment))
     run_segments = segment.take(run_starts)
     step = steps.take(run_segments)
-    share = since / step.repeat(counts)
+    fraction = since / step.repeat(counts)
     # In Horner's method, each row is a derivative divided by the factorial of its order.
     rows = [*np.zeros((order + 1, knots.shape[1], len(segment)))]
     for term in reversed(_polynomials(knots, run_segments, step)):
         for row in range(order, 0, -1):
-            rows[row] = rows[row] * share + rows[row - 1]
-        rows[0] = rows[0] * share + term.repeat(counts, axis=1)
+            rows[row] = rows[row] * fraction + rows[row - 1]
+        rows[0] = rows[0] * fraction + term.repeat(counts, axis=1)
     scale = step.repeat(counts)
     for row, factor in enumerate([1.0, 2.0][:order], 1):
         for _ in range(row):

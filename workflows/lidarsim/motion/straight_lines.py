@@ -76,7 +76,7 @@ class StraightLines(NamedTuple):
         return np.where(total > _STEP_S, total, 0.0)
 
     @classmethod
-    def find(cls, times_s: Floats, positions: Floats) -> StraightLines:
+    def from_trajectory(cls, times_s: Floats, positions: Floats) -> StraightLines:
         """Find the straight lines of a trajectory that last at least a second.
 
         Only the horizontal direction of travel is considered.
@@ -92,7 +92,8 @@ class StraightLines(NamedTuple):
         --------
         >>> times = np.arange(0.0, 21.0, 0.5)
         >>> there_and_back = np.minimum(times, 20 - times)
-        >>> lines = StraightLines.find(times, np.stack([60 * there_and_back] * 3, axis=1))
+        >>> positions = np.stack([60 * there_and_back] * 3, axis=1)
+        >>> lines = StraightLines.from_trajectory(times, positions)
         >>> len(lines.starts_s), round(lines.seconds)
         (2, 20)
         """

@@ -16,8 +16,8 @@ from ..numerics.elementary import arctan2, sin_cos
 from ..numerics.vectors import hypot, matmul, matmul_of_components, matvec, norm
 from ..schema.checks import as_array, check_fields
 from ..schema.declared import AngleDeg, FileSection, Triple, about, accept_short_form, scenario_type
-from ..schema.value_texts import one_line, shown
-from ..words import joined, rounded
+from ..schema.value_texts import format_value, one_line
+from ..words import format_rounded, join_names
 from .headings import CurveHeadings, Heading, headed_poses
 from .rotations import (
     check_rotations,
@@ -148,7 +148,7 @@ def as_pose(name: str, value: Any) -> Pose:
     except (TypeError, ValueError) as error:
         raise LidarError(
             f"{name} must be a Pose, or x, y and z in meters, such as (0, 0, 1), but is "
-            f"{shown(value)}."
+            f"{format_value(value)}."
         ) from error
     return Pose(position)  # type: ignore[arg-type]  # Pose checks the length
 
@@ -240,7 +240,7 @@ def check_trajectory_type(name: str, value: object) -> None:
     """
     if not hasattr(value, "poses"):
         raise ArgumentError(
-            f"{name} must be a trajectory, but is {shown(value)}. To read a file, use "
+            f"{name} must be a trajectory, but is {format_value(value)}. To read a file, use "
             "load_trajectory('drive.tum')."
         )
 
@@ -462,13 +462,13 @@ class Track:
         """
         if self.quaternions is not None:
             raise LidarError(
-                f"quaternions and {joined([*angles])} both define the rotations. Pass only one of "
-                "them."
+                f"quaternions and {join_names([*angles])} both define the rotations. Pass only one "
+                "of them."
             )
         if "yaw_deg" not in angles:
             raise LidarError(
-                f"{joined([*angles])} cannot be used without yaw_deg. Pass yaw_deg as well, for "
-                "example yaw_deg=0."
+                f"{join_names([*angles])} cannot be used without yaw_deg. Pass yaw_deg as well, "
+                "for example yaw_deg=0."
             )
         poses = np.size(self.times_s)
         table = np.zeros((poses, 3))
@@ -477,7 +477,7 @@ class Track:
             if values.shape not in ((), (poses,)) or not np.isfinite(values).all():
                 raise LidarError(
                     f"{name} must be a finite angle, or one finite angle for each of the {poses} "
-                    f"poses, but is {shown(angles[name])}."
+                    f"poses, but is {format_value(angles[name])}."
                 )
             table[:, axis] = values
         object.__setattr__(self, "quaternions", quaternions_of(rotations_of(table)))
@@ -655,10 +655,13 @@ class Track:
             moments_s = moments_s.clip(times[0], times[-1])
         elif gap > self.slack_s:
             gaps_s = {"first": times[0] - first_s, "last": last_s - times[-1]}
-            parts = [f"the {end} {rounded(s)} s" for end, s in gaps_s.items() if s > self.slack_s]
+            parts = [
+                f"the {end} {format_rounded(s)} s" for end, s in gaps_s.items() if s > self.slack_s
+            ]
             raise LidarError(
                 f"The trajectory covers {times[0]:.9g} to {times[-1]:.9g} s, but poses from "
-                f"{first_s:.9g} to {last_s:.9g} s are required, so {joined(parts)} are not covered."
+                f"{first_s:.9g} to {last_s:.9g} s are required, so {join_names(parts)} are not "
+                "covered."
             )
         segment = np.clip(np.searchsorted(times, moments_s, "right") - 1, 0, len(times) - 2)
         return _SegmentTimes(segment, moments_s - times.take(segment), within)

@@ -22,7 +22,7 @@ Records = NDArray[np.void]  # rows of named fields
 AnyArray = NDArray[Any]
 
 
-def owned(array: AnyArray, kind: type = np.float64) -> AnyArray:
+def to_writable(array: AnyArray, kind: type = np.float64) -> AnyArray:
     """Convert an array to the form that compiled loops require.
 
     The result has the given dtype and is contiguous and writable. The array is copied only if

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arrays import Floats, owned
+from .arrays import Floats, to_writable
 from .elementary_scalars import arctan2_of, exp_of, log_of, sin_cos_of
 
 _MAX_INTERPRETED = 1 << 12  # maximum array size for plain Python, which takes about 20 ms
@@ -147,5 +147,5 @@ def _apply(
     else:
         from . import elementary_loops
 
-        getattr(elementary_loops, name + "_each")(*map(owned, map(np.ravel, arrays)), *output)
+        getattr(elementary_loops, name + "_each")(*map(to_writable, map(np.ravel, arrays)), *output)
     return tuple(row.reshape(shape)[()] for row in output)

@@ -79,7 +79,7 @@ def named_seed(seed: int, name: str) -> int:
     return int.from_bytes(sha256(f"{seed}\n{name}".encode()).digest()[:8], "little") >> 1
 
 
-def starts(seed: int, *purposes: Purpose) -> NDArray[np.uint64]:
+def initial_states(seed: int, *purposes: Purpose) -> NDArray[np.uint64]:
     """Return the initial hash state for each purpose.
 
     The seed must be less than 2**63. The result has dtype uint64 and shape (k,).
@@ -98,7 +98,7 @@ def raw(
     `ray` is the index of the ray in its scan and must be less than 2**32, and `number` must be less
     than 256. The result has dtype uint64 and shape (n,).
     """
-    start = starts(seed, purpose)
+    start = initial_states(seed, purpose)
     # Each scan has its own SplitMix64 stream, in which each ray has 256 numbers.
     streams = _mixed(start + np.asarray(scan).astype(np.uint64) * np.uint64(_GAMMA))
     steps = np.asarray(ray).astype(np.uint64) * np.uint64(_NUMBERS)
@@ -131,8 +131,8 @@ def normal(
 @cache
 def quantiles() -> Floats:
     """Return 65,536 quantiles of the standard normal distribution with equal probabilities."""
-    shares = (np.arange(2**15) + 0.5) / 2**16
-    lower_half = np.array([NormalDist().inv_cdf(share) for share in shares])
+    fractions = (np.arange(2**15) + 0.5) / 2**16
+    lower_half = np.array([NormalDist().inv_cdf(fraction) for fraction in fractions])
     table = np.concatenate([lower_half, -lower_half[::-1]])
     # The logarithms of different C libraries agree once they are rounded to single precision.
     return (table / np.sqrt((table**2).mean())).astype(np.float32).astype(np.float64)

@@ -15,7 +15,7 @@ from pathlib import Path
 from struct import Struct, error, unpack_from
 from typing import BinaryIO, NamedTuple
 
-from ..errors import LidarError, explained
+from ..errors import LidarError, explain_os_errors
 from ..io.input_files import open_input
 
 ENDINGS = (".pcap", ".pcapng")
@@ -130,7 +130,7 @@ class Capture:
 
         Raises LidarError if the file cannot be read.
         """
-        with explained(f"{self.name} cannot be read"), open_input(self.path) as file:
+        with explain_os_errors(f"{self.name} cannot be read"), open_input(self.path) as file:
             head = file.read(24)
         if len(head) < 24 or head[:4] not in _PCAP_MAGIC:
             return False
@@ -150,7 +150,7 @@ class Capture:
         unknown_links: set[int] = set()
         fragments = _Fragments()
         is_empty = True
-        with explained(f"{self.name} cannot be read"), open_input(self.path) as file:
+        with explain_os_errors(f"{self.name} cannot be read"), open_input(self.path) as file:
             for frame in self._frames(file):
                 if frame.link not in _LINKS:
                     unknown_links.add(frame.link)

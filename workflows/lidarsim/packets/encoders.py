@@ -41,7 +41,7 @@ class Datagrams:
     def __len__(self) -> int:
         return len(self.payloads)
 
-    def without(self, dropped: Bools) -> Datagrams:
+    def drop(self, dropped: Bools) -> Datagrams:
         """Return only the datagrams that are not lost.
 
         `dropped` (n,) is True for lost datagrams.
@@ -296,7 +296,7 @@ def _encoder_of_plugin(plugin: Plugin) -> type[PacketEncoder]:
     """Load the encoder class of a plug-in. Raises LidarError if it is not an encoder class."""
     encoder = plugin.load(type)
     if not issubclass(encoder, PacketEncoder):
-        raise plugin.lacks("a subclass of lidarsim.packets.encoders.PacketEncoder")
+        raise plugin.missing_field_error("a subclass of lidarsim.packets.encoders.PacketEncoder")
     return encoder
 
 

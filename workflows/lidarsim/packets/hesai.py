@@ -72,7 +72,7 @@ class HesaiEncoder(PacketEncoder):
         last_ns = filled.starts_ns[self._firings - 1 :: self._firings]
         datagrams = Datagrams(payloads, last_ns + self.firing_interval_ns, self._port)
         dropped = np.all(filled.dropped.reshape(-1, self._firings), axis=1)
-        return [datagrams.without(np.asarray(dropped))]
+        return [datagrams.drop(np.asarray(dropped))]
 
     def finish(self) -> list[Datagrams]:
         """Return no packets, because the sensor only sends packets whose blocks are all full."""

@@ -149,7 +149,7 @@ class PtcService(TcpService):
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer the commands on a connection until it closes or sends invalid bytes."""
         try:
-            with suppress(*_ENDS), self.counted() as renew:
+            with suppress(*_ENDS), self.register_connection() as renew:
                 while True:
                     start = await reader.readexactly(1)
                     renew()

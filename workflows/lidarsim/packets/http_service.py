@@ -114,7 +114,10 @@ class HttpService(TcpService):
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer a single request on a connection, and close the connection."""
         try:
-            with suppress(OSError, TimeoutError, asyncio.IncompleteReadError), self.counted():
+            with (
+                suppress(OSError, TimeoutError, asyncio.IncompleteReadError),
+                self.register_connection(),
+            ):
                 async with asyncio.timeout(_WITHIN_S):
                     writer.write((await self._answered(reader, writer)).encode())
                     await writer.drain()

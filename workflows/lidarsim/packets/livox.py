@@ -169,7 +169,7 @@ class LivoxEncoder(PacketEncoder):
         if not len(filling):
             return imu
         dropped = np.all(filling.dropped.reshape(-1, self._firings), axis=1)
-        return [self._points(filling).without(np.asarray(dropped)), *imu]
+        return [self._points(filling).drop(np.asarray(dropped)), *imu]
 
     def finish(self) -> list[Datagrams]:
         """Return the last IMU packets.

@@ -388,7 +388,7 @@ class OusterEncoder(PacketEncoder):
         due_ns = shots.starts_ns[last_shots] + self.firing_interval_ns
         datagrams = Datagrams(payloads, due_ns, self.port("lidar", LIDAR_PORT))
         lost = ~blocks.valid.reshape(-1, COLUMNS_PER_PACKET)
-        return [datagrams.without(np.asarray(lost.all(axis=1)))]
+        return [datagrams.drop(np.asarray(lost.all(axis=1)))]
 
     def _blocks(self, shots: Shots) -> MeasurementBlocks:
         """Return the measurement blocks of shots, padded to whole packets with invalid blocks."""

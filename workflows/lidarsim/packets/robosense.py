@@ -196,7 +196,7 @@ class RobosenseEncoder(PacketEncoder):
             return []
         msop = self._msop(filling)
         dropped = np.all(filling.dropped.reshape(-1, self._firings), axis=1)
-        return [self._difop(filling, int(msop.due_ns[-1])), msop.without(np.asarray(dropped))]
+        return [self._difop(filling, int(msop.due_ns[-1])), msop.drop(np.asarray(dropped))]
 
     def finish(self) -> list[Datagrams]:
         """Return no packets, because the sensor only sends packets whose blocks are all full."""
@@ -240,8 +240,8 @@ class RobosenseEncoder(PacketEncoder):
         if len(shots.range_m) == 1:
             return np.concatenate([first, first])
         signal = shots.columns["signal"]
-        first[0] = shots.returned[1] & (signal[1] > signal[0])
-        return np.concatenate([first, shots.returned[1:2] ^ first])
+        first[0] = shots.return_mask[1] & (signal[1] > signal[0])
+        return np.concatenate([first, shots.return_mask[1:2] ^ first])
 
     def _difop(self, shots: Shots, until_ns: int) -> Datagrams:
         """Return the device data packets that are due by a given time.

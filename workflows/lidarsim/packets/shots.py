@@ -42,7 +42,7 @@ class Shots:
         return Shots(**arrays, range_m=self.range_m[:, firings], columns=columns)
 
     @property
-    def returned(self) -> Bools:
+    def return_mask(self) -> Bools:
         """Whether each shot has a return of each number.
 
         The shape is (r, n, c).
@@ -122,7 +122,7 @@ class Shots:
             columns={name: in_laser_order(points[name], 0) for name in names},
         )
 
-    def shifted(self, shift_ns: int) -> Shots:
+    def shift_times(self, shift_ns: int) -> Shots:
         """Return the shots with shifted times, for the repetition of a survey."""
         if not shift_ns:
             return self

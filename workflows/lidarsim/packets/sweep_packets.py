@@ -86,12 +86,12 @@ class Packets:
 
         `start` has the same meaning as in `Packets`.
         """
-        carried = scanner.survey.carried[0]
+        carried = scanner.survey.mounted_sensors[0]
         return cls(carried, returns=scanner.survey.returns_each[0], start=start)
 
     def _prepare(self, survey: Survey) -> None:
         """Create the encoder for the sensor of a survey."""
-        carried = survey.carried[0]
+        carried = survey.mounted_sensors[0]
         self._sensor = carried.sensor
         self._returns = 2 if survey.returns_each[0].mode in TWO_RETURNS else 1
         start_ns = START_NS if survey.start is None else nanoseconds(survey.start)

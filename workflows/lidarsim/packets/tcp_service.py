@@ -55,7 +55,7 @@ class TcpService(Service):
         """Answer the requests on a connection, and close the connection."""
 
     @contextmanager
-    def counted(self) -> Iterator[Callable[[], None]]:
+    def register_connection(self) -> Iterator[Callable[[], None]]:
         """Register the current task's connection.
 
         Close the oldest connection if there are too many.

@@ -85,7 +85,7 @@ class VelodyneEncoder(PacketEncoder):
         stamps_ns = whole.stamps_ns[last] + self.firing_interval_ns
         positions = self._positions.following(data.due_ns, stamps_ns)
         dropped = np.all(whole.dropped.reshape(-1, self._firings), axis=1)
-        return [data.without(np.asarray(dropped)), positions]
+        return [data.drop(np.asarray(dropped)), positions]
 
     def finish(self) -> list[Datagrams]:
         """Return no packets, because the sensor only sends packets whose blocks are all full."""

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import LidarError, prefixed
+from ..errors import LidarError, prefix_errors
 from ..motion.rotations import check_rotations, quaternions_of
 from ..motion.trajectory import (
     CENTER,
@@ -98,7 +98,7 @@ class Actor:
             _, rotations = full_poses(self.trajectory, 0, np.array([first_ns]))
         except LidarError:  # the trajectory does not cover this time, which `check` reports
             return
-        with prefixed(f"Actor {self.name!r}"):
+        with prefix_errors(f"Actor {self.name!r}"):
             check_rotations(np.asarray(rotations, np.float64))
 
     def with_trajectory(self, trajectory: Trajectory) -> Actor:
@@ -129,7 +129,7 @@ class Actor:
         """
         return (self.mesh.animation or self.mesh).bounds
 
-    def placed(self, time_ns: float) -> SceneMesh:
+    def mesh_at(self, time_ns: float) -> SceneMesh:
         """Return the mesh at a given time in local scene coordinates.
 
         At times when the actor is absent, the mesh is collapsed to a point.

@@ -92,14 +92,14 @@ class Animation:
         each frame, pass their indices as `vertex` with shape (n, k).
         """
         first_pose = frames.astype(np.int64).clip(0, len(self.vertices) - 2)
-        share = (frames - first_pose)[:, None, None]
+        fraction = (frames - first_pose)[:, None, None]
         first_pose = first_pose if isinstance(vertex, slice) else first_pose[:, None]
         start = self.vertices[first_pose, vertex]
         stop = self.vertices[first_pose + 1, vertex]
-        return (1 - share) * start + share * stop, stop - start
+        return (1 - fraction) * start + fraction * stop, stop - start
 
     @cached_property
-    def pictured(self) -> Animation:
+    def for_pictures(self) -> Animation:
         """Animation for rendering, with fewer keyframes if the mesh has many vertices.
 
         Coordinates are rounded to 1/1024 m.
@@ -116,7 +116,7 @@ class Animation:
         """
         return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
-    def moved(self, linear: Floats, offset: Floats) -> Animation:
+    def affine_transform(self, linear: Floats, offset: Floats) -> Animation:
         """Return the animation transformed by p -> linear @ p + offset."""
         points = rotate(self.vertices.reshape(-1, 3), linear) + offset
         return replace(self, vertices=points.reshape(self.vertices.shape))

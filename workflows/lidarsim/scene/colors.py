@@ -39,8 +39,8 @@ def as_bytes(shares: ArrayLike) -> Bytes:
 
     NaN becomes 0.
     """
-    finite_shares = np.nan_to_num(np.asarray(shares, np.float64))
-    return np.rint(255 * np.clip(finite_shares, 0, 1)).astype(np.uint8)
+    finite_fractions = np.nan_to_num(np.asarray(shares, np.float64))
+    return np.rint(255 * np.clip(finite_fractions, 0, 1)).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,8 +210,8 @@ class Lookup:
                 light = LINEAR[tints[rows][tinted[rows]]]
                 lights.append(_fit_planes(block[tinted[rows]], light))
             start += len(block)
-        self._texture = _Planes.joined(textured, textures)
-        self._light = _Planes.joined(tinted, lights)
+        self._texture = _Planes.concatenate(textured, textures)
+        self._light = _Planes.concatenate(tinted, lights)
 
     def colors_at(self, face_indices: Integers, points: Floats) -> UInts32:
         """Return the packed colors of points on given faces.
@@ -244,7 +244,7 @@ class _Planes(NamedTuple):
     everywhere: bool  # whether all faces have values
 
     @classmethod
-    def joined(cls, has_values: Bools, blocks: list[Floats]) -> _Planes | None:
+    def concatenate(cls, has_values: Bools, blocks: list[Floats]) -> _Planes | None:
         """Concatenate the slopes of all faces that have values.
 
         Each block has shape (k, 4 w). The result is None if no face has values.

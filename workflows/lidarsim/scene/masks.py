@@ -59,7 +59,7 @@ def read_opacity(image: Path | bytes, allowance: Allowance, *, gray: bool = Fals
         pixels = opened.width * opened.height
         if not allowance.fits(PIXEL_BYTES * pixels):
             raise _TooLargeError
-        allowance.take(pixels)
+        allowance.reserve(pixels)
         if opened.has_transparency_data:
             rgba = opened if "A" in opened.getbands() else opened.convert("RGBA")
             alpha = np.asarray(rgba.getchannel("A"))
@@ -86,7 +86,7 @@ def read_colors(image: Path | bytes, allowance: Allowance, notes: MaskNotes) -> 
         if max(rgb.size) > MAX_SIDE_PIXELS:
             notes.reduced_sizes.append(f"{rgb.width:,} x {rgb.height:,}")
             rgb.thumbnail((MAX_SIDE_PIXELS, MAX_SIDE_PIXELS), Image.Resampling.BOX)
-        allowance.take(3 * rgb.width * rgb.height)
+        allowance.reserve(3 * rgb.width * rgb.height)
         return np.asarray(rgb)
 
 
@@ -106,7 +106,7 @@ def read_heights(image: Path, allowance: Allowance, bytes_per_pixel: int) -> Flo
         pixels = opened.width * opened.height
         if not allowance.fits((PIXEL_BYTES + bytes_per_pixel) * pixels):
             raise _TooLargeError
-        allowance.take((8 + bytes_per_pixel) * pixels)
+        allowance.reserve((8 + bytes_per_pixel) * pixels)
         is_gray = opened.mode in ("L", "I", "F") or opened.mode.startswith("I;16")
         values = np.asarray(opened if is_gray else opened.convert("L"), np.float64)
     if not np.isfinite(values).all() or values.min() < 0:
@@ -286,7 +286,7 @@ def _deduct(allowance: Allowance, count: int) -> None:
     """Deduct bytes from the allowance, or raise MaskError if too few are left."""
     if not allowance.fits(count):
         raise MaskError("its image would be too large")
-    allowance.take(count)
+    allowance.reserve(count)
 
 
 class MaskNotes:

@@ -18,7 +18,7 @@ _MAX_SHOWN = 3
 def resolve_same_names(
     objects: Sequence[SceneMesh | SceneInstance],
     same_names: SameNames,
-    tell: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> list[SceneMesh | SceneInstance]:
     """Merge objects with the same name, or report duplicate names.
 
@@ -30,7 +30,7 @@ def resolve_same_names(
         With "join", all objects with the same name become one object at the position of the first.
         With "number", the objects are returned unchanged, since a scene appends numbers to
         duplicate names (Wall, Wall.2).
-    tell
+    report
         Called with a message about duplicate names if `same_names` is "number".
 
     Raises
@@ -51,7 +51,7 @@ def resolve_same_names(
     if numbered := [unique for name, unique in pairs if unique != name]:
         shown = ", ".join(numbered[:_MAX_SHOWN]) + ", …" * (len(numbered) > _MAX_SHOWN)
         have = "has" if len(numbered) == 1 else "have"
-        tell(
+        report(
             f"{plural(len(numbered), 'object')} with a duplicate name {have} a number appended: "
             f'{shown}. To merge objects with the same name, use <scene.same_names="join">'
         )

@@ -21,8 +21,8 @@ from ..motion.trajectory import Track
 from ..numerics.arrays import Bools, Floats, Indices, Ints32
 from ..numerics.vectors import hypot
 from ..schema.checks import as_array, check_fields, check_list
-from ..schema.value_texts import shown
-from ..words import listed, plural
+from ..schema.value_texts import format_value
+from ..words import list_names, plural
 from .actors import Actor
 from .colors import GRAY, Colors, are_valid_indices, join_colors
 from .face_materials import ObjectMaterials
@@ -64,8 +64,8 @@ class Scene:
         World coordinates of the local origin, which are whole meters plus `world_origin`. Shape
         (3,), float64.
     world_origin
-        Offset in meters that `georeferenced` added to `origin`. Without it, world coordinates are
-        the coordinates in the scene files. Shape (3,), float64.
+        Offset in meters that `with_world_origin` added to `origin`. Without it, world coordinates
+        are the coordinates in the scene files. Shape (3,), float64.
     actors
         Moving objects, numbered after the static objects. `faces` does not contain their meshes.
     instances
@@ -106,17 +106,18 @@ class Scene:
     def _repr_html_(self) -> str:
         """Return an HTML table of the main properties, and an image if a plug-in draws scenes."""
         sides = " × ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0))
+        object_names = self.object_names
         rows = {
-            "scene": f"{plural(len(self.object_names), 'object')}: {listed(self.object_names, 8)}",
+            "scene": f"{plural(len(object_names), 'object')}: {list_names(object_names, 8)}",
             "triangles": f"{self.triangles:,}",
             "extent": f"{sides} m",
         }
         if self.origin.any():
             rows["origin"] = ", ".join(f"{value:,.0f}" for value in self.origin) + " m"
         if self.actors:
-            rows["actors"] = listed([actor.name for actor in self.actors], 8)
+            rows["actors"] = list_names([actor.name for actor in self.actors], 8)
         if names := [name for name in self.material_names if name]:
-            rows["materials"] = listed(names, 8)
+            rows["materials"] = list_names(names, 8)
         return html_table(rows.items()) + html_picture(self)
 
     def __post_init__(self) -> None:
@@ -232,15 +233,16 @@ class Scene:
         return cls.from_objects(objects._replace(static=tuple(static)))
 
     @classmethod
-    def from_objects(cls, objects: Objects, tell: Callable[[str], None] = _log.warning) -> Scene:
+    def from_objects(cls, objects: Objects, report: Callable[[str], None] = _log.warning) -> Scene:
         """Create a scene from the objects of mesh files.
 
         A scene requires at least one static object. If there are none, the actors become static
-        objects at their first pose, and `tell` is called with a warning that their motion is lost.
+        objects at their first pose, and `report` is called with a warning that their motion is
+        lost.
         """
         if not objects.static:
             note_start = "a scene requires at least one static object. This scene moves "
-            return cls.from_meshes(objects.at_start(lambda line: tell(note_start + line)))
+            return cls.from_meshes(objects.at_start(lambda line: report(note_start + line)))
         scene = cls.from_meshes(objects.static)
         object.__setattr__(scene, "epsg", objects.epsg)
         actors = []
@@ -316,13 +318,14 @@ class Scene:
         for actor in actors:
             if not isinstance(actor, Actor):
                 raise LidarError(
-                    f"actors must contain Actor(mesh, trajectory), but contains {shown(actor)}."
+                    "actors must contain Actor(mesh, trajectory), but contains "
+                    f"{format_value(actor)}."
                 )
         scene = copy(self)
         object.__setattr__(scene, "actors", actors)
         return scene
 
-    def georeferenced(self, world_origin: ArrayLike) -> Scene:
+    def with_world_origin(self, world_origin: ArrayLike) -> Scene:
         """Return the same scene at another location in the world.
 
         Local coordinates and the poses of surveys do not change.
@@ -335,7 +338,7 @@ class Scene:
 
         Examples
         --------
-        >>> Scene.seed().georeferenced((500_000, 5_400_000, 0)).origin.tolist()
+        >>> Scene.seed().with_world_origin((500_000, 5_400_000, 0)).origin.tolist()
         [500000.0, 5400000.0, 0.0]
         """
         added = _world_position(world_origin)
@@ -346,7 +349,9 @@ class Scene:
         object.__setattr__(scene, "world_origin", added)
         return scene
 
-    def moved(self, instance_indices: Indices, positions: Floats, rotations: Floats) -> Scene:
+    def with_instance_poses(
+        self, instance_indices: Indices, positions: Floats, rotations: Floats
+    ) -> Scene:
         """Return a copy of the scene in which some instances are moved to new poses.
 
         Instances keep their scales.
@@ -364,7 +369,7 @@ class Scene:
         scene = copy(self)
         for cached in ("bounds", "object_bounds", "footprints"):
             vars(scene).pop(cached, None)
-        moved = self.instances.moved(instance_indices, positions, rotations)
+        moved = self.instances.with_poses(instance_indices, positions, rotations)
         object.__setattr__(scene, "instances", moved)
         return scene
 
@@ -432,7 +437,7 @@ class Scene:
         return of_kind[rows]
 
     @property
-    def masked(self) -> tuple[str, ...]:
+    def masked_objects(self) -> tuple[str, ...]:
         """Names of the objects with opacity masks, in the order of `object_names`."""
         owners = set()
         if (instances := self.instances) is not None:
@@ -442,7 +447,7 @@ class Scene:
         return tuple(name for i, name in enumerate(self.object_names) if i in owners)
 
     @property
-    def colored(self) -> list[Colors]:
+    def all_colors(self) -> list[Colors]:
         """Colors of all parts of the scene that have colors.
 
         The list contains the colors of `faces`, of instances and of actors, in this order. It is
@@ -524,7 +529,7 @@ class Scene:
         """
         if not self.actors:
             return self
-        meshes = [actor.placed(time_ns) for actor in self.actors]
+        meshes = [actor.mesh_at(time_ns) for actor in self.actors]
         moving = [(mesh.vertices, mesh.faces.astype(np.int32)) for mesh in meshes]
         owners = np.repeat(
             np.arange(len(self.names), len(self.object_names), dtype=np.int32),
@@ -655,7 +660,9 @@ class Scene:
 def _world_position(value: ArrayLike) -> Floats:
     position = np.array(as_array("world_origin", value))
     if position.shape != (3,) or not np.isfinite(position).all():
-        raise LidarError(f"world_origin must be x, y and z in meters, but is {shown(value)}.")
+        raise LidarError(
+            f"world_origin must be x, y and z in meters, but is {format_value(value)}."
+        )
     position.flags.writeable = False
     return position
 
@@ -714,7 +721,8 @@ def _check_objects(objects: Sequence[object]) -> None:
     for item in objects:
         if not isinstance(item, (SceneMesh, SceneInstance)):
             raise LidarError(
-                f"meshes must contain SceneMesh or SceneInstance, but contains {shown(item)}."
+                "meshes must contain SceneMesh or SceneInstance, but contains "
+                f"{format_value(item)}."
             )
     if not objects:
         raise LidarError("A scene requires at least one object with triangles.")

@@ -106,14 +106,14 @@ class SceneInstance:
         """The transform as a matrix of shape (4, 4)."""
         return np.asarray(self.transform)
 
-    def moved(self, name: str, linear: Floats, offset: Floats) -> SceneInstance:
+    def affine_transform(self, name: str, linear: Floats, offset: Floats) -> SceneInstance:
         """Return a renamed instance that is transformed by p -> linear @ p + offset."""
         position = matvec(linear, self.matrix[:3, 3]) + offset
         return SceneInstance(self.mesh, affine(matmul(linear, self.matrix[:3, :3]), position), name)
 
     def flat(self) -> SceneMesh:
         """Return a copy of the mesh in world coordinates."""
-        return self.mesh.moved(self.name, self.matrix[:3, :3], self.matrix[:3, 3])
+        return self.mesh.affine_transform(self.name, self.matrix[:3, :3], self.matrix[:3, 3])
 
 
 def check_coordinate(position: Floats) -> None:
@@ -239,7 +239,7 @@ class Instances:
         fulfilled = np.array([condition(part) for part in self.mesh_parts], np.bool_)
         return self.owner[fulfilled[self.part]]
 
-    def placed(self) -> Iterator[tuple[Indices, Floats]]:
+    def vertex_blocks(self) -> Iterator[tuple[Indices, Floats]]:
         """Yield the instances of each part in blocks, with their vertices in local coordinates.
 
         Instance indices have shape (k,), and vertices have shape (k, 3, v).
@@ -277,7 +277,7 @@ class Instances:
             ).bounds
             return corners
         corners = np.empty((len(self), 2, 3))
-        for rows, points in self.placed():
+        for rows, points in self.vertex_blocks():
             corners[rows] = np.stack([points.min(axis=2), points.max(axis=2)], axis=1)
         return corners
 
@@ -287,7 +287,7 @@ class Instances:
         `centers` has shape (n, 2), and the result has shape (n,).
         """
         radii = np.empty(len(self))
-        for rows, points in self.placed():
+        for rows, points in self.vertex_blocks():
             x, y = np.moveaxis(points[:, :2] - centers[rows, :, None], 1, 0)
             radii[rows] = np.sqrt((x * x + y * y).max(axis=1))
         return radii
@@ -317,7 +317,9 @@ class Instances:
             is_known[unknown] = True
         return np.asarray(scales[instance_indices])
 
-    def moved(self, instance_indices: Indices, positions: Floats, rotations: Floats) -> Instances:
+    def with_poses(
+        self, instance_indices: Indices, positions: Floats, rotations: Floats
+    ) -> Instances:
         """Return the instances with some of them moved to new poses.
 
         Moved instances keep their scales.

@@ -60,7 +60,7 @@ class Voxels:
     density: Floats32
     matrix: Floats
 
-    def moved(self, linear: Floats, offset: Floats) -> Voxels:
+    def affine_transform(self, linear: Floats, offset: Floats) -> Voxels:
         """Return the voxels transformed by p -> linear @ p + offset.
 
         The leaf area per volume does not change.
@@ -164,7 +164,7 @@ class SceneMesh:
         edges = (block[:, 1:] - block[:, :1] for block in blocks)
         return self.animation is not None or any(np.cross(*e.swapaxes(0, 1)).any() for e in edges)
 
-    def moved(self, name: str, linear: Floats, offset: Floats) -> SceneMesh:
+    def affine_transform(self, name: str, linear: Floats, offset: Floats) -> SceneMesh:
         """Return a renamed copy of the mesh that is transformed by p -> linear @ p + offset."""
         faces = self.faces
         cutouts = self.cutouts
@@ -173,8 +173,8 @@ class SceneMesh:
             faces = faces[:, ::-1]
             cutouts = tuple(replace(cut, uv=cut.uv[:, ::-1]) for cut in cutouts)
             colors = colors and colors.reverse_corners()
-        voxels = self.voxels and self.voxels.moved(linear, offset)
-        animation = self.animation and self.animation.moved(linear, offset)
+        voxels = self.voxels and self.voxels.affine_transform(linear, offset)
+        animation = self.animation and self.animation.affine_transform(linear, offset)
         vertices = rotate(self.vertices, linear) + offset
         return SceneMesh(
             name=name,

@@ -58,11 +58,13 @@ class SimplifiedScene:
         """
         if (shared := scene.instances) is None:
             return cls(scene, np.arange(len(scene.faces)), is_original=True)
-        shares = _triangle_shares(shared, max_triangles, near_positions)
+        fractions = _triangle_shares(shared, max_triangles, near_positions)
         copies = _CopiedInstances(scene)
-        for index, share in sorted(set(zip(shared.part.tolist(), shares.tolist(), strict=True))):
-            part = _simplify_for_drawing(shared.mesh_parts[index], share)
-            for row in np.flatnonzero((shared.part == index) & (shares == share)):
+        for index, fraction in sorted(
+            set(zip(shared.part.tolist(), fractions.tolist(), strict=True))
+        ):
+            part = _simplify_for_drawing(shared.mesh_parts[index], fraction)
+            for row in np.flatnonzero((shared.part == index) & (fractions == fraction)):
                 copies.add(part, shared, int(row))
         return cls(copies.scene(), np.concatenate(copies.counters))
 
@@ -75,9 +77,9 @@ class SimplifiedScene:
         if self.is_original:
             return counts
         area = triangle_areas(self.scene.vertices[self.scene.faces]) + np.finfo(np.float64).tiny
-        share = area / np.bincount(self.counter, area, len(counts))[self.counter]
+        fraction = area / np.bincount(self.counter, area, len(counts))[self.counter]
         actor_triangles = sum(len(actor.mesh.faces) for actor in self.scene.actors)
-        return np.append(counts[self.counter] * share, counts[len(counts) - actor_triangles :])
+        return np.append(counts[self.counter] * fraction, counts[len(counts) - actor_triangles :])
 
 
 class _DrawnPart(NamedTuple):
@@ -222,22 +224,22 @@ def _triangle_shares(
     distance to the nearest position, so that all triangles appear about equally large from there.
     The shape is (n,).
     """
-    even_share = min(1.0, max_triangles / shared.triangles)
+    even_fraction = min(1.0, max_triangles / shared.triangles)
     positions = np.concatenate([np.empty((0, 3)), *near_positions])
-    if even_share == 1 or not len(positions):
-        return np.full(len(shared), even_share)
-    middles = shared.bounds.mean(axis=1)
+    if even_fraction == 1 or not len(positions):
+        return np.full(len(shared), even_fraction)
+    centers = shared.bounds.mean(axis=1)
     distance = np.full(len(shared), np.inf)
     for position in positions[:: len(positions) // _MAX_POSITIONS + 1]:
-        np.minimum(distance, np.linalg.norm(middles - position, axis=1), out=distance)
+        np.minimum(distance, np.linalg.norm(centers - position, axis=1), out=distance)
     distance += 1e-3
     full_distance = distance.max()  # up to this distance, instances keep all triangles
     while True:
         # Shares are powers of four, since each distinct share requires a separate mesh.
-        near_share = 4.0 ** np.floor(np.log2(np.minimum(full_distance / distance, 1)))
-        shares = np.maximum(near_share, even_share / 2)
-        if shares @ shared.sizes <= max_triangles:
-            return shares
+        near_fraction = 4.0 ** np.floor(np.log2(np.minimum(full_distance / distance, 1)))
+        fractions = np.maximum(near_fraction, even_fraction / 2)
+        if fractions @ shared.sizes <= max_triangles:
+            return fractions
         full_distance *= 0.9
 
 

@@ -24,7 +24,9 @@ _ROUNDNESS = 0.05  # maximum difference between length and height, relative to t
 
 
 def animate_wheels(
-    objects: Sequence[SceneMesh | SceneInstance], wheels: Sequence[str], tell: Callable[[str], None]
+    objects: Sequence[SceneMesh | SceneInstance],
+    wheels: Sequence[str],
+    report: Callable[[str], None],
 ) -> list[SceneMesh]:
     """Animate wheels that roll along x and rotate about y around their centers.
 
@@ -37,7 +39,7 @@ def animate_wheels(
         Objects of a scene file. Objects that are not wheels do not change.
     wheels
         Names of the wheels, which can contain the wildcards * and ?.
-    tell
+    report
         Called with a message for each wheel that is not round or is too small compared to other
         wheels.
 
@@ -62,7 +64,7 @@ def animate_wheels(
         smaller = f"{revolutions.pop(index)} times smaller than the largest wheel"
         notes.append(f"{meshes[index].name} is {smaller} and does not rotate")
     for line in notes:
-        tell(line)
+        report(line)
     steps = _POSES_PER_REVOLUTION * max(revolutions.values())
     step_s = 2 * np.pi * largest / steps
     for index, count in revolutions.items():

@@ -20,9 +20,9 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from ..errors import ArgumentError
 from ..numerics.arrays import AnyArray
-from ..words import alternatives, did_you_mean
+from ..words import did_you_mean, join_alternatives
 from .section_fields import LIMITS, own_limits, range_words
-from .value_texts import shown, with_article
+from .value_texts import format_value, with_article
 
 _NO_LIMITS: Mapping[str, Any] = MappingProxyType({})
 _WITHIN = {"ge": operator.ge, "gt": operator.gt, "le": operator.le, "lt": operator.lt}
@@ -34,7 +34,7 @@ def check_type(name: str, value: object, *kinds: type, advice: str = "") -> None
     """Check that an argument is an instance of one of the given classes."""
     if not isinstance(value, kinds):
         words = ["None" if kind is NoneType else with_article(kind.__name__) for kind in kinds]
-        raise _wrong(name, value, alternatives(words), advice)
+        raise _wrong(name, value, join_alternatives(words), advice)
 
 
 def check_items(name: str, values: object, *kinds: type, advice: str = "") -> None:
@@ -60,7 +60,7 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> None:
     """Check that an argument is one of the given names."""
     if value not in choices:
         hint = did_you_mean(value, choices) if isinstance(value, str) else ""
-        raise _wrong(name, value, alternatives([*map(repr, choices)]), hint)
+        raise _wrong(name, value, join_alternatives([*map(repr, choices)]), hint)
 
 
 def check_number(name: str, value: object, *, whole: bool = False, **limits: float) -> None:
@@ -108,7 +108,7 @@ def as_array(name: str, values: ArrayLike, dtype: DTypeLike = np.float64) -> Any
 
 
 def _wrong(name: str, value: object, allowed: str, advice: str = "") -> ArgumentError:
-    return ArgumentError(f"{name} must be {allowed}, but is {shown(value)}.{advice}")
+    return ArgumentError(f"{name} must be {allowed}, but is {format_value(value)}.{advice}")
 
 
 class _Rule(NamedTuple):
@@ -136,10 +136,10 @@ def _rule(hint: Any, limits: Mapping[str, Any] = _NO_LIMITS) -> _Rule:
         return _rule(args[0], own_limits(notes))
     if origin in (Union, UnionType):
         rules = [_rule(arg, limits) for arg in args]
-        words = alternatives([*dict.fromkeys(rule.allowed for rule in rules)])
+        words = join_alternatives([*dict.fromkeys(rule.allowed for rule in rules)])
         return _Rule(lambda value: any(rule.fits(value) for rule in rules), words)
     if origin is Literal:
-        words = alternatives([*map(repr, args)])
+        words = join_alternatives([*map(repr, args)])
         return _Rule(lambda value: isinstance(value, (str, *_WHOLE)) and value in args, words)
     if origin in _LISTS:
         return _list_rule([_rule(arg) for arg in args if arg is not ...], limits)

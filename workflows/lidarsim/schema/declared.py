@@ -27,7 +27,7 @@ from pydantic import (
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from ..errors import LidarError
-from ..words import joined
+from ..words import join_names
 
 UnitShare = Annotated[float, Field(ge=0, le=1)]
 Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
@@ -123,7 +123,8 @@ def accept_short_form(
     `allowed` is the type of the input in the JSON schema, including the short form.
     """
     return BeforeValidator(
-        lambda value: long(value) if is_short(value) else value, json_schema_input_type=allowed
+        lambda value: long(value) if is_short(value) else value,
+        json_schema_input_type=allowed,
     )
 
 
@@ -137,13 +138,13 @@ def require_one_of(*fields: str) -> Any:
 
     def check(section: Any) -> Any:
         if sum(bool(getattr(section, field)) for field in fields) != 1:
-            raise ValueError(f"Set exactly one of {joined(fields)}.")
+            raise ValueError(f"Set exactly one of {join_names(fields)}.")
         return section
 
     return model_validator(mode="after")(check)
 
 
-def allowed(words: str) -> WrapValidator:
+def describe_allowed(words: str) -> WrapValidator:
     """Replace the pydantic errors for a field of several types with a single line.
 
     `words` describes the allowed values, for example "from 0 to 1, or texture".

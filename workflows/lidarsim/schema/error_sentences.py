@@ -13,19 +13,19 @@ from typing import Any
 from pydantic_core import ErrorDetails, ValidationError
 
 from ..errors import Mistakes
-from ..words import did_you_mean, listed, plural
+from ..words import did_you_mean, list_names, plural
 from .field_advice import Contradictory, list_advice, name_advice, place_advice
 from .section_fields import (
     LIMITS,
     FieldPath,
     Fields,
     classes_in,
-    dotted,
     fields_by_name,
+    format_path,
     limits_of,
     range_words,
 )
-from .value_texts import shown
+from .value_texts import format_value
 
 # {pydantic error type: allowed values}
 _ALLOWED = {
@@ -62,7 +62,7 @@ def convert_validation_errors(
         for details in _alike(error):
             line = _line(details, section, content, contradictory)
             mistakes.lines.append(f"{source}: {line}" if source else line)
-        mistakes.tell()
+        mistakes.raise_if_any()
 
 
 def _alike(error: ValidationError) -> Iterable[Sequence[ErrorDetails]]:
@@ -103,19 +103,19 @@ def _line(
         return line
     values = ""
     if kind == "literal_error":
-        values = f": {listed([*dict.fromkeys(_in_file(d['input']) for d in further_details)])}"
+        values = f": {list_names([*dict.fromkeys(_in_file(d['input']) for d in further_details)])}"
     others = plural(len(further_details), "other entry", "other entries")
     return f"{line} The same applies to {others}{values}."
 
 
 def _in_file(value: Any) -> str:
-    plain = str(value).lower() if isinstance(value, bool) else shown(value)
+    plain = str(value).lower() if isinstance(value, bool) else format_value(value)
     return "empty" if value is None else plain
 
 
 def _sentence(path: FieldPath, detail: ErrorDetails, hint: Any, advice: str) -> str:
     """Compose a sentence from the location, the value, the allowed values and the advice."""
-    location = dotted(path)
+    location = format_path(path)
     kind = detail["type"]
     value = detail["input"]
     if kind == "value_error":

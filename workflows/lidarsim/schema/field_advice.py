@@ -15,9 +15,9 @@ from pydantic import GetPydanticSchema, ValidationError
 from pydantic.fields import FieldInfo
 
 from ..unit_suffixes import convert_value, factor_between, find_other_unit
-from ..words import did_you_mean, joined, most_similar
+from ..words import did_you_mean, join_names, most_similar
 from .section_fields import FieldPath, classes_in, fields_by_name, is_section
-from .value_texts import shown
+from .value_texts import format_value
 
 # Function that returns True if the fields in the content of a file contradict each other.
 Contradictory = Callable[[Any], bool]
@@ -154,7 +154,9 @@ def _similar_name(name: str, value: Any, field_names: Collection[str]) -> str:
     factor = None if similar is None else factor_between(name, similar)
     right = None if factor is None else convert_value(value, factor)
     return (
-        did_you_mean(name, field_names) if right is None else f" Write {similar}: {shown(right)}."
+        did_you_mean(name, field_names)
+        if right is None
+        else f" Write {similar}: {format_value(right)}."
     )
 
 
@@ -177,7 +179,7 @@ def _in_words(
     An empty string in `direct` represents the top level of the file.
     """
     sections = [section for section in direct if section]
-    listed = joined(sections)
+    listed = join_names(sections)
     if suggestion and listed:
         return f"{suggestion} {path[-1]!r} is a field of {listed}."
     if suggestion and "" in direct:
@@ -258,11 +260,11 @@ def _example(owner: Owner, name: str, value: Any) -> str:
         if value is None or _error(owner.kind, {**sample, name: value}) is None:
             needed = keys
             break
-    shown = str(value) if isinstance(value, (str, int, float)) else "…"
-    shown = shown.lower() if isinstance(value, bool) else shown
-    text = ", ".join([*(f"{key}: …" for key in needed if key != name), f"{name}: {shown}"])
+    shown_value = str(value) if isinstance(value, (str, int, float)) else "…"
+    shown_value = shown_value.lower() if isinstance(value, bool) else shown_value
+    text = ", ".join([*(f"{key}: …" for key in needed if key != name), f"{name}: {shown_value}"])
     is_short = first == name and isinstance(value, str) and set(needed) <= {name}
-    text = shown if is_short else f"{{{text}}}"
+    text = shown_value if is_short else f"{{{text}}}"
     for step, form in zip(reversed(owner.names), reversed(owner.forms), strict=True):
         text = f"{{{step}: {form % text}}}"
     return text[1:-1]

@@ -68,7 +68,7 @@ def maker_folder(plugin: Plugin) -> Traversable:
     package = plugin.load(ModuleType)
     folder = files(package) / plugin.name if hasattr(package, "__path__") else None
     if folder is None or not folder.is_dir():
-        raise plugin.lacks(f"the folder {plugin.name} in {plugin.module}")
+        raise plugin.missing_field_error(f"the folder {plugin.name} in {plugin.module}")
     return folder
 
 

@@ -98,7 +98,7 @@ def range_words(limits: Mapping[str, Any]) -> str:
     return " and ".join(f"{_LIMIT_WORDS[name]} {number}" for name, number in numbers.items())
 
 
-def dotted(path: Sequence[int | str]) -> str:
+def format_path(path: Sequence[int | str]) -> str:
     """Format a path as text, for example "poses[0].position"."""
     steps = (f"[{step}]" if isinstance(step, int) else f".{step}" for step in path)
     return "".join(steps).removeprefix(".")

@@ -17,7 +17,7 @@ _MAX_LINE = 119  # maximum length of a `repr`
 _MAX_VALUE = 64  # maximum length of a field value in a `repr`
 
 
-def shown(value: object) -> str:
+def format_value(value: object) -> str:
     """Format a value for a message, shortened to a readable length.
 
     Objects other than plain Python values are represented by their type.

@@ -303,12 +303,12 @@ class Mirror(Spin):
         """
         phase = self._within(firings) / self.firings_per_turn
         if self.motion == "sine":
-            line_share = -cos(2 * np.pi * phase) / 2
+            line_fraction = -cos(2 * np.pi * phase) / 2
         elif self.motion == "triangle":
-            line_share = 0.5 - np.abs(2 * phase - 1)
+            line_fraction = 0.5 - np.abs(2 * phase - 1)
         else:
-            line_share = phase - 0.5
-        turned = np.radians(self.width_deg) * line_share
+            line_fraction = phase - 0.5
+        turned = np.radians(self.width_deg) * line_fraction
         return np.radians(self.zero_deg) + (-turned if self.clockwise else turned)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import converted
+from ..errors import convert_errors
 from ..io.textfile import read_text
 from ..io.yamlfile import load_yaml
 from ..numerics.arrays import Floats
@@ -22,7 +22,7 @@ from ..sensor_files.format_table import read_rays
 from ..sensor_files.livox import is_livox
 from ..sensor_files.livox import rays_of_text as rays_of_livox
 from ..sensor_files.ray_csv import is_ray_table, rays_of_text
-from ..words import did_you_mean_each, joined, printable
+from ..words import did_you_mean_each, join_names, printable
 from .beams import Beams
 
 
@@ -96,7 +96,7 @@ def read_calibration(path: Path) -> Calibration:
     LidarError
         If the file format is unknown, or if values are missing, not finite or in the wrong order.
     """
-    with converted(f"{path} is not a valid calibration file"):
+    with convert_errors(f"{path} is not a valid calibration file"):
         if path.suffix.lower() not in (".yaml", ".yml", ".json", ".csv"):
             rays = read_rays(path)
             if rays is not None:
@@ -325,7 +325,7 @@ def _parse_table(name: str, text: str) -> Calibration:
         if unknown:
             noun = "columns" if unknown[1:] else "column"
             raise ValueError(
-                f"unknown {noun} {joined([repr(printable(name)) for name in unknown])}."
+                f"unknown {noun} {join_names([repr(printable(name)) for name in unknown])}."
                 f"{did_you_mean_each(unknown, names)} The known columns are {', '.join(names)}"
             )
         if duplicate := next((word for word in header if header.count(word) > 1), None):

@@ -95,8 +95,8 @@ def _gaussian_points(count: int) -> Floats:
     error is 0.280 with 7 sub-rays, 0.143 with 19, 0.103 with 37, and 0.034 with 217.
     """
     points = _disc_points(count)
-    share = (points**2).sum(axis=1)
-    outwards = np.sqrt(-log1p(-share[1:]) / 2 / share[1:])
+    fraction = (points**2).sum(axis=1)
+    outwards = np.sqrt(-log1p(-fraction[1:]) / 2 / fraction[1:])
     points = np.concatenate([points[:1], points[1:] * outwards[:, None]])
     return np.asarray(points * np.sqrt(count / 2 / (points**2).sum()))
 

@@ -13,7 +13,7 @@ from ..numerics.arrays import Ints
 from ..schema.checks import check_fits, check_type
 from ..sensor_files.fired_rays import FRAME_HZ, Light, RayList
 from ..sensor_files.format_table import PROPERTIES, SensorFormat, format_of
-from ..words import rounded
+from ..words import format_rounded
 from .optics import Optics
 from .ray_sensors import PrismSensor
 from .sensor import Sensor
@@ -106,7 +106,8 @@ def export_sensor(
         if not rays.repeats:
             assert rays.cycle_ns is not None  # rays of a sensor have a cycle
             lost.append(
-                f"rays after {rounded(rays.cycle_ns / 1e9, 4)} s, where the pattern does not repeat"
+                f"rays after {format_rounded(rays.cycle_ns / 1e9, 4)} s, where the pattern does "
+                "not repeat"
             )
         left_out = write(path, rays, lost)
     return SensorFile(path, row.name, rays, tuple(left_out))
@@ -180,8 +181,8 @@ def _count_firings(sensor: Sensor, duration_ns: float) -> int:
 
     if starts_before(limit):
         raise LidarError(
-            f"{sensor.model} fires more than {MAX_RAYS:,} rays in {rounded(duration_ns / 1e9, 4)} "
-            "s. Reduce seconds or revolutions."
+            f"{sensor.model} fires more than {MAX_RAYS:,} rays in "
+            f"{format_rounded(duration_ns / 1e9, 4)} s. Reduce seconds or revolutions."
         )
     lower = 0
     while limit - lower > 1:

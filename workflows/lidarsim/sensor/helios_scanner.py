@@ -21,7 +21,7 @@ import numpy as np
 from ..errors import LidarError
 from ..numerics.arrays import Floats
 from ..sensor_files.complete_files import write_complete_text, xml_comment
-from ..words import rounded
+from ..words import format_rounded
 from .beams import Beams, Mirror, Spin
 from .noise import Noise
 from .ray_sensors import ListedSensor, PrismSensor
@@ -258,8 +258,8 @@ def _whole_hz(sensor: Sensor, exact_hz: float) -> int:
     if exact_hz < 0.5:
         raise _unsupported(
             sensor,
-            f"it fires {rounded(exact_hz)} times per second, but pulseFreq_hz must be a whole "
-            "number",
+            f"it fires {format_rounded(exact_hz)} times per second, but pulseFreq_hz must be a "
+            "whole number",
         )
     return round(exact_hz)
 

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from ..environment.plugins import Plugin, find_plugin
-from ..errors import LidarError, converted
+from ..errors import LidarError, convert_errors
 from ..io.input_files import read_input_text
 from ..io.yamlfile import load_yaml
 from ..numerics.arrays import Floats, Ints
@@ -408,7 +408,7 @@ def _read_built_in(name: str) -> SensorModel:
 
 def _read(path: Path | Traversable) -> SensorModel:
     """Read the data file of a model. Raises LidarError if it is invalid."""
-    with converted(f"{path} is not a valid sensor model"):
+    with convert_errors(f"{path} is not a valid sensor model"):
         text = read_input_text(path) if isinstance(path, Path) else path.read_text("utf-8")
         content = load_yaml(text)
         with convert_validation_errors(SensorModel, path, content):

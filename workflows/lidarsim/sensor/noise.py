@@ -13,7 +13,7 @@ from ..errors import LidarError
 from ..media.materials import normal_incidence_energy
 from ..numerics.random_numbers import named_seed
 from ..schema.checks import check_fields
-from ..schema.declared import AngleDeg, Seed, Several, UnitShare, about, allowed
+from ..schema.declared import AngleDeg, Seed, Several, UnitShare, about, describe_allowed
 from ..schema.value_texts import one_line
 
 # Detection threshold for signal plus noise, in standard deviations.
@@ -129,7 +129,7 @@ class Noise:
     ] = None
     channel_bias_m: Annotated[
         Meters | Several[Bias],
-        allowed("a number from 0 to 1000, or a list of numbers, one for each channel"),
+        describe_allowed("a number from 0 to 1000, or a list of numbers, one for each channel"),
         about(
             "constant range errors of the channels in meters, as a standard deviation or as one "
             "value per channel"

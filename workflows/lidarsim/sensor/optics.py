@@ -14,9 +14,9 @@ from ..errors import LidarError
 from ..numerics.elementary_scalars import log_of
 from ..numerics.vectors import hypot
 from ..schema.checks import check_fields
-from ..schema.declared import FileSection, about, allowed
+from ..schema.declared import FileSection, about, describe_allowed
 from ..schema.value_texts import one_line
-from ..words import rounded
+from ..words import format_rounded
 from .disc import SUBRAYS, Beam, Profile
 from .reflectivity import SCALES
 
@@ -39,7 +39,7 @@ AngleMrad = Annotated[float, Field(ge=0, le=1000)]
 # Full cone angle of a beam at 1/e² of the maximum, or a horizontal and a vertical angle.
 Divergence = Annotated[
     AngleMrad | Annotated[Sequence[AngleMrad], Field(min_length=2, max_length=2)],
-    allowed("from 0 to 1000, or two such numbers as [horizontal, vertical]"),
+    describe_allowed("from 0 to 1000, or two such numbers as [horizontal, vertical]"),
 ]
 Diameter = Annotated[float, Field(ge=0, le=10)]
 Pulse = Annotated[float, Field(ge=0, le=1e6)]
@@ -242,8 +242,8 @@ class Returns:
         sigma = hypot(self.length_ns(optics) / FWHM, response)
         if not 2 * self.sample_ns <= FWHM * sigma * (1 + 1e-9):
             raise LidarError(
-                f"returns.sample_ns must be at most {rounded(FWHM * sigma / 2)}, which is half of "
-                f"the pulse width in the waveform, but is {self.sample_ns:g}. Reduce it, or "
-                "increase pulse_ns."
+                f"returns.sample_ns must be at most {format_rounded(FWHM * sigma / 2)}, which is "
+                f"half of the pulse width in the waveform, but is {self.sample_ns:g}. Reduce it, "
+                "or increase pulse_ns."
             )
         return sigma

@@ -26,8 +26,8 @@ class ByteScale(NamedTuple):
 
         Reflectances above the end of the scale have the code 255. Both arrays have shape (n,).
         """
-        share = reflectance / self.reflectance
-        code = self.code * np.minimum(share, 1) + log(np.maximum(share, 1)) / self._step
+        fraction = reflectance / self.reflectance
+        code = self.code * np.minimum(fraction, 1) + log(np.maximum(fraction, 1)) / self._step
         return np.rint(np.minimum(code, 255)).astype(np.uint8)
 
     def decode(self, codes: Bytes) -> Floats:

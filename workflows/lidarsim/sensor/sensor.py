@@ -20,7 +20,7 @@ from ..numerics.vectors import rotate
 from ..schema.checks import check_fields, check_fits
 from ..schema.declared import about
 from ..schema.value_texts import one_line
-from ..words import rounded
+from ..words import format_rounded
 from .beams import MAX_CHANNELS, Beams, Head, Mirror, Spin
 from .noise import Noise
 from .optics import LIGHT_M_NS, Optics, Returns
@@ -155,7 +155,7 @@ class Sensor:
         first, stop = self._revolution_firings()
         seconds = (self.revolution_start_ns(1) - self.revolution_start_ns(0)) / 1e9
         rays = (stop - first) * self.channels / seconds
-        return f"{rounded(1 / seconds, 4)} Hz, {rays:,.0f} rays/s"
+        return f"{format_rounded(1 / seconds, 4)} Hz, {rays:,.0f} rays/s"
 
     def with_packets(
         self, ports: Mapping[str, int], identifiers: Mapping[str, Identifier]

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-from ..errors import explained
+from ..errors import explain_os_errors
 from ..io.storage import Storage
 
 
@@ -18,7 +18,7 @@ def open_complete(path: Path) -> Iterator[IO[bytes]]:
     Raises LidarError if the file cannot be written.
     """
     with (
-        explained(f"{path} cannot be written"),
+        explain_os_errors(f"{path} cannot be written"),
         Storage.at(path.parent, durable=False).writing(path.name) as file,
     ):
         yield file

@@ -80,7 +80,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
             entries = archive.infolist()
         if any(entry.flag_bits & _ENCRYPTED for entry in entries):
             raise ValueError("it is encrypted. Write it again without a password")
-        allowance.take(sum(entry.file_size for entry in entries))
+        allowance.reserve(sum(entry.file_size for entry in entries))
         with np.load(path, allow_pickle=False) as content:
             arrays = {name: content[name] for name in content.files}
     except BadZipFile as error:

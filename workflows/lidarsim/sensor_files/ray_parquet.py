@@ -59,7 +59,7 @@ def read(path: Path) -> RayList | None:
             for field in schema:
                 if not any(is_kind(field.type) for is_kind in _NUMBERS):
                     raise not_numbers(field.name, field.type)
-            allowance.take(_bytes_of(content.metadata))
+            allowance.reserve(_bytes_of(content.metadata))
             table = content.read()
     except pa.ArrowException as error:
         raise ValueError(f"it is not a Parquet file: {message_of(error)}") from error

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import LidarError, prefixed
+from ..errors import LidarError, prefix_errors
 from ..motion.rotations import check_rotations
 from ..motion.trajectory import CENTER, Pose, StaticPose, Track, Trajectory, as_pose
 from ..numerics.arrays import Bools, Floats
-from ..schema.value_texts import shown
+from ..schema.value_texts import format_value
 
 ROW_SLACK = 1e-8  # tolerance for the last row of a pose matrix
 
@@ -99,7 +99,7 @@ def poses_of_bodies(poses: Any, count: int, times_s: ArrayLike | None) -> BodyPo
         return BodyPoses(table[:, :3, 3], table[:, :3, :3], (None,) * count)
     raise LidarError(
         "poses must be a list of Pose, positions (k, 3) or matrices (k, 4, 4), but is "
-        f"{shown(poses)} of the shape {table.shape}."
+        f"{format_value(poses)} of the shape {table.shape}."
     )
 
 
@@ -145,7 +145,7 @@ def _followed_matrices(table: Floats, count: int, times_s: ArrayLike) -> BodyPos
             f"at times (samples,), but has the shape {table.shape}."
         )
     _check_count(len(table), count)
-    with prefixed("poses (flattened over bodies and times)"):
+    with prefix_errors("poses (flattened over bodies and times)"):
         check_matrices(table.reshape(-1, 4, 4))
     tracks = Track.from_matrices(times, table)
     return BodyPoses(table[:, 0, :3, 3], table[:, 0, :3, :3], tracks)

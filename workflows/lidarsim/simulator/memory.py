@@ -69,11 +69,11 @@ def rig_bytes(scene: Scene, survey: Survey) -> int:
     # Sensors for which different static objects are visible have separate trees.
     trees = len({static_key(scene, mask) for mask in unseen_objects(scene, survey)})
     triangles = (SCENE_TRIANGLE + CASTER_TRIANGLE * trees) * scene.kept_triangles
-    images = {id(image): image.nbytes for mesh in scene.colored for image in mesh.images}
-    colors = COLORED_TRIANGLE * sum(map(len, scene.colored)) + IMAGE_BYTE * sum(images.values())
+    images = {id(image): image.nbytes for mesh in scene.all_colors for image in mesh.images}
+    colors = COLORED_TRIANGLE * sum(map(len, scene.all_colors)) + IMAGE_BYTE * sum(images.values())
     instances = INSTANCE * len(scene.instances or ())
     patterns = 0
-    for carried in survey.carried:
+    for carried in survey.mounted_sensors:
         sensor = carried.sensor
         rays = (sensor.period or 0) * sensor.channels
         patterns += PATTERN_RAY * min(rays, PATTERN_RAYS)
@@ -93,7 +93,7 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
     most memory. Columns computed by user functions count like built-in columns. Set `on_device` if
     a CUDA device casts the rays. Device memory, about 300 MB, is not included.
     """
-    setups = [setup_of(scene, survey, number) for number in range(len(survey.carried))]
+    setups = [setup_of(scene, survey, number) for number in range(len(survey.mounted_sensors))]
     on_device = on_device and not any(map(steps_of, setups))
     peak = max(_bytes(setup, scans, on_device) for setup in setups)
     return int(peak) + HIT_COUNTER * scene.counters
@@ -154,7 +154,7 @@ def _point_bytes(setup: Setup, scans: int, on_device: bool) -> float:
     survey = setup.survey
     columns = sum(np.dtype(column.dtype).itemsize for column in survey.stored_columns)
     if on_device and not needs_hits(setup.scene, survey):
-        single_run = scans <= survey.steps_each[setup.number] and len(survey.carried) == 1
+        single_run = scans <= survey.steps_each[setup.number] and len(survey.mounted_sensors) == 1
         return (PAGE_LOCKED + (0 if single_run else JOINED)) * columns
     # NumPy computes all columns. Columns that are copied from the device count once more.
     return POINT + POINT_BYTE * columns + columns * on_device

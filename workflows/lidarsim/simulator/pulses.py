@@ -35,13 +35,13 @@ import numpy as np
 
 from raybeam import Pattern
 
-from ..numerics.arrays import Ints, owned
+from ..numerics.arrays import Ints, to_writable
 from ..scene.scene import Scene
 from ..survey.survey import Survey
 from .casting.motion import CastPoses, Firings
 from .casting.scene_caster import SceneCaster
 from .casting.surfaces import SceneSurfaces, sensor_light_of
-from .returns import NO_SURFACE, Keys, PulseReturns, concatenate_returns, required
+from .returns import NO_SURFACE, Keys, PulseReturns, concatenate_returns, require_column
 from .steps.doppler import radial_velocities
 from .steps.step import Emitter, PulseBatch, PulseStep, Role
 from .steps.step_list import setup_of, steps_of
@@ -177,8 +177,10 @@ class PulseCaster:
         start = np.searchsorted(returns.ray, returns.ray)  # row of the first return of each pulse
         stop = np.searchsorted(returns.ray, returns.ray, "right")
         removed_before = np.append(0, np.cumsum(~in_range))  # removed returns above each row
-        number = required(returns.number) - (removed_before[:-1] - removed_before[start])
-        count = required(returns.return_counts) - (removed_before[stop] - removed_before[start])
+        number = require_column(returns.number) - (removed_before[:-1] - removed_before[start])
+        count = require_column(returns.return_counts) - (
+            removed_before[stop] - removed_before[start]
+        )
         renumbered = returns._replace(
             number=number.astype(np.uint8), return_counts=count.astype(np.uint8)
         )
@@ -240,7 +242,7 @@ class PulseCaster:
                 triangle=triangle,
                 times=times,
             )
-        if surfaces.materials.textured:
+        if surfaces.materials.has_textures:
             points = directions * distance[:, None]
             points += origins
             color = surfaces.colors(triangle, points, times, poses.actor_trajectories)
@@ -267,8 +269,8 @@ class PulseCaster:
         row_indices = np.empty(size, np.int64)
         number, return_counts = np.empty((2, size), np.uint8)
         count = pulse_loops.thin_out(
-            owned(returns.ray, np.int64),
-            owned(scan_starts, np.int64),
+            to_writable(returns.ray, np.int64),
+            to_writable(scan_starts, np.int64),
             keep_every=keep_every,
             hit_counts=hit_counts,
             row_indices=row_indices,

@@ -92,7 +92,7 @@ class PulseReturns(NamedTuple):
     @property
     def height(self) -> Floats:
         """Peak heights of the returns in the waveform, or energies if there is no waveform."""
-        return required(self.energy if self.amplitude is None else self.amplitude)
+        return require_column(self.energy if self.amplitude is None else self.amplitude)
 
 
 # Surface normals of hits, and directions of the sub-rays at the sensor, each of shape (n, 3).
@@ -100,7 +100,7 @@ class PulseReturns(NamedTuple):
 Planes = tuple[Floats, Floats]
 
 
-def required(column: T | None) -> T:
+def require_column(column: T | None) -> T:
     """Return a column, asserting that an earlier step has written it."""
     assert column is not None
     return column

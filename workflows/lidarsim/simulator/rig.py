@@ -26,7 +26,7 @@ from .casting.surfaces import SceneSurfaces
 from .points.batch_points import BatchPoints
 from .points.device_columns import DeviceColumns, DevicePoints
 from .pulses import PulseCaster
-from .returns import required
+from .returns import require_column
 
 # Largest number of rays in a period of the head that are stored, at 24 bytes each. Directions
 # repeat after each period.
@@ -85,7 +85,7 @@ class Rig:
         self.survey = survey
         self.options = options
         self._actor_trajectories = ActorTrajectories.from_actors(scene.actors)
-        wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
+        wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.mounted_sensors}
         # These parts are public so that other tools can inspect them.
         self.surfaces = SceneSurfaces(scene, tuple(survey.materials), sorted(wavelengths))
         # Casters by sensor number.
@@ -98,7 +98,7 @@ class Rig:
         self._repeated_rays: dict[tuple[int, bool], _Rays] = {}
         # {(sensor number, first firing, stop of firings): rays}
         self._patterns: dict[tuple[int, int, int], Pattern] = {}
-        for number in range(len(survey.carried)):
+        for number in range(len(survey.mounted_sensors)):
             self._rays_of_sensor(number, survey.path.moves)
 
     def _rays_of_sensor(self, number: int, moves: bool) -> _Rays:
@@ -108,7 +108,7 @@ class Rig:
         """
         rays = self._repeated_rays.get((number, moves))
         if rays is None:
-            sensor = self.survey.carried[number].sensor
+            sensor = self.survey.mounted_sensors[number].sensor
             repeats, by_head = rays_repeat(sensor, moves)
             rays = _Rays(None)
             if by_head:
@@ -157,13 +157,15 @@ class Rig:
         """Return a rig in which the instances of the given objects have moved to new poses.
 
         `owners` are k distinct object numbers. The poses are positions (k, 3) and rotations
-        (k, 3, 3), as in `Scene.moved`. The trees are shared and modified, so this rig must not be
-        used afterwards, and no cast may be in progress.
+        (k, 3, 3), as in `Scene.with_instance_poses`. The trees are shared and modified, so this rig
+        must not be used afterwards, and no cast may be in progress.
         """
         assert self.scene.instances is not None
         instance_indices, index = self.scene.instances.rows_of(owners)
         rig = copy(self)
-        rig.scene = scene = self.scene.moved(instance_indices, positions[index], rotations[index])
+        rig.scene = scene = self.scene.with_instance_poses(
+            instance_indices, positions[index], rotations[index]
+        )
         assert scene.instances is not None
         rig.surfaces = surfaces = self.surfaces.with_moved_instances(scene)
         move_instances(rig.scene_casters, surfaces, scene.instances, instance_indices)
@@ -206,7 +208,7 @@ class Rig:
         The rays are sorted by firing and beam. Firings are counted from the start of the station.
         """
         firings = np.arange(first, stop, dtype=np.int64)
-        carried = self.survey.carried[number]
+        carried = self.survey.mounted_sensors[number]
         mount = carried.mount
         origins = carried.sensor.origins(firings)
         directions = rotate(carried.sensor.directions(firings).reshape(-1, 3), mount.rotation)
@@ -244,7 +246,7 @@ class Rig:
         """
         number = specs[0].sensor
         repeated, by_head = self._rays_of_sensor(number, path.moves)
-        sensor = self.survey.carried[number].sensor
+        sensor = self.survey.mounted_sensors[number].sensor
         channels = sensor.channels
         first = specs[0].firings[0]
         stop = specs[-1].firings[1]
@@ -287,7 +289,7 @@ class Rig:
         nanoseconds are added to the firing times to find the platform's poses, but not for actors.
         """
         spec = firings.spec
-        carried = self.survey.carried[spec.sensor]
+        carried = self.survey.mounted_sensors[spec.sensor]
         if path.moves or by_head:
             first = spec.firings[0]
             stop = first + len(firings.numbers)
@@ -325,7 +327,7 @@ class Rig:
         in meters, or inf if there is no return.
         """
         number = specs[0].sensor
-        sensor = self.survey.carried[number].sensor
+        sensor = self.survey.mounted_sensors[number].sensor
         first = specs[0].firings[0]
         self.scene_casters[number].ensure_trees(positions)
         pattern = self._pattern_of_firings(number, first, specs[-1].firings[1])
@@ -357,7 +359,7 @@ class Rig:
         """
         rays = len(pattern)
         count = len(image) // rays
-        sensor = self.survey.carried[specs[0].sensor].sensor
+        sensor = self.survey.mounted_sensors[specs[0].sensor].sensor
         firings = Firings.from_scans(sensor, specs, count)
         poses = self._with_actor_clock(poses, firings)
         if self._device is not None:
@@ -379,7 +381,7 @@ class Rig:
             .returns
         )
         assert returns.reported is not None  # the steps have set the ranges of reported returns
-        nearest = required(returns.number) == 1
+        nearest = require_column(returns.number) == 1
         if nearest.all():
             image[returns.ray] = returns.reported
         else:
@@ -387,7 +389,7 @@ class Rig:
 
     def _pattern_of_firings(self, number: int, first: int, stop: int) -> Pattern:
         """Return the rays of firings in the platform frame, and cache them."""
-        sensor = self.survey.carried[number].sensor
+        sensor = self.survey.mounted_sensors[number].sensor
         if sensor.period:
             stop = first % sensor.period + stop - first
             first = first % sensor.period

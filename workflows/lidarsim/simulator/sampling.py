@@ -53,14 +53,18 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
     hit_count = 0
     points = 0
     for batch in _batches(Rig(scene, sampled, backend), firsts, stops):
-        every = getattr(sampled.carried[batch.specs[0].sensor].sensor, "every", 1)
+        every = getattr(sampled.mounted_sensors[batch.specs[0].sensor].sensor, "every", 1)
         rays = sum(spec.ray_count for spec in batch.specs)
         cast_rays = cast_rays + rays
         sampled_rays = sampled_rays + rays * every
         hit_count += int(batch.hit_counts.sum()) * every
         points += int(np.ceil(batch.hit_counts * every / survey.keep_every).sum())
-    share = survey.ray_count / sampled_rays
-    return {"rays": cast_rays, "hits": round(hit_count * share), "points": round(points * share)}
+    fraction = survey.ray_count / sampled_rays
+    return {
+        "rays": cast_rays,
+        "hits": round(hit_count * fraction),
+        "points": round(points * fraction),
+    }
 
 
 def sample_ranges(scene: Scene, survey: Survey, scans: range | None = None) -> Floats:
@@ -111,7 +115,7 @@ def _with_few_rays(survey: Survey, every: int) -> list[Mounted]:
     """Return a survey's sensors, reduced to one in `every` of their rays."""
     return [
         replace(mounted, sensor=_FewRays.from_sensor(mounted.sensor, every), steps=steps)
-        for mounted, steps in zip(survey.carried, survey.steps_each, strict=True)
+        for mounted, steps in zip(survey.mounted_sensors, survey.steps_each, strict=True)
     ]
 
 

@@ -26,7 +26,7 @@ from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..schema.checks import check_fits, check_type
 from ..schema.declared import Names
-from ..schema.value_texts import shown
+from ..schema.value_texts import format_value
 from ..sensor import Noise, Returns, Sensor
 from ..survey.survey import Mounted, ScanSpec, Survey
 from ..words import name_hint
@@ -521,7 +521,7 @@ class Scanner:
             0 if start_s is None else round(start_s * 1e9 - sensor.revolution_start_ns(number))
         )
         ahead = revolutions_ahead * len(specs)
-        return [spec.shifted(late_ns, ahead) for spec in specs], late_ns
+        return [spec.with_offsets(late_ns, ahead) for spec in specs], late_ns
 
     def _revolution(self, sensor: Sensor, number: int) -> list[ScanSpec]:
         """Return the scans of revolution `number`, and cache them."""
@@ -586,5 +586,5 @@ def _poses_of(poses: Any) -> tuple[Floats, Floats | None]:
         return table[:, :3, 3], table[:, :3, :3]
     raise LidarError(
         "poses must be a list of Pose, positions (k, 3) or matrices (k, 4, 4), but is "
-        f"{shown(poses)} of the shape {table.shape}."
+        f"{format_value(poses)} of the shape {table.shape}."
     )

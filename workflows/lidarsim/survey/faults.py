@@ -10,14 +10,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from ..errors import LidarError, prefixed
+from ..errors import LidarError, prefix_errors
 from ..numerics.arrays import Bools, Floats, Ints
 from ..numerics.random_numbers import Purpose, uniform
 from ..schema.checks import check_fields, check_order
 from ..schema.declared import AngleDeg, FileSection, MinMax, Several, Text, Two, UnitShare, about
 from ..schema.value_texts import one_line
 from ..sensor.sensor import Sensor
-from ..words import did_you_mean, joined
+from ..words import did_you_mean, join_names
 
 PACKET = Purpose(61, "whether a packet is lost")
 FaultKind = Literal["dirt", "dead_channels", "dropped_packets", "frozen", "time_jump"]
@@ -93,7 +93,7 @@ class Fault(FileSection):
         for name in sorted((present ^ {*kind_fields}) - optional):
             advice = f"Remove {name}" if name in present else f"Set {name}"
             takes = (
-                f"supports {joined([*kind_fields])}"
+                f"supports {join_names([*kind_fields])}"
                 if kind_fields
                 else "supports only from_s and to_s"
             )
@@ -169,7 +169,7 @@ def check_faults(
         If a fault refers to a sensor or channel that does not exist, or starts at an invalid time.
     """
     for number, fault in enumerate(faults):
-        with prefixed(f"faults[{number}]"):
+        with prefix_errors(f"faults[{number}]"):
             _check_fault(fault, sensors, duration_ns / 1e9)
 
 

@@ -32,12 +32,12 @@ from ..motion.trajectory import CENTER, Pose, Stations, Trajectory, as_pose, che
 from ..numerics.arrays import Floats, Ints
 from ..schema.checks import check_fields, check_type
 from ..schema.declared import FILLED_IN, FileSection, Names, Several, about, scenario_type
-from ..schema.value_texts import one_line, shown
+from ..schema.value_texts import format_value, one_line
 from ..schema.vocabulary import OF_THE_WORLD, WORLD_EPSG
 from ..sensor.noise import MAX_ALARMS, Noise
 from ..sensor.optics import WINDOW_SIGMAS, Precision, Returns
 from ..sensor.sensor import Sensor
-from ..words import format_scan_counts, joined, listed, plural, rounded
+from ..words import format_rounded, format_scan_counts, join_names, list_names, plural
 from .faults import Fault, FaultKind, check_faults
 
 STEPS = 36  # default number of steps per pose, which is one revolution of most sensors
@@ -143,7 +143,7 @@ class ScanSpec:
         """Number of rays in this scan."""
         return (self.firings[1] - self.firings[0]) * self.channels
 
-    def shifted(self, start_ns: int, random_offset: int) -> ScanSpec:
+    def with_offsets(self, start_ns: int, random_offset: int) -> ScanSpec:
         """Return a copy with a new station start and a new offset for random numbers."""
         spec = object.__new__(type(self))  # five times as fast as `replace`
         vars(spec).update(vars(self), start_ns=start_ns, random_offset=random_offset)
@@ -263,7 +263,7 @@ class Survey(CloudOptions, Weather):
         cloud contains the column `class`.
     epsg
         EPSG code of the world coordinates, which is written to files that support it. To place a
-        scene with local coordinates in the world, use `Scene.georeferenced`.
+        scene with local coordinates in the world, use `Scene.with_world_origin`.
     **options
         Fields of `Weather` and `CloudOptions`, such as `rain_mm_h` and `keep_every`.
 
@@ -313,29 +313,31 @@ class Survey(CloudOptions, Weather):
         added = {"sensor": len(self.sensors) > 1, "class": self.classes}
         columns = (*self.columns, *(name for name, present in added.items() if present))
         self._set(columns=optional_columns(columns), classes=dict(sorted(self.classes.items())))
-        finest = min(mounted.sensor.optics.resolution_m or PRECISION_M for mounted in self.carried)
+        finest = min(
+            mounted.sensor.optics.resolution_m or PRECISION_M for mounted in self.mounted_sensors
+        )
         for name, default in {"keep_every": 1, "precision_m": finest}.items():
             if getattr(self, name) is None:
                 self._set(**{name: default})
         self._check_values()
         if self.steps is None and self.path.duration_ns == float("inf"):
             self._set(steps=STEPS)
-        for carried, steps in zip(self.carried, self.steps_each, strict=True):
+        for carried, steps in zip(self.mounted_sensors, self.steps_each, strict=True):
             self._check_duration(carried.sensor, steps)
-        sensors = {carried.name: carried.sensor for carried in self.carried}
+        sensors = {carried.name: carried.sensor for carried in self.mounted_sensors}
         check_faults(self.faults, sensors, self.duration_ns)
 
     def _repr_html_(self) -> str:
         """Return an HTML table of the main properties, with an image if a package can draw it."""
         models = [
             f"{carried.name}: {carried.sensor.model}" if carried.name else carried.sensor.model
-            for carried in self.carried
+            for carried in self.mounted_sensors
         ]
         poses = plural(self.path.stations, "position")
         if self.path.moves:
             poses = "along a trajectory"
         rows = {
-            "survey": f"{plural(len(models), 'sensor')}: {listed(models, 8)}",
+            "survey": f"{plural(len(models), 'sensor')}: {list_names(models, 8)}",
             "poses": poses,
             "scans": format_scan_counts(self.scan_count, self.sweep_count),
             "rays": f"{self.ray_count:,}",
@@ -382,7 +384,7 @@ class Survey(CloudOptions, Weather):
         if len(names) > MAX_SENSORS or len({*names}) < len(names):
             raise LidarError(
                 f"A survey supports at most {MAX_SENSORS} sensors, each with a unique name. "
-                f"The names are {joined(names[:10])}."
+                f"The names are {join_names(names[:10])}."
             )
 
     def _check_values(self) -> None:
@@ -396,17 +398,17 @@ class Survey(CloudOptions, Weather):
                 "start must be a time from 2017 on with its time zone, such as "
                 f"2026-11-21T10:00:00Z, but is {self.start}."
             )
-        for carried, returns in zip(self.carried, self.returns_each, strict=True):
+        for carried, returns in zip(self.mounted_sensors, self.returns_each, strict=True):
             returns.divergence(carried.sensor.optics)  # raises LidarError if it is unknown
             self._check_waveform(carried.sensor, returns)
         for number, noise in enumerate(self.noise_each):
-            _check_noise(noise, self.carried[number].sensor)
+            _check_noise(noise, self.mounted_sensors[number].sensor)
             if noise.crosstalk:
                 self._check_crosstalk(number)
         if self.spray_g_m3 and not self.wet:
             raise LidarError("spray_g_m3 requires wet ground. Set wet to a value above 0.")
         if self.rain_mm_h or self.snow_mm_h or self.dust_mg_m3 or self.spray_g_m3:
-            for number in range(len(self.carried)):
+            for number in range(len(self.mounted_sensors)):
                 self._check_air(number)
 
     def _check_waveform(self, sensor: Sensor, returns: Returns) -> None:
@@ -432,25 +434,25 @@ class Survey(CloudOptions, Weather):
         Crosstalk requires several sensors, a maximum range for each of them, and the divergence of
         the affected sensor.
         """
-        if len(self.carried) == 1:
+        if len(self.mounted_sensors) == 1:
             raise LidarError(
                 "noise.crosstalk requires at least two sensors, but this survey has one."
             )
-        for carried in self.carried:
+        for carried in self.mounted_sensors:
             if not carried.sensor.max_range_m < float("inf"):
                 raise LidarError(
                     f"noise.crosstalk requires a maximum range, but {carried.name} has none. Set "
                     "its max_range_m."
                 )
-        if not self.returns_each[number].divergence(self.carried[number].sensor.optics):
+        if not self.returns_each[number].divergence(self.mounted_sensors[number].sensor.optics):
             raise LidarError(
-                f"noise.crosstalk requires the beam divergence, but {self.carried[number].name} "
-                "has none. Set returns.divergence_mrad."
+                "noise.crosstalk requires the beam divergence, but "
+                f"{self.mounted_sensors[number].name} has none. Set returns.divergence_mrad."
             )
 
     def _check_air(self, number: int) -> None:
         """Check that a sensor's returns from the air can be simulated and are not too numerous."""
-        carried = self.carried[number]
+        carried = self.mounted_sensors[number]
         sensor = carried.sensor
         name = f" of {carried.name}" if carried.name else ""
         if self.noise_each[number].detection_range_m is None:
@@ -493,8 +495,9 @@ class Survey(CloudOptions, Weather):
         duration_ns = firing_start_ns(sensor, sensor.firings(steps - 1)[1]) * self.path.stations
         if not duration_ns < MAX_DURATION_NS:
             raise LidarError(
-                f"The survey would last {rounded(duration_ns / 1e9)} s, but times in nanoseconds "
-                "are limited to 292 years. Increase rate_hz, or reduce start_s or steps."
+                f"The survey would last {format_rounded(duration_ns / 1e9)} s, but times in "
+                "nanoseconds are limited to 292 years. Increase rate_hz, or reduce start_s or "
+                "steps."
             )
 
     @cached_property
@@ -504,25 +507,26 @@ class Survey(CloudOptions, Weather):
         return self.trajectory
 
     @cached_property
-    def carried(self) -> tuple[Mounted, ...]:
+    def mounted_sensors(self) -> tuple[Mounted, ...]:
         """Mounted sensors, including one that was passed as `sensor`."""
         return tuple(self.sensors) or (Mounted(self.sensor),)
 
     @property
     def platform_name(self) -> str:
         """Name of the first sensor, which determines the seeds of the platform's instruments."""
-        return self.carried[0].name
+        return self.mounted_sensors[0].name
 
     @cached_property
     def returns_each(self) -> tuple[Returns, ...]:
         """Settings for the returns of each sensor."""
-        return tuple(carried.returns or self.returns for carried in self.carried)
+        return tuple(carried.returns or self.returns for carried in self.mounted_sensors)
 
     @cached_property
     def noise_each(self) -> tuple[Noise, ...]:
         """Noise of each sensor, with a seed that depends on the name of the sensor."""
         return tuple(
-            (carried.noise or self.noise).for_sensor(carried.name) for carried in self.carried
+            (carried.noise or self.noise).for_sensor(carried.name)
+            for carried in self.mounted_sensors
         )
 
     @cached_property
@@ -539,7 +543,7 @@ class Survey(CloudOptions, Weather):
 
     def air(self, number: int) -> Air:
         """Return the properties of the air for the sensor with the given index."""
-        optics = self.carried[number].sensor.optics
+        optics = self.mounted_sensors[number].sensor.optics
         divergence = self.returns_each[number].divergence(optics)
         overlap_m = self.noise_each[number].overlap_m
         exit_m = self.returns_each[number].exit_m(optics) or EXIT_M
@@ -549,7 +553,7 @@ class Survey(CloudOptions, Weather):
         """Return the mean number of drops and flakes per pulse that can cause a return."""
         if not self.particles:
             return 0.0
-        sensor = self.carried[number].sensor
+        sensor = self.mounted_sensors[number].sensor
         min_energy = FAINTEST * self.noise_each[number].threshold
         air = self.air(number)
         span = particle_range(sensor.min_range_m, sensor.max_range_m)
@@ -559,7 +563,7 @@ class Survey(CloudOptions, Weather):
     def steps_each(self) -> tuple[int, ...]:
         """Number of time steps of each sensor per station."""
         counts = []
-        for carried in self.carried:
+        for carried in self.mounted_sensors:
             if steps := carried.steps or self.steps:
                 counts.append(steps)
                 continue
@@ -595,7 +599,7 @@ class Survey(CloudOptions, Weather):
         """First scan, start time and end time of each sensor's sweeps."""
         sweeps = []
         stations = np.arange(self.path.stations)[:, None]
-        for number, carried in enumerate(self.carried):
+        for number, carried in enumerate(self.mounted_sensors):
             sensor = carried.sensor
             steps = self.steps_each[number]
             base = self._firsts[number]
@@ -642,7 +646,7 @@ class Survey(CloudOptions, Weather):
         """Number of rays in all scans."""
         rays = (
             carried.sensor.firings(steps - 1)[1] * carried.sensor.channels
-            for carried, steps in zip(self.carried, self.steps_each, strict=True)
+            for carried, steps in zip(self.mounted_sensors, self.steps_each, strict=True)
         )
         return self.path.stations * sum(rays)
 
@@ -651,13 +655,13 @@ class Survey(CloudOptions, Weather):
         """Time that all sensors need to finish their scans at a station, in nanoseconds."""
         return max(
             round(firing_start_ns(carried.sensor, carried.sensor.firings(steps - 1)[1]))
-            for carried, steps in zip(self.carried, self.steps_each, strict=True)
+            for carried, steps in zip(self.mounted_sensors, self.steps_each, strict=True)
         )
 
     @property
     def duration_ns(self) -> float:
         """Time from the start of the survey to the start of the last firing, in nanoseconds."""
-        pairs = zip(self.carried, self.steps_each, strict=True)
+        pairs = zip(self.mounted_sensors, self.steps_each, strict=True)
         last = max(_last_firing_ns(carried.sensor, steps) for carried, steps in pairs)
         return (self.path.stations - 1) * self.station_ns + last
 
@@ -668,7 +672,7 @@ class Survey(CloudOptions, Weather):
         """
         sensor = bisect_right(self._firsts, index) - 1
         station, step = divmod(index - self._firsts[sensor], self.steps_each[sensor])
-        lidar = self.carried[sensor].sensor
+        lidar = self.mounted_sensors[sensor].sensor
         start = station * self.station_ns
         return ScanSpec(index, station, lidar.firings(step), start, sensor, lidar.channels)
 
@@ -677,7 +681,7 @@ class Survey(CloudOptions, Weather):
 
         The keys are indices into `faults`.
         """
-        name = self.carried[sensor].name
+        name = self.mounted_sensors[sensor].name
         return {
             index: fault
             for index, fault in enumerate(self.faults)
@@ -716,12 +720,12 @@ class Survey(CloudOptions, Weather):
         """Return the pose of the sensor at the start of a scan."""
         spec = self.scan(index)
         time = self.begins_ns(index) - spec.start_ns
-        return self.path.pose(spec.station, time).compose(self.carried[spec.sensor].mount)
+        return self.path.pose(spec.station, time).compose(self.mounted_sensors[spec.sensor].mount)
 
     def begins_ns(self, index: int) -> float:
         """Return the start time of a scan in nanoseconds since the start of the survey."""
         spec = self.scan(index)
-        sensor = self.carried[spec.sensor].sensor
+        sensor = self.mounted_sensors[spec.sensor].sensor
         return spec.start_ns + firing_start_ns(sensor, spec.firings[0]) + sensor.lead_ns
 
 
@@ -746,8 +750,9 @@ def _check_noise(noise: Noise, sensor: Sensor) -> None:
         )
     if noise.false_alarm_hz and (mean := noise.false_alarm_hz * sensor.gate_s) > MAX_ALARMS:
         raise LidarError(
-            f"noise.false_alarm_hz is {noise.false_alarm_hz:g}, which causes {rounded(mean)} false "
-            f"alarms per pulse, but the limit is {MAX_ALARMS}. Reduce it, or reduce max_range_m."
+            f"noise.false_alarm_hz is {noise.false_alarm_hz:g}, which causes "
+            f"{format_rounded(mean)} false alarms per pulse, but the limit is {MAX_ALARMS}. Reduce "
+            "it, or reduce max_range_m."
         )
 
 
@@ -768,6 +773,6 @@ def _poses(poses: Sequence[Any]) -> tuple[Pose, ...]:
     """Convert positions to poses. Raises LidarError if `poses` is not a list."""
     if isinstance(poses, str) or not isinstance(poses, Iterable):
         raise LidarError(
-            f"poses must be a list of poses, such as [(0, 0, 1)], but is {shown(poses)}."
+            f"poses must be a list of poses, such as [(0, 0, 1)], but is {format_value(poses)}."
         )
     return tuple(as_pose("poses", pose) for pose in poses)

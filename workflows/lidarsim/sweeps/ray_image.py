@@ -8,7 +8,7 @@ import numpy as np
 
 from ..columns.cloud import Cloud
 from ..errors import LidarError
-from ..numerics.arrays import AnyArray, Ints, Ints32, owned
+from ..numerics.arrays import AnyArray, Ints, Ints32, to_writable
 from ..sensor import Sensor
 from .sweeps import MIXED_UP, FiredRays, Sweeps
 
@@ -81,8 +81,8 @@ class RayImage:
         firings = np.arange(bounds[0, 0], bounds[-1, 1])
         plane, row, column = np.empty((3, len(points)), np.int64)
         max_returns = image_loops.find_pixels(
-            owned(points["ray"], np.int64),
-            owned(points["scan"] - first_scan, np.int64),
+            to_writable(points["ray"], np.int64),
+            to_writable(points["scan"] - first_scan, np.int64),
             first_rays=(bounds[:, 0] - firings[0]) * sensor.channels,
             ray_count=len(firings) * sensor.channels,
             channels=sensor.channels,

@@ -188,7 +188,7 @@ def compute_knots(survey: Survey, lidars: Sequence[LidarTraits], rotations: Floa
             rows = np.flatnonzero(stations == station)
             for part in np.array_split(rows, -(-len(rows) * count // _POSES) or 1):
                 times_ns = begins_ns[part, None] + np.linspace(0, 1, count) * span[part, None]
-                mount = survey.carried[number].mount
+                mount = survey.mounted_sensors[number].mount
                 knots[first + part] = _relative_poses(
                     path, station, times_ns, mount, rotations[first + part]
                 )

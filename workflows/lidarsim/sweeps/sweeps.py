@@ -210,7 +210,7 @@ class Sweeps:
         return _with_vectors(points, poses.rotate_to_body_frame, poses.to_body_frame)
 
     def columns_compensated(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
-        """Return the columns of a sweep, with vectors in the frame of `compensated`."""
+        """Return the columns of a sweep, with vectors in the frame of `compensate_motion`."""
         if self.coordinates != "sensor":
             return self.columns_in_sensor(sweep, points)
         poses = self.firing_poses(sweep, points)
@@ -227,7 +227,7 @@ class Sweeps:
             return exact
         return self.firing_poses(sweep, points).to_body_frame(exact)
 
-    def compensated(self, sweep: int, points: Cloud) -> Floats:
+    def compensate_motion(self, sweep: int, points: Cloud) -> Floats:
         """Return the points of a sweep in the sensor frame at the start of the sweep.
 
         Points that are stored in the sensor frame are compensated for motion.
@@ -302,11 +302,13 @@ class Sweeps:
             return points
         moved = points[rows]
         owners = actor[rows]
-        shares = self._shares(sweep, moved)
-        sensor = self._sensor_firing_poses(sweep, shares) if self.coordinates == "sensor" else None
+        fractions = self._shares(sweep, moved)
+        sensor = (
+            self._sensor_firing_poses(sweep, fractions) if self.coordinates == "sensor" else None
+        )
         masks = {owner: owners == owner for owner in np.unique(owners).tolist()}
         bodies = {
-            owner: self._actor_firing_poses(owner, sweep, shares[mask])
+            owner: self._actor_firing_poses(owner, sweep, fractions[mask])
             for owner, mask in masks.items()
         }
 
@@ -440,16 +442,18 @@ class Sweeps:
     @classmethod
     def from_survey(cls, survey: Survey, scene: Scene) -> Sweeps:
         """Compute the sweeps of a survey in a scene."""
-        by_sensor = [_sensor_sweeps(survey, number) for number in range(len(survey.carried))]
+        by_sensor = [
+            _sensor_sweeps(survey, number) for number in range(len(survey.mounted_sensors))
+        ]
         begins_ns = np.concatenate([starts for _, starts, _ in survey.sweeps_each])
         ends_ns = np.concatenate([stops for _, _, stops in survey.sweeps_each])
         firsts = [first_scans for first_scans, _, _ in survey.sweeps_each]
         positions = np.concatenate([sweeps.positions for sweeps in by_sensor])
         rotations = np.concatenate([sweeps.rotations for sweeps in by_sensor])
-        mounts = [carried.mount for carried in survey.carried]
+        mounts = [carried.mount for carried in survey.mounted_sensors]
         traits = tuple(
             LidarTraits.from_sensor(carried.sensor, returns.mode)
-            for carried, returns in zip(survey.carried, survey.returns_each, strict=True)
+            for carried, returns in zip(survey.mounted_sensors, survey.returns_each, strict=True)
         )
         sensor = np.concatenate(
             [np.full(len(first), n, np.uint8) for n, first in enumerate(firsts)]
@@ -469,7 +473,7 @@ class Sweeps:
                 np.array([mount.position for mount in mounts]),
                 np.array([mount.rotation_matrix for mount in mounts]),
             ),
-            sensors=tuple(carried.name for carried in survey.carried),
+            sensors=tuple(carried.name for carried in survey.mounted_sensors),
             objects=tuple(scene.names),
             actors=tuple(actor.name for actor in scene.actors),
             actor_poses=SweepPoses(
@@ -688,7 +692,7 @@ class _SensorSweeps(NamedTuple):
 def _sensor_sweeps(survey: Survey, number: int) -> _SensorSweeps:
     """Compute the sweeps of the sensor with index `number` in a survey."""
     path = survey.path
-    mount = survey.carried[number].mount
+    mount = survey.mounted_sensors[number].mount
     firsts, starts, _ = survey.sweeps_each[number]
     times = starts[: len(starts) // path.stations]
     positions = []
@@ -709,7 +713,7 @@ def _fired_rays(survey: Survey, first_steps: list[Ints]) -> FiredRays | None:
     if survey.keep_every != 1 or all(c.name != "ray" for c in survey.stored_columns):
         return None
     max_returns = tuple(2 if returns.mode in TWO_RETURNS else 1 for returns in survey.returns_each)
-    sensors = tuple(carried.sensor for carried in survey.carried)
+    sensors = tuple(carried.sensor for carried in survey.mounted_sensors)
     seeds = tuple(noise.seed for noise in survey.noise_each)
     return FiredRays(sensors, max_returns, np.concatenate(first_steps), seeds)
 

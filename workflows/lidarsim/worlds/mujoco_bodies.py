@@ -147,7 +147,7 @@ def create_bodies(model: Any, choice: BodySelection) -> ModelBodies:
         name = names[group[0] if choice.objects == "geom" else body]
         if is_static[body]:
             rotation, position = _rest_pose(model, body)
-            static.append(meshes[key].moved(name, rotation, position))
+            static.append(meshes[key].affine_transform(name, rotation, position))
         else:
             moving.append(ModelBody(body, replace(meshes[key], name=name)))
     return ModelBodies(static, moving)

@@ -96,8 +96,8 @@ def count_segments(radius: float, sag_m: float) -> int:
     The centers of the sides are at most `sag_m` from the circle, unless the number of sides is
     limited. The result is a multiple of 4.
     """
-    share = min(max(sag_m / radius, 1e-9), 0.2)
-    half_angle = float(arctan2(math.sqrt((2 - share) * share), 1 - share))
+    fraction = min(max(sag_m / radius, 1e-9), 0.2)
+    half_angle = float(arctan2(math.sqrt((2 - fraction) * fraction), 1 - fraction))
     return min(4 * math.ceil(math.pi / half_angle / 4), _MAX_SEGMENTS)
 
 
@@ -129,11 +129,11 @@ def _field_vertices(model: Any, field: int) -> Floats:
     columns = int(model.hfield_ncol[field])
     first = int(model.hfield_adr[field])
     half_x, half_y, height, _ = np.asarray(model.hfield_size[field], np.float64).tolist()
-    shares = np.asarray(model.hfield_data[first : first + rows * columns], np.float64)
+    fractions = np.asarray(model.hfield_data[first : first + rows * columns], np.float64)
     row, column = np.divmod(np.arange(rows * columns), columns)
     x = 2 * half_x / (columns - 1) * column - half_x
     y = 2 * half_y / (rows - 1) * row - half_y
-    return np.stack([x, y, shares * height], axis=1)
+    return np.stack([x, y, fractions * height], axis=1)
 
 
 def _cells(grid: Ints) -> Ints:

@@ -149,8 +149,8 @@ class ScenePart:
         )
         full_areas = triangle_areas(scene.vertices[scene.faces[parents]])
         areas = triangle_areas(vertices[faces])
-        shares = np.divide(areas, full_areas, out=np.ones(len(full_areas)), where=full_areas > 0)
-        return ScenePart(part, self.parents[parents], self.shares[parents] * shares)
+        fractions = np.divide(areas, full_areas, out=np.ones(len(full_areas)), where=full_areas > 0)
+        return ScenePart(part, self.parents[parents], self.shares[parents] * fractions)
 
 
 def _clip_triangles(
@@ -190,5 +190,5 @@ def _crossing(vertices: Floats, beyond: Floats, start: Ints, stop: Ints) -> Floa
 
     `beyond` (v,) contains the signed distances of all vertices from the plane.
     """
-    share = beyond[start] / (beyond[start] - beyond[stop])
-    return vertices[start] + share[:, None] * (vertices[stop] - vertices[start])
+    fraction = beyond[start] / (beyond[start] - beyond[stop])
+    return vertices[start] + fraction[:, None] * (vertices[stop] - vertices[start])

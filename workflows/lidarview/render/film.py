@@ -134,7 +134,7 @@ class Film:
 
     def _actor_shapes(self, moment_ns: float) -> list[_Shape]:
         """Return the triangles of the actors that are present at a given time."""
-        meshes = [actor.placed(moment_ns) for actor in self.actors]
+        meshes = [actor.mesh_at(moment_ns) for actor in self.actors]
         present = [mesh.vertices[mesh.faces] for mesh in meshes if np.ptp(mesh.vertices, 0).any()]
         return [_shape(np.concatenate(present), ACTOR)] if present else []
 

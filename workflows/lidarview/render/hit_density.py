@@ -169,8 +169,8 @@ def _density_colors(density: Floats, hit: Bools, limits: tuple[float, float]) ->
     with hits, marked by the mask `hit` (...,), never do.
     """
     lower, upper = limits
-    share = np.log(np.maximum(density, lower) / lower) / np.log(upper / lower)
-    colors = TURBO[np.clip(share * 255, 0, 255).astype(np.int64)]
+    fraction = np.log(np.maximum(density, lower) / lower) / np.log(upper / lower)
+    colors = TURBO[np.clip(fraction * 255, 0, 255).astype(np.int64)]
     opacity = np.where(hit, 1.0, np.clip(density / lower / 0.6 - 0.3, 0, 1))[..., None]
     return np.asarray(rgb(UNSEEN) * (1 - opacity) + colors * opacity)
 
@@ -194,10 +194,10 @@ def _divide(
     unit_weights = np.ones(len(points))
     for _ in range(_GRID_LEVELS):
         is_hit = hit[owner]
-        middles = pieces.mean(axis=1)
-        point_count = _WeightGrid(points, unit_weights, width, lower).interpolate(middles[active])
-        area = _WeightGrid(middles[is_hit], areas[is_hit], width, lower).interpolate(
-            middles[active]
+        centers = pieces.mean(axis=1)
+        point_count = _WeightGrid(points, unit_weights, width, lower).interpolate(centers[active])
+        area = _WeightGrid(centers[is_hit], areas[is_hit], width, lower).interpolate(
+            centers[active]
         )
         # Cells with few points are not divided again, so this density is final.
         parts = np.bincount(owner)[owner[active]]

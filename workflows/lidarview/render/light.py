@@ -61,7 +61,7 @@ class LightMap:
         cell = np.floor(start).astype(np.int64)
         part = start - cell
         # Interpolate the mean of two by two grid points, which rotate the lights differently.
-        shares = 1 - part, np.ones_like(part), part
+        fractions = 1 - part, np.ones_like(part), part
         total = np.full(len(pixels), 1e-3, np.float32)
         summed = np.full(len(pixels), 1e-3 * THIN_OPENNESS, np.float32)
         for down, right in product(range(3), repeat=2):
@@ -70,7 +70,7 @@ class LightMap:
             weight = surface_similarity(
                 position, normal, self.position[row, column], self.normal[row, column], tolerance
             )
-            weight *= shares[down][:, 1] * shares[right][:, 0]
+            weight *= fractions[down][:, 1] * fractions[right][:, 0]
             total += weight
             summed += weight * self.openness[row, column]
         return summed / total

@@ -13,7 +13,7 @@ from matplotlib.colors import Normalize, to_rgb
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.sensor import LineSensor, Sensor
 from lidarsim.sensor.ray_sensors import PrismSensor
-from lidarsim.words import listed
+from lidarsim.words import list_names
 
 from . import theme
 from .beam_picture import COLORS, beam_page
@@ -81,7 +81,7 @@ def pattern_page(sensor: Sensor) -> Page:
     """
     if isinstance(sensor, LineSensor):
         page = beam_page(sensor)
-        page.note(
+        page.draw_note(
             "angle: 0 points down, positive angles point left of the flight direction; rays lie in "
             "the yz plane"
         )
@@ -187,7 +187,7 @@ def _coverages(met_s: Floats, has_shares: bool) -> list[tuple[str, Bools]]:
     coverages = []
     for count, members in groups:
         times_s = [*members]
-        words = f"after {listed([f'{seconds:g}' for seconds in times_s])} s"
+        words = f"after {list_names([f'{seconds:g}' for seconds in times_s])} s"
         if times_s[1:]:
             words += ": identical coverage"
         if has_shares:

@@ -22,7 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from lidarsim.errors import explained
+from lidarsim.errors import explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.numerics.arrays import AnyFloats, Floats
 from lidarsim.words import shorten_name
@@ -64,7 +64,7 @@ class Page:
         self.figure = Figure(figsize=(size[0] / DPI, size[1] / DPI), dpi=DPI, facecolor=theme.PAGE)
         self.unit = size[0] / 1600  # fonts and lines scale with the picture
 
-    def show(self, shot: SurfaceView, image: AnyFloats) -> Axes:
+    def draw_view(self, shot: SurfaceView, image: AnyFloats) -> Axes:
         """Draw a colored view with grid, axes, sensors, and actor names.
 
         The grid is on the ground. The returned axes use the pixel coordinates of the view.
@@ -327,7 +327,7 @@ class Page:
             position = 0.03, 1 - (1.84 + 0.62 * number) * line
             self._text(self.figure, position, detail, 7.2, theme.MUTED, ha="left")
 
-    def note(self, text: str) -> None:
+    def draw_note(self, text: str) -> None:
         """Write a line at the bottom left."""
         self._text(self.figure, (0.03, 0.025), text, 7.2, theme.MUTED, ha="left")
 
@@ -445,7 +445,7 @@ class Page:
             If the folder does not exist or is not writable.
         """
         advice = "choose an existing, writable folder with enough free space"
-        with explained(f"The picture {path} could not be written", advice):
+        with explain_os_errors(f"The picture {path} could not be written", advice):
             Storage.at(path.parent, durable=False).write(path.name, self.png())
 
     def png(self) -> bytes:

@@ -42,13 +42,13 @@ def draw_scene(shot: SurfaceView, triangles: int) -> Page:
     words = f"{plural(len(scene.names), 'object')} · {plural(triangles, 'triangle')}"
     if scene.colors is not None:
         page = Page(shot.camera.size)
-        page.show(shot, shot.paint(scene.colors.mean_colors() / 255))
+        page.draw_view(shot, shot.paint(scene.colors.mean_colors() / 255))
         page.title("Scene", f"{words} · {shot.caption}", shot.models)
         return page
     kinds, names = _group_objects(scene.names, shot.actors)
     colors = _object_colors(scene, kinds)
     page = Page(shot.camera.size)
-    page.show(shot, shot.paint(colors[scene.face_object]))
+    page.draw_view(shot, shot.paint(colors[scene.face_object]))
     has_faces = np.bincount(scene.face_object, minlength=len(kinds)) > 0
     _, firsts, counts = np.unique(kinds, return_index=True, return_counts=True)
     labels = [
@@ -91,7 +91,7 @@ def draw_hits(
         shot.scene, corners, hits, counted_points, max_pieces
     )
     page = Page(shot.camera.size)
-    axes = page.show(shot, shot.subdivide(pieces, owner).paint(colors, 0.5))
+    axes = page.draw_view(shot, shot.subdivide(pieces, owner).paint(colors, 0.5))
     page.draw_lines(axes, shot, _choose_rays(shot, sample_rays).astype(np.float64), 0.45, 0.5)
     page.color_bar(TURBO, LogNorm(*limits), hits_title(limits))
     if label := _sensor_label(shot):
@@ -163,7 +163,7 @@ def draw_cloud(
             scale = LogNorm if colored.logarithmic else Normalize
             norm = scale(lower, upper if upper > lower else lower + 1)
             page.color_bar(colored.scale, norm, (colored.name + unit).rstrip())
-    page.show(shot, image)
+    page.draw_view(shot, image)
     by = "height" if column is Z else column.name.removesuffix("_deg").replace("_", " ")
     page.title(f"Point cloud by {by}", f"{plural(count, 'point')} · {shot.caption}", shot.models)
     return page
@@ -197,8 +197,8 @@ def _object_colors(scene: Scene, kinds: Ints) -> Floats:
     """
     width = scene.object_bounds[:, 1] - scene.object_bounds[:, 0]
     scene_size = np.maximum(scene.bounds[1] - scene.bounds[0], 1e-9)
-    share = np.where(np.isfinite(width), width, 0.0)[:, :2].prod(axis=1) / scene_size[:2].prod()
-    gray = (share >= MIN_FLOOR_SHARE) & (len(scene.names) > 1)
+    fraction = np.where(np.isfinite(width), width, 0.0)[:, :2].prod(axis=1) / scene_size[:2].prod()
+    gray = (fraction >= MIN_FLOOR_SHARE) & (len(scene.names) > 1)
     colors = np.empty((len(scene.names), 3))
     kind_numbers, kind = np.unique(kinds[~gray], return_inverse=True)
     colors[~gray] = theme.object_colors(len(kind_numbers))[kind]

@@ -202,10 +202,10 @@ class SurfaceView:
             (segments[:, end] - self.camera.eye) @ self.camera.axes[2] for end in (0, 1)
         )
         s = np.linspace(0, 1, STEPS)[None]
-        share = (
+        fraction = (
             s * start_depth[:, None] / (stop_depth[:, None] * (1 - s) + s * start_depth[:, None])
         )
-        path = segments[:, :1] + share[..., None] * (segments[:, 1:] - segments[:, :1])
+        path = segments[:, :1] + fraction[..., None] * (segments[:, 1:] - segments[:, :1])
         pixels, shown = is_visible(path.reshape(-1, 3))
         pieces = []
         for line, visible in zip(
@@ -260,7 +260,7 @@ def take_shot(
     positions = np.concatenate([sensors, *paths])
     caption = caption or plural(len(sensors), "sensor position")
     opened = _open_scene(scene, positions, trajectories, backend)
-    caption += opened.remark
+    caption += opened.part_caption
     stage = _stage(opened.bounds, positions, scene.origin)
     viewpoint = _choose_viewpoint(opened.surface, stage, positions, size, bool(paths or actors))
     camera = viewpoint.camera
@@ -300,7 +300,7 @@ class _OpenScene(NamedTuple):
     cut_height: float | None  # None if the part is not cut open
 
     @property
-    def remark(self) -> str:
+    def part_caption(self) -> str:
         """Caption remark about the displayed part.
 
         It is an empty string if the entire scene is displayed.

@@ -159,7 +159,7 @@ def available_colorings(
     "reflectance" is available if the objects have different values, "material" if the faces have
     materials, and "color" if the scene has colors.
     """
-    scene_colors = ("color",) if scene.colored else ()
+    scene_colors = ("color",) if scene.all_colors else ()
     reflectances = (
         ("reflectance",) if reflectance is not None and len(np.unique(reflectance)) > 1 else ()
     )

@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.colors import as_bytes
-from lidarsim.words import rounded
+from lidarsim.words import format_rounded
 
 from ..render.coloring import NORMALS, RGB, TURBO, Coloring
 
@@ -36,7 +36,7 @@ def make_legend(coloring: Coloring) -> Legend:
     title = f"{coloring.name}, {coloring.unit}" if coloring.unit else coloring.name
     title += f": {coloring.meaning}" if coloring.meaning else ""
     if coloring.logarithmic:
-        marks = [rounded(number, 2) for number in (lower, (lower * upper) ** 0.5, upper)]
+        marks = [format_rounded(number, 2) for number in (lower, (lower * upper) ** 0.5, upper)]
     else:  # as many digits as the span needs; adding 0.0 avoids "-0"
         digits = int(np.clip(np.ceil(1 - np.log10(upper - lower)), 0, 6)) if upper > lower else 2
         marks = [

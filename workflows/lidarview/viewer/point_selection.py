@@ -276,9 +276,9 @@ class BrowserCamera:
     def tiles(self, points: AnyFloats) -> Ints:
         """Return the image tile of each point, or -1 for points outside the image."""
         projected, inside = self.project(points)
-        x_share, y_share = (np.clip(projected, -1, 0.9999).T + 1) / 2
-        column = (x_share * _TILE_COLUMNS).astype(np.int64)
-        row = (y_share * _TILE_ROWS).astype(np.int64)
+        x_fraction, y_fraction = (np.clip(projected, -1, 0.9999).T + 1) / 2
+        column = (x_fraction * _TILE_COLUMNS).astype(np.int64)
+        row = (y_fraction * _TILE_ROWS).astype(np.int64)
         return np.where(inside, row * _TILE_COLUMNS + column, -1)
 
     def may_see(self, box: Floats) -> bool:
@@ -307,8 +307,8 @@ def even_shares(counts: AnyArray, max_points: int) -> Floats:
     """
     ordered = np.sort(counts)
     # Show all points of the smaller tiles, and equally many points of each larger tile.
-    shares = (max_points - np.cumsum(ordered) + ordered) / np.arange(len(counts), 0, -1)
-    level = shares[(shares <= ordered).argmax()] if ordered.sum() > max_points else np.inf
+    fractions = (max_points - np.cumsum(ordered) + ordered) / np.arange(len(counts), 0, -1)
+    level = fractions[(fractions <= ordered).argmax()] if ordered.sum() > max_points else np.inf
     return np.minimum(level / np.maximum(counts, 1e-9), 1.0)
 
 
@@ -343,7 +343,7 @@ class PointFinder:
             (-(-len(points) // BLOCK_ROWS), 2, 3), np.nan
         )  # NaN for unread blocks
 
-    def find(
+    def find_points(
         self,
         max_points: int,
         point_filter: PointFilter = PointFilter(),
@@ -393,7 +393,7 @@ class PointFinder:
             return rows[point_filter.mask(self.points, rows)], total
         if camera is None:
             return self._search(ranges, max_points, point_filter, is_disconnected)
-        sample, count = self.find(_SAMPLE_POINTS, point_filter, scans, None, is_disconnected)
+        sample, count = self.find_points(_SAMPLE_POINTS, point_filter, scans, None, is_disconnected)
         tiles = camera.tiles(self._local(sample))
         counts = np.bincount(tiles[tiles >= 0], minlength=TILES) * (count / max(len(sample), 1))
         if counts.sum() == 0:  # the sample may have missed rare points
@@ -424,7 +424,7 @@ class PointFinder:
 
         `ranges` are ranges of rows, start and stop. `shares` (tiles,) are the fractions of points
         to keep in each tile of the camera's image. The other parameters and the results are the
-        same as in `find`.
+        same as in `find_points`.
         """
         random = np.random.default_rng(0)
         thin = 1.0
@@ -442,7 +442,7 @@ class PointFinder:
                     continue
                 rows = first + np.flatnonzero(point_filter.mask(self.points, slice(first, last)))
                 count += len(rows)
-                share = np.full(len(rows), thin)
+                fraction = np.full(len(rows), thin)
                 if camera is not None and shares is not None and len(rows):
                     local = self._local(rows)
                     is_whole_block = len(rows) == min(
@@ -451,8 +451,8 @@ class PointFinder:
                     if is_whole_block and not is_read:
                         box[:] = local.min(axis=0), local.max(axis=0)
                     tiles = camera.tiles(local)
-                    share *= np.where(tiles >= 0, shares[tiles], 0.0)
-                chunks.append(rows[random.random(len(rows)) < share])
+                    fraction *= np.where(tiles >= 0, shares[tiles], 0.0)
+                chunks.append(rows[random.random(len(rows)) < fraction])
                 while sum(map(len, chunks)) > max_points:
                     thin *= _KEEP_SHARE
                     joined = np.concatenate(chunks)

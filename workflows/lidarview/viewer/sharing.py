@@ -23,7 +23,7 @@ import click
 import numpy as np
 from PIL import Image
 
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.numerics.arrays import AnyArray, Floats, Ints
@@ -97,7 +97,7 @@ def export_view(
             raise LidarError(
                 f"{file} cannot be written, because the folder {file.parent} does not exist."
             )
-    if not len(PointFinder(view.points, view.origin).find(1000)[0]):
+    if not len(PointFinder(view.points, view.origin).find_points(1000)[0]):
         raise LidarError("There are no points to show, because no ray hit a surface.")
     if view.note:
         click.echo(f"note: {view.note}", err=True)
@@ -109,7 +109,7 @@ def export_view(
             content = (
                 render_page(view, show) if file == page else render_film(view, file.suffix, show)
             )
-        with explained(f"{file} cannot be written", "choose another path"):
+        with explain_os_errors(f"{file} cannot be written", "choose another path"):
             Storage.at(file.parent, durable=False).write(file.name, content)
         click.echo(click.format_filename(file))
 
@@ -165,7 +165,7 @@ class _FilmSource:
 
     def positions(self, max_points: int, scans: ScanRanges | None = None) -> Floats:
         """Sample the points below `top` and return their local positions."""
-        rows, _ = self.finder.find(max_points, scans=scans)
+        rows, _ = self.finder.find_points(max_points, scans=scans)
         local = read_positions(self.view.points, rows) - self.view.origin
         return local[local[:, 2] <= self.top]
 
@@ -177,9 +177,9 @@ class _FilmSource:
         The colors span the height of `box`, which has shape (2, 3).
         """
         local = self.positions(max_points, scans)
-        share = np.clip((local[:, 2] - box[0, 2]) / max(np.ptp(box[:, 2]), 1e-9), 0, 1)
+        fraction = np.clip((local[:, 2] - box[0, 2]) / max(np.ptp(box[:, 2]), 1e-9), 0, 1)
         # The darkest colors are skipped, because they are hard to see on a dark background.
-        colors = TURBO[(24 + 231 * np.sqrt(share)).astype(np.int64)]
+        colors = TURBO[(24 + 231 * np.sqrt(fraction)).astype(np.int64)]
         return local, np.pad(colors, ((0, 0), (0, 1)), constant_values=1)
 
     def new_points(
@@ -371,13 +371,13 @@ def _thinned(view: View, max_points: int) -> Answer:
     The sample contains a smaller fraction of the points where they are dense.
     """
     points = view.shown_points
-    rows, _ = PointFinder(points, view.origin).find(_SAMPLE_POINTS)
+    rows, _ = PointFinder(points, view.origin).find_points(_SAMPLE_POINTS)
     world = read_positions(points, rows)
     cell_m = max(float(np.linalg.norm(np.ptp(world, axis=0))) / _CELLS, 1e-9)
     cells = ((world - world.min(axis=0)) / cell_m).astype(np.int64) @ [1 << 20, 1 << 10, 1]
     _, cell_of_point, counts = np.unique(cells, return_inverse=True, return_counts=True)
-    shares = even_shares(counts, max_points)[cell_of_point]
-    chosen = np.random.default_rng(0).random(len(rows)) < shares
+    fractions = even_shares(counts, max_points)[cell_of_point]
+    chosen = np.random.default_rng(0).random(len(rows)) < fractions
     columns = {c.name: points.values(c.name, rows[chosen]) for c in points.table}
     order = _compact_order(columns, int(chosen.sum()))
     return _packed_points(

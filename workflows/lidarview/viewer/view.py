@@ -449,7 +449,7 @@ class View:
         """Return the class of each object, taken from one of its points in a sample."""
         if not {"object", "class"} <= self.columns.keys():
             return {}
-        rows, _ = self._finder.find(_SAMPLE)
+        rows, _ = self._finder.find_points(_SAMPLE)
         columns = (self.points.values(name, rows).tolist() for name in ("object", "class"))
         return dict(zip(*columns, strict=True))
 
@@ -464,7 +464,7 @@ class View:
             raise KeyError(ending)
         points = self.points
         sweeps = self.sweeps
-        rows, count = self._finder.find(
+        rows, count = self._finder.find_points(
             MAX_POINTS, *self._read_selection(arguments), None, is_disconnected
         )
         if count > MAX_POINTS:
@@ -521,7 +521,7 @@ class View:
         column = self._colored[name]
         camera = BrowserCamera.parse(arguments["eye"]) if "eye" in arguments else None
         max_points = max(1, min(int(arguments["most"]), MAX_POINTS))
-        rows, count = finder.find(max_points, *selection, camera, is_disconnected)
+        rows, count = finder.find_points(max_points, *selection, camera, is_disconnected)
         limits = _read_limits(arguments["limits"]) if "limits" in arguments else None
         coloring = self._coloring(
             finder, name, selection[0].without_column(name), limits, is_disconnected
@@ -559,7 +559,7 @@ class View:
         colorings = self._colorings
         coloring = colorings.get((name, point_filter, limits))
         if coloring is None:
-            rows, _ = finder.find(_SAMPLE, point_filter, None, None, is_disconnected)
+            rows, _ = finder.find_points(_SAMPLE, point_filter, None, None, is_disconnected)
             column = self._colored[name]
             values = column_values(
                 column, lambda column_name: finder.points.values(column_name, rows)
@@ -574,7 +574,7 @@ class View:
     def _column(self, name: str) -> Answer:
         """Return the limits or the labels of a column for the page's filters."""
         column = self.columns[name]
-        values = self._finder.points.values(name, self._finder.find(_SAMPLE)[0])
+        values = self._finder.points.values(name, self._finder.find_points(_SAMPLE)[0])
         values = values[np.isfinite(values)]
         names = self._names(name)
         distinct = np.unique(values)
@@ -611,7 +611,7 @@ class View:
                         counts, finder.points.values(name, slice(start, start + BLOCK_ROWS))
                     )
             else:
-                rows, _ = finder.find(_SAMPLE)
+                rows, _ = finder.find_points(_SAMPLE)
                 _add_counts(counts, finder.points.values(name, rows))
                 scale = total / max(len(rows), 1)
                 counts = Counter({value: round(scale * n) for value, n in counts.items()})
@@ -668,7 +668,7 @@ class View:
             if not len(hit_counts):  # the run has not started
                 hit_counts = np.zeros(len(pictured.scene.faces), np.int64)
             hit_counts = hit_counts[: len(pictured.scene.faces)]  # without actors' triangles
-            rows, _ = self._finder.find(HITS_SAMPLE)
+            rows, _ = self._finder.find_points(HITS_SAMPLE)
             if "object" in self.columns:  # only points on static objects
                 owners = self._finder.points.values("object", rows)
                 rows = rows[(owners >= 0) & (owners < len(pictured.scene.names))]
@@ -705,7 +705,7 @@ class View:
         if sweeps is None or not 0 <= sweep < len(sweeps):
             raise KeyError(sweep)
         first_scan, next_scan = (int(scan) for scan in sweeps.scans[sweep : sweep + 2])
-        rows, _ = finder.find(MAX_POINTS, scans=((first_scan, next_scan - 1),))
+        rows, _ = finder.find_points(MAX_POINTS, scans=((first_scan, next_scan - 1),))
         image = np.zeros((1, 1, 4), np.uint8)
         limits = (0.0, 1.0)
         sensor = int(sweeps.sensor[sweep])
@@ -750,7 +750,7 @@ def _cloud_extent(points: Points) -> tuple[Floats, Floats, Floats]:
     local. A coordinate of the origin is 0 unless the points are more than 10 km from 0. In that
     case, it is rounded to whole meters.
     """
-    sample = read_positions(points, PointFinder(points, np.zeros(3)).find(_SAMPLE)[0])
+    sample = read_positions(points, PointFinder(points, np.zeros(3)).find_points(_SAMPLE)[0])
     if not len(sample):
         empty_box = np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
         return np.zeros(3), empty_box, box_corners(empty_box)

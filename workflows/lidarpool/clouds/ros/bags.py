@@ -33,7 +33,7 @@ from lidarsim.motion.trajectory import Track
 from lidarsim.numerics.arrays import AnyArray, Floats, Floats32
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps, states_compensation
-from lidarsim.words import joined
+from lidarsim.words import join_names
 
 from ...processes.per_process import PerProcess
 from .. import laser_scan
@@ -137,7 +137,7 @@ class Rosbag2(CloudFormat):
             raise LidarError(
                 f"The layout {spec.layout} does not support `organized`, because its driver does "
                 "not publish organized clouds. Remove `organized`, or use one of the layouts "
-                f"{joined(organized)}."
+                f"{join_names(organized)}."
             )
 
     @classmethod
@@ -245,7 +245,7 @@ def _point_cloud(job: JobReader, sweep: int, file: str) -> Any:
     """Return the PointCloud2 of a sweep, or raise ValueError if the bag does not contain it."""
     from .messages import sweep_topic
 
-    bag = job.cached("bag", lambda: _open_job(job, file))
+    bag = job.get_or_compute("bag", lambda: _open_job(job, file))
     topic = sweep_topic(job.sweeps, sweep)
     connections = [opened for opened in bag.connections if opened.topic == topic]
     time_ns = survey_start_ns(job.sweeps) + round(job.sweeps.begins_ns[sweep])
@@ -270,7 +270,7 @@ def _at_start(job: JobReader, sweep: int, points: Floats32, times: AnyArray) -> 
     scans = np.full(len(points), sweeps.scans[sweep])
     sensor_cloud = Cloud(points, {"scan": scans, "time": stamps})
     fired_in_sensor = replace(sweeps, coordinates="sensor")
-    return fired_in_sensor.compensated(sweep, sensor_cloud).astype(np.float32)
+    return fired_in_sensor.compensate_motion(sweep, sensor_cloud).astype(np.float32)
 
 
 def _open_bag(source: RecordingSource) -> Recording:

@@ -341,7 +341,7 @@ def encode_points(
     layout = message_layout.layout
     traits = sensor_traits(sweeps, sweep)
     if message_layout.compensated:
-        positions = sweeps.compensated(sweep, points).astype(np.float32)
+        positions = sweeps.compensate_motion(sweep, points).astype(np.float32)
         columns = sweeps.columns_compensated(sweep, points)
     else:
         positions = sweeps.as_fired(sweep, points).astype(np.float32)

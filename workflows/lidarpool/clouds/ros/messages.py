@@ -216,11 +216,11 @@ class SurveyMessages:
         since_ns = self._pose_times(sweep)
         if not len(since_ns):
             return
-        shares = since_ns / sweeps.span_ns(sweep)
-        frames = [(VEHICLE, sweeps.platform_poses_at(sweep, shares))]
+        fractions = since_ns / sweeps.span_ns(sweep)
+        frames = [(VEHICLE, sweeps.platform_poses_at(sweep, fractions))]
         stays = sweeps.actor_there[:, sweep] & ~sweeps.actor_leaves[:, sweep]
         frames += [
-            (self._actors[actor], sweeps.actor_poses_at(actor, sweep, shares))
+            (self._actors[actor], sweeps.actor_poses_at(actor, sweep, fractions))
             for actor in np.flatnonzero(stays).tolist()
         ]
         for index, time_ns in enumerate((self.sweep_start_ns(sweep) + since_ns).tolist()):

@@ -43,18 +43,22 @@ class Estimate(NamedTuple):
         from scipy.stats import beta
 
         total = float(totals.sum())
-        share = float(counts.sum()) / total
-        share_variance = float(((counts - share * totals) ** 2).sum()) / total**2
-        binomial_variance = share * (1 - share) / total
+        fraction = float(counts.sum()) / total
+        fraction_variance = float(((counts - fraction * totals) ** 2).sum()) / total**2
+        binomial_variance = fraction * (1 - fraction) / total
         pulses = (
-            total * binomial_variance / share_variance
-            if share_variance > binomial_variance > 0
+            total * binomial_variance / fraction_variance
+            if fraction_variance > binomial_variance > 0
             else total
         )
         tail = (1 - _CONFIDENCE) / 2
-        lower = beta.ppf(tail, share * pulses, (1 - share) * pulses + 1) if share > 0 else 0.0
-        upper = beta.isf(tail, share * pulses + 1, (1 - share) * pulses) if share < 1 else 1.0
-        return cls(share, float(lower), float(upper))
+        lower = (
+            beta.ppf(tail, fraction * pulses, (1 - fraction) * pulses + 1) if fraction > 0 else 0.0
+        )
+        upper = (
+            beta.isf(tail, fraction * pulses + 1, (1 - fraction) * pulses) if fraction < 1 else 1.0
+        )
+        return cls(fraction, float(lower), float(upper))
 
     def is_within(self, share: float) -> bool:
         """Return True if half of the confidence interval is at most `share` times the value."""

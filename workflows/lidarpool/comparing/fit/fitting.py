@@ -16,7 +16,7 @@ import yaml
 from lidarsim._version import __version__
 from lidarsim.columns.cloud import Cloud
 from lidarsim.environment.extras import require_package
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.motion.trajectory import Pose
 from lidarsim.scene.scene import Scene
@@ -71,7 +71,7 @@ class Fit:
         page = render_template("fit.html", report=self.figures, pictures=pictures)
         contents = {model_path: text, model_path.with_suffix(".html"): page}
         advice = "choose an existing folder with enough free space"
-        with explained(f"{model_path} cannot be written", advice):
+        with explain_os_errors(f"{model_path} cannot be written", advice):
             for path, content in contents.items():
                 Storage.at(path.parent, durable=False).write(path.name, content.encode())
         return [*contents]

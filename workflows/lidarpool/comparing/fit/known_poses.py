@@ -90,7 +90,7 @@ class KnownPoses:
         turn_deg = float(turns_deg.sum() / sweeps)
         return Speed(shift_m, turn_deg if turn_deg > _MIN_SPEED_DEG else 0.0, period_ns)
 
-    def fired(self, recording: Recording) -> Callable[[int], Sweep]:
+    def sweep_reader(self, recording: Recording) -> Callable[[int], Sweep]:
         """Return a function that reads a sweep's original firings and their poses in the scene.
 
         A result records the pose of each pulse. In other recordings, the pose of a sweep is used

@@ -111,7 +111,9 @@ def measure_standing(
     `white` is the intensity of a white surface. Raises LidarError if the sensor moves, if it is not
     at its pose in the scene, or if too few rays hit smooth surfaces.
     """
-    stack = read_static(recording, stands=poses is not None and poses.are_of_firings(recording))
+    stack = read_static(
+        recording, is_stationary=poses is not None and poses.are_of_firings(recording)
+    )
     lost_by_range = None
     expected = None
     if scene is not None:
@@ -143,7 +145,7 @@ def measure_moving(
     `white` is the intensity of a white surface. Raises LidarError if the sensor is not at its poses
     in the scene, or if too few pulses hit smooth surfaces.
     """
-    stack, sweeps = measure_pulses(recording, scene, poses.fired(recording))
+    stack, sweeps = measure_pulses(recording, scene, poses.sweep_reader(recording))
     _check_pose(sweeps.near / max(sweeps.compared, 1), recording.name)
     pulses = sweeps.pulses
     if np.isfinite(stack.intensities).any():

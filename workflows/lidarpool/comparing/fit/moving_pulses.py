@@ -109,7 +109,7 @@ class SweepPulses(NamedTuple):
     near: int  # number of these returns within `SCENE_TOLERANCE_M` of the surface
 
     @classmethod
-    def joined(cls, sweeps: Sequence[SweepPulses]) -> SweepPulses:
+    def concatenate(cls, sweeps: Sequence[SweepPulses]) -> SweepPulses:
         """Concatenate the pulses of several sweeps.
 
         If there are too many pulses, they are sampled evenly.
@@ -134,7 +134,7 @@ def measure_pulses(
     stack = SweepStack.read(recording, fired)
     caster = _CellCaster.from_stack(stack, scene)
     sweeps = enumerate(stack.numbers.tolist())
-    return stack, SweepPulses.joined(
+    return stack, SweepPulses.concatenate(
         [_pulses_of_sweep(stack, index, caster, fired(number)) for index, number in sweeps]
     )
 

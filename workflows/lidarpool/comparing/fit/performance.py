@@ -179,7 +179,7 @@ class _VarianceModel:
         direction_term = theta[2] * (slope / self.slope_scale) ** 2
         return np.asarray(self.variance_scale * (range_term ** (2 / self.power) + direction_term))
 
-    def expected(self, parameters: Floats, samples: _VarianceSamples) -> Floats:
+    def predict(self, parameters: Floats, samples: _VarianceSamples) -> Floats:
         return self.variance(parameters, samples.growth, samples.slope)
 
 
@@ -214,7 +214,7 @@ def fit_scatter(rays: SmoothRays, increase_name: str, growth: Floats, power: int
         )
         if k != 1 or upper > _MIN_RANGE_RATIO * lower
     }
-    expected = model.expected(theta, samples)
+    expected = model.predict(theta, samples)
     ratios = np.minimum(samples.variance / expected, _MAX_VARIANCE_RATIO)
     deviance = float(samples.freedom @ (np.log(expected) + ratios))
     return ScatterFit(estimates, np.sqrt(model.variance(theta, growth, rays.slope)), deviance)
@@ -274,7 +274,7 @@ def _fit_trimmed(
     truncated_mean = chi2.cdf(limit, freedom + 2) / (1 - chance)
     theta = start
     for step in range(12):
-        expected = model.expected(theta, samples)
+        expected = model.predict(theta, samples)
         if step:
             inliers = freedom * samples.variance / expected < limit
         scale = truncated_mean if step else 1.0
@@ -286,7 +286,7 @@ def _fit_trimmed(
             weight: Floats = weight,
             scale: Any = scale,
         ) -> Any:
-            variance = scale * model.expected(parameters, samples)
+            variance = scale * model.predict(parameters, samples)
             return ((samples.variance - variance) * weight)[row_mask]
 
         x_scale = np.maximum(theta, 0.01)
@@ -309,8 +309,8 @@ def fit_threshold(
     from scipy.stats import binom
 
     def detection(log_threshold: Any) -> Floats:
-        share = ndtr(THRESHOLD_SIGMAS * (energy / np.exp(log_threshold) - 1))
-        return np.clip((1 - dropout) * share, 1e-9, 1 - 1e-9)
+        fraction = ndtr(THRESHOLD_SIGMAS * (energy / np.exp(log_threshold) - 1))
+        return np.clip((1 - dropout) * fraction, 1e-9, 1 - 1e-9)
 
     def deviance(log_threshold: Any) -> Floats:
         p: Floats = detection(log_threshold)

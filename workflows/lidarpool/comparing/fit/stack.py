@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from lidarsim.columns.sweep import Sweep
-from lidarsim.errors import LidarError, prefixed
+from lidarsim.errors import LidarError, prefix_errors
 from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
 from lidarsim.numerics.even_samples import even_indices
-from lidarsim.words import rounded
+from lidarsim.words import format_rounded
 
 from ...clouds.recording import Recording
 from ..compared_sweep import compared_sweep, rings_note
@@ -91,15 +91,15 @@ class SweepStack:
             )
         for index, number in enumerate(cells.numbers.tolist()):
             sweep = read(number)
-            with prefixed(recording.name):
+            with prefix_errors(recording.name):
                 cells.add_sweep(index, sweep)
         elevation_deg, values = cells.sorted_by_elevation()
         covered = covered_cells(np.isfinite(values[0]))
         has_return = np.isfinite(values[0]).any(axis=0)
         if (gaps := 1 - covered[:, has_return].mean()) > 0.5 / covered.size:
             notes.append(
-                f"{rounded(100 * gaps, 2)} % of the cells in the sweeps are gaps, which are runs "
-                "of cells without a return that are too long for individually lost pulses. "
+                f"{format_rounded(100 * gaps, 2)} % of the cells in the sweeps are gaps, which are "
+                "runs of cells without a return that are too long for individually lost pulses. "
                 "Possible causes are lost packets, truncated sweeps, and motion of the sensor or "
                 "of objects. Gaps are not counted as lost pulses"
             )
@@ -149,10 +149,10 @@ class _CommonCells:
         reference = max(map(read, range(min(3, recording.count))), key=len)
         if not len(reference):
             raise LidarError(f"{recording.name} contains no points, so there is nothing to fit.")
-        # This call determines the rings. It stays outside `prefixed`, because errors that occur
-        # when a sweep is read already name the recording.
+        # This call determines the rings. It stays outside `prefix_errors`, because errors that
+        # occur when a sweep is read already name the recording.
         ring_notes = rings_note(recording, reference)
-        with prefixed(recording.name):
+        with prefix_errors(recording.name):
             images = range_images(reference, reference, ("a sweep", "a sweep"))
         shape = len(images.rings), round(360 / images.step_deg)
         max_sweeps = max(MAX_RETURNS // (shape[0] * shape[1]), 2)
@@ -275,8 +275,8 @@ def covered_cells(returned: Bools) -> Bools:
     rings, is considered a gap if independent losses of pulses are very unlikely to produce such a
     run.
     """
-    share = (returned.sum(axis=0) + 0.5) / (len(returned) + 1)
-    log_chance = np.where(share > _MIN_CELL_SHARE, np.log1p(-share), 0.0)
+    fraction = (returned.sum(axis=0) + 0.5) / (len(returned) + 1)
+    log_chance = np.where(fraction > _MIN_CELL_SHARE, np.log1p(-fraction), 0.0)
     # Columns without a return in any ring are gaps even if few sweeps return there.
     sparse_log_chance = np.log1p(-returned.sum(axis=0) / (len(returned) + 1)).sum(axis=0)
     columns = _improbable_runs(np.asarray(~returned.any(axis=1)), sparse_log_chance)
@@ -327,11 +327,11 @@ def steady_cells(returned: Bools, covered: Bools) -> Bools:
 
     pulses = sum(patch_sums(mask) for mask in covered)
     return_counts = sum(patch_sums(mask) for mask in returned & covered)
-    mean_share = return_counts / np.maximum(pulses, 1)
-    unsteady = np.zeros(mean_share.shape, bool)
+    mean_fraction = return_counts / np.maximum(pulses, 1)
+    unsteady = np.zeros(mean_fraction.shape, bool)
     for sweep_returned, sweep_covered in zip(returned, covered, strict=True):
         trials = patch_sums(sweep_covered)
-        share = patch_sums(sweep_returned & sweep_covered) / np.maximum(trials, 1)
-        divergence = rel_entr(share, mean_share) + rel_entr(1 - share, 1 - mean_share)
+        fraction = patch_sums(sweep_returned & sweep_covered) / np.maximum(trials, 1)
+        divergence = rel_entr(fraction, mean_fraction) + rel_entr(1 - fraction, 1 - mean_fraction)
         unsteady |= np.where(trials > 0, divergence, 0) * trials > -_MAX_LOG_CHANCE
     return ~maximum_filter(unsteady, _STEADY_PATCH, mode=modes)

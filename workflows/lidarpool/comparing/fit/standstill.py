@@ -12,7 +12,7 @@ import numpy as np
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Ints
 from lidarsim.numerics.even_samples import even_indices
-from lidarsim.words import rounded
+from lidarsim.words import format_rounded
 
 from ...clouds.recording import Recording
 from .planes import fit_creep, range_scatter
@@ -37,17 +37,17 @@ class Speed(NamedTuple):
     period_ns: float | None  # time between consecutive sweeps, if known
 
 
-def read_static(recording: Recording, *, stands: bool = False) -> SweepStack:
+def read_static(recording: Recording, *, is_stationary: bool = False) -> SweepStack:
     """Read the sweeps of a stationary sensor into common cells.
 
-    If `stands` is true, the sensor is known to be stationary. Raises the same errors as
+    If `is_stationary` is true, the sensor is known to be stationary. Raises the same errors as
     `SweepStack.read`, and LidarError if the sensor or the recorded scene moves.
     """
     stack = SweepStack.read(recording)
     if stack.sweep_count < 2:
         return stack
     name = recording.name
-    speed = None if stands else find_motion(stack, sweep_period_ns(recording, stack.numbers))
+    speed = None if is_stationary else find_motion(stack, sweep_period_ns(recording, stack.numbers))
     if speed is not None:
         raise LidarError(
             moving_message(
@@ -60,9 +60,9 @@ def read_static(recording: Recording, *, stands: bool = False) -> SweepStack:
     changes = np.abs(np.diff(stack.ranges, axis=0))
     if (change := finite_median(changes, (0, 1, 2))) > _MAX_CHANGE_M:
         raise LidarError(
-            f"The ranges in {name} change by a median of {rounded(change, 2)} m between sweeps, "
-            "which sensor motion cannot explain. Use points in meters that were recorded in a "
-            "stationary environment."
+            f"The ranges in {name} change by a median of {format_rounded(change, 2)} m between "
+            "sweeps, which sensor motion cannot explain. Use points in meters that were recorded "
+            "in a stationary environment."
         )
     return stack
 
@@ -83,10 +83,10 @@ def moving_message(name: str, speed: Speed, advice: str) -> str:
     if speed.shift_m > 0:
         by_time = ""
         if speed.period_ns:
-            by_time = f" ({rounded(1e9 * speed.shift_m / speed.period_ns, 2)} m/s)"
-        amounts.append(f"{rounded(speed.shift_m, 2)} m{by_time}")
+            by_time = f" ({format_rounded(1e9 * speed.shift_m / speed.period_ns, 2)} m/s)"
+        amounts.append(f"{format_rounded(speed.shift_m, 2)} m{by_time}")
     if speed.turn_deg > 0:
-        amounts.append(f"{rounded(speed.turn_deg, 2)}°")
+        amounts.append(f"{format_rounded(speed.turn_deg, 2)}°")
     return (
         f"{name} was recorded by a sensor that moves by {' and '.join(amounts)} between sweeps. "
         f"{advice}, or use sweeps from a stationary sensor. `lidarpool twin` reconstructs such a "
@@ -143,7 +143,8 @@ def _check_drift(stack: SweepStack, name: str) -> None:
     if drift_m > _DRIFT_FACTOR * step_m + _DRIFT_M:
         raise LidarError(
             f"The ranges in {name} drift: on smooth surfaces, they change by "
-            f"{rounded(step_m, 2)} m between consecutive sweeps, but by {rounded(drift_m, 2)} m "
-            f"over {lag} sweeps. Either the sensor or its environment is moving, or the sensor "
-            "is warming up. Use sweeps from a stationary sensor that has warmed up."
+            f"{format_rounded(step_m, 2)} m between consecutive sweeps, but by "
+            f"{format_rounded(drift_m, 2)} m over {lag} sweeps. Either the sensor or its "
+            "environment is moving, or the sensor is warming up. Use sweeps from a stationary "
+            "sensor that has warmed up."
         )

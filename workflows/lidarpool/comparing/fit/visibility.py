@@ -221,7 +221,7 @@ class VisibilityPair:
         together.
         """
         seen = np.append(self.seen_first, self.seen_second)
-        shares = {kind: min(1.0, count / max((seen == kind).sum(), 1)) for kind in _KNOWN}
+        fractions = {kind: min(1.0, count / max((seen == kind).sum(), 1)) for kind in _KNOWN}
         samples = []
         for points, seen_points in (
             (self.first.points, self.seen_first),
@@ -229,7 +229,7 @@ class VisibilityPair:
         ):
             indices_by_kind = [np.flatnonzero(seen_points == kind) for kind in _KNOWN]
             chosen = [
-                indices[even_indices(len(indices), round(shares[kind] * len(indices)))]
+                indices[even_indices(len(indices), round(fractions[kind] * len(indices)))]
                 for kind, indices in zip(_KNOWN, indices_by_kind, strict=True)
             ]
             samples.append(points[np.concatenate(chosen)])

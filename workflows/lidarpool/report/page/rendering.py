@@ -23,7 +23,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 from PIL import Image
 
-from lidarsim.errors import explained
+from lidarsim.errors import explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.media.weather import Weather
 from lidarsim.numerics.arrays import Ints
@@ -85,7 +85,7 @@ def write_page(
     OSError
         If the file cannot be written.
     """
-    has_model = any(mounted.sensor.name for mounted in result.survey.carried)
+    has_model = any(mounted.sensor.name for mounted in result.survey.mounted_sensors)
     marks = _station_marks(result, cloud)
     text = render_template(
         "page.html",
@@ -114,7 +114,7 @@ def insert_picture(page: Path, name: str, svg: str) -> None:
         If the page cannot be written.
     """
     pattern = re.compile(rf'(<figure data-picture="{name}").*?(?=<figcaption>)', re.DOTALL)
-    with explained(f"{page} cannot be written"):
+    with explain_os_errors(f"{page} cannot be written"):
         text = pattern.sub(lambda match: f"{match[1]}>{svg}", page.read_text(encoding="utf-8"))
         Storage.at(page.parent, durable=False).write(page.name, text.encode())
 
@@ -243,7 +243,7 @@ def render_template(
 
 @cache  # compiling a template takes longer than rendering it
 def _template(name: str) -> Template:
-    escaped = markdown if name.endswith(".md") else printable
+    escaped = escape_markdown if name.endswith(".md") else printable
     environment = Environment(
         loader=PackageLoader(__package__ or ""),
         autoescape=name.endswith(".html"),
@@ -260,9 +260,9 @@ def _template(name: str) -> Template:
         share,
         excess,
         numbers,
-        formatted,
+        format_value,
         code,
-        markdown,
+        escape_markdown,
         millimeters,
         ratio,
         sentence,
@@ -301,7 +301,7 @@ def _scenario_yaml(scenario: Scenario) -> str:
 
 def _changed_fields(values: Mapping[str, Any], kind: type) -> list[tuple[str, str]]:
     usual = declared_values(kind(), kind)
-    return [(name, formatted(values[name])) for name in usual if values[name] != usual[name]]
+    return [(name, format_value(values[name])) for name in usual if values[name] != usual[name]]
 
 
 def make_timeline(stages: Sequence[StageTotals]) -> dict[str, Any] | None:
@@ -365,7 +365,7 @@ def _partition_groups(stages: Sequence[StageTotals], axis: _TimeAxis) -> list[di
     # {partition: recorded tasks}
     drawn: dict[str, WorkerTasks] = defaultdict(lambda: defaultdict(list))
     for record in (record for stage in stages for record in stage.records):
-        name = record.partition if not record.misplaced else " + ".join(record.resources)
+        name = record.partition if not record.is_misplaced else " + ".join(record.resources)
         drawn[name or "no partition"][record.worker, record.stage].append(record)
     groups = []
     for partition, tasks in sorted(drawn.items()):
@@ -420,7 +420,7 @@ def printable(text: str) -> str:
     )
 
 
-def markdown(text: str) -> str:
+def escape_markdown(text: str) -> str:
     """Escape text for Markdown, and join its lines."""
     line = " ".join("".join(c if c.isprintable() else " " for c in text).split())
     return re.sub(r"([\\`*{}\[\]<>|#&~]|(?<!\w)_|_(?!\w))", r"\\\1", line)
@@ -433,7 +433,7 @@ def code(text: str) -> Markup:
     instead.
     """
     is_plain = text.isprintable() and not re.search(r"[`|\\]", text)
-    return Markup(f"`{text}`" if is_plain else markdown(text))
+    return Markup(f"`{text}`" if is_plain else escape_markdown(text))
 
 
 def duration(seconds: float) -> str:
@@ -476,7 +476,7 @@ def excess(fraction: float) -> str:
     return f"{fraction:+.2%}".replace("-", MINUS)
 
 
-def formatted(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Format a value for display.
 
     Floating-point numbers are rounded to four significant digits, or to one decimal place if they
@@ -485,7 +485,7 @@ def formatted(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list | tuple):
-        return " × ".join(map(formatted, value))
+        return " × ".join(map(format_value, value))
     if isinstance(value, float):
         digits = ".1f" if 1000 <= abs(value) < 1e9 else ".4g"
         return f"{value:,{digits}}".removesuffix(".0")

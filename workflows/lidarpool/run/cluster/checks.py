@@ -107,7 +107,7 @@ def find_workers(
                 raise
             # The advice to start workers is omitted, because the user has already started some.
             shortage = re.split(r"(?i)[:.] start ", str(error), maxsplit=1)[0]
-            waiting.tell("workers", shortage + (f"; {queued_clause(coming)}" if coming else ""))
+            waiting.report("workers", shortage + (f"; {queued_clause(coming)}" if coming else ""))
         time.sleep(LOOK_EVERY_S)
 
 

@@ -85,11 +85,11 @@ class ClusterConnection:
         slots = slots_needed(options, planning=first.planning is not None, writing=writing)
         if options.cluster is not None:
             options.cluster.require(slots)
-        waiting = WaitTimer(options.startup_timeout_s, self.screen.tell)
+        waiting = WaitTimer(options.startup_timeout_s, self.screen.report)
         client = self._stack.enter_context(
             open_client(options, slots, waiting, self.screen, self._local)
         )
-        timeline.mark(timeline.WORKERS)
+        timeline.record_step(timeline.WORKERS)
         self.cluster = Cluster(client, first, store, options, self.screen, slots, waiting)
         return self.cluster
 
@@ -118,10 +118,10 @@ def open_client(
                 return nullcontext(own_client())
         return connect_client(options.scheduler, options.files, waiting)
     if options.cluster is not None:
-        started = start_client(options.cluster, screen.tell)
-        return screen.starting(started, f"starting {options.cluster}")
+        started = start_client(options.cluster, screen.report)
+        return screen.start_cluster(started, f"starting {options.cluster}")
     local = local or _start_local(options, required_slots)
-    return screen.starting(local, "starting the workers", shares_terminal=True)
+    return screen.start_cluster(local, "starting the workers", shares_terminal=True)
 
 
 def _start_local(options: RunOptions, slots: Mapping[str, int]) -> BackgroundClient:
@@ -208,7 +208,7 @@ class Cluster:
         if note := gpu_note(self._workers.pool, self._workers.casting, self.backend):
             store.notes.append(note)
         self._callers_error: BaseException | None = None
-        timeline.mark(timeline.CHECKED)
+        timeline.record_step(timeline.CHECKED)
 
     def _request_slots(
         self, first: Job, store: RunStore, required_slots: Mapping[str, int]
@@ -239,7 +239,9 @@ class Cluster:
 
     def watch(self, names: Sequence[str], lasting: Sequence[str] = ()) -> Watch:
         """Start watching the workers of the given partitions with a `Watch`."""
-        return Watch(self.client, names, lasting, self.options.worker_timeout_s, self._screen.tell)
+        return Watch(
+            self.client, names, lasting, self.options.worker_timeout_s, self._screen.report
+        )
 
     def check(self, job: Job) -> None:
         """Raise JobError if the memory of the workers is insufficient for a job."""
@@ -266,7 +268,7 @@ class Cluster:
             yield
             return
         with suppress(PoolError):
-            self._screen.tell(f"partitions page: {self._workers.pool.page()}")
+            self._screen.report(f"partitions page: {self._workers.pool.page()}")
         try:
             yield
         finally:
@@ -275,7 +277,7 @@ class Cluster:
                     self._workers.pool.leave_page()
 
     @contextmanager
-    def stopping(self, stop: Callable[[str], None]) -> Iterator[None]:
+    def stop_on_error(self, stop: Callable[[str], None]) -> Iterator[None]:
         """Call `stop` with the reason if the body raises an error, and convert cluster errors.
 
         Finally, the partitions are allowed to shrink.

@@ -189,14 +189,14 @@ class BackgroundClient(AbstractContextManager[Client]):
 
 
 @contextmanager
-def start_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator[Client]:
+def start_client(file: ClusterFile, report: Callable[[str], object]) -> Iterator[Client]:
     """Start the cluster that a file describes, yield its client, and stop the cluster at the end.
 
     Parameters
     ----------
     file
         Cluster file.
-    tell
+    report
         Function that is called when the cluster has started, and with messages about failing
         workers.
 
@@ -205,8 +205,8 @@ def start_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator[C
     LidarError
         If the cluster does not start.
     """
-    with _client_of(file.start(tell)) as client:
-        tell(f"started {file}")
+    with _client_of(file.start(report)) as client:
+        report(f"started {file}")
         try:
             yield client
         except TooFewWorkersError as error:
@@ -294,7 +294,7 @@ async def _wait_for_scheduler(address: str, security: Security, waiting: WaitTim
         timeout: float = CONNECT_TIMEOUT_S
         if waiting.seconds:
             timeout = min(KNOCK_S, max(waiting.remaining_s(), 1.0))
-        waiting.tell(f"the scheduler at {address}", reason)
+        waiting.report(f"the scheduler at {address}", reason)
         try:
             options = security.get_connection_args("client")
             # Normally, `connect` times out first and reports a reason. It does not time out if a

@@ -57,7 +57,7 @@ class TaskGroup(Generic[T]):
         if not finished:
             return results
         for key, (result, record) in fetch_available(self._client, [*finished]).items():
-            self.book.add(record)
+            self.book.add_task(record)
             results.append((self.running.pop(finished[key]), result))
         return results
 

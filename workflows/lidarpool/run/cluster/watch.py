@@ -17,7 +17,7 @@ from poolpart.task_locations import take_snapshot
 from poolpart.workers import worker_identities
 
 WATCH_EVERY_S = 1.0
-TELL_EVERY_S = 5.0  # minimum interval between messages, which become less frequent over time
+REPORT_EVERY_S = 5.0  # minimum interval between messages, which become less frequent over time
 
 
 class WaitTimer:
@@ -27,14 +27,14 @@ class WaitTimer:
     ----------
     seconds
         Time limit in seconds.
-    tell
+    report
         Function that is called every few seconds with a message.
     """
 
-    def __init__(self, seconds: float = 0.0, tell: Callable[[str], None] = lambda words: None):
+    def __init__(self, seconds: float = 0.0, report: Callable[[str], None] = lambda words: None):
         self.seconds = seconds
-        self._tell = tell
-        self._told_at = float("-inf")
+        self._report = report
+        self._reported_at = float("-inf")
 
     @cached_property
     def _start_s(self) -> float:
@@ -52,15 +52,15 @@ class WaitTimer:
         now_s = time.monotonic() if now_s is None else now_s
         return max(0.0, self._start_s + self.seconds - now_s)
 
-    def tell(self, awaited: str, reason: str = "") -> None:
+    def report(self, awaited: str, reason: str = "") -> None:
         """Report that the run is waiting for `awaited`, unless it was reported recently."""
         now_s = time.monotonic()
-        if now_s - max(self._told_at, self._start_s) >= max(
-            TELL_EVERY_S, (now_s - self._start_s) / 10
+        if now_s - max(self._reported_at, self._start_s) >= max(
+            REPORT_EVERY_S, (now_s - self._start_s) / 10
         ):
-            self._told_at = now_s
+            self._reported_at = now_s
             remaining = f"for up to {self.remaining_s(now_s):.0f} s more"
-            self._tell(f"waiting for {awaited} {remaining}{f': {reason}' if reason else ''}")
+            self._report(f"waiting for {awaited} {remaining}{f': {reason}' if reason else ''}")
 
 
 def queued_clause(jobs: int) -> str:
@@ -83,7 +83,7 @@ class Watch:
         Partitions whose tasks run until the end, so that their workers need not accept new tasks.
     worker_timeout_s
         Time in seconds that a partition may be without workers.
-    tell
+    report
         Function that is called every few seconds with a message during this time.
     """
 
@@ -93,17 +93,19 @@ class Watch:
         names: Iterable[str],
         lasting: Iterable[str] = (),
         worker_timeout_s: float = PATIENCE_S,
-        tell: Callable[[str], None] = lambda words: None,
+        report: Callable[[str], None] = lambda words: None,
     ) -> None:
         self.client = client
         self.lasting = frozenset(lasting)
-        self._tell = tell
+        self._report = report
         # Time limit for each partition without workers.
-        self._waits = {name: WaitTimer(worker_timeout_s, tell) for name in (*names, *self.lasting)}
+        self._waits = {
+            name: WaitTimer(worker_timeout_s, report) for name in (*names, *self.lasting)
+        }
         self._checked_at = float("-inf")
         self.notes: list[str] = []  # notes for the user about workers that Dask has paused
 
-    def forget(self, names: Iterable[str]) -> None:
+    def remove_partitions(self, names: Iterable[str]) -> None:
         """Stop watching partitions that have no tasks left."""
         for name in names:
             self._waits.pop(name, None)
@@ -136,10 +138,10 @@ class Watch:
                 )
             elif name in paused:
                 advice = "their memory is nearly full. Start them with a larger `--memory-limit`"
-                waiting.tell(f"paused workers of partition {name}", advice)
+                waiting.report(f"paused workers of partition {name}", advice)
             else:
                 coming = take_snapshot(self.client, name).queued_jobs
-                waiting.tell(
+                waiting.report(
                     f"workers of partition {name}", queued_clause(coming) if coming else ""
                 )
 
@@ -151,7 +153,7 @@ class Watch:
         )
         if note not in self.notes:
             self.notes.append(note)
-            self._tell(note)
+            self._report(note)
 
 
 def _missing_workers_message(name: str, paused: bool, seconds: str) -> str:

@@ -60,7 +60,7 @@ class Batch:
         """Numbers of the scans in the batch."""
         return range(self.first, self.stop)
 
-    def move(self, state: BatchState) -> None:
+    def set_state(self, state: BatchState) -> None:
         """Change the state, and record the time of the change."""
         self.state = state
         self.since = time.monotonic()

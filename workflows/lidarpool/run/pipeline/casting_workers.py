@@ -139,7 +139,7 @@ class CastingWorkers:
 
     # -- jobs ------------------------------------------------------------------------------
 
-    def add(self, job: int, scene: Scene, survey: Survey) -> tuple[bytes, str]:
+    def register_job(self, job: int, scene: Scene, survey: Survey) -> tuple[bytes, str]:
         """Register a job to be cast.
 
         Returns
@@ -268,7 +268,7 @@ class CastingWorkers:
                 "Check the output of nvidia-smi and dmesg there, and continue with `--resume`."
             )
 
-    def forget(self, key: str) -> None:
+    def release_task(self, key: str) -> None:
         """Cancel a casting task, or release its result."""
         if (cast := self._casts.pop(key, None)) is not None:
             cast[0].release()

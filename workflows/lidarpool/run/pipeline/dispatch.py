@@ -166,7 +166,7 @@ class Dispatcher:
                 batch.key = key
                 batch.worker = worker
                 batch.collector = ""
-                batch.move(BatchState.CASTING)
+                batch.set_state(BatchState.CASTING)
                 batch.job.trace("submit", INTERSECT, batch.scans)
 
     def check(self) -> None:
@@ -188,7 +188,7 @@ class Dispatcher:
                 continue
             for batch in [*task_batches]:
                 if outcome is Outcome.DONE:
-                    batch.move(BatchState.CAST)
+                    batch.set_state(BatchState.CAST)
                     batch.job.cast += len(batch)
                 else:
                     self._offer_again(batch, outcome.value)
@@ -208,7 +208,7 @@ class Dispatcher:
         """Change the state of a batch so that it is either cast or collected again."""
         if state is BatchState.WAITING:
             self._forget_task(batch)
-        batch.move(state)
+        batch.set_state(state)
         self.replayed += 1
         if reason in (Outcome.DIED.value, Outcome.GONE.value):
             self.lost_workers.add(batch.worker)
@@ -235,7 +235,7 @@ class Dispatcher:
             task_batches.remove(batch)
             if not task_batches:
                 del self._tasks[key]
-                self._workers.forget(key)
+                self._workers.release_task(key)
 
     # -- batches that kill workers -----------------------------------------------------------
 
@@ -304,7 +304,7 @@ class Dispatcher:
                 batch.collector = name
                 number = batch.job.number
                 first = batch.first
-                batch.move(BatchState.COLLECTING)
+                batch.set_state(BatchState.COLLECTING)
                 batch.job.trace("handon", COLLECT, batch.scans)
                 part = part_name(self._mark, number, first, batch.stop)
                 parts.append((number, (first, batch.stop), part))
@@ -345,7 +345,7 @@ class Dispatcher:
             # A collector processes its batches in order, so the time limit for its remaining
             # batches starts now.
             if waiting.collector in earliest_s and waiting.since >= earliest_s[waiting.collector]:
-                waiting.move(BatchState.COLLECTING)
+                waiting.set_state(BatchState.COLLECTING)
         self._learn(records)
 
     def reclaim_uncollected(self, died: Mapping[str, str], started: Collection[str]) -> None:

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, contextmanager
 
 from distributed import Client, Future, KilledWorker
 
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
 from poolpart.task_context import WorkerLeavingError
 
@@ -53,10 +53,10 @@ def naming_scans(first: int, stop: int) -> Iterator[None]:
         raise ScanError(f"{words}: {type(error).__name__}: {error}") from error
 
 
-def storing(storage: Storage) -> AbstractContextManager[None]:
+def convert_storage_errors(storage: Storage) -> AbstractContextManager[None]:
     """Convert OSErrors in the body to a LidarError that suggests how to make space available."""
     advice = "Free space there, or choose a different location with `--scratch-dir`"
-    return explained(f"The points cannot be stored in {storage.url}", advice)
+    return explain_os_errors(f"The points cannot be stored in {storage.url}", advice)
 
 
 def error_of(future: Future) -> BaseException | None:

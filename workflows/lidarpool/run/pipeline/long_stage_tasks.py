@@ -25,7 +25,7 @@ from poolpart.pipe import get_advice
 from poolpart.task_context import translate_leaving_errors
 
 from ...columns.parts import pack
-from .failures import ScanError, naming_scans, storing
+from .failures import ScanError, convert_storage_errors, naming_scans
 from .rigs import CastBatch
 from .stage_messages import (
     CollectOrder,
@@ -185,7 +185,7 @@ def _write_parts(
             if storage is None:
                 yield replace(receipt, held_at=hold_bytes(name, b"".join(pieces)))
                 continue
-            with storing(storage):
+            with convert_storage_errors(storage):
                 storage.write(name, pieces)
             start.trace("stored", scans)
             yield receipt

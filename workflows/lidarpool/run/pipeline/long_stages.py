@@ -35,7 +35,7 @@ from poolpart.task_locations import PartitionSnapshot, take_snapshot
 
 from ...columns.parts import probe_name
 from ...identity.software import call_with_same_sources
-from .failures import memory_clause, raise_if_failed, storing, was_killed
+from .failures import convert_storage_errors, memory_clause, raise_if_failed, was_killed
 from .long_stage_tasks import collect, generate, sort_frames
 from .stage_messages import CollectOrder, Description, Message, Receipt, StageStart, Summaries
 from .stage_names import COLLECT, GENERATE, SORT
@@ -140,7 +140,7 @@ class LongStages:
 
     def open(self) -> None:
         """Create the pipes and the probe file, which `finish` removes."""
-        with storing(self._storage):
+        with convert_storage_errors(self._storage):
             self._storage.prepare()
             self._storage.write(*self.probe)
         for pipe in (self._scans, self._news):
@@ -183,7 +183,7 @@ class LongStages:
         if task is not None:
             self._outbox.setdefault(task.inlet.name, []).extend(messages)
 
-    def advise(self, scans: int) -> None:
+    def set_message_scans(self, scans: int) -> None:
         """Set the number of scans in each message from stage 1."""
         set_advice(self._scans, scans)
 
@@ -193,7 +193,7 @@ class LongStages:
         data = fetch_held_bytes(self.client, receipt.held_at, receipt.name)
         if data is None:
             return False
-        with storing(self._storage):
+        with convert_storage_errors(self._storage):
             self._storage.write(receipt.name, data)
         return True
 
@@ -418,7 +418,7 @@ class LongStages:
         self._closed_at = time.monotonic()
 
     @property
-    def closed(self) -> bool:
+    def is_closing(self) -> bool:
         """True if the stages have exited or are shutting down."""
         return self._closed_at is not None
 
@@ -427,7 +427,7 @@ class LongStages:
         return [self._scans, self._news, *(task.inlet for task in self._tasks.values())]
 
     @property
-    def ended(self) -> bool:
+    def has_ended(self) -> bool:
         """True if all stages have exited after `close`, or if the shutdown has timed out."""
         if self._closed_at is None:
             return False
@@ -455,7 +455,7 @@ class LongStages:
         futures = [task.future for task in self._tasks.values()]
         try:
             self._closed_at = self._closed_at or time.monotonic()
-            while not self.ended:
+            while not self.has_ended:
                 time.sleep(0.01)
             ended = [future.key for future in futures if future.status == "finished"]
             results = fetch_available(self.client, ended)

@@ -109,7 +109,7 @@ class Pipeline:
 
     # -- jobs --------------------------------------------------------------------------------
 
-    def begin(
+    def add_job(
         self,
         committed: CommittedResults,
         scene: Scene,
@@ -136,7 +136,7 @@ class Pipeline:
         JobError
             If the job cannot be sent to workers.
         """
-        packed, scene_name = self.workers.add(committed.number, scene, survey)
+        packed, scene_name = self.workers.register_job(committed.number, scene, survey)
         job = PipelineJob(
             committed=committed,
             run=self.stages.run,
@@ -178,7 +178,7 @@ class Pipeline:
 
     def _end_complete(self, jobs: Iterable[PipelineJob]) -> None:
         for job in jobs:
-            if job.complete and job.number in self.jobs:
+            if job.is_complete and job.number in self.jobs:
                 self._end(job)
 
     @property
@@ -230,7 +230,7 @@ class Pipeline:
 
         The next `step` processes the messages.
         """
-        if self.stages.closed:
+        if self.stages.is_closing:
             self._messages += self.stages.wait(CLOSING_S, [], scans=False)
             return
         # Each step takes one or two milliseconds, even with few messages. If many small jobs or
@@ -287,12 +287,12 @@ class Pipeline:
         advice = self.dispatcher.advice
         self.dispatcher.release((self.jobs[receipt.job], receipt) for receipt in new)
         if self.dispatcher.advice != advice:
-            self.stages.advise(self.dispatcher.advice)
+            self.stages.set_message_scans(self.dispatcher.advice)
         parts_of_jobs: dict[PipelineJob, list[Receipt]] = {}
         for receipt in new:
             job = self.jobs[receipt.job]
             if receipt.record is not None:
-                self.book.add(receipt.record)
+                self.book.add_task(receipt.record)
             job.trace("points", COLLECT, receipt.scans)
             parts_of_jobs.setdefault(job, []).append(receipt)
             self.progress += len(receipt.scans)
@@ -404,6 +404,6 @@ class Pipeline:
         """Wait briefly for the stages to exit, add their records to `book`, and clean up."""
         try:
             for record in self.stages.finish(self.workers.futures):
-                self.book.add(record)
+                self.book.add_task(record)
         finally:
             self.workers.release()

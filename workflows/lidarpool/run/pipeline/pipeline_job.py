@@ -44,7 +44,7 @@ class PipelineJob:
         self.sorted_at = time.monotonic()
 
     @property
-    def complete(self) -> bool:
+    def is_complete(self) -> bool:
         """True if all scans have been committed and, in a job with frames, sorted."""
         is_sorted = not self.committed.has_frames or self.sorted == self.scans.stop
         return is_sorted and not self.committed.missing_count

@@ -222,7 +222,7 @@ def choose_offers(
         task = _take_task(group, min(task_size, state.free_weight), per_task)
         passed.update(task)
         chosen.append(TaskOffer(task, worker))
-        state.add(task, worker, alone=suspect)
+        state.count_task(task, worker, alone=suspect)
     return chosen
 
 
@@ -282,7 +282,7 @@ class _OfferState:
             return False
         return min(self.free_weight, weight(group, self.per_task)) < self.per_task
 
-    def add(self, task: Collection[Batch], worker: str, *, alone: bool) -> None:
+    def count_task(self, task: Collection[Batch], worker: str, *, alone: bool) -> None:
         """Count a task that is offered to a worker, and reserve the worker if `alone` is set."""
         self.free_weight -= weight(task, self.per_task)
         self.load[worker] += 1

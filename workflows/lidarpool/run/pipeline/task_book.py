@@ -37,7 +37,7 @@ class StageTotals:
     _every: int = 1  # interval n at which records are kept
     _gap: float = 1e-4  # maximum gap between spans that are merged, in seconds
 
-    def add(self, record: TaskRecord) -> None:
+    def add_task(self, record: TaskRecord) -> None:
         """Add the record of a task to the totals."""
         if self.tasks % self._every == 0:
             self.records.append(record)
@@ -51,7 +51,7 @@ class StageTotals:
         self.stop = max(self.stop, record.stop)
         self.workers.add(record.worker)
         self.resources.update(record.resources or ("none",))
-        if record.misplaced:
+        if record.is_misplaced:
             self.violations += 1
             if len(self.misplaced) < MAX_MISPLACED:
                 self.misplaced.append(record)
@@ -70,10 +70,10 @@ class TaskBook:
     def __init__(self) -> None:
         self.stages: dict[str, StageTotals] = {}
 
-    def add(self, record: TaskRecord) -> None:
+    def add_task(self, record: TaskRecord) -> None:
         """Add the record of a task."""
         new = StageTotals(record.stage, record.partition)
-        self.stages.setdefault(record.stage, new).add(record)
+        self.stages.setdefault(record.stage, new).add_task(record)
 
 
 def union(spans: Iterable[tuple[float, float]], gap: float = 0.0) -> list[tuple[float, float]]:

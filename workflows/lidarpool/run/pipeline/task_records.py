@@ -32,7 +32,7 @@ class TaskRecord:
         return self.stop - self.start
 
     @property
-    def misplaced(self) -> bool:
+    def is_misplaced(self) -> bool:
         """True if the task ran on a worker outside its partition."""
         return self.partition not in self.resources
 
@@ -72,4 +72,4 @@ def call_recorded(
 
 def placement_violations(records: Iterable[TaskRecord]) -> list[TaskRecord]:
     """Return the records of tasks that ran outside their partition."""
-    return [record for record in records if record.misplaced]
+    return [record for record in records if record.is_misplaced]

@@ -188,15 +188,15 @@ class RunDatabase:
             job.advance_frames(int(count))
 
     @property
-    def used(self) -> bool:
+    def has_results(self) -> bool:
         """True if results have been committed, even if they were removed later."""
         return "forgot" in self.meta or bool(self.ended_count or self.begun)
 
-    def ended(self, number: int) -> bool:
+    def has_ended(self, number: int) -> bool:
         """Return True if a job has ended."""
         return number < len(self._ended) and self._ended[number] != 0
 
-    def failed(self) -> list[int]:
+    def failed_jobs(self) -> list[int]:
         """Return the numbers of all failed jobs in ascending order."""
         query = "SELECT number FROM jobs WHERE failed ORDER BY number"
         return [number for (number,) in self._rows(query)]

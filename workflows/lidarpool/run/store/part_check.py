@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from operator import attrgetter
 
-from lidarsim.words import listed
+from lidarsim.words import list_names
 
 from ..pipeline.stage_messages import Receipt, format_scans
 from .database import RunDatabase
@@ -73,7 +73,7 @@ def _state(job: StoredJob, part: Receipt, sizes: Mapping[str, int]) -> str:
 
 
 def _note(job: StoredJob, receipts: Sequence[Receipt], state: str) -> str:
-    names = listed([part.name for part in receipts])
-    scans = listed([format_scans(part.first, part.stop) for part in receipts])
+    names = list_names([part.name for part in receipts])
+    scans = list_names([format_scans(part.first, part.stop) for part in receipts])
     verb = "was" if len(receipts) == 1 else "were"
     return f"repeated {scans}, because {names} {verb} {state} in {job.storage.url}"

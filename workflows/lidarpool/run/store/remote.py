@@ -12,7 +12,7 @@ import time
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
 
 from .database import FILE, RunDatabase
@@ -72,11 +72,11 @@ class RemoteRun:
             )
 
     def _explained(self) -> AbstractContextManager[None]:
-        return explained(f"The run cannot be stored in {self.storage.url}")
+        return explain_os_errors(f"The run cannot be stored in {self.storage.url}")
 
 
 def fetch_database(storage: Storage, path: Path) -> None:
     """Copy the database of a run from a remote storage to a local path, if it exists."""
-    with explained(f"The run in {storage} cannot be read"):
+    with explain_os_errors(f"The run in {storage} cannot be read"):
         if FILE in storage.sizes():
             storage.get(FILE, path)

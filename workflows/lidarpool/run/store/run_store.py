@@ -14,11 +14,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lidarsim.errors import LidarError, explained
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
 from lidarsim.sensor import Sensor
 from lidarsim.simulator.casting.scene_caster import AUTO_ADVICE
-from lidarsim.words import rounded
+from lidarsim.words import format_rounded
 
 from ...columns.parts import deletable_files, mark_name, parse_part_name
 from ...datasets.job_table import JobRow
@@ -29,7 +29,7 @@ from ...identity.software import software
 from ...scenario.job import Job
 from ..job_source import CONTENT, Jobs, input_fingerprints
 from ..pipeline.committed_results import CommittedResults
-from ..pipeline.failures import storing
+from ..pipeline.failures import convert_storage_errors
 from .database import (
     FILE,
     PARTS_FOLDER,
@@ -128,7 +128,7 @@ class RunStore:
         if location is None or self._remote:
             weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         advice = "Create its parent folder first, or choose a different folder"
-        with explained(f"The run folder {folder} cannot be created", advice):
+        with explain_os_errors(f"The run folder {folder} cannot be created", advice):
             folder.mkdir(exist_ok=True)
         self.in_flight: dict[int, StoredJob] = {}  # {number: job that has not ended}
         # Jobs in flight whose input hashes are stored, so that a later run can recognize them.
@@ -180,7 +180,7 @@ class RunStore:
             if not path.exists():
                 return _EarlierDatabase()
             db = RunDatabase(path, durable=durable)
-            if db.used:
+            if db.has_results:
                 return _EarlierDatabase(db)
             db.close()
             return _EarlierDatabase(mark=db.meta["mark"], parts_location=db.meta.get("parts", ""))
@@ -236,23 +236,23 @@ class RunStore:
     def _claim(self, resume: bool) -> None:
         """Find existing parts, check the earlier run, and write the mark file."""
         self.storage = replace(parts_of(self.location, self.db.meta["parts"]), durable=self.lasting)
-        with explained(f"{self.storage.url} cannot be listed"):
+        with explain_os_errors(f"{self.storage.url} cannot be listed"):
             self._sizes = self.storage.sizes()  # fails if the location is not accessible
         self._strays: dict[int, list[str]] = {}  # {job: names of existing parts}
         for name in self._sizes:
             if resume and (scans := parse_part_name(name, self.db.meta["mark"])) is not None:
                 self._strays.setdefault(scans[0], []).append(name)
-        if self.db.used:
+        if self.db.has_results:
             self._check_same(self.db.meta)
         if (only_job := self.jobs.only_job) is not None:
             self.only_job = self._load(only_job)
             self._identified.add(only_job.number)  # the identity of the run identifies it
-        if self.db.used:
+        if self.db.has_results:
             self._check_resumable(resume)
         if self._remote:
             self._remote.claim(self.db)
         if mark_name(self.db.meta["mark"]) not in self._sizes:
-            with storing(self.storage):
+            with convert_storage_errors(self.storage):
                 self.storage.prepare()
                 self._write_mark()
         if self.only_job is not None:  # after it is certain that the run is the same
@@ -328,7 +328,7 @@ class RunStore:
         """Store the backend and software with which all scans are cast."""
         if backend != self.backend or casting != self.casting:
             self.db.set(backend=backend, casting=json.dumps(casting))
-            with storing(self.storage):
+            with convert_storage_errors(self.storage):
                 self._write_mark()
 
     @property
@@ -347,7 +347,11 @@ class RunStore:
         """Number of committed scans, trials or jobs as text, or an empty string for none."""
         if self.only_job is not None:
             return self.only_job.committed_text
-        return f"{self.db.ended_count:,} of {len(self.jobs.numbers):,} jobs" if self.db.used else ""
+        return (
+            f"{self.db.ended_count:,} of {len(self.jobs.numbers):,} jobs"
+            if self.db.has_results
+            else ""
+        )
 
     @property
     def advice(self) -> str:
@@ -423,7 +427,7 @@ class RunStore:
         self.only_job.committed.advance_frames(self.only_job.scans.stop)
         self.only_job = self._add(replace(self.only_job, job=job, resumed=0))
 
-    def end(self, rows: Sequence[JobRow]) -> list[tuple[JobRow, StoredJob]]:
+    def commit_jobs(self, rows: Sequence[JobRow]) -> list[tuple[JobRow, StoredJob]]:
         """Commit the rows of ended jobs, and return those that were in flight, with their jobs.
 
         The models and rates of their sensors are also stored, for the data set card.
@@ -433,7 +437,7 @@ class RunStore:
             (mounted.name or "lidar", _describe_model(mounted.sensor))
             for row, stored in ended
             if row.done
-            for mounted in stored.job.survey.carried
+            for mounted in stored.job.survey.mounted_sensors
         )
         sensors = add_sensors(self.sensors, named)
         if sensors != self.sensors:
@@ -444,7 +448,7 @@ class RunStore:
             self._identified.discard(row.number)
         return ended
 
-    def forget(self, numbers: Iterable[int]) -> None:
+    def reset_jobs(self, numbers: Iterable[int]) -> None:
         """Reset ended jobs, so that they are cast again."""
         if forgotten := [*numbers]:
             self.db.forget_jobs(forgotten)
@@ -454,7 +458,7 @@ class RunStore:
         """Add jobs that are already finished in the data set, and store values of `meta`."""
         if meta:
             self.db.set(**meta)
-        self.end([row for row in rows if not self.db.ended(row.number)])
+        self.commit_jobs([row for row in rows if not self.db.has_ended(row.number)])
         self.resumed = self.db.ended_count
 
     # -- the end -----------------------------------------------------------------------------
@@ -466,7 +470,7 @@ class RunStore:
         `force` is True. Raise LidarError if this fails, or if another run has taken over.
         """
         for number, stored in self.in_flight.items():
-            begun = stored.parts.scans_done and not stored.complete
+            begun = stored.parts.scans_done and not stored.is_complete
             if begun and number not in self._identified:
                 self._identified.add(number)
                 self.db.set_input_hash(number, _hash_inputs(stored.job))
@@ -474,7 +478,9 @@ class RunStore:
         if self._remote:
             self._remote.save(self.db, force=force)
 
-    def keep(self, scenario_source: Mapping[str, Any] | None, notes: Sequence[str]) -> None:
+    def close_with_points(
+        self, scenario_source: Mapping[str, Any] | None, notes: Sequence[str]
+    ) -> None:
         """Close the store and keep its points.
 
         If `scenario_source` is given, it is stored together with the notes.
@@ -484,7 +490,7 @@ class RunStore:
             self.save(force=True)
         self.db.close()
 
-    def tidy(self) -> None:
+    def remove_orphaned_parts(self) -> None:
         """Remove parts of dead or replaced collectors that do not belong to a job in flight."""
         mark = self.db.meta["mark"]
         part_names = [part.name for job in self.in_flight.values() for part in job.parts.ordered]
@@ -525,7 +531,7 @@ class RunStore:
 
     def close(self) -> None:
         """Close the database of an unfinished run, and remove the store if it is empty."""
-        used = self.db.used or self.begun
+        used = self.db.has_results or self.begun
         self.db.close()
         if not used:
             with suppress(OSError, LidarError):
@@ -555,7 +561,7 @@ def add_sensors(sensors: Mapping[str, str], added: Iterable[tuple[str, str]]) ->
 
 
 def _describe_model(sensor: Sensor) -> str:
-    return f"{sensor.model}, {rounded(1e9 / sensor.revolution_start_ns(1))} Hz"
+    return f"{sensor.model}, {format_rounded(1e9 / sensor.revolution_start_ns(1))} Hz"
 
 
 def _hash_inputs(job: Job) -> str:
@@ -623,7 +629,7 @@ def _remove(location: Storage, part_storage: Storage, mark: str | None) -> None:
     If `mark` is None because the database cannot be read, the parts of all mark files in the parts
     folder are removed.
     """
-    with explained(f"The run in {location} cannot be removed"):
+    with explain_os_errors(f"The run in {location} cannot be removed"):
         names = deletable_files(part_storage, mark)  # fails if the folder is a symbolic link
         part_storage.remove(names, folder=True)
         location.remove([FILE, f"{FILE}-journal", OWNER], folder=True)

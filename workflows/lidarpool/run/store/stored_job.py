@@ -98,7 +98,7 @@ class StoredJob:
         return ""
 
     @property
-    def complete(self) -> bool:
+    def is_complete(self) -> bool:
         """True if all scans and trials have been committed and all frames delivered."""
         return self.committed.scans_complete and len(self.trials) == self.job.trials
 
@@ -161,7 +161,7 @@ class StoredJob:
             spec = survey.scan(scan)
             yield ScanFrame(
                 scan=scan,
-                sensor=survey.carried[spec.sensor].name,
+                sensor=survey.mounted_sensors[spec.sensor].name,
                 rays=spec.ray_count,
                 hit_count=int(summary["hits"]),
                 count=int(summary["points"]),

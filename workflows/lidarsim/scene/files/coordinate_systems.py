@@ -119,7 +119,7 @@ class AreaOfUse:
         """Width in degrees of longitude."""
         return (self.east - self.west) % 360 or 360.0
 
-    def reaches(self, longitude: float, latitude: float, margin_deg: float = 0.0) -> bool:
+    def contains(self, longitude: float, latitude: float, margin_deg: float = 0.0) -> bool:
         """Return whether a location is inside the area or within `margin_deg` of it.
 
         The margin is an angular distance in degrees.
@@ -339,7 +339,7 @@ def missed_area(
     if area is None:
         return None
     place = longitude_latitude(crs, x, y)
-    is_near = place is not None and area.reaches(*place, margin_deg)
+    is_near = place is not None and area.contains(*place, margin_deg)
     return None if is_near else area
 
 
@@ -389,7 +389,7 @@ def zone_in_area(epsg: int, x: float, y: float) -> int | None:
     latitude = (area.south + area.north) / 2
     codes = {utm_code((at + 180) % 360 - 180, latitude) for at in longitudes}
     places = {code: longitude_latitude(crs_from_code(code), x, y) for code in codes - {epsg}}
-    fitting = [code for code, at in places.items() if at is not None and area.reaches(*at)]
+    fitting = [code for code, at in places.items() if at is not None and area.contains(*at)]
     return fitting[0] if len(fitting) == 1 else None
 
 
@@ -514,8 +514,8 @@ def center_of(objects: Sequence[SceneMesh | SceneInstance]) -> Floats:
     """
     if not objects:
         return np.zeros(2)
-    middles = np.array([_center(item)[:2] for item in objects])
-    middle: Floats = (middles.min(axis=0) + middles.max(axis=0)) / 2
+    centers = np.array([_center(item)[:2] for item in objects])
+    middle: Floats = (centers.min(axis=0) + centers.max(axis=0)) / 2
     return middle
 
 

@@ -21,7 +21,7 @@ from ...io.allowance import Allowance
 from ...motion.rotations import matrices
 from ...numerics.arrays import Floats
 from ...numerics.vectors import matmul, matvec, norm
-from ...words import listed, plural, printable
+from ...words import list_names, plural, printable
 from ..animation import RATE_HZ
 from ..scene_mesh import SceneMesh
 from .gltf_animation import WIDTHS, AnimatedNodes, find_animation, keyframe_range, sample_channels
@@ -30,10 +30,10 @@ from .gltf_file import (
     INSTANCING,
     VISIBILITY,
     GltfFile,
+    check_index,
     check_readable,
     extension,
     extension_notes,
-    natural,
     root_nodes,
     split_chunks,
 )
@@ -117,7 +117,7 @@ class _NodeReader:
         animation = find_animation(self._file.header.get("animations", []), name)
         first, last = keyframe_range(animation, self._file.accessor)
         count = max(1, math.ceil((last - first) * RATE_HZ))
-        self._allowance.take(32 * (count + 1) * (1 + len(animation["channels"])))
+        self._allowance.reserve(32 * (count + 1) * (1 + len(animation["channels"])))
         times_s = np.linspace(first, last, count + 1)
         return bake_animation(self._poses(animation, times_s), times_s.tolist(), self._allowance)
 
@@ -204,7 +204,7 @@ class _NodeReader:
         nodes = plural(len(names), "hidden node")
         return [
             f"has {nodes} ({VISIBILITY}). Hidden nodes and their descendants were skipped: "
-            f"{listed(names)}"
+            f"{list_names(names)}"
         ]
 
     def _copies(self, attributes: dict[str, Any]) -> Floats | None:
@@ -217,7 +217,7 @@ class _NodeReader:
         if not indices:
             return None
         counts = [
-            natural(self._file.part("accessors", index)["count"]) for index in indices.values()
+            check_index(self._file.part("accessors", index)["count"]) for index in indices.values()
         ]
         if len({*counts}) > 1:
             raise ValueError(
@@ -229,7 +229,7 @@ class _NodeReader:
                 f"places a mesh {counts[0]:,} times with {INSTANCING}, but the limit is "
                 f"{MAX_NODES:,}. Export it in parts"
             )
-        self._allowance.take(2 * 128 * counts[0])
+        self._allowance.reserve(2 * 128 * counts[0])
         rows = {
             name: self._file.accessor(index).astype(np.float64) for name, index in indices.items()
         }
@@ -306,7 +306,7 @@ class _NodeReader:
                     f"deforms meshes that are compressed with {DRACO}, which is not supported. "
                     "Export it without this extension"
                 )
-            self._allowance.take(600 * len(unposed.vertices))  # temporary matrices and points
+            self._allowance.reserve(600 * len(unposed.vertices))  # temporary matrices and points
             vertices = unposed.vertices.astype(np.float64)
             for weight, target in zip(weights, primitive.get("targets", ()), strict=False):
                 if weight and "POSITION" in target:
@@ -374,7 +374,7 @@ class _NodeReader:
         mode = primitive.get("mode", 4)
         # Reserve memory for the corners and for the triangles of strips and fans.
         count = len(vertices if index is None else self._file.accessor(index))
-        self._allowance.take((8 if mode == 4 else 24) * count)
+        self._allowance.reserve((8 if mode == 4 else 24) * count)
         corners = np.arange(count)
         if index is not None:
             corners = self._file.accessor(index)[:, 0].astype(np.int64)

@@ -108,25 +108,25 @@ def _interpolate(
     start = start.clip(0, max(len(keys) - 2, 0))
     stop = np.minimum(start + 1, len(keys) - 1)
     seconds = np.where(stop > start, keys[stop] - keys[start], 1.0)
-    share = ((at_s - keys[start]) / seconds).clip(0, 1)[:, None]
+    fraction = ((at_s - keys[start]) / seconds).clip(0, 1)[:, None]
     start_values, stop_values = (values[k, values.shape[1] // 2] for k in (start, stop))
     if kind == "STEP":
-        sampled = np.where(share < 1, start_values, stop_values)
+        sampled = np.where(fraction < 1, start_values, stop_values)
     elif kind == "CUBICSPLINE":
         start_slope = values[start, 2] * seconds[:, None]
         stop_slope = values[stop, 0] * seconds[:, None]
-        square = share * share
-        cube = share * share * share
-        bend = (cube - 2 * square + share) * start_slope + (cube - square) * stop_slope
+        square = fraction * fraction
+        cube = fraction * fraction * fraction
+        bend = (cube - 2 * square + fraction) * start_slope + (cube - square) * stop_slope
         sampled = (
             (2 * cube - 3 * square + 1) * start_values
             + (3 * square - 2 * cube) * stop_values
             + bend
         )
     elif are_rotations:
-        sampled = _slerp(share, start_values, stop_values)
+        sampled = _slerp(fraction, start_values, stop_values)
     else:
-        sampled = (1 - share) * start_values + share * stop_values
+        sampled = (1 - fraction) * start_values + fraction * stop_values
     return sampled / norm(sampled)[:, None] if are_rotations else sampled
 
 
@@ -141,6 +141,6 @@ def _slerp(u: Floats, start: Floats, stop: Floats) -> Floats:
     sine = sin(angle)
     small = sine < 1e-9
     sine = np.where(small, 1.0, sine)
-    start_share = np.where(small, 1 - u, sin((1 - u) * angle) / sine)
-    stop_share = np.where(small, u, sin(u * angle) / sine)
-    return np.asarray(start_share * start + stop_share * stop)
+    start_fraction = np.where(small, 1 - u, sin((1 - u) * angle) / sine)
+    stop_fraction = np.where(small, u, sin(u * angle) / sine)
+    return np.asarray(start_fraction * start + stop_fraction * stop)

@@ -20,7 +20,7 @@ def decompress_draco(data: bytes, allowance: Allowance) -> Any:
         raise MeshFileError(
             f"is compressed with {DRACO}. Install DracoPy, or export it without compression"
         ) from error
-    allowance.take(24 * sum(_draco_counts(data)))
+    allowance.reserve(24 * sum(_draco_counts(data)))
     return DracoPy.decode(data)
 
 

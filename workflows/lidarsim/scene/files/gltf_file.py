@@ -17,7 +17,7 @@ import numpy as np
 from ...io.allowance import Allowance
 from ...io.input_files import read_input
 from ...numerics.arrays import AnyArray
-from ...words import listed, printable
+from ...words import list_names, printable
 from .companions import find_named_file, image_file
 from .gltf_draco import DRACO
 from .scene_graph import MeshFileError, ReadOptions
@@ -83,7 +83,7 @@ def extension_notes(header: dict[str, Any]) -> list[str]:
     names = dict.fromkeys(printable(str(name))[:60] for name in header.get("extensionsUsed", ()))
     unknown = [name for name in names if not (_READ.match(name) or _WITHOUT_SHAPE.match(name))]
     return (
-        [f"uses extensions that are not supported and were ignored: {listed(unknown, 8)}"]
+        [f"uses extensions that are not supported and were ignored: {list_names(unknown, 8)}"]
         if unknown
         else []
     )
@@ -127,7 +127,7 @@ class GltfFile:
             If the index is out of range.
         """
         entries: list[dict[str, Any]] = self.header.get(kind, [])
-        number = natural(index)
+        number = check_index(index)
         if number >= len(entries):
             raise ValueError(
                 f"it refers to index {number} of its {kind}, but there are {len(entries)}"
@@ -140,7 +140,7 @@ class GltfFile:
         The shape is (count, width).
         """
         accessor = self.part("accessors", index)
-        count = natural(accessor["count"])
+        count = check_index(accessor["count"])
         if accessor["type"] not in _WIDTHS or accessor["componentType"] not in _TYPES:
             raise ValueError(
                 f"accessor {index} has the type {accessor['type']!r} with components of type "
@@ -150,7 +150,7 @@ class GltfFile:
         kind = np.dtype(_TYPES[accessor["componentType"]])
         sparse = accessor.get("sparse")
         if sparse:
-            self.allowance.take(count * width * kind.itemsize)
+            self.allowance.reserve(count * width * kind.itemsize)
         if "bufferView" in accessor:
             numbers = self._array(accessor, kind, count, width)
         elif sparse:
@@ -164,13 +164,13 @@ class GltfFile:
             rows = self._array(changed, index_type, sparse["count"], 1)[:, 0]
             numbers = numbers.copy()
             numbers[rows] = self._array(values, kind, sparse["count"], width)
-        return self.normalized(numbers) if accessor.get("normalized") else numbers
+        return self.normalize_integers(numbers) if accessor.get("normalized") else numbers
 
-    def normalized(self, numbers: AnyArray) -> AnyArray:
+    def normalize_integers(self, numbers: AnyArray) -> AnyArray:
         """Convert normalized integers to floating-point values (glTF 2.0, section 3.6.2.2)."""
         if numbers.dtype.kind not in "iu":
             return numbers
-        self.allowance.take(8 * numbers.size)
+        self.allowance.reserve(8 * numbers.size)
         return np.maximum(numbers / np.iinfo(numbers.dtype).max, -1.0)
 
     def _array(self, part: dict[str, Any], kind: np.dtype[Any], count: int, width: int) -> Any:
@@ -250,7 +250,7 @@ def extension(part: dict[str, Any], name: str) -> dict[str, Any]:
     return content
 
 
-def natural(number: Any) -> int:
+def check_index(number: Any) -> int:
     """Validate a count or an index.
 
     Raises

@@ -24,7 +24,7 @@ from ..masks import (
     read_opacity,
 )
 from .gltf_draco import DRACO
-from .gltf_file import GltfFile, extension, natural
+from .gltf_file import GltfFile, check_index, extension
 from .polygons import check_corners
 from .scene_graph import Piece, ReadOptions
 
@@ -75,14 +75,14 @@ class GltfMaterials:
         if not self._allowance.fits(FACE_BYTES * len(faces)):
             raise MaskError("there are too many triangles")
         if "COLOR_0" in primitive["attributes"]:
-            light = self._file.normalized(self._attribute("COLOR_0", primitive, mesh))
+            light = self._file.normalize_integers(self._attribute("COLOR_0", primitive, mesh))
             check_corners(faces, len(light))
             if light.shape[1] < 3:
                 raise MaskError("its COLOR_0 is not red, green and blue")
             corners = as_srgb(np.clip(light[:, :3], 0, 1))[faces]
             colors = Colors.from_vertex_colors(corners)
         if number is not None:
-            base, info = self._base(natural(number))
+            base, info = self._base(check_index(number))
             if isinstance(base, Texture):
                 colors = base.colors(self._coordinates(info, primitive, mesh), faces)
             else:
@@ -112,7 +112,7 @@ class GltfMaterials:
         image, light, wrap_u, wrap_v = key
         colors = self._file.image(image, partial(read_colors, notes=self.notes))
         if light != (1.0, 1.0, 1.0):
-            scaled = [as_srgb(LINEAR * share) for share in light]
+            scaled = [as_srgb(LINEAR * fraction) for fraction in light]
             colors = np.stack([table[colors[..., k]] for k, table in enumerate(scaled)], axis=-1)
         return Texture(colors, (wrap_u, wrap_v), self._allowance)
 
@@ -194,7 +194,7 @@ class GltfMaterials:
             # then translates.
             angle = float(transform.get("rotation", 0))
             s, c = sin_cos_of(angle)
-            self._allowance.take(32 * len(uv))
+            self._allowance.reserve(32 * len(uv))
             uv = uv * np.array(transform.get("scale", (1, 1)), np.float64)
             uv = matmul(uv, [[c, -s], [s, c]]) + np.array(transform.get("offset", (0, 0)))
         return uv
@@ -206,7 +206,7 @@ class GltfMaterials:
         packed = primitive["extensions"][DRACO]["attributes"][name]
         rows = np.asarray(mesh.get_attribute_by_unique_id(packed)["data"])
         normal = self._file.part("accessors", accessor).get("normalized")
-        return self._file.normalized(rows) if normal else rows
+        return self._file.normalize_integers(rows) if normal else rows
 
 
 def _base_of(material: dict[str, Any]) -> tuple[dict[str, Any] | None, Sequence[float]]:
@@ -225,4 +225,4 @@ def _image_of(texture: dict[str, Any]) -> int:
     index = texture.get("source", extension(texture, "EXT_texture_webp").get("source"))
     if index is None:
         raise MaskError("its image is in a format that cannot be read")
-    return natural(index)
+    return check_index(index)

@@ -132,13 +132,13 @@ class CoordinateUnits:
         return self.horizontal.meters, self.horizontal.meters, self.vertical.meters
 
     @property
-    def metric(self) -> bool:
+    def is_metric(self) -> bool:
         """Whether all coordinates are in meters."""
         return self.factors == (1.0, 1.0, 1.0)
 
-    def note(self) -> str:
+    def conversion_note(self) -> str:
         """Return a note about the conversion to meters, or an empty string if none is needed."""
-        if self.metric:
+        if self.is_metric:
             return ""
         if not self.vertical_stated:
             return (

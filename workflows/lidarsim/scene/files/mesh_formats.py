@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from ...environment.plugins import Plugin, find_plugin, plugins_of
-from ...errors import LidarError, prefixed
+from ...errors import LidarError, prefix_errors
 from ...schema.checks import check_fields
-from ...words import did_you_mean, joined
+from ...words import did_you_mean, join_names
 from .mesh_options import MeshOptions
 from .scene_graph import Content, ReadOptions
 
@@ -265,7 +265,7 @@ def _row_of_plugin(plugin: Plugin) -> MeshFormat:
     """Load the format of a plug-in, or raise LidarError if the plug-in cannot be used."""
     row = plugin.load(MeshFormat)
     if row.read is None:
-        raise plugin.lacks("read")
+        raise plugin.missing_field_error("read")
     if plugin.name not in row.endings:
         raise LidarError(
             f"{plugin} is a MeshFormat for {' '.join(row.endings)}. Name the plug-in after one of "
@@ -310,7 +310,7 @@ def split_options(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tupl
     kind = row.own_options
     shared = MeshOptions(**shared_values)
     own = None if kind is None else kind(**own_values)
-    with prefixed(path):
+    with prefix_errors(path):
         check_fields(shared)
         if own is not None:
             check_fields(own)
@@ -333,9 +333,9 @@ def unsupported_options(row: MeshFormat | None, options: Iterable[str]) -> str:
     parts = []
     for having, group in groups.items():
         kind = "options" if group[1:] else "an option"
-        parts.append(joined(group) + (f" ({kind} of {having})" if having else ""))
+        parts.append(join_names(group) + (f" ({kind} of {having})" if having else ""))
     hint = did_you_mean(groups[""][0], names) if "" in groups else ""
-    return f"does not support {', '.join(parts)}. Remove {joined(lacks)}.{hint}"
+    return f"does not support {', '.join(parts)}. Remove {join_names(lacks)}.{hint}"
 
 
 def option_names(row: MeshFormat | None) -> tuple[str, ...]:

@@ -18,7 +18,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...environment.extras import install_command
-from ...errors import CutShortError, LidarError, MissingFileError, as_sentence, prefixed, unreadable
+from ...errors import (
+    CutShortError,
+    LidarError,
+    MissingFileError,
+    as_sentence,
+    prefix_errors,
+    unreadable_message,
+)
 from ...io.input_files import not_found, open_input, read_input
 from ...motion.rotations import quaternions_of
 from ...motion.trajectory import Track
@@ -26,7 +33,7 @@ from ...numerics.arrays import Floats
 from ...numerics.elementary import cbrt
 from ...numerics.vectors import determinant, matmul, rotate
 from ...schema.vocabulary import UNITS_M
-from ...words import format_as_python, listed, plural, printable, rounded
+from ...words import format_as_python, format_rounded, list_names, plural, printable
 from ..actors import Actor, join_meshes
 from ..colors import colors_summary
 from ..scene_instances import MAX_COORDINATE_M, SceneInstance
@@ -82,22 +89,22 @@ class Objects(NamedTuple):
     is_landscape: bool = False  # whether the file represents terrain rather than an object
     epsg: int | None = None  # code of the coordinate system of x and y, if the file states it
 
-    def at_start(self, tell: Callable[[str], None]) -> tuple[SceneMesh | SceneInstance, ...]:
+    def at_start(self, report: Callable[[str], None]) -> tuple[SceneMesh | SceneInstance, ...]:
         """Convert actors at their first pose to static objects, and return all objects.
 
-        If there are actors, `tell` is called with a message about them.
+        If there are actors, `report` is called with a message about them.
         """
         if self.actors:
             names = ", ".join(actor.name for actor in self.actors[:3])
             names += ", …" * (len(self.actors) > 3)
-            tell(f"{names}, but all objects are treated as static at their first pose")
+            report(f"{names}, but all objects are treated as static at their first pose")
         return (*self.static, *map(_mesh_at_start, self.actors))
 
 
 def load_objects(
     path: str | Path,
     *,
-    tell: Callable[[str], None] = warn,
+    report: Callable[[str], None] = warn,
     axes: Callable[[str], None] | None = None,
     **options: Any,
 ) -> Objects:
@@ -113,7 +120,7 @@ def load_objects(
     path
         Path of the file. Its extension must be one of those in `mesh_formats`, in upper or lower
         case.
-    tell
+    report
         Called with messages about skipped objects, unreadable images, materials that may be glass,
         and reference systems. By default, messages are logged as warnings.
     axes
@@ -157,7 +164,7 @@ def load_objects(
         axis = shared.up_axis or content.up_axis or "z"
         upright = Transform(UP_AXES[axis] * unit_m, np.zeros(3))
         objects = _place_in_world(path, content, upright, shared.transform)
-    _report_notes(path, content, tell, unit_given=unit is not None)
+    _report_notes(path, content, report, unit_given=unit is not None)
     meshes = objects.at_start(lambda _: None)
     if not any((o.mesh if isinstance(o, SceneInstance) else o).has_area for o in meshes):
         raise LidarError(f"{path} contains only triangles without an area.")
@@ -196,7 +203,7 @@ def _place_in_world(
     static = []
     actors = []
     reaches_m: dict[str, float] = {}  # {name of a remote object: meters from the origin}
-    with prefixed(path):
+    with prefix_errors(path):
         for mesh in content.meshes:
             item, reach_m = _place_object(mesh, path.stem, transforms)
             if item is None:
@@ -218,34 +225,34 @@ def _place_in_world(
     if reaches_m:
         content.notes.append(
             f"has objects farther than anything on Earth ({max(reaches_m.values()):.3g} m from "
-            f"the origin), which were skipped: {listed([*reaches_m])}. Check their units and "
+            f"the origin), which were skipped: {list_names([*reaches_m])}. Check their units and "
             "placement"
         )
     return Objects(tuple(static), tuple(actors))
 
 
 def _report_notes(
-    path: Path, content: Content, tell: Callable[[str], None], *, unit_given: bool
+    path: Path, content: Content, report: Callable[[str], None], *, unit_given: bool
 ) -> None:
-    """Call `tell` with messages about skipped objects and with the reader's notes."""
+    """Call `report` with messages about skipped objects and with the reader's notes."""
     if content.skipped:
         names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
-        tell(f"{path} has objects without an area, which were skipped: {names}.")
+        report(f"{path} has objects without an area, which were skipped: {names}.")
     for note in content.notes:
-        tell(f"{path} {note}.")
+        report(f"{path} {note}.")
     if content.unit_note and not unit_given:
-        tell(f"{path} {content.unit_note}.")
+        report(f"{path} {content.unit_note}.")
 
 
 def load_meshes(
-    path: str | Path, *, tell: Callable[[str], None] = warn, **options: Any
+    path: str | Path, *, report: Callable[[str], None] = warn, **options: Any
 ) -> tuple[SceneMesh | SceneInstance, ...]:
     """Read all objects of a mesh file as static objects.
 
     `options` are described in `load_objects`.
     """
-    objects = load_objects(path, tell=tell, **options)
-    return objects.at_start(lambda line: tell(f"{path} moves {line}"))
+    objects = load_objects(path, report=report, **options)
+    return objects.at_start(lambda line: report(f"{path} moves {line}"))
 
 
 def _summary(
@@ -278,7 +285,7 @@ def _summary(
     return ", ".join(words)
 
 
-def written_by_lidarpool(path: Path) -> bool:
+def is_written_by_lidarpool(path: Path) -> bool:
     """Return whether lidarpool wrote the file.
 
     Files written by lidarpool are in meters. The format of the file must not state a unit itself.
@@ -332,14 +339,15 @@ def _doubt_about_rotation(content: Content, meshes: Sequence[SceneMesh | SceneIn
     lower = np.min([_corners(mesh).min(axis=0) for mesh in meshes], axis=0)
     x, y, z = np.max([_corners(mesh).max(axis=0) for mesh in meshes], axis=0) - lower
     if 2 * y < min(x, z):
-        return f", and is now {rounded(x)} m wide, {rounded(z)} m high and {rounded(y)} m thick"
+        width, height, thickness = (format_rounded(side) for side in (x, z, y))
+        return f", and is now {width} m wide, {height} m high and {thickness} m thick"
     return ""
 
 
 def _read(path: Path, row: MeshFormat, data: bytes, options: ReadOptions) -> Content:
     """Read a file, converting all errors to LidarError."""
     try:
-        with prefixed(path):
+        with prefix_errors(path):
             return _checked_content(row, path, data, options)
     except MemoryError:
         raise
@@ -349,12 +357,12 @@ def _read(path: Path, row: MeshFormat, data: bytes, options: ReadOptions) -> Con
         raise LidarError(f"{path} {error}.{_other_format(path, data)}") from error
     except Exception as error:
         if row.plugin is not None and isinstance(error, ImportError):
-            raise LidarError(f"{path}: {row.plugin.broken(error)}") from error
+            raise LidarError(f"{path}: {row.plugin.import_error(error)}") from error
         # Readers raise errors of many classes, such as ValueError, IndexError, KeyError,
         # BadZipFile, ParseError and struct.error.
         failure = _truncation_error(error, data) or error
         raise LidarError(
-            f"{unreadable(path, failure, _advice(failure))}{_other_format(path, data)}"
+            f"{unreadable_message(path, failure, _advice(failure))}{_other_format(path, data)}"
         ) from error
 
 
@@ -419,7 +427,7 @@ def _format_to_read(path: Path) -> MeshFormat:
 def _bytes_of(path: Path, max_bytes: int | None) -> bytes:
     """Return the content of a file, or at most its first `max_bytes` bytes."""
     try:
-        with prefixed(path):
+        with prefix_errors(path):
             data = read_input(path, max_bytes)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise MissingFileError(not_found(path, endings())) from error
@@ -461,7 +469,7 @@ def _place_object(
     name = printable(item.name) or printable(stem)
     for transform in transforms:
         if name != item.name or not _is_identity(transform):
-            item = item.moved(name, transform.linear, transform.offset)
+            item = item.affine_transform(name, transform.linear, transform.offset)
     reach_m = float(np.abs(_corners(item)).max())
     return (item if reach_m <= MAX_COORDINATE_M else None), reach_m
 
@@ -491,7 +499,9 @@ def _actor_of_part(
         raise LidarError(
             f"Object {name!r} moves but is scaled non-uniformly. Use a single scale factor."
         )
-    objects = [item.moved(name, scale * upright.linear, np.zeros(3)) for item in part.objects]
+    objects = [
+        item.affine_transform(name, scale * upright.linear, np.zeros(3)) for item in part.objects
+    ]
     linear = matmul(placement.linear, upright.linear)
     positions = rotate(part.positions, linear) + placement.offset
     reach_m = float(np.abs(positions).max())
@@ -505,7 +515,7 @@ def _actor_of_part(
 def _mesh_at_start(actor: Actor) -> SceneMesh:
     positions, rotations = actor.trajectory.poses(0, np.zeros(1))
     rotation = np.eye(3) if rotations is None else rotations[0]
-    return actor.mesh.moved(actor.name, rotation, positions[0])
+    return actor.mesh.affine_transform(actor.name, rotation, positions[0])
 
 
 def _corners(item: SceneMesh | SceneInstance) -> Floats:

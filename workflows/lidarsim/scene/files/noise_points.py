@@ -29,7 +29,7 @@ class OmittedPoints(NamedTuple):
     withheld: int = 0
     noise: int = 0
 
-    def note(self) -> str:
+    def omission_note(self) -> str:
         """Return a note that states the numbers, or an empty string if no points were omitted."""
         kinds = []
         if self.withheld:

@@ -346,7 +346,7 @@ def _read_compressed(header: _Header, body: memoryview, file_size: int) -> list[
             f"{packed_size:,} bytes of compressed points are declared, but only {len(body) - 8:,} "
             "are present"
         )
-    Allowance(file_size, _SMALLER).take(size)
+    Allowance(file_size, _SMALLER).reserve(size)
     content = _decompress(body[8 : 8 + packed_size], size)
     arrays = []
     start = 0

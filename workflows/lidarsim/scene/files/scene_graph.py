@@ -240,7 +240,7 @@ def placed_content(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> C
         ):
             objects.append(SceneInstance(mesh, matrix, name))
         else:
-            objects.append(mesh.moved(name, matrix[:3, :3], matrix[:3, 3]))
+            objects.append(mesh.affine_transform(name, matrix[:3, :3], matrix[:3, 3]))
     return content
 
 
@@ -265,7 +265,7 @@ def bake_animation(
     for index, pose in zip(range(count), contents, strict=False):
         vertices_now = [mesh.vertices for mesh in pose.meshes if isinstance(mesh, SceneMesh)]
         if not index:
-            allowance.take(count * sum(vertices.nbytes for vertices in vertices_now))
+            allowance.reserve(count * sum(vertices.nbytes for vertices in vertices_now))
             content = pose
             used_bytes = allowance.used_bytes
             pose_arrays = [np.empty((count, *vertices.shape)) for vertices in vertices_now]
@@ -346,8 +346,8 @@ def _compact_piece(piece: Piece, allowance: Allowance | None) -> Piece:
     if allowance is not None:
         extra = 0 if cutout is None else cutout.uv.nbytes
         extra += 0 if face_colors is None else 40 * len(faces)
-        allowance.take(faces.nbytes + extra)
+        allowance.reserve(faces.nbytes + extra)
     vertices, faces = drop_unused_vertices(vertices, faces)
     if allowance is not None:
-        allowance.take(24 * len(vertices))  # double precision
+        allowance.reserve(24 * len(vertices))  # double precision
     return Piece(vertices, faces, cutout, face_colors, material)

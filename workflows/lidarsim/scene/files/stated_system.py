@@ -324,7 +324,7 @@ def stated_meters(
     units = system.units()
     if units is None:
         return (1.0, 1.0, 1.0), []
-    return units.factors, [note for note in (units.note(), scale.note) if note]
+    return units.factors, [note for note in (units.conversion_note(), scale.note) if note]
 
 
 def check_metric_format(system: StatedSystem | None, positions: Floats) -> list[str]:

@@ -21,7 +21,7 @@ from ...motion.trajectory import (
     find_batch,
     presence_ns,
 )
-from ...numerics.arrays import Floats, Indices, Integers, Ints, owned
+from ...numerics.arrays import Floats, Indices, Integers, Ints, to_writable
 from ...scene.actors import Actor
 
 if TYPE_CHECKING:
@@ -185,7 +185,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         if not len(number):
             return table
         outside = surface_loops.poses_on_tracks(
-            owned(number, np.int64), owned(times_ns), tracks, table
+            to_writable(number, np.int64), to_writable(times_ns), tracks, table
         )
         if outside >= 0:  # let `poses` raise the LidarError
             self[number[outside]].poses(0, times_ns[number == number[outside]])
@@ -221,8 +221,8 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         """
         from . import surface_loops
 
-        number = owned(number, np.int64)
-        times = owned(times_ns)
+        number = to_writable(number, np.int64)
+        times = to_writable(times_ns)
         first, run = np.empty((2, len(number)), np.int64)
         first = first[: surface_loops.find_runs(number, times, first, run)]
         return self.table(number[first], times[first]), run

@@ -108,6 +108,6 @@ def _crossing(first: tuple[_Corner, float], second: tuple[_Corner, float]) -> _C
     The corners are sorted so that both triangles that share the edge get the same point.
     """
     (start, start_height), (stop, stop_height) = sorted((first, second))
-    share = start_height / (start_height - stop_height)
-    x, y, z = (p + share * (q - p) for p, q in zip(start, stop, strict=True))
+    fraction = start_height / (start_height - stop_height)
+    x, y, z = (p + fraction * (q - p) for p, q in zip(start, stop, strict=True))
     return x, y, z

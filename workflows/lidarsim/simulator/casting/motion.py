@@ -13,7 +13,7 @@ import raybeam.poses
 from raybeam import Pattern, PoseMotion, pattern_rays
 
 from ...motion.trajectory import Trajectory, velocities
-from ...numerics.arrays import Floats, Indices, Integers, Ints, owned
+from ...numerics.arrays import Floats, Indices, Integers, Ints, to_writable
 from ...numerics.vectors import matmul, rotate_into_frames
 from ...sensor import Sensor
 from ...survey.survey import Mounted, ScanSpec
@@ -45,11 +45,11 @@ class FiringClock:
 
         times_ns = np.empty(len(ray))
         surface_loops.firing_times(
-            owned(ray, np.int64),
+            to_writable(ray, np.int64),
             self.start,
             self.subrays,
-            owned(self.firing_starts),
-            owned(self.delays),
+            to_writable(self.firing_starts),
+            to_writable(self.delays),
             times_ns,
         )
         return times_ns

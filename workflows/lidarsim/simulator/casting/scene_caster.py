@@ -247,7 +247,7 @@ class SceneCaster:
                 pattern, **common, keep_every=keep_every, groups=groups, tally=tally
             )
         hits = trees.caster.scan(pattern, **common)
-        hits = replace(hits, triangle=trees.numbered(hits))
+        hits = replace(hits, triangle=trees.to_scene_triangles(hits))
         if self._shapes is None:
             ray = hits.ray.astype(np.int64)
             distance = hits.distance
@@ -434,7 +434,7 @@ def move_instances(
         (m,): rows of the instances that have moved.
     """
     for static in dict.fromkeys(caster.bodies.static for caster in casters):
-        static.move(instances, instance_indices)
+        static.move_instances(instances, instance_indices)
     for caster in dict.fromkeys(casters):
         caster.update_instances(surfaces, instances)
 

@@ -36,7 +36,7 @@ _SLACK_M = 200.0  # part of the margin reserved for sensors mounted away from th
 
 def largest_range_m(survey: Survey) -> float:
     """Return the maximum range of the survey's sensors, in meters."""
-    return max(carried.sensor.max_range_m for carried in survey.carried)
+    return max(carried.sensor.max_range_m for carried in survey.mounted_sensors)
 
 
 def warn_of_reach(scene: Scene, survey: Survey) -> None:
@@ -80,7 +80,7 @@ class _Trees(NamedTuple):
         """Number of instances (0 or 1) in the caster that represent the scene's faces."""
         return self.caster.instance_count - len(self.instance_indices)
 
-    def numbered(self, hits: ScanReturns) -> Ints32:
+    def to_scene_triangles(self, hits: ScanReturns) -> Ints32:
         """Convert the triangles of hits to the scene's triangle numbers."""
         triangle = hits.triangle
         if self.origins:
@@ -188,7 +188,7 @@ class StaticBodies:
                 region = np.stack([lower, np.maximum(region[1], trees.region[1])])
             self._trees = self._build(None if _half_side(region) > MAX_REACH_M else region)
 
-    def move(self, instances: Instances, instance_indices: Indices) -> None:
+    def move_instances(self, instances: Instances, instance_indices: Indices) -> None:
         """Move the instances in the given rows to their transforms in `instances`.
 
         No cast may be in progress. Trees are rebuilt if an instance enters or leaves the region

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...numerics.arrays import Floats, Floats32, Indices, Integers, Ints, Ints32, owned
+from ...numerics.arrays import Floats, Floats32, Indices, Integers, Ints, Ints32, to_writable
 from ...numerics.vectors import inverse, norm
 from ...scene.actors import distinct_meshes
 from ...scene.colors import Colors
@@ -79,7 +79,7 @@ class StoredTriangles:
         count = len(triangle)
         row, instance = np.empty((2, count), np.int64)
         located = surface_loops.TriangleOwners(row, np.empty(count, np.int32), instance)
-        surface_loops.find_owners(owned(triangle, np.int32), self._triangle_numbers, located)
+        surface_loops.find_owners(to_writable(triangle, np.int32), self._triangle_numbers, located)
         return located
 
     @cached_property
@@ -90,15 +90,15 @@ class StoredTriangles:
         instances = self._scene.instances
         no_instances = np.zeros(0, np.int64)
         return TriangleNumbers(
-            instance_starts=owned(self.instance_starts, np.int64),
-            owners=owned(self.owners, np.int32),
-            instance_objects=owned(
+            instance_starts=to_writable(self.instance_starts, np.int64),
+            owners=to_writable(self.owners, np.int32),
+            instance_objects=to_writable(
                 no_instances if instances is None else instances.owner, np.int32
             ),
-            instance_rows=owned(
+            instance_rows=to_writable(
                 no_instances if instances is None else self.part_starts[instances.part], np.int64
             ),
-            actor_shifts=owned(self._actor_shifts, np.int64),
+            actor_shifts=to_writable(self._actor_shifts, np.int64),
             static_objects=self.static_objects,
         )
 

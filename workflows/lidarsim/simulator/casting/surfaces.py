@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ...media.materials import NEAR_NM, Material, MaterialTable, normal_incidence_energy
-from ...numerics.arrays import Bools, Floats, Integers, Ints, Ints32, UInts32, owned
+from ...numerics.arrays import Bools, Floats, Integers, Ints, Ints32, UInts32, to_writable
 from ...numerics.vectors import rotate_into_frames
 from ...scene.colors import GRAY, Lookup, join_colors, luminance, pack_colors
 from ...scene.scene import Scene
@@ -63,7 +63,7 @@ def sensor_light_of(survey: Survey, sensor: Sensor) -> SensorLight:
 
 def warn_of_gray(scene: Scene, survey: Survey) -> None:
     """Log a warning if materials use colors as reflectance but the scene has no colors."""
-    if not scene.colored and any(m.reflectance == "texture" for m in survey.materials):
+    if not scene.all_colors and any(m.reflectance == "texture" for m in survey.materials):
         _log.warning(
             "a material has reflectance: texture, but the scene has no colors, so all surfaces "
             "are gray. In Python, read colors with Scene.load(path, colors=True)"
@@ -154,7 +154,7 @@ class SceneSurfaces:
         deformed_normals = _NO_NORMALS
         if trajectories:
             actors = objects - np.int64(self.triangles.static_objects)
-            poses, run = trajectories.pose_runs(actors, owned(times))
+            poses, run = trajectories.pose_runs(actors, to_writable(times))
             if len(deforming := trajectories.deforming_rows(actors)):
                 deformed = self.on_actors.deformed_corners(
                     row[deforming], actors[deforming], times[deforming], trajectories
@@ -165,7 +165,7 @@ class SceneSurfaces:
         incidence = surface_loops.Incidence(np.empty((3, len(row))), cosines, back)
         surface_loops.compute_incidence(
             surface_loops.HitSurfaces(row, kinds, instance, run),
-            owned(directions.T),
+            to_writable(directions.T),
             surface_loops.NormalTables(
                 self.triangles.unit_normals, deformed_normals, self.triangles.normal_matrices, poses
             ),
@@ -200,15 +200,15 @@ class SceneSurfaces:
         trajectories
             Trajectories of the actors.
         colors
-            (n,): packed colors, which are required if materials are `textured`.
+            (n,): packed colors, which are required if materials have textures.
         """
         from . import surface_loops
 
         table = self.at_wavelength(sensor_light.wavelength_nm)
         incidence, kinds = self._incidence(triangle, directions, table, times, trajectories)
         normals, cosines, back = incidence
-        bright = luminance(colors) if table.textured and colors is not None else None
-        if table.textured or table.roughness.any():
+        bright = luminance(colors) if table.has_textures and colors is not None else None
+        if table.has_textures or table.roughness.any():
             back = table.relative_energy(kinds, np.abs(cosines), bright)
         film = None
         if sensor_light.wet:
@@ -218,7 +218,7 @@ class SceneSurfaces:
             surface_loops.apply_water_film(
                 normals[2], cosines, kinds=kinds, shares=shares, water=water, film=film, back=back
             )
-        surface_loops.attenuate_energies(owned(distance), sensor_light.extinction, back)
+        surface_loops.attenuate_energies(to_writable(distance), sensor_light.extinction, back)
         return IlluminatedHits(normals.T, cosines, kinds, back, film)
 
     def colors(
@@ -293,10 +293,10 @@ class SceneSurfaces:
 
         The energy is ``reflectance * cosine * (10 m / distance)**2 * exp(-2 * extinction *
         distance)``. For a retroreflector, a gain replaces the cosine. Rough surfaces add gloss.
-        Distances below `NEAREST_M` are treated as `NEAREST_M`. If materials are `textured`,
+        Distances below `NEAREST_M` are treated as `NEAREST_M`. If materials have textures,
         `colors` (n,) is required.
         """
         table = self.at_wavelength(sensor_light.wavelength_nm)
-        bright = luminance(colors) if table.textured and colors is not None else None
+        bright = luminance(colors) if table.has_textures and colors is not None else None
         scattered = table.relative_energy(self.kinds(triangle), cosine, bright)
         return np.asarray(scattered * normal_incidence_energy(distance, sensor_light.extinction))

@@ -26,12 +26,12 @@ def unseen_objects(scene: Scene, survey: Survey) -> tuple[Bools | None, ...]:
     LidarError
         If a pattern in `Mounted.unseen` matches no object.
     """
-    if not any(carried.unseen for carried in survey.carried):
-        return (None,) * len(survey.carried)
+    if not any(carried.unseen for carried in survey.mounted_sensors):
+        return (None,) * len(survey.mounted_sensors)
     names = scene.object_names
     object_rows = {name: row for row, name in enumerate(names)}
     masks: list[Bools | None] = []
-    for carried in survey.carried:
+    for carried in survey.mounted_sensors:
         mask = np.zeros(len(names), np.bool_)
         subject = f"unseen of sensor {carried.name!r}" if carried.name else "unseen"
         for pattern in carried.unseen:

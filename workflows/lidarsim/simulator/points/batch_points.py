@@ -25,7 +25,7 @@ from ...survey.survey import ScanSpec, Survey
 from ..casting.motion import CastPoses, Firings
 from ..casting.surfaces import SceneSurfaces, sensor_light_of
 from ..pulses import ScannedReturns
-from ..returns import required
+from ..returns import require_column
 from ..steps.cast import GHOST
 from ..steps.doppler import VELOCITY, radial_velocities
 from ..steps.step_list import received_causes
@@ -57,7 +57,7 @@ class BatchPoints:
     ) -> None:
         self.scene = scene
         self.survey = survey
-        self.carried = survey.carried[specs[0].sensor]
+        self.carried = survey.mounted_sensors[specs[0].sensor]
         self.sensor = self.carried.sensor
         self.specs = specs
         # Nonzero counters (`StoredTriangles.counter`) and their hits, each of shape (k,). Counts of
@@ -190,7 +190,7 @@ class BatchPoints:
     @property
     def range(self) -> Floats:
         """Distance from the ray origin in meters, including noise."""
-        return required(self.pulse_returns.reported)
+        return require_column(self.pulse_returns.reported)
 
     @cached_property
     def positions(self) -> Floats:
@@ -447,7 +447,7 @@ class BatchPoints:
         """Signed cosines of incidence and received energies, computed in blocks to save memory."""
         sensor_light = sensor_light_of(self.survey, self.sensor)
         cosines, energy = np.empty((2, len(self)))
-        colors = self._colors if self._surfaces.materials.textured else None
+        colors = self._colors if self._surfaces.materials.has_textures else None
         for begin in range(0, len(self), BLOCK_HITS):
             block = slice(begin, begin + BLOCK_HITS)
             lit = self._surfaces.illuminate(
@@ -576,7 +576,7 @@ class BatchPoints:
     @property
     def waveform(self) -> Records:
         """Recorded waveform with its location and direction (`columns.waveforms.record`)."""
-        table = required(self.pulse_returns.waveform).copy()
+        table = require_column(self.pulse_returns.waveform).copy()
         begin_ps = table["begin"] * table["sample_ps"].astype(np.float64)
         table["location_ps"] = self.range * (2000 / LIGHT_M_NS) - begin_ps
         world = self.survey.coordinates == "world"
@@ -587,12 +587,12 @@ class BatchPoints:
     @property
     def return_number(self) -> Bytes:
         """Number of the return within its pulse, starting at 1."""
-        return required(self.pulse_returns.number)
+        return require_column(self.pulse_returns.number)
 
     @property
     def returns(self) -> Bytes:
         """Number of returns that are reported for the pulse."""
-        return required(self.pulse_returns.return_counts)
+        return require_column(self.pulse_returns.return_counts)
 
     @property
     def cause(self) -> Bytes:

@@ -57,9 +57,9 @@ _NO_HITS = (np.zeros(0, np.int64), *(np.zeros(0, kind) for kind in _HITS))
 
 def _device_column_names(scene: Scene, survey: Survey) -> set[str]:
     """Return the names of the columns that a device can compute for a survey in a scene."""
-    hazy = any(survey.extinction(carried.sensor) for carried in survey.carried)
+    hazy = any(survey.extinction(carried.sensor) for carried in survey.mounted_sensors)
     several_wavelengths = (
-        len({carried.sensor.optics.wavelength_nm for carried in survey.carried}) > 1
+        len({carried.sensor.optics.wavelength_nm for carried in survey.mounted_sensors}) > 1
     )
     textured_or_rough = any(
         m.reflectance == "texture"
@@ -185,7 +185,7 @@ class DeviceColumns:
         first ray of each scan, counted from the start of the window.
         """
         survey = self.survey
-        sensor = survey.carried[specs[0].sensor].sensor
+        sensor = survey.mounted_sensors[specs[0].sensor].sensor
         seen = self._seen_bodies[specs[0].sensor]
         keep_every = survey.keep_every
         scan = check_scan(
@@ -244,7 +244,7 @@ class DeviceColumns:
         Ray i is row ``i % len(pattern)`` of the pattern. The caller fills `image` with inf, which
         remains where a ray has no return.
         """
-        sensor = self.survey.carried[number].sensor
+        sensor = self.survey.mounted_sensors[number].sensor
         seen = self._seen_bodies[number]
         scan = check_scan(
             pattern,
@@ -424,7 +424,7 @@ class _ColumnTransfer:
         """
         maker = self._maker
         specs = self._specs
-        sensor = maker.survey.carried[specs[0].sensor].sensor
+        sensor = maker.survey.mounted_sensors[specs[0].sensor].sensor
         bodies, owners, normals, reflectance, retro, classes, normal_matrices = maker.tables(
             cupy, self._seen
         )

@@ -15,7 +15,17 @@ from raybeam import Pattern
 
 from ...columns.table import CAUSES, COLORS
 from ...media.weather import FAINTEST
-from ...numerics.arrays import Bools, Bytes, Floats, Indices, Integers, Ints, Ints32, UInts32, owned
+from ...numerics.arrays import (
+    Bools,
+    Bytes,
+    Floats,
+    Indices,
+    Integers,
+    Ints,
+    Ints32,
+    UInts32,
+    to_writable,
+)
 from ...numerics.random_numbers import Purpose, raw
 from ...numerics.vectors import dot, rotate_into_frames
 from ...scene.colors import luminance
@@ -207,7 +217,7 @@ class CastStep(PulseStep):
         # Largest energy that any kind of surface returns from a distance of 10 m.
         self._brightest = float(table.relative_energy(np.arange(len(white)), white, white).max())
         shown = any(column.name in COLORS for column in survey.stored_columns)
-        self._colored = shown or surfaces.materials.textured
+        self._colored = shown or surfaces.materials.has_textures
         # Whether the origins of rays are needed in addition to their directions.
         self._needs_origins = (
             self._colored
@@ -533,11 +543,11 @@ class CastStep(PulseStep):
         order = order_along_rings(
             light.ray[row_indices] // subrays_per_beam, self.setup.sensor.channels
         )
-        row_indices, reflected, share = self._divide(
+        row_indices, reflected, fraction = self._divide(
             light, surface_hits, row_indices[order], reflected[order]
         )
         onward = light.take(row_indices)
-        onward.share = share
+        onward.share = fraction
         crossings = SurfaceCrossings(
             step_m=surface_hits.step_m[row_indices],
             distance=surface_hits.distance[row_indices],
@@ -565,13 +575,13 @@ class CastStep(PulseStep):
 
         materials = self.surfaces.at_wavelength(self._sensor_light.wavelength_nm)
         bright = None
-        if materials.textured and surface_hits.color is not None:
+        if materials.has_textures and surface_hits.color is not None:
             bright = luminance(surface_hits.color[row_indices])
         in_media = light.in_media
         drops_faint = light.mirrored is not None and not (
             in_media is not None and in_media.differentials
         )
-        share = np.empty(len(row_indices))
+        fraction = np.empty(len(row_indices))
         film = np.zeros(0, np.bool_) if surface_hits.film is None else surface_hits.film
         count = surface_loops.divide_light(
             row_indices,
@@ -593,9 +603,9 @@ class CastStep(PulseStep):
                 self._sensor_light.extinction,
                 self._faintest if drops_faint else -1.0,
             ),
-            onward_share=share,
+            onward_share=fraction,
         )
-        return OnwardRows(row_indices[:count], reflected[:count], share[:count])
+        return OnwardRows(row_indices[:count], reflected[:count], fraction[:count])
 
     def _cast_again(self, onward: OnwardLight, actor_trajectories: ActorTrajectories) -> CastLight:
         """Cast light onward from surfaces, and return the light that hits another surface in range.
@@ -700,7 +710,7 @@ class CastStep(PulseStep):
         This moves the light into the media behind the surfaces.
         """
         outgoing = light.directions
-        share = light.share
+        fraction = light.share
         mirrored = crossings.reflected
         if light.in_media is not None:
             refraction = light.in_media.cross(
@@ -712,11 +722,13 @@ class CastStep(PulseStep):
                 crossings.reflected,
             )
             outgoing = refraction.directions
-            share = share * refraction.shares**2  # light passes on the way out and on the way back
+            fraction = (
+                fraction * refraction.shares**2
+            )  # light passes on the way out and on the way back
             mirrored = mirrored | refraction.totally_reflected
         twice_normals = 2 * mirrored[:, None] * crossings.normals
         outgoing = outgoing - crossings.cosines[:, None] * twice_normals
-        return Deflection(outgoing, share, mirrored, twice_normals)
+        return Deflection(outgoing, fraction, mirrored, twice_normals)
 
 
 def _range_rate_behind(
@@ -749,11 +761,11 @@ def _pattern_behind(
     from ..casting import surface_loops
 
     origins = np.empty((3, len(clear_m)))
-    directions = owned(outgoing.T)
+    directions = to_writable(outgoing.T)
     surface_loops.start_behind(
-        owned(light.origins.T),
-        owned(light.directions.T),
-        owned(step_m),
+        to_writable(light.origins.T),
+        to_writable(light.directions.T),
+        to_writable(step_m),
         clear_m,
         origins,
         directions,

@@ -12,7 +12,7 @@ from raybeam import Pattern
 
 from ...columns.table import CAUSES
 from ...media.materials import normal_incidence_energy
-from ...numerics.arrays import Floats, Indices, Ints, Ints32, owned
+from ...numerics.arrays import Floats, Indices, Ints, Ints32, to_writable
 from ...numerics.elementary import arccos, exp
 from ...numerics.elementary_scalars import sin_cos_of
 from ...numerics.random_numbers import Purpose
@@ -115,7 +115,7 @@ class CrosstalkStep(PulseStep):
         nm = self._sensor.optics.wavelength_nm
         self._other_sensors = [
             number
-            for number, carried in enumerate(self._survey.carried)
+            for number, carried in enumerate(self._survey.mounted_sensors)
             if number != setup.number and abs(carried.sensor.optics.wavelength_nm - nm) <= FILTER_NM
         ]
 
@@ -182,7 +182,7 @@ class CrosstalkStep(PulseStep):
         self, number: int, spec: ScanSpec, waiting: _WaitingRays, poses: CastPoses
     ) -> ReceivedPulses:
         """Return the foreign pulses that rays receive from sensor `number` of the survey."""
-        max_range_m = self._survey.carried[number].sensor.max_range_m
+        max_range_m = self._survey.mounted_sensors[number].sensor.max_range_m
         reach_ns = (max_range_m + self._sensor.max_range_m) / LIGHT_M_NS
         first_ns = waiting.fired[waiting.order[0]] - reach_ns
         last_ns = waiting.fired[waiting.order[-1]] + waiting.gate[1]
@@ -212,11 +212,11 @@ class CrosstalkStep(PulseStep):
             stray_loops.SpotPairs(candidates.spot, candidates.start, candidates.stop),
             stray_loops.ReceivingRays(
                 waiting.order,
-                owned(waiting.fired),
-                owned(waiting.origins),
-                owned(waiting.directions),
+                to_writable(waiting.fired),
+                to_writable(waiting.origins),
+                to_writable(waiting.directions),
             ),
-            stray_loops.LitSpots(owned(spots.time), owned(spots.position)),
+            stray_loops.LitSpots(to_writable(spots.time), to_writable(spots.position)),
             stray_loops.ReceptionLimits(
                 self._cosine, self._sensor.min_range_m, self._sensor.max_range_m
             ),
@@ -265,7 +265,7 @@ class CrosstalkStep(PulseStep):
         self, number: int, spec: ScanSpec, span: tuple[float, float], poses: CastPoses
     ) -> _Spots:
         """Cast the pulses that another sensor fires in a time interval, and return their spots."""
-        sensor: Sensor = self._survey.carried[number].sensor
+        sensor: Sensor = self._survey.mounted_sensors[number].sensor
         firings = np.arange(*_firings_in(sensor, self._survey.steps_each[number], span))
         firing_starts = sensor.begins_ns(firings)
         fired = (firing_starts[:, None] + sensor.beams.time_ns).reshape(-1)
@@ -300,7 +300,7 @@ class CrosstalkStep(PulseStep):
         self, number: int, station: int, firings: Ints, firing_starts: Floats
     ) -> tuple[Floats, Floats]:
         """Return the origins and directions of the rays that a sensor fires, in the scene frame."""
-        carried = self._survey.carried[number]
+        carried = self._survey.mounted_sensors[number]
         path = self._survey.path
         sensor = carried.sensor
         directions = sensor.directions(firings)
@@ -361,5 +361,5 @@ def _foreign_pulses(survey: Survey, sensor: Sensor) -> float:
         begin, end = lidar.begins_ns(np.array([first, stop], np.int64))
         return float((stop - first) * lidar.channels / (end - begin))
 
-    total = sum(rate(carried.sensor) for carried in survey.carried)
+    total = sum(rate(carried.sensor) for carried in survey.mounted_sensors)
     return total / rate(sensor) - 1

@@ -20,7 +20,7 @@ class DetectionStep(PulseStep):
 
     The fraction is `Noise.dropout`.
 
-    Without waveforms, `SeparationStep` drops returns with the same function, `detected`.
+    Without waveforms, `SeparationStep` drops returns with the same function, `is_detected`.
     """
 
     role = Role.CHANGES
@@ -35,13 +35,13 @@ class DetectionStep(PulseStep):
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Keep the detected returns of a batch."""
         scan, ray = batch.keys.scan_and_number(returns.ray)
-        detected_mask = detected(
+        detected_mask = is_detected(
             self.setup.noise, returns.height, scan, ray, number_within_ray(returns.ray)
         )
         return returns.take(detected_mask)
 
 
-def detected(
+def is_detected(
     noise: Noise, energy: Floats, scan: Integers, ray: Integers, number: Integers
 ) -> Bools:
     """Return whether returns with the given energies are detected.
@@ -70,7 +70,7 @@ def exceeds_threshold(
 ) -> Bools:
     """Return whether signals with noise exceed the threshold.
 
-    The arguments are the same as in `detected`, with a purpose for the random numbers.
+    The arguments are the same as in `is_detected`, with a purpose for the random numbers.
     """
     signal = THRESHOLD_SIGMAS * (energy / noise.threshold - 1)
     return np.asarray(signal + normal(noise.seed, purpose, scan, ray, number) > 0)

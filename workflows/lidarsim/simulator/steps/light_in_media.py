@@ -572,10 +572,10 @@ class LightInMedia:
         self.stack.kinds[keeps_media] = stack_before.kinds[keeps_media]
         self.stack.triangles[keeps_media] = stack_before.triangles[keeps_media]
         mirrors = self.media.mirrors[kinds]
-        shares = np.where(refraction.totally_reflected & mirrors, 0.0, refraction.shares)
-        shares = np.where(reflected, np.where(mirrors, 1 - shares, 1.0), shares)
+        fractions = np.where(refraction.totally_reflected & mirrors, 0.0, refraction.shares)
+        fractions = np.where(reflected, np.where(mirrors, 1 - fractions, 1.0), fractions)
         outgoing = np.where(reflected[:, None], directions, refraction.directions)
-        return Refraction(outgoing, shares, refraction.totally_reflected)
+        return Refraction(outgoing, fractions, refraction.totally_reflected)
 
     def deflect(self, incoming: Floats, outgoing: Floats, normals: Floats, mirrored: Bools) -> None:
         """Update the differentials at flat surfaces that change the direction of light."""
@@ -610,8 +610,8 @@ def _crown_layers(bits: NDArray[np.uint64], cumulative: Floats) -> Indices:
     `bits` (k,) are random bits, and `cumulative` (k, MAX_MEDIA) are cumulative sums of the
     densities of the media in the stacks. The result has columns of `MediaStack`.
     """
-    share = (bits >> np.uint64(11)).astype(np.float64) * 2.0**-53
-    return np.asarray((cumulative <= (share * cumulative[:, -1])[:, None]).sum(axis=1))
+    fraction = (bits >> np.uint64(11)).astype(np.float64) * 2.0**-53
+    return np.asarray((cumulative <= (fraction * cumulative[:, -1])[:, None]).sum(axis=1))
 
 
 def random_depths(bits: NDArray[np.uint64]) -> Floats:
@@ -619,8 +619,8 @@ def random_depths(bits: NDArray[np.uint64]) -> Floats:
 
     For speed, the logarithm is computed from the binary exponent and a table of 32,768 logarithms.
     """
-    share = ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
-    mantissa, exponent = np.frexp(share)
+    fraction = ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
+    mantissa, exponent = np.frexp(fraction)
     row = ((mantissa - 0.5) * (2 * len(_logs()))).astype(np.intp)
     return np.asarray(_logs()[row] - exponent * float(np.float32(log_of(2.0))))
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...numerics.arrays import Bools, Floats, owned
+from ...numerics.arrays import Bools, Floats, to_writable
 from ...numerics.elementary import sin_cos
 from ...numerics.vectors import hypot
 from ...survey.faults import PACKET, Fault
-from ..returns import PulseReturns, required
+from ..returns import PulseReturns, require_column
 from .step import PulseBatch, PulseStep, Role, Setup
 
 
@@ -35,12 +35,14 @@ class DirtStep(PulseStep):
             in_spot = _in_spot(fault, x, y, z)
             if fault.from_s or fault.to_s is not None:
                 in_spot &= fault.is_active(batch.firings.times(beams))
-            transmission[in_spot] *= required(fault.transmission)
+            transmission[in_spot] *= require_column(fault.transmission)
         transmission = transmission.repeat(batch.subrays_per_beam)
-        hits = returns._replace(energy=required(returns.energy) * transmission.take(returns.ray))
+        hits = returns._replace(
+            energy=require_column(returns.energy) * transmission.take(returns.ray)
+        )
         batch.hits = hits
         if batch.air is not None:
-            energy = required(batch.air.energy) * transmission.take(batch.air.ray)
+            energy = require_column(batch.air.energy) * transmission.take(batch.air.ray)
             batch.air = batch.air._replace(energy=energy)
         return hits
 
@@ -90,13 +92,13 @@ class LossStep(PulseStep):
         lost_firings = np.zeros((len(faults), len(firings.numbers)), np.bool_)
         for row, (fault_number, fault) in enumerate(faults.items()):
             if fault.packet is None:
-                lost_channels[row, required(fault.channels)] = True
+                lost_channels[row, require_column(fault.channels)] = True
             else:
                 lost_firings[row] = fault.find_dropped(
                     firings.numbers, seed, spec.station, fault_number
                 )
         row_indices = np.empty(len(returns.ray), np.int64)
-        ray = owned(returns.ray, np.int64)
+        ray = to_writable(returns.ray, np.int64)
         count = fault_loops.remaining(
             ray, firings.times(ray), spans, lost_firings, lost_channels, row_indices
         )

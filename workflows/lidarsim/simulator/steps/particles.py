@@ -17,10 +17,10 @@ import numpy as np
 from ...columns.table import CAUSES
 from ...media.materials import MaterialTable
 from ...media.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles, particle_range
-from ...numerics.arrays import Bools, Floats, Indices, Ints, owned
+from ...numerics.arrays import Bools, Floats, Indices, Ints, to_writable
 from ...numerics.elementary import exp, expm1, geomspace, interp, log1p
 from ...numerics.elementary_scalars import exp_of
-from ...numerics.random_numbers import Purpose, named_seed, starts
+from ...numerics.random_numbers import Purpose, initial_states, named_seed
 from ...sensor.noise import THRESHOLD_SIGMAS
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import SceneSurfaces
@@ -283,10 +283,12 @@ def random_keys(seed: int, purposes: tuple[Purpose, ...], keys: Keys, first: int
     """Return the random number keys of the beams from number `first`, for compiled loops."""
     from .random_loops import RandomKeys
 
-    return RandomKeys(starts(seed, *purposes), keys.scan, owned(keys.scan_starts, np.int64), first)
+    return RandomKeys(
+        initial_states(seed, *purposes), keys.scan, to_writable(keys.scan_starts, np.int64), first
+    )
 
 
-def room_for_hits(size: int) -> SampledHits:
+def empty_hits(size: int) -> SampledHits:
     """Allocate arrays to which compiled loops write up to `size` hits."""
     from .pulse_loops import SampledHits
 
@@ -308,7 +310,7 @@ def _particles(
     )
     beam = 0
     while beam < beams:
-        hits = room_for_hits(2 * beams + len(detectable.counts))
+        hits = empty_hits(2 * beams + len(detectable.counts))
         beam, count = particle_loops.sample_particles(
             beam, beams, subrays=subrays, tables=tables, keys=random, reach=reach, hits=hits
         )
@@ -322,7 +324,7 @@ def _fog_hits(fog: FogCells, random: RandomKeys, subrays: int, reach: Floats) ->
     """
     from . import particle_loops
 
-    hits = room_for_hits(len(reach) // subrays)
+    hits = empty_hits(len(reach) // subrays)
     tables = particle_loops.FogTables(fog.begin_m, FARTHEST_M, fog.cell_m, fog.energy, fog.peaks)
     count = particle_loops.sample_fog(subrays, tables, random, reach, hits)
     return hits.first(count)
@@ -376,8 +378,8 @@ def seen_by_range(
     rate = air.particle_rate(kind, min_energy, distance)
     integrals = (rate[1:] + rate[:-1]) / 2 * np.diff(distance)
     sums = np.concatenate([[0.0], np.cumsum(integrals)])
-    shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
-    distance = round_to_single(interp(shares, sums / sums[-1], distance))
+    fractions = (np.arange(QUANTILES) + 0.5) / QUANTILES
+    distance = round_to_single(interp(fractions, sums / sums[-1], distance))
     smallest = np.minimum(air.min_diameter_mm(kind, min_energy, distance), kind.largest)
     larger = -expm1(-kind.slope * (kind.largest - smallest))
     full_beam_energy = kind.reflectance * air.white_energy(distance)
@@ -440,8 +442,8 @@ def highest_probabilities(signals: Floats) -> Floats:
     product = np.ones(len(levels))
     for number in range(1, count + 1):
         product = product * below[number - 1]
-        share = (density[:number] * product).sum(axis=1)
-        probabilities[number, :number] = np.cumsum(share / share.sum())
+        fraction = (density[:number] * product).sum(axis=1)
+        probabilities[number, :number] = np.cumsum(fraction / fraction.sum())
         probabilities[number, number - 1 :] = 1.0
     return probabilities
 
@@ -457,5 +459,5 @@ def round_to_single(table: Floats) -> Floats:
 @cache
 def exponential_quantiles() -> Floats:
     """Return the exponential distribution's quantiles at the centers of equal intervals."""
-    shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
-    return round_to_single(-log1p(-shares))
+    fractions = (np.arange(QUANTILES) + 0.5) / QUANTILES
+    return round_to_single(-log1p(-fractions))

@@ -11,7 +11,7 @@ from ...numerics.arrays import Floats, Integers, Ints
 from ...numerics.elementary import exp, log
 from ...numerics.random_numbers import Purpose, normal
 from ...sensor.noise import Noise
-from ..returns import PulseReturns, required
+from ..returns import PulseReturns, require_column
 from .step import PulseBatch, PulseStep, Role, Setup
 
 RANGE = Purpose(1, "range noise of a return")
@@ -42,7 +42,7 @@ class RangeNoiseStep(PulseStep):
         if noise.channel_bias_m or noise.warm_up_m:
             channel = returns.ray % self.setup.sensor.channels
             distance = distance + lasting_errors(noise, channel, batch.firings.times(returns.ray))
-        reported = noisy_ranges(noise, distance, height, scan, ray, required(returns.number))
+        reported = noisy_ranges(noise, distance, height, scan, ray, require_column(returns.number))
         return returns._replace(reported=reported)
 
 

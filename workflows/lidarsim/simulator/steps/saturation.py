@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...numerics.arrays import owned
+from ...numerics.arrays import to_writable
 from ...numerics.elementary import log
 from ...numerics.elementary_scalars import log_of
 from ...sensor.optics import FWHM, LIGHT_M_NS
-from ..returns import PulseReturns, required
+from ..returns import PulseReturns, require_column
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 _HALF_WIDTH_M_NS = LIGHT_M_NS / 4  # half of a pulse's width in meters of range, per ns of width
@@ -54,18 +54,18 @@ def apply_saturation(returns: PulseReturns, full: float, pulse_ns: float) -> Pul
 
     height = returns.height
     in_waveforms = returns.width is not None
-    width = required(returns.width) if in_waveforms else np.full(len(height), pulse_ns)
+    width = require_column(returns.width) if in_waveforms else np.full(len(height), pulse_ns)
     unclipped = np.where(width > 0, width, pulse_ns)  # without a waveform, the width is 0
     widened = unclipped * np.sqrt(1 + log(np.maximum(height / full, 1)) / log_of(2.0))
     early_m = _HALF_WIDTH_M_NS * (widened - unclipped) if in_waveforms else 0.0
     pulses = saturation_loops.PulseExtents(
-        ray=owned(returns.ray, np.int64),
+        ray=to_writable(returns.ray, np.int64),
         clipped=height > full,
-        height=owned(height),
+        height=to_writable(height),
         front=returns.distance - _HALF_WIDTH_M_NS * widened,
         back=returns.distance + _HALF_WIDTH_M_NS * widened,
         distance=np.maximum(returns.distance - early_m, 0),
-        energy=required(returns.energy).copy(),
+        energy=require_column(returns.energy).copy(),
     )
     remains = np.empty(len(height), np.bool_)
     saturation_loops.join_clipped(pulses, remains)

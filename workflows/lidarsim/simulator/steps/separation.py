@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ...numerics.arrays import Bools, owned
-from ...numerics.random_numbers import quantiles, starts
+from ...numerics.arrays import Bools, to_writable
+from ...numerics.random_numbers import initial_states, quantiles
 from ...scene.colors import GRAY, pack_colors
 from ...sensor.disc import neighboring_subrays
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise
@@ -19,7 +19,7 @@ from ..returns import (
     Keys,
     Planes,
     PulseReturns,
-    required,
+    require_column,
     returns_without_surface,
     select_rows,
 )
@@ -136,11 +136,13 @@ def _detection_keys(reporting: Reporting) -> RandomKeys:
     keys = reporting.keys
     detects = noise is not None and noise.loses_returns
     return RandomKeys(
-        starts=starts(noise.seed, LOSS, DETECTION)
+        starts=initial_states(noise.seed, LOSS, DETECTION)
         if noise is not None and detects
         else np.zeros(0, np.uint64),
         scan=0 if keys is None else keys.scan,
-        scan_starts=np.zeros(1, np.int64) if keys is None else owned(keys.scan_starts, np.int64),
+        scan_starts=np.zeros(1, np.int64)
+        if keys is None
+        else to_writable(keys.scan_starts, np.int64),
         first=reporting.first,
     )
 
@@ -160,7 +162,7 @@ def _columns(hits: PulseReturns, air_hits: PulseReturns, output: ReturnArrays) -
         return returns
     from_air = np.flatnonzero(row < 0)
     cause = np.full(len(row), SURFACE, np.uint8) if returns.cause is None else returns.cause
-    cause[from_air] = required(air_hits.cause)[-1 - row[from_air]]
+    cause[from_air] = require_column(air_hits.cause)[-1 - row[from_air]]
     returns.triangle[from_air] = NO_SURFACE
     if returns.color is not None:
         returns.color[from_air] = pack_colors(GRAY[0])[0]
@@ -176,10 +178,10 @@ def _subray_hits(hits: PulseReturns, solid: Bools, *, with_velocity: bool) -> Su
 
     velocity = hits.velocity if with_velocity else None
     return SubrayHits(
-        ray=owned(hits.ray, np.int64),
-        distance=owned(hits.distance),
-        energy=owned(required(hits.energy)),
-        velocity=_NO_VALUES if velocity is None else owned(velocity),
+        ray=to_writable(hits.ray, np.int64),
+        distance=to_writable(hits.distance),
+        energy=to_writable(require_column(hits.energy)),
+        velocity=_NO_VALUES if velocity is None else to_writable(velocity),
         solid=solid,
     )
 
@@ -195,8 +197,8 @@ def neighbors_of(subrays: int, planes: Planes | None) -> SubrayNeighbors:
         no_planes = np.zeros((3, 0))
         return SubrayNeighbors(subrays, np.zeros((0, 2), np.int64), no_planes, no_planes)
     normals, directions = planes
-    pairs = owned(neighboring_subrays(subrays), np.int64)
-    return SubrayNeighbors(subrays, pairs, owned(normals.T), owned(directions.T))
+    pairs = to_writable(neighboring_subrays(subrays), np.int64)
+    return SubrayNeighbors(subrays, pairs, to_writable(normals.T), to_writable(directions.T))
 
 
 class SeparationStep(PulseStep):
@@ -249,6 +251,6 @@ def reported_mask(returns: PulseReturns, mode: Mode) -> Bools:
     from . import separation_loops
 
     shown = np.empty(len(returns.ray), np.bool_)
-    ray = owned(returns.ray, np.int64)
-    separation_loops.mark_reported(ray, owned(returns.height), MODES.index(mode), shown)
+    ray = to_writable(returns.ray, np.int64)
+    separation_loops.mark_reported(ray, to_writable(returns.height), MODES.index(mode), shown)
     return shown

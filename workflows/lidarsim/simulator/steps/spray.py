@@ -16,7 +16,7 @@ from raybeam.moving import pair_cells_with_boxes
 
 from ...columns.table import CAUSES
 from ...media.weather import FAINTEST, LARGE, particle_range, spray_clumps
-from ...numerics.arrays import Floats, Ints, owned
+from ...numerics.arrays import Floats, Ints, to_writable
 from ...numerics.random_numbers import Purpose
 from ...numerics.vectors import norm, rotate_into_frames
 from ...scene.actors import check_spray
@@ -28,15 +28,15 @@ from ..returns import (
     RETURN_COLUMNS,
     PulseReturns,
     concatenate_returns,
-    required,
+    require_column,
     returns_without_surface,
 )
 from .particles import (
     add_air_hits,
+    empty_hits,
     exponential_quantiles,
     light_reach,
     random_keys,
-    room_for_hits,
     seen_by_range,
 )
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
@@ -129,9 +129,9 @@ class SprayStep(PulseStep):
         crossings = self._crossings(batch, reach_m.reshape(-1, subrays).max(axis=1))
         if not len(crossings.beam):
             return returns
-        energy = required(returns.energy).copy()
+        energy = require_column(returns.energy).copy()
         ray = returns.ray.astype(np.int64)
-        surface_hits = pulse_loops.SampledHits(ray, owned(returns.distance), energy)
+        surface_hits = pulse_loops.SampledHits(ray, to_writable(returns.distance), energy)
         spray_loops.attenuate(crossings, subrays, self._extinction, reach_m, surface_hits)
         batch.hits = returns = returns._replace(energy=energy)
         clumps = self._sample_clumps(returns, batch, crossings, reach_m)
@@ -150,7 +150,7 @@ class SprayStep(PulseStep):
         clump_hits: list[PulseReturns] = []
         row = 0
         while row < len(crossings.beam):
-            hits = room_for_hits(1024 + len(crossings.beam))
+            hits = empty_hits(1024 + len(crossings.beam))
             row, count = spray_loops.sample_clumps(
                 row,
                 crossings,
@@ -195,7 +195,7 @@ class SprayStep(PulseStep):
             crossings = spray_loops.BoxCrossings(np.empty(room, np.int64), np.empty((3, room)))
             count = spray_loops.find_crossings(rays, times, reach_m, pairs, spray_boxes, crossings)
         return spray_loops.BoxCrossings(
-            ring_order[crossings.beam[:count]], owned(crossings.spans[:, :count])
+            ring_order[crossings.beam[:count]], to_writable(crossings.spans[:, :count])
         )
 
     def _boxes(self, trajectories: ActorTrajectories, begin_ns: float, end_ns: float) -> SprayBoxes:

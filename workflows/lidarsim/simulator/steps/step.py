@@ -61,7 +61,7 @@ class Setup:
     @property
     def sensor(self) -> Sensor:
         """The simulated sensor."""
-        return self.survey.carried[self.number].sensor
+        return self.survey.mounted_sensors[self.number].sensor
 
     @property
     def noise(self) -> Noise:
@@ -171,7 +171,7 @@ class Emitter:
 
     def __init__(self, setup: Setup) -> None:
         self.beam = setup.reporting.beam(setup.sensor.optics)
-        carried = setup.survey.carried[setup.number]
+        carried = setup.survey.mounted_sensors[setup.number]
         # Rotation axis of the head in the platform frame. The sub-rays of an oval beam are spread
         # perpendicular to the axis and along it.
         axis = rotate(np.array([[0.0, 0, 1]]), setup.sensor.axes)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...columns.table import CAUSES
 from ...media.materials import MaterialTable
-from ...numerics.arrays import Bools, Floats, Integers, Ints, Ints32, owned
+from ...numerics.arrays import Bools, Floats, Integers, Ints, Ints32, to_writable
 from ...numerics.random_numbers import Purpose
 from ...numerics.vectors import dot, norm, rotate, rotate_into_frames
 from ...scene.scene import Scene
@@ -160,7 +160,7 @@ def _ray_cells(origins: Floats, directions: Floats) -> RayCells:
     from . import stray_loops
 
     cones = np.empty((-(-len(origins) // stray_loops.CELL_RAYS), 5))
-    cells = stray_loops.RayCells(owned(origins.T), owned(directions.T), cones)
+    cells = stray_loops.RayCells(to_writable(origins.T), to_writable(directions.T), cones)
     stray_loops.bound_cells(*cells)
     return cells
 
@@ -168,7 +168,7 @@ def _ray_cells(origins: Floats, directions: Floats) -> RayCells:
 class _Bounds(NamedTuple):
     """Centers and bounding sphere of triangles."""
 
-    middles: Floats  # (k, 3): centers of the triangles
+    centers: Floats  # (k, 3): centers of the triangles
     center: Floats  # (3,): center of the bounding sphere
     radius: float  # radius of the bounding sphere, meters
 

@@ -37,7 +37,7 @@ class RetroTriangles(NamedTuple):
     """Cluster of retroreflecting triangles."""
 
     corners: Floats  # (t, 3, 3)
-    middles: Floats  # (t, 3): centers of the triangles
+    centers: Floats  # (t, 3): centers of the triangles
     center: Floats  # (3,): center of the bounding sphere
     radius: float  # radius of the bounding sphere, meters
     # (t,): energy that a beam at normal incidence returns from 10 m, relative to a white surface.
@@ -195,8 +195,12 @@ def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
         tangent = math.sqrt((x + step * u) * (x + step * u) + (y + step * v) * (y + step * v))
         if tangent < min_tangent:
             # A step on the plane corresponds to a different fraction of the edge in space.
-            share = step * p_depth / (step * p_depth + (1 - step) * q_depth)
-            nearest = px + share * (qx - px), py + share * (qy - py), pz + share * (qz - pz)
+            fraction = step * p_depth / (step * p_depth + (1 - step) * q_depth)
+            nearest = (
+                px + fraction * (qx - px),
+                py + fraction * (qy - py),
+                pz + fraction * (qz - pz),
+            )
             min_tangent = tangent
     return (0.0 if all_left or all_right else min_tangent), nearest
 
@@ -233,25 +237,25 @@ def _reach_of_cell(rays, c, triangles, limits):
 
 
 @inlined
-def _choose_triangles(middles, ray, chosen):
+def _choose_triangles(centers, ray, chosen):
     """Write the triangles whose centers are at the smallest angles to a ray. Return their number.
 
-    `middles` has shape (t, 3). The length of `chosen` is the number of triangles to choose.
+    `centers` has shape (t, 3). The length of `chosen` is the number of triangles to choose.
     """
     ox, oy, oz, dx, dy, dz = ray
-    count = min(len(middles), len(chosen))
+    count = min(len(centers), len(chosen))
     for number in range(count):
         chosen[number] = number
-    if len(middles) > count:
+    if len(centers) > count:
         for number in range(count):
             max_cosine = -2.0
-            for t in range(len(middles)):
+            for t in range(len(centers)):
                 is_chosen = False
                 for earlier in range(number):
                     is_chosen |= chosen[earlier] == t
-                x = middles[t, 0] - ox
-                y = middles[t, 1] - oy
-                z = middles[t, 2] - oz
+                x = centers[t, 0] - ox
+                y = centers[t, 1] - oy
+                z = centers[t, 2] - oz
                 cosine = (x * dx + y * dy) + z * dz
                 cosine = cosine / math.sqrt((x * x + y * y) + z * z)
                 if not is_chosen and cosine > max_cosine:
@@ -263,13 +267,13 @@ def _choose_triangles(middles, ray, chosen):
 @inlined
 def _add_light(k, t, ray, triangles, limits, strongest):
     """Replace row `k` of `strongest` with the light of triangle `t` if that is stronger."""
-    middles = triangles.middles
+    centers = triangles.centers
     tangent, nearest = _nearest_point(triangles.corners, t, ray)
     angle = math.degrees(arctan2(tangent, 1.0))
     if 0 < angle < math.degrees(MAX_STRAY):
-        x = nearest[0] + INWARDS * ((middles[t, 0] - ray[0]) - nearest[0])
-        y = nearest[1] + INWARDS * ((middles[t, 1] - ray[1]) - nearest[1])
-        z = nearest[2] + INWARDS * ((middles[t, 2] - ray[2]) - nearest[2])
+        x = nearest[0] + INWARDS * ((centers[t, 0] - ray[0]) - nearest[0])
+        y = nearest[1] + INWARDS * ((centers[t, 1] - ray[1]) - nearest[1])
+        z = nearest[2] + INWARDS * ((centers[t, 2] - ray[2]) - nearest[2])
         distance = math.sqrt((x * x + y * y) + z * z)
         in_beam_energy = triangles.back[t] * normal_incidence_energy(distance, limits.extinction)
         energy = min(limits.share_at_degree / (angle * angle), 1.0) * in_beam_energy
@@ -311,7 +315,7 @@ def find_stray_light(rays, triangles, limits, chosen, strongest):  # noqa: PLR09
             if (x * dx + y * dy) + z * dz < cosine * math.sqrt((x * x + y * y) + z * z):
                 continue
             ray = (ox, oy, oz, dx, dy, dz)
-            for number in range(_choose_triangles(triangles.middles, ray, chosen)):
+            for number in range(_choose_triangles(triangles.centers, ray, chosen)):
                 _add_light(k, chosen[number], ray, triangles, limits, strongest)
 
 

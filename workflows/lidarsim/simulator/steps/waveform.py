@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...numerics.arrays import Floats, Ints, owned
+from ...numerics.arrays import Floats, Ints, to_writable
 from ...sensor.optics import CUT, FWHM, LIGHT_M_NS
-from ..returns import NO_SURFACE, RETURN_COLUMNS, Planes, PulseReturns, required
+from ..returns import NO_SURFACE, RETURN_COLUMNS, Planes, PulseReturns, require_column
 from .separation import neighbors_of
 from .step import PulseBatch, PulseStep, Role, Setup
 
@@ -157,9 +157,9 @@ def _wave_hits(hits: PulseReturns, subrays: int) -> WaveHits:
     """
     from . import pulse_loops, wave_loops
 
-    ray = owned(hits.ray, np.int64)
-    distance = owned(hits.distance)
-    energy = owned(required(hits.energy))
+    ray = to_writable(hits.ray, np.int64)
+    distance = to_writable(hits.distance)
+    energy = to_writable(require_column(hits.energy))
     row = np.empty((len(ray), 2), np.int64)
     count, max_hits = wave_loops.order_hits(subrays, ray, distance, energy, row)
     row = row[:count]
@@ -183,7 +183,7 @@ def _wave_hits(hits: PulseReturns, subrays: int) -> WaveHits:
         beam=pulse_hits.subray // subrays,
         pulses=pulse_hits,
         energy=energy[order],
-        velocity=np.zeros(0) if hits.velocity is None else owned(hits.velocity[order]),
+        velocity=np.zeros(0) if hits.velocity is None else to_writable(hits.velocity[order]),
         marks=marks,
     )
 

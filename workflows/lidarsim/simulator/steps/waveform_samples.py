@@ -13,7 +13,7 @@ from ...numerics.elementary import exp
 from ...numerics.random_numbers import Purpose, normal, raw
 from ...sensor.noise import THRESHOLD_SIGMAS
 from ...sensor.optics import CUT
-from ..returns import Keys, PulseReturns, number_within_ray, required
+from ..returns import Keys, PulseReturns, number_within_ray, require_column
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 from .waveform import Digitizer
 
@@ -125,7 +125,7 @@ def _windows(
     begin = _window_starts(returns.distance, return_number, digitizer, count)
     starts_window = (return_number == 0) | (np.diff(begin, prepend=-1) != 0)
     beam = returns.ray[starts_window] - batch.start
-    ray = required(batch.hits).ray
+    ray = require_column(batch.hits).ray
     first_hit = np.searchsorted(ray, beam * batch.subrays_per_beam)
     stop_hit = np.searchsorted(ray, (beam + 1) * batch.subrays_per_beam)
     windows = Windows(beam, begin[starts_window], first_hit, stop_hit)
@@ -136,7 +136,7 @@ def _signal_samples(
     batch: PulseBatch, digitizer: Digitizer, windows: Windows, count: int
 ) -> Floats:
     """Return the summed signals of the hits in each window, without noise."""
-    hits = required(batch.hits)
+    hits = require_column(batch.hits)
     hit_counts = windows.stop_hit - windows.first_hit
     window = np.repeat(np.arange(len(hit_counts)), hit_counts)
     first_rows = windows.first_hit - np.cumsum(hit_counts) + hit_counts
@@ -145,7 +145,7 @@ def _signal_samples(
     first = np.ceil(time - CUT * digitizer.sigma).astype(np.int64)  # first nonzero sample
     sample_times = first[:, None] + np.arange(int(2 * CUT * digitizer.sigma) + 1)
     height = exp(-0.5 * ((sample_times - time[:, None]) / digitizer.sigma) ** 2)
-    height *= required(hits.energy)[row_indices, None] / batch.subrays_per_beam
+    height *= require_column(hits.energy)[row_indices, None] / batch.subrays_per_beam
     sample = sample_times - windows.begin[window, None]
     inside = (sample >= 0) & (sample < count)
     sample += count * window[:, None]
