@@ -46,7 +46,7 @@ CAPTIONS = ("recorded: OS1-64", "in the twin: Pandar128")
 
 
 def drive(sweeps: int) -> Cloud:
-    """Record a drive through the city among moving cars as a cloud in memory."""
+    """Simulate a drive through the city among moving cars, and return the recorded cloud."""
     end_s = (sweeps + 1) * SWEEP_S
     actors = [
         Actor(box(f"car {number}", (4.4, 1.8, 1.5)), Track([0, end_s], [(*start, 0), (*stop, 0)]))

@@ -300,7 +300,7 @@ def box_corners(box):  # type: ignore[no-untyped-def]
 
 @inlined
 def _clip_axis(slab, o, d, interval):  # type: ignore[no-untyped-def]
-    """Clip a range of distances along a ray to the part between two planes across an axis."""
+    """Clip an interval of a ray to the part between two planes perpendicular to an axis."""
     enters, leaves = interval
     inverse = 1 / (d if abs(d) >= _TINY else _TINY)
     lower = (slab[0] - o) * inverse
@@ -378,7 +378,7 @@ def _find_rays_near_sphere(rays, n, x, y, z, radius, near):  # type: ignore[no-u
 
 @inlined
 def _ray_intersects_box(rays, n, k, reach, pose, corners, pad):  # type: ignore[no-untyped-def]
-    """Return whether ray `k` in the table at an address intersects a box at a pose."""
+    """Return whether ray `k` intersects a posed box. `rays` is the address of a table."""
     ray = float64s(rays)
     (px, py, pz), rotation = pose
     origin = to_body_axes(rotation, ray[k] - px, ray[n + k] - py, ray[2 * n + k] - pz)
@@ -422,7 +422,7 @@ def _pair_rays(rays, reaches, pairs, poses, boxes, near, ray_pairs):  # type: ig
 def rays_through_boxes(
     rays: Floats, reaches: Floats, pairs: CellBodyPairs, poses: Floats, boxes: Floats
 ) -> tuple[Indices, Indices]:
-    """Find the rays that intersect the bounding box of a body, and the cell-body pair of each.
+    """Find the rays in given cells that intersect the bounding boxes of given bodies.
 
     Parameters
     ----------

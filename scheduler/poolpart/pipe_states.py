@@ -476,7 +476,7 @@ class PipeRegistry(SchedulerPlugin):
         return self._replies(states, take_from)
 
     def _states_for_taker(self, task: str, names: Sequence[str]) -> dict[str, PipeState]:
-        """Return the states of all named pipes that exist, and record the task as their taker."""
+        """Return the states of the named pipes that exist, and record which task takes items."""
         states = self._existing(names)
         for state in states.values():
             state.takers |= {task} - {""}

@@ -30,7 +30,7 @@ Real = NDArray[np.float64]
 
 
 def in_weather(survey: Survey, **weather: Any) -> Survey:
-    """Return the survey in this weather, with a sensor that detects 10 % at 90 m."""
+    """Return the survey in this weather. The detection range of its sensor is 90 m."""
     return replace(survey, noise=NOISE, **weather)
 
 

@@ -50,7 +50,7 @@ def _waveform(wall_m: float, noise: Noise) -> tuple[NDArray, NDArray]:
 
 
 def _separable_distance(name: str, plate_m: float) -> tuple[float, float]:
-    """Return a plate's signal over saturation, and its least separable distance to a wall."""
+    """Return a plate's relative signal, and the smallest resolved distance to a wall."""
     beam = Returns("all", subrays=61, divergence_mrad=1)
     options = {"materials": MATERIALS[name], "returns": beam, "columns": COLUMNS}
     lower_m = 0.1
@@ -64,7 +64,7 @@ def _separable_distance(name: str, plate_m: float) -> tuple[float, float]:
 
 
 def picture(path: Path) -> None:
-    """Plot clipped pulses, pulse widths, range errors, and the least separable wall distance."""
+    """Plot clipped pulses, pulse widths, range errors, and the smallest resolved distance."""
     figure = Figure((11, 3.7), layout="constrained", dpi=110)
     pulse, widths, apart = figure.subplots(1, 3)
     pulse.axhline(1, color="k", lw=0.8, ls=":")

@@ -1,4 +1,4 @@
-"""Client waits that lend slots, callbacks, and requests, based on private API."""
+"""Extend the waits of Dask's clients, and send requests, through private API."""
 
 from __future__ import annotations
 

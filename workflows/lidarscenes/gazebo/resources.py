@@ -210,7 +210,7 @@ class Resources:
             yield Candidate(model / file, root, is_allowed)
 
     def _downloads(self, uri: str) -> Iterator[Candidate]:
-        """Yield the paths of a Fuel model or of a file in it, first in the caches, then by name."""
+        """Yield possible paths of a Fuel model or its file, first in caches, then elsewhere."""
         parts = [unquote(part) for part in urlsplit(uri.strip()).path.split("/") if part]
         if len(parts) < 4 or parts[2].lower() != "models" or ".." in parts:
             return

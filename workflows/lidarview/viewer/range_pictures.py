@@ -100,10 +100,10 @@ def _range_colors(ranges: Floats, limits: tuple[float, float]) -> Bytes:
 
 
 def surround_object(sensors: Floats, bounds: Floats) -> bool:
-    """Return whether there are several sensors, all of which are outside an object.
+    """Return whether several sensors surround an object.
 
-    They can be beside or above the object. `sensors` has shape (n, 3), and `bounds` has shape (2,
-    3).
+    All of them must be outside the bounds of the object, either beside or above the object.
+    `sensors` has shape (n, 3), and `bounds` has shape (2, 3).
     """
     outside = ((sensors < bounds[0]) | (sensors > bounds[1])).any(axis=1)
     return len(sensors) > 1 and bool(outside.all())
