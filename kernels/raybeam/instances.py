@@ -372,12 +372,12 @@ def _scene_frame(center: Floats, shift: Floats, half: Floats) -> tuple[LocalFram
 
 
 def _multiply(matrices: Floats, vectors: Floats) -> Floats:
-    """Multiply matrices by vectors, with the same bits on every machine."""
+    """Multiply matrices by vectors. The results are bit-identical on every machine."""
     return (matrices * vectors[:, None, :]).sum(axis=2)
 
 
 def _invert(matrices: Floats) -> Floats:
-    """Invert 3 x 3 matrices, with the same bits on every machine."""
+    """Invert 3 x 3 matrices. The results are bit-identical on every machine."""
     (a, d, g), (b, e, h), (c, f, i) = matrices.transpose(1, 2, 0)  # columns (a, b, c), …
     # The rows are cross products of columns. `numpy.cross` takes four times as long for few
     # matrices.

@@ -220,7 +220,7 @@ def _may_hit(cell, box, sphere, reach):  # type: ignore[no-untyped-def]  # noqa:
 # The loops write to preallocated arrays, because numba takes 8 s to compile slices and copies.
 @compiled(types.int64(_f64_2, _f64_2, _SAMPLES, types.float64, _i64_2))
 def _pair_cells(wide_cells, cells, samples, reach, pairs):  # type: ignore[no-untyped-def]
-    """Write the pairs of a cell and a body that its rays may hit, and return their number."""
+    """Write the (cell, body) pairs in which a ray may hit the body, and return their number."""
     sample_of_cell, boxes, spheres = samples
     count = 0
     # Pointers are used because reference counting of array views takes longer than the comparisons.
@@ -253,7 +253,7 @@ def _pair_cells(wide_cells, cells, samples, reach, pairs):  # type: ignore[no-un
 def pair_cells_with_bodies(
     wide_cells: Floats, cells: Floats, samples: BodySamples, reach: float
 ) -> tuple[Indices, Indices]:
-    """Find pairs of a cell and a body that the cell's rays may hit, sorted by body, then by cell.
+    """Find the (cell, body) pairs in which a ray may hit the body, sorted by body, then by cell.
 
     Parameters
     ----------

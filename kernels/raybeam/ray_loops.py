@@ -510,7 +510,10 @@ def write_shared_origin(cast, tile, rays):  # type: ignore[no-untyped-def]
 
 @inlined
 def _clip_axis(lower, upper, o, d, entry):  # type: ignore[no-untyped-def]
-    """Return the larger of `entry` and the distance at which a ray enters a slab."""
+    """Return the larger of `entry` and the distance at which a ray enters a slab.
+
+    The slab lies between `lower` and `upper` along an axis.
+    """
     component = d
     if abs(d) < _TINY:
         component = -_TINY if d < 0 else _TINY

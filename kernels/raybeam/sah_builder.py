@@ -98,7 +98,7 @@ def _cheapest_splits(
 def _split_costs(
     lower: Floats32, upper: Floats32, weight: Floats, level: _Level, node: Indices
 ) -> Floats:
-    """Compute the cost of splitting a node after each position.
+    """For each position, compute the cost of splitting its node after this position.
 
     The boxes and weights are sorted along an axis.
     """

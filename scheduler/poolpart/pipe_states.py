@@ -286,7 +286,7 @@ class PipeRegistry(SchedulerPlugin):
             self._released.discard(task.key)
 
     def _fail_soon(self, names: Sequence[str], reason: str, cancelled: str = "") -> None:
-        """Make pipes fail that are still open after the current step of the event loop.
+        """Fail those pipes that are still open after the current step of the event loop.
 
         `cancelled` is the key of a canceled task. If this task has already used a pipe, the pipe
         does not fail, because the task is running and can continue to use the pipe. Dask does not

@@ -295,7 +295,7 @@ class _WaitHooks:
 
     @contextmanager
     def lend(self, waits: bool = True) -> Iterator[None]:
-        """Within the block, lend the slots and thread of this thread's task if `waits` is true.
+        """If `waits` is true, lend the slots and thread of the current task within the block.
 
         At the end of the block, the thread waits until the task has its slots and thread back.
         """

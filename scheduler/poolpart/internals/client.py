@@ -27,7 +27,7 @@ class WaitHooks(Protocol):
         """Wait until a call has been answered or another task needs the slots."""
 
     def lend(self, waits: bool = True) -> AbstractContextManager[None]:
-        """Within the block, lend the slots if `waits` is true."""
+        """If `waits` is true, lend the slots within the block."""
 
 
 _hooks: list[WaitHooks] = []  # set by `install_wait_hooks`
@@ -98,7 +98,7 @@ def install_wait_hooks(hooks: WaitHooks) -> None:
 
 
 def lend_slots(waits: bool) -> AbstractContextManager[None]:
-    """Within the block, lend the slots of this thread's task if `waits` is true.
+    """If `waits` is true, lend the slots of the current task within the block.
 
     Nothing happens if the hooks are not installed in this process.
     """

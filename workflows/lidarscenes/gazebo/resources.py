@@ -142,7 +142,7 @@ class Resources:
         raise ResourceNotFoundError(printable(uri))
 
     def _targets(self, uri: str, source: Source) -> Iterator[Source]:
-        """Yield those paths to which a URI may refer that exist.
+        """Yield the existing paths to which a URI may refer.
 
         Raises LidarError if a path must not be read.
         """

@@ -181,7 +181,7 @@ class LaneSection:
     def _borders_and_widths(
         self, road: Road, stations: RoadStations
     ) -> tuple[dict[int, Floats], dict[int, Floats]]:
-        """Return t coordinates of lane borders, and widths as in the file, by lane number.
+        """Return the border t coordinates, and the widths that the file states, by lane number.
 
         All arrays have shape (k,).
         """

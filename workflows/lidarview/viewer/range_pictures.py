@@ -79,7 +79,7 @@ def range_image(
 
 
 def _image_rows(points: Floats, ranges: Floats, channels: Ints | None) -> tuple[Ints, int]:
-    """Return the row of each point in a range image, from the top, and the number of rows."""
+    """Return each point's row in a range image, counted from the top, and the row count."""
     if channels is not None:
         count = int(channels.max()) + 1
         if _MIN_CHANNELS <= count <= _MAX_CHANNELS:
