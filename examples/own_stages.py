@@ -59,7 +59,7 @@ def sort_frames(frames, shown):
 
 
 def collect(hits):
-    """Return the points of the scans that this collector, one of two, receives (stage 4)."""
+    """Return the points of all scans that arrive in this task, one of two collectors (stage 4)."""
     return dict(hits)
 
 

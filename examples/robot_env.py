@@ -21,7 +21,7 @@ GOAL = (-30.0, -20.0)
 
 
 class RobotEnv(gymnasium.Env):
-    """Environment of a robot that avoids columns on its way to a goal.
+    """Environment in which a robot drives to a goal and avoids columns.
 
     An observation contains 64 ranges, and the distance and direction of the goal. An action
     consists of the speed (0 to 2 m/s) and the yaw rate. The reward is the distance covered toward

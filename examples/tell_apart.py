@@ -67,7 +67,7 @@ def features(sweep):
 
 
 def column_features(points, side):
-    """Return the height of each point above the lowest and below the highest point nearby."""
+    """Return features that compare each point's height with the lowest and highest nearby."""
     z = points[:, 2]
     cell = np.floor(points[:, :2] / side).astype(int)
     cell -= cell.min(axis=0) - 1  # leaves a border of empty cells

@@ -1,4 +1,4 @@
-"""Define a Gymnasium vector environment of MuJoCo robots that drive between columns by lidar."""
+"""Define a Gymnasium vector environment: MuJoCo robots use lidars to avoid columns."""
 
 import numpy as np
 

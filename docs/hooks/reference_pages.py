@@ -96,7 +96,7 @@ def members_page(package: str) -> str:
 
 
 def _declared(member: Any) -> Iterator[str]:
-    """Yield a table of the fields that a dataclass declares with a description, if any."""
+    """Yield a table of a dataclass's fields that have a description, unless none have one."""
     hints = get_type_hints(member, include_extras=True) if is_dataclass(member) else {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnsupportedFieldAttributeWarning)  # an alias in scenarios

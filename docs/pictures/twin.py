@@ -36,7 +36,7 @@ CAPTIONS = ("recorded: OS1-64", "in the twin: Pandar128")
 
 
 def drive(sweeps: int) -> Cloud:
-    """Record a drive through the city, amid cars that move: a cloud in memory."""
+    """Simulate a drive through the city, amid cars, and return the recorded cloud."""
     end_s = (sweeps + 1) * SWEEP_S
     actors = [
         Actor(box(f"car {number}", (4.4, 1.8, 1.5)), Track([0, end_s], [(*start, 0), (*stop, 0)]))

@@ -76,7 +76,7 @@ class Backend(ABC):
 
     @classmethod
     def versions(cls) -> str:
-        """Return the versions that affect the bits of the results, or "" if only NumPy's does."""
+        """Return the versions of software, except NumPy, that affect the results, or ""."""
         return ""
 
     @classmethod  # noqa: B027 - most backends have nothing to limit
@@ -165,7 +165,7 @@ class Backend(ABC):
         return collector.result()
 
     def scan_parts(self, scan: Scan) -> Iterator[tuple[int, int, HitColumns]]:
-        """Yield consecutive parts of a scan as tuples of the first ray, the end, and the hits.
+        """Yield (start, stop, hits) for consecutive ranges of rays in a scan.
 
         The ray indices of the hits start at 0 in each part.
         """

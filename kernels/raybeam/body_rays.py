@@ -64,7 +64,7 @@ class RayBodyPairs(NamedTuple):
 
 
 class TimedBodies(NamedTuple):
-    """Bodies that share a shape, with their poses at consecutive ray times.
+    """Bodies with the same shape, and their poses at a series of ray times.
 
     Attributes
     ----------

@@ -165,7 +165,7 @@ class RayCaster:
     def upload_rays(
         self, scan: Scan, start: int, stop: int, time_index: Ints32, end: float
     ) -> DeviceNearestHits:
-        """Copy rays `start` to `stop` of a scan to the device, initially without hits on bodies.
+        """Copy rays `start` to `stop` of a scan to the device. No hits are recorded yet.
 
         `time_index` (n,) contains the index of each ray's time. Only hits at a distance of less
         than `end` meters are recorded. Raises BackendUnavailable if this backend does not use a
@@ -229,7 +229,7 @@ class RayCaster:
 
     @property
     def engine(self) -> Backend:
-        """Backend for the scene, which is updated first if instances have moved."""
+        """Backend for the scene. If instances have moved, the scene is updated first."""
         with self._lock:
             if self._moved:
                 self._scene = self._scene.with_transforms(self._transforms)

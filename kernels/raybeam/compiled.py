@@ -147,7 +147,7 @@ def _compile_lock(folder: str) -> Iterator[None]:
 
 
 def _log_if_slow(seconds: float) -> None:
-    """Add the time spent on compiling a loop, and log once that loops are being compiled.
+    """Add to the total compilation time. Once the total is long, log a single message.
 
     Loops are compiled one after the other when modules are imported. If they take more than a
     second in total, many of them are being compiled, so a message is helpful.

@@ -91,7 +91,7 @@ def build_mesh_tables(meshes: tuple[LocalMesh, ...]) -> MeshTables:
 
 
 def build_instance_tables(scene: LocalScene, roots: Ints) -> InstanceTables:
-    """Build the tree over the instances. For a plain scene, return placeholders.
+    """Build the tree over the instances, or return placeholders for a single mesh.
 
     `roots` contains the root of each mesh's tree.
     """

@@ -120,9 +120,10 @@ def _inverse(d):  # type: ignore[no-untyped-def]
 
 @inlined
 def _corner(vertices, frame, share, vertex, axis):  # type: ignore[no-untyped-def]
-    """Interpolate a vertex between two frames, with the coordinate of `axis` last, in meters.
+    """Interpolate a vertex between two frames. Its coordinate along `axis` is returned last.
 
-    `share` is the fraction of the time from `frame` to the next frame, between 0 and 1.
+    Coordinates are in meters. `share` is the fraction of the time from `frame` to the next frame,
+    between 0 and 1.
     """
     x = axis + 1 if axis < 2 else 0
     y = x + 1 if x < 2 else 0

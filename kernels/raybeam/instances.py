@@ -98,7 +98,7 @@ class MeshFrames:
     box_center
         float64 (n, 3): center of the bounding box relative to `center`, in meters.
     box_half_size
-        float64 (n, 3): half side lengths of the bounding box, in meters.
+        float64 (n, 3): half the dimensions of the bounding box, in meters.
     """
 
     scale: Floats
@@ -154,17 +154,17 @@ class LocalScene:
 
     @cached_property
     def first_face(self) -> Ints:
-        """First tally row of each mesh, followed by the number of rows. Shape (meshes + 1,)."""
+        """First row of each mesh in a table of hit counts, then its length. Shape (meshes + 1,)."""
         return np.cumsum([0, *(mesh.face_count for mesh in self.meshes)])
 
     @property
     def face_count(self) -> int:
-        """Number of tally rows."""
+        """Number of rows in a table of hit counts."""
         return int(self.first_face[-1])
 
     @property
     def counters(self) -> Ints:
-        """First tally row of each instance, and the step from one row to the next. Shape (n, 2)."""
+        """First row of each instance in a table of hit counts, and the row step. Shape (n, 2)."""
         first = self.first_face[:-1][self.mesh]
         return np.stack([first, np.ones_like(first)], axis=1)
 
@@ -178,7 +178,7 @@ class LocalScene:
         return _nested_scene(self.meshes, self.mesh, self.mesh_frames, transforms)
 
     def tally_rows(self, instance: Ints32, triangle: Ints32) -> Integers:
-        """Return the tally row of each hit, given the hit instance and triangle."""
+        """Return the row of each hit in a table of hit counts, given instances and triangles."""
         return self.first_face[self.mesh[instance]] + triangle if self.has_matrices else triangle
 
     def to_mesh_coordinates(
@@ -358,8 +358,8 @@ def _nested_scene(
 def _scene_frame(center: Floats, shift: Floats, half: Floats) -> tuple[LocalFrame, Floats]:
     """Compute the local coordinates of a scene, and the boxes of its instances in them.
 
-    The boxes have the centers ``center + shift`` and the half side lengths `half`, with shape (n,
-    3). The returned boxes have shape (n, 2, 3).
+    The boxes have the centers ``center + shift`` (n, 3), and half their dimensions are `half`
+    (n, 3). The returned boxes have shape (n, 2, 3).
     """
     lower = (center + shift - half).min(axis=0)
     upper = (center + shift + half).max(axis=0)
@@ -372,12 +372,12 @@ def _scene_frame(center: Floats, shift: Floats, half: Floats) -> tuple[LocalFram
 
 
 def _multiply(matrices: Floats, vectors: Floats) -> Floats:
-    """Multiply matrices by vectors, with the same bits on every machine."""
+    """Multiply matrices by vectors. The results are bit-identical on every machine."""
     return (matrices * vectors[:, None, :]).sum(axis=2)
 
 
 def _invert(matrices: Floats) -> Floats:
-    """Invert 3 x 3 matrices, with the same bits on every machine."""
+    """Invert 3 x 3 matrices. The results are bit-identical on every machine."""
     (a, d, g), (b, e, h), (c, f, i) = matrices.transpose(1, 2, 0)  # columns (a, b, c), …
     # The rows are cross products of columns. `numpy.cross` takes four times as long for few
     # matrices.

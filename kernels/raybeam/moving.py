@@ -87,7 +87,7 @@ class MovingBodies:
 
     @cached_property
     def box_half_sizes(self) -> Floats:
-        """Half side lengths of each shape's bounding box, in meters. Shape (s, 3)."""
+        """Half the dimensions of each shape's bounding box, in meters. Shape (s, 3)."""
         return (self.boxes[:, 1] - self.boxes[:, 0]) / 2
 
     @cached_property
@@ -170,7 +170,7 @@ def _exclusive_limit(scan: Scan) -> float:
 def _hits_on_device(
     moving: MovingBodies, scan: Scan, times: Callable[[Ints], Floats], bodies: Ints
 ) -> Iterator[BodyHits]:
-    """Yield the closest hits of consecutive rays on bodies whose shape is on a device."""
+    """Yield the closest hits of rays on those bodies whose shape is on a CUDA device."""
     if not len(bodies):
         return
     limits = (scan.t_min, scan.t_max)
@@ -211,7 +211,7 @@ def _distinct(times: Floats) -> tuple[Floats, Ints32]:
 
 
 def _poses_and_boxes(moving: MovingBodies, bodies: Ints, times: Floats) -> tuple[Floats, Floats]:
-    """Return poses at the given times, and boxes around the paths, as in `TimedBodies`."""
+    """Compute the fields `poses` and `boxes` of `TimedBodies` for bodies at given times."""
     body = np.tile(bodies, len(times))
     time = np.repeat(times, len(bodies))
     present = moving.is_present(body, time)
@@ -446,7 +446,7 @@ class _Chunk:
             caster.cast_pairs(ray_body_pairs, self._nearest)
 
     def _cell_poses(self, cell: Indices, spans: Floats, body: Ints) -> _CellPoses:
-        """Return each body's pose when its cell is fired, and a margin for its later motion."""
+        """Return each body's pose at the first time of its cell, and a margin for its motion."""
         moving = self._moving
         starts, stops = np.clip(spans, *moving.presence[body].T)
         new = (np.diff(body, prepend=-1) != 0) | (np.diff(starts, prepend=np.nan) != 0)
@@ -463,7 +463,7 @@ class _Chunk:
         return _CellPoses(cell, body, pose, poses, pads, has_several_times)
 
     def _passing_rays(self, pairs: _CellPoses) -> _RayPairs:
-        """Find the rays that intersect the bounding box of a body, and the pose of the body.
+        """Find the rays that intersect a body's bounding box. Return them with the body's pose.
 
         If the rays of a cell are fired at different times, each ray gets the pose at its own time.
         """

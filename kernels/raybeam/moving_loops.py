@@ -220,7 +220,7 @@ def _may_hit(cell, box, sphere, reach):  # type: ignore[no-untyped-def]  # noqa:
 # The loops write to preallocated arrays, because numba takes 8 s to compile slices and copies.
 @compiled(types.int64(_f64_2, _f64_2, _SAMPLES, types.float64, _i64_2))
 def _pair_cells(wide_cells, cells, samples, reach, pairs):  # type: ignore[no-untyped-def]
-    """Write the pairs of a cell and a body that its rays may hit, and return their number."""
+    """Write the (cell, body) pairs in which a ray may hit the body, and return their number."""
     sample_of_cell, boxes, spheres = samples
     count = 0
     # Pointers are used because reference counting of array views takes longer than the comparisons.
@@ -253,7 +253,7 @@ def _pair_cells(wide_cells, cells, samples, reach, pairs):  # type: ignore[no-un
 def pair_cells_with_bodies(
     wide_cells: Floats, cells: Floats, samples: BodySamples, reach: float
 ) -> tuple[Indices, Indices]:
-    """Find pairs of a cell and a body that the cell's rays may hit, sorted by body, then by cell.
+    """Find the (cell, body) pairs in which a ray may hit the body, sorted by body, then by cell.
 
     Parameters
     ----------
@@ -300,7 +300,7 @@ def box_corners(box):  # type: ignore[no-untyped-def]
 
 @inlined
 def _clip_axis(slab, o, d, interval):  # type: ignore[no-untyped-def]
-    """Clip a range of distances along a ray to the part between two planes across an axis."""
+    """Clip an interval of a ray to the part between two planes perpendicular to an axis."""
     enters, leaves = interval
     inverse = 1 / (d if abs(d) >= _TINY else _TINY)
     lower = (slab[0] - o) * inverse
@@ -378,7 +378,7 @@ def _find_rays_near_sphere(rays, n, x, y, z, radius, near):  # type: ignore[no-u
 
 @inlined
 def _ray_intersects_box(rays, n, k, reach, pose, corners, pad):  # type: ignore[no-untyped-def]
-    """Return whether ray `k` in the table at an address intersects a box at a pose."""
+    """Return whether ray `k` intersects a posed box. `rays` is the address of a table."""
     ray = float64s(rays)
     (px, py, pz), rotation = pose
     origin = to_body_axes(rotation, ray[k] - px, ray[n + k] - py, ray[2 * n + k] - pz)
@@ -422,7 +422,7 @@ def _pair_rays(rays, reaches, pairs, poses, boxes, near, ray_pairs):  # type: ig
 def rays_through_boxes(
     rays: Floats, reaches: Floats, pairs: CellBodyPairs, poses: Floats, boxes: Floats
 ) -> tuple[Indices, Indices]:
-    """Find the rays that intersect the bounding box of a body, and the cell-body pair of each.
+    """Find the rays in given cells that intersect the bounding boxes of given bodies.
 
     Parameters
     ----------

@@ -406,6 +406,6 @@ def _packet(
 
 
 def _limit(t: Floats, entry: Floats) -> Floats32:
-    """Convert distances to float32 relative to `entry`, never rounding down."""
+    """Subtract `entry` from distances. Convert the result to float32, but never round it down."""
     remaining = (t - entry) * (1 + _SLACK) + _SLACK
     return np.clip(remaining, -MAX_DIAGONAL, MAX_DIAGONAL).astype(np.float32)

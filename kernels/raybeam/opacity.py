@@ -53,7 +53,7 @@ class LocalOpacity:
 
 
 def check_opacity(opacity: Opacity, face_count: int, index: Ints32) -> LocalOpacity:
-    """Validate an opacity, and select the triangles `index`.
+    """Validate an opacity, and keep only the triangles with the indices `index`.
 
     Raises ValueError if the opacity is invalid.
     """

@@ -140,7 +140,7 @@ class Pattern:
 
     @cached_property
     def step(self) -> int:
-        """Number of rows from one firing of a channel to the next, as passed or estimated."""
+        """Number of rows between successive firings of a channel, either passed or estimated."""
         if self._step is not None:
             return self._step
         return _repetition_step(self._directions) or _closest_step(self._directions)
@@ -154,7 +154,7 @@ class Pattern:
 
 
 def _repetition_step(directions: Floats) -> int:
-    """Return the step at which the distances between neighboring rows repeat, or 0 if none do.
+    """Return the number of rows after which the distances between neighbors repeat, or 0.
 
     `directions` (3, n) contains unit vectors. If each firing contains all rings, the distances
     repeat after one firing, because the head has rotated as a whole in between. If the rows are
@@ -175,7 +175,7 @@ def _repetition_step(directions: Floats) -> int:
     deviations = np.abs(sliding_window_view(squared[1:], samples) - first)  # (steps, samples)
 
     def equal_shares(difference: float) -> Floats:
-        """Return the fraction of distances that are equal within a tolerance, for each step."""
+        """For each step, return the fraction of distances that are equal within a tolerance."""
         return np.asarray((deviations <= difference * first).mean(axis=1))
 
     # The strict tolerance distinguishes rings of nearly the same radius if the directions are
@@ -190,7 +190,7 @@ def _repetition_step(directions: Floats) -> int:
 
 
 def _closest_step(directions: Floats) -> int:
-    """Return the step that leads to the smallest angles between rows.
+    """Return the step whose multiples separate the rows with the most similar directions.
 
     `directions` (3, n) contains unit vectors, of which 32 rows are sampled.
     """
@@ -207,7 +207,7 @@ def _closest_step(directions: Floats) -> int:
 
 
 def sample_rows(count: int, stop: int) -> Ints:
-    """Choose `count` integers from 0 to `stop`, evenly but irregularly spaced in ascending order.
+    """Return `count` ascending integers below `stop`, distributed evenly but not regularly.
 
     Rows at regular intervals may all belong to the same ring.
 

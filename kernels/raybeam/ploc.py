@@ -108,7 +108,7 @@ class _Nodes:
         self.count = np.ones(2 * n - 1, np.int32)
 
     def merge(self, clusters: _Clusters, next_node: int, first: Indices, second: Indices) -> None:
-        """Create parents for pairs of clusters, from `next_node` on, and replace the clusters."""
+        """Replace pairs of clusters by new parent nodes, numbered from `next_node`."""
         if loops := _compiled_loops():
             left = loops.merge_pairs(
                 (clusters.lower, clusters.upper, clusters.node),

@@ -46,7 +46,7 @@ def best_partners(lower, upper, radius, best):  # type: ignore[no-untyped-def]
 def merge_pairs(  # type: ignore[no-untyped-def]
     clusters, first, second, next_node, boxes, children, count
 ):
-    """Create parents for pairs of clusters, replace the clusters, and return how many are left.
+    """Replace pairs of clusters by new parent nodes, and return how many clusters are left.
 
     Parameters
     ----------

@@ -88,7 +88,7 @@ def oriented_axes(x, y, z, axis):  # type: ignore[no-untyped-def]
 
 @noinline
 def _find_rows(tile, rays, first_row, row_count):  # type: ignore[no-untyped-def]
-    """Write the pattern row of each ray in a tile, counting every sub-ray as a row.
+    """Write the pattern row of each ray in a tile. Each sub-ray counts as a separate row.
 
     `first_row` is the pattern row of the call's first ray. The pattern has `row_count` rows and
     repeats.
@@ -103,7 +103,7 @@ def _find_rows(tile, rays, first_row, row_count):  # type: ignore[no-untyped-def
 
 @noinline
 def _find_poses(tile, rays, first, rays_per_pose, poses):  # type: ignore[no-untyped-def]
-    """Write the pose of each ray in a tile, and the index of the ray within its pose.
+    """Write each ray's pose index, and its index among the rays that share the pose.
 
     `first` is the `FirstRay` of the call. Rays that do not belong to the call use the closest pose.
     """
@@ -238,9 +238,10 @@ def _make_single_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # 
 
 @inlined
 def _rotate_four(floats, target, rays, matrix):  # type: ignore[no-untyped-def]
-    """Rotate four vectors by a matrix whose nine elements are vectors, too.
+    """Rotate four vectors by four matrices.
 
-    The components of the vectors are in three rows of the tile, starting at index `target`.
+    The components of the vectors are in three rows of the tile, starting at index `target`. Each of
+    the nine elements of `matrix` contains one number for each of the four matrices.
     """
     a, b, c, d, e, f, g, h, i = matrix
     p = load(floats, target)
@@ -253,7 +254,7 @@ def _rotate_four(floats, target, rays, matrix):  # type: ignore[no-untyped-def]
 
 @inlined
 def _matrix(matrices, pose, poses):  # type: ignore[no-untyped-def]
-    """Return a pose's matrix as nine vectors, each of which repeats one element."""
+    """Return a pose's matrix as nine SIMD vectors, each filled with one matrix element."""
     k = pose
     n = poses
     return (
@@ -271,7 +272,7 @@ def _matrix(matrices, pose, poses):  # type: ignore[no-untyped-def]
 
 @inlined
 def _rotate_one(floats, i, rays, matrices, k, n):  # type: ignore[no-untyped-def]
-    """Rotate the vector whose first component has index `i` by the `k`-th of `n` matrices."""
+    """Rotate a vector by matrix `k` of `n`. Its components are `rays` apart, from index `i` on."""
     p = floats[i]
     q = floats[i + rays]
     r = floats[i + 2 * rays]
@@ -354,7 +355,7 @@ def _add_to_origins(tile, rays, table, count, field):  # type: ignore[no-untyped
 
 @noinline
 def _add_position(tile, rays, position):  # type: ignore[no-untyped-def]
-    """Add the only pose's position, given by its address, to the ray origins in a tile."""
+    """Add the position of a single pose to the ray origins in a tile. `position` is an address."""
     floats = float64s(tile)
     vector = float64s(position)
     target = row_index(OX, rays)
@@ -460,7 +461,7 @@ def first_ray(cast, ray):  # type: ignore[no-untyped-def]
 
 @called_by_address(types.void(*4 * INT64))
 def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
-    """Compute the rays in a tile in local coordinates, given their indices in the call.
+    """Compute the rays in a tile from their indices, in local coordinates.
 
     `address` is the address of the `CAST`, `start` is the index of the call's first ray in the
     scan, and `count` is the number of rays in the call. If there is a single pose, the tile may
@@ -509,7 +510,10 @@ def write_shared_origin(cast, tile, rays):  # type: ignore[no-untyped-def]
 
 @inlined
 def _clip_axis(lower, upper, o, d, entry):  # type: ignore[no-untyped-def]
-    """Return the distance at which a ray enters the range of one axis, but at least `entry`."""
+    """Return the larger of `entry` and the distance at which a ray enters a slab.
+
+    The slab lies between `lower` and `upper` along an axis.
+    """
     component = d
     if abs(d) < _TINY:
         component = -_TINY if d < 0 else _TINY
@@ -518,10 +522,11 @@ def _clip_axis(lower, upper, o, d, entry):  # type: ignore[no-untyped-def]
 
 @inlined
 def entry_distance(half, o, d):  # type: ignore[no-untyped-def]
-    """Return the distance at which a ray enters the cube from -half to half, or 0 from inside.
+    """Return the distance at which a ray enters a cube, or 0 if it starts inside.
 
-    All lengths are in local units. `o` and `d` are the origin and the direction of the ray. The
-    result is meaningless if the ray misses the cube.
+    The cube extends from -half to half along each axis. All lengths are in local units. `o` and `d`
+    are the origin and the direction of the ray. The result is meaningless if the ray misses the
+    cube.
     """
     entry = 0.0
     if max(max(abs(o[0]), abs(o[1])), abs(o[2])) > half:
@@ -533,7 +538,7 @@ def entry_distance(half, o, d):  # type: ignore[no-untyped-def]
 
 @compiled(types.void(memory.CASTS, types.int64[::1], types.float64[:, ::1], types.float64[:, ::1]))
 def _compute_rays(casts, rays, origins, directions):  # type: ignore[no-untyped-def]
-    """Write ray directions, and also ray origins unless `origins` has shape (3, 0)."""
+    """Write ray directions, and also write ray origins unless the array `origins` is empty."""
     cast = casts[0]
     address = casts.ctypes.data
     tile = cast.tile

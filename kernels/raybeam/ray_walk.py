@@ -75,9 +75,10 @@ class _Start(NamedTuple):
 
 @inlined
 def _make_start(floats, k, rays):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Return the `_Start` of a ray. Its six numbers start at index `k` and are `rays` apart.
+    """Return the `_Start` of a ray.
 
-    The box of a scene or mesh is within [-1, 1], plus padding.
+    The origin and the direction of the ray are six numbers, which start at index `k` and are `rays`
+    elements apart. The box of a scene or mesh is within [-1, 1], plus padding.
     """
     ox = floats[k]
     oy = floats[k + rays]
@@ -124,7 +125,7 @@ def _not_zero(component):  # type: ignore[no-untyped-def]
 
 @inlined
 def _limit_of(t, entry):  # type: ignore[no-untyped-def]
-    """Convert a distance to float32 relative to `entry`, never rounding down."""
+    """Subtract `entry` from a distance. Convert the result to float32, but never round it down."""
     return np.float32(min(max((t - entry) * (1 + SLACK) + SLACK, -MAX_DIAGONAL), MAX_DIAGONAL))
 
 

@@ -25,7 +25,7 @@ def available_backends() -> dict[str, str]:
 
 
 def backend_versions(name: str) -> str:
-    """Return the versions, except NumPy's, that affect the bits of a backend's results.
+    """Return the versions of software, except NumPy, that affect a backend's results.
 
     Two processes with the same versions, and with the same version of NumPy, return bit-identical
     hits.

@@ -98,7 +98,7 @@ def _cheapest_splits(
 def _split_costs(
     lower: Floats32, upper: Floats32, weight: Floats, level: _Level, node: Indices
 ) -> Floats:
-    """Compute the cost of splitting a node after each position.
+    """For each position, compute the cost of splitting its node after this position.
 
     The boxes and weights are sorted along an axis.
     """
@@ -114,7 +114,7 @@ def _split_costs(
 
 
 def _prefix_half_areas(lower: Floats32, upper: Floats32, node: Indices) -> Floats:
-    """Compute half the surface area of the box around each node's first boxes, for all counts."""
+    """For each position, compute half the surface area around a node's boxes up to there."""
     # Each node is shifted by a different offset, so that one pass over all nodes restarts at each
     # node.
     shift = _NODE_SPACING * node

@@ -246,7 +246,7 @@ class HitCollector(HitGroups):
         return row_indices
 
     def count_triangles(self, tally_indices: Integers) -> None:
-        """Add a chunk's hits to the tally, given their tally rows.
+        """Add a chunk's hits to the tally. `tally_indices` contains the tally row of each hit.
 
         Without a tally, the call has no effect.
         """

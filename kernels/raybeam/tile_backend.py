@@ -140,7 +140,7 @@ class TileBackend(Backend):
         self._loops.cast_pairs(record, pairs.contiguous(), nearest)
 
     def scan_parts(self, scan: Scan) -> Iterator[tuple[int, int, HitColumns]]:
-        """Yield consecutive parts of a scan as tuples of the first ray, the end, and the hits.
+        """Yield (start, stop, hits) for consecutive ranges of rays in a scan.
 
         The ray indices of the hits start at 0 in each part.
         """
@@ -230,7 +230,7 @@ class TileBackend(Backend):
         instance = (np.empty if self._scene.has_matrices else np.zeros)(n, np.int32)
 
         def cast_share(begin: int) -> HitColumns:
-            """Cast up to `share` rays from `begin` on, and return their hits as output views."""
+            """Cast up to `share` rays, starting with ray `begin`. Return views of their hits."""
             record = cast.record.copy()
             row = begin - start
             hits = np.empty(2 * (min(share, stop - begin) + 1))

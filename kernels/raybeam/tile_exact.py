@@ -95,7 +95,7 @@ def shear_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: 
 
 @inlined
 def _ray_shear(floats, rays, ray):  # type: ignore[no-untyped-def]
-    """Return a ray's origin with the longest axis last, followed by its shear, as six numbers."""
+    """Return six numbers: a ray's origin with the longest axis last, and the ray's shear."""
     k = row_index(U, rays) + ray
     return (
         floats[k],

@@ -1,4 +1,4 @@
-"""The coordinate system of a tile, and the tile's rays, sides, and depths in this system.
+"""Set up the coordinate system of a tile, and express the tile's rays and sides in it.
 
 A ray becomes a point (su, sv) on a plane perpendicular to the tile's mean direction m. In the axes
 (u, v, m), the direction of the ray is (su, sv, 1), scaled so that its component along m is 1.
@@ -66,7 +66,7 @@ def cross(a, b):  # type: ignore[no-untyped-def]
 
 @inlined
 def tile_axes(singles):  # type: ignore[no-untyped-def]
-    """Return the tile axes u, v, and m, each as three vectors of equal numbers."""
+    """Return the tile axes u, v, and m. Each component is a vector that repeats one number."""
     k = _AXES
     u = splat(singles[k]), splat(singles[k + 1]), splat(singles[k + 2])
     v = splat(singles[k + 3]), splat(singles[k + 4]), splat(singles[k + 5])
@@ -147,12 +147,13 @@ def _set_frame(singles, x, y, z):  # type: ignore[no-untyped-def]
 
 @noinline
 def _project_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write su, sv, and the depth of each ray in a tile, and the bounds of these values.
+    """Project the rays of a tile onto its axes, and write the results and their bounds.
 
-    Return the smallest cosine of the angle between a ray and the axis m. The field `offset` is also
-    written. To compute it, each ray is compared with the ray that has the same (su, sv) but starts
-    at the tile's point. The offset is the maximum, over all rays, of the distance between these two
-    rays across m plus the distance between their origins along m.
+    The results are su, sv, and the depth of each ray. Return the smallest cosine of the angle
+    between a ray and the axis m. The field `offset` is also written. To compute it, each ray is
+    compared with the ray that has the same (su, sv) but starts at the tile's point. The offset is
+    the maximum, over all rays, of the distance between these two rays across m plus the distance
+    between their origins along m.
     """
     singles = float32s(tile)
     floats = float64s(tile)
@@ -218,7 +219,7 @@ def _project_rays(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noq
 
 @noinline
 def _set_planes(tile):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write the side planes of a tile and its subtiles, with margins, and the margin for depths."""
+    """Write the side planes of a tile and of its subtiles. Also write the depth margin."""
     singles = float32s(tile)
     numbers = int64s(tile)
     u, v, m = tile_axes(singles)

@@ -90,7 +90,7 @@ def l1_norm(a):  # type: ignore[no-untyped-def]
 
 @inlined
 def _max_over_bounds(normal, bounds):  # type: ignore[no-untyped-def]
-    """Return the maximum of a linear function for su and sv within their bounds."""
+    """Return the maximum of a linear function of su and sv over a rectangle."""
     nu, nv, nm = normal
     low_u, high_u, low_v, high_v = bounds
     return (nm + maximum(nu * low_u, nu * high_u)) + maximum(nv * low_v, nv * high_v)

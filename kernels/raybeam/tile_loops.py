@@ -74,7 +74,7 @@ _FEW = 6  # up to this number of rays, tiles are cast ray by ray
 
 @noinline
 def _cast_in_mesh(tile, rays, first_row, mesh, instance, mask):  # type: ignore[no-untyped-def]
-    """Cast the rays in selected subtiles at a mesh, as a tile or one by one.
+    """Cast the rays in selected subtiles at a mesh, either together or one by one.
 
     If a tile is too wide or visits too many leaves, the following tiles are cast ray by ray,
     because they are likely to be similar. After that, tiles are tried again. The rays must already
@@ -134,7 +134,7 @@ def _transform_rays(tile, rays, instance):  # type: ignore[no-untyped-def]  # no
 
 @noinline
 def _reaching_subtiles(tile, rays, near, mask):  # type: ignore[no-untyped-def]
-    """Return which of the given subtiles contain a ray that reaches a depth along the axis m.
+    """Return a mask of those given subtiles in which a ray reaches the depth `near`.
 
     The depth is in scene coordinates, in which a distance along a ray is at least as long as its
     depth.

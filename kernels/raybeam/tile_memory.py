@@ -67,7 +67,7 @@ FIRST_ROW = -(-TILE.itemsize // 64) * 8  # index of the first row, in units of 8
 
 
 def field_index(name: str) -> int:
-    """Return a field's index if the tile memory is read as an array of the field's type."""
+    """Return a field's offset in the tile memory, counted in elements of the field's type."""
     field = TILE[name]
     kind = field.subdtype[0] if field.subdtype else field
     return int(TILE.fields[name][1]) // kind.itemsize  # type: ignore[index]

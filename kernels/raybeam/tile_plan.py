@@ -91,7 +91,7 @@ def plan_tiles(scan: Scan) -> TilePlan:
 
 
 def _sort_rings(first: Floats, second: Floats) -> tuple[Ints, Ints, tuple[float, float]]:
-    """Find out which rings are neighbors from the directions of two firings.
+    """Find neighboring rings by comparing the directions of two firings.
 
     The directions have shape (n, 3), and the firings must be consecutive.
 

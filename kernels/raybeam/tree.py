@@ -139,7 +139,7 @@ def _choose_leaves(
 
 
 def _positions(tree: ploc.BinaryTree, count: Ints32) -> Ints32:
-    """Return the position in leaf order of the first triangle below each node."""
+    """For each node, return the position of its first triangle in leaf order."""
     first = np.zeros(len(count), np.int32)
     for start, stop in reversed(tree.rounds):
         first_child = tree.first_child[start:stop]

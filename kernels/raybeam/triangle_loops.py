@@ -78,5 +78,5 @@ def intersect_plane(corners, ray):  # type: ignore[no-untyped-def]  # noqa: PLR0
 
 @inlined
 def same_sign(a, b, c):  # type: ignore[no-untyped-def]
-    """Return whether all three areas have the same sign, where zero counts as both."""
+    """Return whether all three areas have the same sign. Zero counts as either sign."""
     return ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))

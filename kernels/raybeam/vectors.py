@@ -272,7 +272,7 @@ def prefetch(context: Any, pointer: Any, index: Any) -> Any:
 
 @intrinsic
 def store_masked(context: Any, mask: Any, pointer: Any, index: Any, value: Any) -> Any:
-    """Store the vector lanes that a mask selects at an index, without a branch."""
+    """Store only the selected lanes of a vector at an index, without branching."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         mask, pointer, index, value = arguments

@@ -193,7 +193,7 @@ class AdaptivePartitions(SchedulerPlugin):
         return {job: [job] for job in (*members, *pending)}
 
     def waiting_slots(self) -> dict[str, float]:
-        """Count the slots that tasks without a worker request in each partition."""
+        """For each partition, count the slots requested by tasks that have no worker yet."""
         waiting: dict[str, float] = {}
         for task in unrunnable_tasks(self.scheduler):  # there may be 100,000
             if task.resource_restrictions and not is_bound(task):
@@ -461,7 +461,7 @@ def adaptive_names(dask_scheduler: Any = None) -> set[str]:
 
 
 def slots_of_new_worker(scheduler: Any, name: str) -> int:
-    """Return the number of slots that a new worker would add, or 0 without adaptation."""
+    """Return how many slots a new worker would add, or 0 if the partition is not adaptive."""
     return _upper_bound(scheduler, name)[1]
 
 

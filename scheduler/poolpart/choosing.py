@@ -78,7 +78,7 @@ class _Group:
 
 
 class WorkerChooser(SchedulerPlugin):
-    """Scheduler plugin that chooses workers for tasks in partitions and outside fences."""
+    """Scheduler plugin that chooses workers for tasks, considering partitions and fences."""
 
     name = NAME
 

@@ -95,7 +95,7 @@ def own_device_share() -> float:
 
 
 def assign_device(address: str, gpus: Sequence[str], dask_scheduler: Any = None) -> int | None:
-    """Return the index of a worker's device among its UUIDs, or None if the worker has left.
+    """Return the index in `gpus` of a worker's device, or None if the worker has left.
 
     The first call for a worker selects its device.
     """

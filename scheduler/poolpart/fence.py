@@ -91,7 +91,7 @@ def fence_names(scheduler: Any) -> frozenset[str]:
 
 
 class Fences(SchedulerPlugin):
-    """Scheduler plugin that keeps tasks off fenced workers whose resource they do not request."""
+    """Scheduler plugin that reserves fenced workers for tasks that request their resource."""
 
     name = NAME
 

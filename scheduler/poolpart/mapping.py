@@ -199,7 +199,7 @@ class ChunkSize:
         return int(min(by_time, by_bytes))
 
     def will_grow(self, items: int) -> bool:
-        """Return whether `items` is only limited because few items were processed so far."""
+        """Return whether chunks may grow beyond `items` once more items are processed."""
         return items >= GROWTH * self._tried
 
 
@@ -317,7 +317,7 @@ class Results(Iterator[Any]):
     def _continue_map(
         self, previous: Results, stage: Stage, iterables: Sequence[Iterable[Any]]
     ) -> None:
-        """Take over the source and running tasks of an unread map as the preceding stages."""
+        """Add a stage to an unread map, and take over its source and its running tasks."""
         calls: Iterator[Call] = zip(*iterables, strict=False) if iterables else repeat(())
         self._stages = (*previous._stages, stage)
         self._waits = [*previous._waits, _worker_wait(stage)]
@@ -468,7 +468,7 @@ class Results(Iterator[Any]):
         return size, window
 
     def _run(self, chunks: Sequence[Chunk], previous_tasks: list[Future] | None = None) -> None:
-        """Submit chunks to all stages, or only to the last stage, after `previous_tasks`."""
+        """Submit chunks to all stages, or only to the last one if `previous_tasks` are given."""
         if not chunks:
             return
         firsts = [chunk.first for chunk in chunks]

@@ -315,7 +315,7 @@ def release_partitions(
 
 
 def release_statistics(scheduler: Any) -> None:
-    """Delete the statistics or, if clients are registered, let them end with the last one."""
+    """Delete the statistics, either now or when the last registered client leaves."""
     if NAME in scheduler.plugins:
         statistics_of(scheduler).is_kept = False
     else:

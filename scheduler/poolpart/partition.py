@@ -843,7 +843,7 @@ def _refuse_options(method: str, options: Mapping[str, Any], **instead: str) -> 
 
 
 def _names_of_pipes(arguments: Iterable[Any]) -> list[str]:
-    """Return the names of those pipes among the arguments that fail with their tasks.
+    """Return the names of the pipes among the arguments that fail if their task fails.
 
     Pipes in lists and tuples are included.
     """

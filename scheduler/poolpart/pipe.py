@@ -748,7 +748,7 @@ def _ask_until(
     on_replies: Callable[[Replies], None],
     **arguments: Any,
 ) -> Replies:
-    """Repeat a request to the scheduler until its replies end the wait, and return the last ones.
+    """Repeat a request until a condition or a deadline is met, and return the last replies.
 
     All requests belong to a single wait of this thread, so that the waiting task of a partition
     lends its slot only once.

@@ -286,7 +286,7 @@ class PipeRegistry(SchedulerPlugin):
             self._released.discard(task.key)
 
     def _fail_soon(self, names: Sequence[str], reason: str, cancelled: str = "") -> None:
-        """Make pipes fail that are still open after the current step of the event loop.
+        """Fail those pipes that are still open after the current step of the event loop.
 
         `cancelled` is the key of a canceled task. If this task has already used a pipe, the pipe
         does not fail, because the task is running and can continue to use the pipe. Dask does not
@@ -476,7 +476,7 @@ class PipeRegistry(SchedulerPlugin):
         return self._replies(states, take_from)
 
     def _states_for_taker(self, task: str, names: Sequence[str]) -> dict[str, PipeState]:
-        """Return the states of all named pipes that exist, and record the task as their taker."""
+        """Return the states of the named pipes that exist, and record which task takes items."""
         states = self._existing(names)
         for state in states.values():
             state.takers |= {task} - {""}

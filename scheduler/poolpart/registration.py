@@ -1,4 +1,4 @@
-"""Record for which partitions this process has registered its clients with the scheduler.
+"""Keep track of the partitions for which this process has registered its clients.
 
 A client registers once per partition (see `membership.py`) and then submits tasks without a further
 request. The registration ends when the client loses its connection, or when the partition is

@@ -140,7 +140,7 @@ def partition_of(task: Any) -> str:
 
 
 def workers_of(scheduler: Any, partition: str) -> list[Any]:
-    """Return the states of a partition's workers or, for "", of workers without resources."""
+    """Return the states of a partition's workers. "" selects workers without resources."""
     workers = scheduler.workers.values()
     if partition:
         return [worker for worker in workers if worker.resources.get(partition)]
@@ -148,7 +148,7 @@ def workers_of(scheduler: Any, partition: str) -> list[Any]:
 
 
 def slots_of(worker: Any, partition: str) -> int:
-    """Return a worker's number of slots in a partition or, for "", its number of threads."""
+    """Return a worker's number of slots in a partition. For "", return its thread count."""
     return int(worker.resources.get(partition, 0)) if partition else int(worker.nthreads)
 
 

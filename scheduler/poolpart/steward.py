@@ -344,7 +344,7 @@ class Steward(SchedulerPlugin):
         self.remove_if_done()
 
     async def _reconcile(self, record: WorkerRecord, address: str) -> None:
-        """Make a worker declare its target resources, in as many steps as its tasks require."""
+        """Make a worker declare its target resources, in several steps if its tasks require it."""
         if record.is_unassigned:
             await self._ask_for_gpus(record)
             if record.is_unassigned:

@@ -108,7 +108,7 @@ class TaskTable(tuple[TaskRow, ...]):
 
     @property
     def _omission(self) -> str:
-        """Note below a truncated table that states the number of tasks in each state, or ""."""
+        """Note with the number of tasks in each state, or "" if the table is not truncated."""
         if len(self) <= _SHOWN:
             return ""
         counts = Counter(row.state for row in self)

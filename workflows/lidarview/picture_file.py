@@ -184,7 +184,7 @@ class PictureContent:
 
     @property
     def models(self) -> str:
-        """Sensor model names, including the names of named sensors."""
+        """Models of all sensors as text. Each is preceded by the sensor's name if it has one."""
         models = [
             f"{sensor.name}: {sensor.model}" if sensor.name else sensor.model
             for sensor in self.sensors

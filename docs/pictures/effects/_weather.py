@@ -26,7 +26,7 @@ TURNS = 20
 
 
 def page(title: str, weather: dict[str, Any], reach_m: float) -> tuple[Figure, Any]:
-    """Draw the street from above without and with the weather; return an empty third plot."""
+    """Draw the street from weather. The detection range of its sensor is third plot."""
     figure = Figure((13.5, 4.7), dpi=100, layout="constrained")
     clear, wet, right = figure.subplots(1, 3, width_ratios=[1, 1, 1.25])
     scene = city(20_000)

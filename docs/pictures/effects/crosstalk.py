@@ -56,7 +56,7 @@ def cast_pair(
 
 
 def picture() -> Figure:
-    """Plot the pulses that a sensor receives from another, with the closed form of their number."""
+    """Plot the pulses that a sensor receives from another, with their expected number."""
     figure = Figure((9, 3.9), layout="constrained", dpi=110)
     above, counts = figure.subplots(1, 2, width_ratios=[1.25, 1])
     columns = cast_pair(room(25, 15), 8.0, 1000 * WIDE_RAD)

@@ -1,4 +1,4 @@
-"""Systematic errors: of channels, during warm-up, and of the encoder."""
+"""Systematic errors: caused by channels, warm-up, and the encoder."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def with_effect(survey: Survey) -> Survey:
 
 
 def errors(sensor: Sensor, noise: Noise, **options: object) -> dict[str, np.ndarray]:
-    """Return range errors at a wall 10 m ahead, with the channel and the time in seconds."""
+    """Return range errors at a wall 10 m ahead, with their channel and the time (in seconds)."""
     batches_by_noise = []
     for noise_of_run in (Noise(), noise):
         survey = Survey(

@@ -49,7 +49,7 @@ def _waveform(wall_m: float, noise: Noise) -> tuple[NDArray, NDArray]:
 
 
 def _separable_distance(name: str, plate_m: float) -> tuple[float, float]:
-    """Return a plate's signal over saturation, and the least separable distance to a wall."""
+    """Return a plate's relative signal, and the smallest resolved distance to a wall."""
     beam = Returns("all", subrays=61, divergence_mrad=1)
     options = {"materials": MATERIALS[name], "returns": beam, "columns": COLUMNS}
     lower_m = 0.1
@@ -63,7 +63,7 @@ def _separable_distance(name: str, plate_m: float) -> tuple[float, float]:
 
 
 def picture() -> Figure:
-    """Plot clipped pulses, pulse widths and range errors, and the distance of separable walls."""
+    """Plot clipped pulses, pulse widths and range errors, and the smallest resolved walls."""
     figure = Figure((11, 3.7), layout="constrained", dpi=110)
     pulse, widths, apart = figure.subplots(1, 3)
     pulse.axhline(1, color="k", lw=0.8, ls=":")

@@ -68,7 +68,7 @@ class ScriptlessNanny(Nanny):
 
 
 class FixedCluster(SpecCluster):
-    """Cluster that cannot be scaled, and whose nannies alone restart dead workers.
+    """Cluster with a fixed number of workers. Only nannies restart dead workers.
 
     15 seconds after a worker was lost, a plain SpecCluster closes the nanny of this worker unless a
     worker with the same name is present. A worker that dies twice within this time may just be

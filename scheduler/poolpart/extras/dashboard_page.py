@@ -190,7 +190,7 @@ class PageOwners(SchedulerPlugin):
         add_pages(scheduler, self.page)
 
     def add_owner(self, owner: str, link: str | None) -> None:
-        """Record that a client has opened the page, and its link to the dashboard if known."""
+        """Record that a client has opened the page. Keep its link to the dashboard, if known."""
         self.owners.add(owner)
         host = urlsplit(link or "").hostname
         if link and not host:  # a link relative to the page of a notebook

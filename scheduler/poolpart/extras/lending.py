@@ -155,11 +155,11 @@ class Lender:
     # -- demand for slots --------------------------------------------------------------
 
     def has_slot_requests(self) -> bool:
-        """Return whether any task waits for slots, or has to get its own slots or thread back."""
+        """Return whether any task waits for new slots, or for the slots or thread that it lent."""
         return bool(self._nested or self._returning or self._rejoining)
 
     def lends_at_once(self, loan: _Loan) -> bool:
-        """Return whether a task must lend its slots during each wait, even without demand.
+        """Return whether a task must lend its slots whenever it waits, even if nobody needs them.
 
         This is the case if the task has lent its slots before and the worker has more slots than
         threads. Dask counts a task that has seceded as long-running until it ends, even after it
@@ -295,7 +295,7 @@ class _WaitHooks:
 
     @contextmanager
     def lend(self, waits: bool = True) -> Iterator[None]:
-        """Within the block, lend the slots and thread of this thread's task if `waits` is true.
+        """If `waits` is true, lend the slots and thread of the current task within the block.
 
         At the end of the block, the thread waits until the task has its slots and thread back.
         """

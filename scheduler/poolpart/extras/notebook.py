@@ -100,7 +100,7 @@ def _all_partitions(dask_scheduler: Any = None) -> tuple[list[Sequence[object]],
 
 
 def _one_partition(name: str, dask_scheduler: Any = None) -> tuple[Sequence[object] | None, bool]:
-    """Return a partition's row, or None if it does not exist, and whether the page is open.
+    """Return a partition's row (None if it does not exist), and whether the page is open.
 
     Partitions of a divided pool and adaptive partitions exist even without workers. Runs on the
     scheduler.
@@ -112,7 +112,7 @@ def _one_partition(name: str, dask_scheduler: Any = None) -> tuple[Sequence[obje
 
 
 def _one_pipe(name: str, dask_scheduler: Any = None) -> tuple[Sequence[object] | None, bool]:
-    """Return a pipe's row, or None if it does not exist, and whether the page is open."""
+    """Return a pipe's row (None if it does not exist), and whether the page is open."""
     pipe = pipes_of(dask_scheduler).get(name)
     row = None if pipe is None else [name, *pipe.summary]
     return row, is_page_open(dask_scheduler)

@@ -1,4 +1,4 @@
-"""Client waits that lend slots, callbacks, and requests, based on private API."""
+"""Extend the waits of Dask's clients, and send requests, through private API."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class WaitHooks(Protocol):
         """Wait until a call has been answered or another task needs the slots."""
 
     def lend(self, waits: bool = True) -> AbstractContextManager[None]:
-        """Within the block, lend the slots if `waits` is true."""
+        """If `waits` is true, lend the slots within the block."""
 
 
 _hooks: list[WaitHooks] = []  # set by `install_wait_hooks`
@@ -98,7 +98,7 @@ def install_wait_hooks(hooks: WaitHooks) -> None:
 
 
 def lend_slots(waits: bool) -> AbstractContextManager[None]:
-    """Within the block, lend the slots of this thread's task if `waits` is true.
+    """If `waits` is true, lend the slots of the current task within the block.
 
     Nothing happens if the hooks are not installed in this process.
     """

@@ -24,7 +24,7 @@ Instead = Callable[..., Any]  # receives the arguments; NotImplemented means to 
 
 
 class _Method:
-    """Replacement of a method that applies rules before, after, and instead of the original.
+    """Replacement for a method. It applies rules before, after, or instead of the original.
 
     If a rule raises an exception, the rule is skipped and the first such exception is logged, so
     that other users of the cluster get Dask's own behavior. Errors of the original method reach the

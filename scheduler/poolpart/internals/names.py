@@ -414,7 +414,7 @@ def _slots(kind: type) -> Iterator[str]:
 
 
 def _assigned(kind: type) -> tuple[str, ...]:
-    """Return the names that a class constructor uses, which include unannotated attributes."""
+    """Return all names in the code of a class's constructor, such as unannotated attributes."""
     constructor = vars(kind).get("__init__")
     code = getattr(inspect.unwrap(constructor), "__code__", None) if constructor else None
     return code.co_names if code is not None else ()

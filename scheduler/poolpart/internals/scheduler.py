@@ -252,7 +252,7 @@ async def restart_worker(scheduler: Any, worker: Any, seconds: float) -> bool:
 
 
 def fail_task(scheduler: Any, task: Any, worker: str, error: Exception) -> None:
-    """Make a task fail that waits for inputs on a worker, or retry it if it has retries left."""
+    """Fail a task that waits for inputs on a worker, or retry it if it has retries left."""
     from distributed.core import error_message
 
     stimulus = f"poolpart-failed-{time.time()}"

@@ -485,7 +485,7 @@ def _level(geometry: _Json) -> float:
 
 
 def _surfaces_at(tree: Any, depth: int, *values: Any) -> Iterator[tuple[Any, ...]]:
-    """Yield the items at a given depth of nested lists, each with its values."""
+    """Yield the items at a given depth of nested lists, with the corresponding `values`."""
     if not depth:
         yield (tree, *values)
         return

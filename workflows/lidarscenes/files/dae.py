@@ -215,7 +215,7 @@ class _Document:
         return symbol if bound is None else bound.get("name") or bound.get("id") or symbol
 
     def _bound_materials(self, instance: Element) -> tuple[tuple[str, Element], ...]:
-        """Return the materials that a geometry instance assigns to symbols, as pairs."""
+        """Return pairs of a symbol and the material that a geometry instance assigns to it."""
         entries = instance.findall("bind_material/technique_common/instance_material")
         materials = [
             (entry.get("symbol", ""), self._ids.get(("material", entry.get("target", "")[1:])))
@@ -266,7 +266,7 @@ class _Document:
         return None if shade is None else Colors.plain(shade, len(triangle_corners))
 
     def _coordinates(self, primitive: Element) -> tuple[Floats, int]:
-        """Return texture coordinates, and the position of their index among the numbers in <p>."""
+        """Return texture coordinates. Also return the offset of their indices in <p>."""
         inputs = [e for e in primitive.findall("input") if e.get("semantic") == "TEXCOORD"]
         if not inputs:
             raise MaskError("texture coordinates are missing")

@@ -408,7 +408,7 @@ def _number(stated: dict[str, Any], name: str) -> float | None:
 
 
 def _map_unit_m(unit: float | str | None, project_m: float, scale: float | None) -> float:
-    """Determine how many meters a map unit has, from its length, its name, or the scale."""
+    """Return the length of a map unit in meters. Without a unit, infer it from the scale."""
     if isinstance(unit, str):
         unit_m = unit_by_name(unit)
         if unit_m is None:

@@ -110,7 +110,7 @@ class _Parser:
         return stop
 
     def _start_element(self, tag: re.Match[str], start: int) -> None:
-        """Start an element. It is also complete if its tag is empty."""
+        """Start an element. If its tag is empty, like <a/>, this also completes the element."""
         self._count += 1
         if self._count > MAX_ELEMENTS:
             raise ValueError(f"it contains more than {MAX_ELEMENTS:,} elements")

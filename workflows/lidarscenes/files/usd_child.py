@@ -157,7 +157,7 @@ class StageNodes:
         return node
 
     def _add_child(self, node: list[Any], child: Any, inherited: _Inherited) -> None:
-        """Add a child to its node, or to the roots or the moving nodes."""
+        """Add a child to its parent node, to the roots, or to the moving nodes."""
         xformable = UsdGeom.Xformable(child)
         number = self._number(child, inherited)
         motion = None
@@ -221,7 +221,7 @@ class StageNodes:
         return None
 
     def _copies(self, instancer: Any, excluded: bool) -> list[tuple[int, int]]:
-        """Return pairs of a node that an instancer copies and an index into `copies`."""
+        """Return (node, k) for each node that an instancer copies. `copies[k]` has its matrices."""
         prototype_numbers = np.array(
             instancer.GetProtoIndicesAttr().Get(self._time) or (), np.int64
         )
@@ -508,7 +508,7 @@ class MaterialReader:
         return source | self._coordinates(shader.GetInput("st"))
 
     def _coordinates(self, coordinate_input: Any) -> dict[str, Any]:
-        """Return the name of texture coordinates, and their 3 x 2 matrix for (u, v, 1)."""
+        """Return the name of texture coordinates, and the 3 x 2 matrix that transforms them."""
         matrix = np.eye(3)
         for _ in range(_MAX_LINKS):
             attributes = (

@@ -54,7 +54,7 @@ class _Use(NamedTuple):
         return cls(source["image"], source["channels"], scale, bias, raw, wraps)
 
     def light(self, channel: str) -> Floats:
-        """Return the linear light for each byte value in a channel. Shape (256,)."""
+        """Return the linear light that each byte value in a channel represents. Shape (256,)."""
         k = "rgba".index(channel)
         return (_BYTES if self.raw or k == 3 else LINEAR) * self.scale[k] + self.bias[k]
 
@@ -98,7 +98,7 @@ class MeshAppearance:
         return Colors.from_vertex_colors(colors[corners])
 
     def _corner_values(self, name: str, face_indices: Ints, width: int) -> tuple[Floats, Ints]:
-        """Return values, and their indices at triangle corners.
+        """Return a primvar's values, and the index of the value at each triangle corner.
 
         Raises MaskError if the mesh has no suitable values.
         """

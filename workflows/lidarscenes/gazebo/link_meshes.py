@@ -314,7 +314,7 @@ class LinkMeshes:
 
 
 def _retro(link: Element, shape: Element) -> float:
-    """Return the <laser_retro> of a shape, or else of the first collision shape with one, or 0."""
+    """Return a shape's <laser_retro>. If it has none, use a collision shape's value, or 0."""
     for candidate in (shape, *link.findall("collision")):
         value = float(child_numbers(candidate, "laser_retro", 1, "0").item())
         if value > 0:
@@ -323,5 +323,5 @@ def _retro(link: Element, shape: Element) -> float:
 
 
 def _without_path(line: str, path: Path) -> str:
-    """Shorten the path of a file in a line of text to the file name."""
+    """Replace the path of a file in a line of text by the file name."""
     return line.replace(str(path), path.name)

@@ -142,7 +142,7 @@ class Resources:
         raise ResourceNotFoundError(printable(uri))
 
     def _targets(self, uri: str, source: Source) -> Iterator[Source]:
-        """Yield those paths to which a URI may refer that exist.
+        """Yield the existing paths to which a URI may refer.
 
         Raises LidarError if a path must not be read.
         """
@@ -210,7 +210,7 @@ class Resources:
             yield Candidate(model / file, root, is_allowed)
 
     def _downloads(self, uri: str) -> Iterator[Candidate]:
-        """Yield the paths of a Fuel model or of a file in it, first in the caches, then by name."""
+        """Yield possible paths of a Fuel model or its file, first in caches, then elsewhere."""
         parts = [unquote(part) for part in urlsplit(uri.strip()).path.split("/") if part]
         if len(parts) < 4 or parts[2].lower() != "models" or ".." in parts:
             return

@@ -118,7 +118,7 @@ _SHAPES: dict[str, Callable[[Element], SceneMesh | None]] = {
 
 
 def polyline_mesh(polylines: Sequence[Element]) -> SceneMesh | None:
-    """Extrude outlines along z by the height of the first one, or return None without an area.
+    """Extrude outlines along z by the height of the first one. Return None for an empty shape.
 
     Outlines inside another outline are holes.
     """

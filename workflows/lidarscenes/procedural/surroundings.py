@@ -79,7 +79,7 @@ class Views:
 
     @property
     def is_inside_body(self) -> bool:
-        """Whether only the backs of surfaces are visible from the positions, in all directions."""
+        """Whether the positions are inside a body, so that rays only hit backs of surfaces."""
         enclosed = np.mean(np.isfinite(self.distance)) > _AROUND
         return bool(enclosed and self.hit.any() and np.mean(self.back[self.hit]) > 1 - 1 / RAYS)
 
@@ -220,7 +220,7 @@ class PlacementChecker:
         return bool(lower and np.mean(hits[up > _RAISED]) >= _WIDELY_COVERED)
 
     def _is_room(self, views: Views) -> bool:
-        """Return whether positions are in a room, even though all sides face outward."""
+        """Return whether positions are in a room, for a scene whose sides all face outward."""
         if not _has_floor(views):
             return False
         if np.mean(views.back) < 1 - _CLOSED:  # the walls have a thickness

@@ -51,7 +51,7 @@ class RoadStations:
 
     @classmethod
     def at(cls, distances: Floats) -> RoadStations:
-        """Create stations at the given distances, with values from after any steps."""
+        """Create stations at the given distances. At a step, they have the values after it."""
         return cls(distances, distances)
 
     def __len__(self) -> int:
@@ -120,7 +120,7 @@ class Intervals:
         return cls(ends, pieces)
 
     def with_lead(self, breaks: Floats) -> Intervals:
-        """Add a lead interval if pieces of the road start at the first distance."""
+        """If a piece of the road starts at the first distance, add an empty interval before it."""
         start = self.ends[0, 0]
         at_start = breaks[np.abs(breaks - start) <= GAP_M]
         if not len(at_start) or start <= GAP_M:
@@ -275,7 +275,7 @@ def place_stations(
 
 
 def _part_counts_in_groups(surfaces: Sequence[SampledSurface], sag_m: float) -> Iterator[Floats]:
-    """Yield the part counts of each measured surface, processing a few surfaces at a time."""
+    """Yield the `part_counts` of each measured surface, processing a few surfaces at a time."""
     group: list[SampledSurface] = []
     size = 0
     for surface in surfaces:
@@ -320,7 +320,7 @@ def part_counts(surfaces: Sequence[SampledSurface], sag_m: float) -> list[Floats
 
 
 class _Columns(NamedTuple):
-    """Columns of points for several surfaces, by interval, and the cells between the columns."""
+    """Columns of points on several surfaces, with their intervals, and the cells between them."""
 
     size: int  # number of intervals
     intervals: Ints  # (r,) interval of each column
@@ -382,7 +382,7 @@ def has_extent(points: Floats, faces: Ints) -> Bools:
 
 
 def _bend_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> tuple[Floats, Floats]:
-    """Return the errors that bends would cause in plan and in height without division."""
+    """Return the errors in plan and in height that bends cause in undivided intervals."""
     # Half of the second differences (r, 3), a quarter of the error of an undivided interval.
     bends = [(v[:, 2:] + v[:, :-2]) / 2 - v[:, 1:-1] for v in (x, y, z)]
     along = [v[:, 2:] - v[:, :-2] for v in (x, y, z)]

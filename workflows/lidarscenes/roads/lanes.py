@@ -96,7 +96,7 @@ class Lane:
 
 
 def _steps(elements: Sequence[Element], start: float, *names: str) -> Cubics:
-    """Read a piecewise constant function from the first attribute that each element has."""
+    """Read a piecewise constant function. Each element has one of the attributes `names`."""
     if not elements:
         return NO_CUBICS
     rows = []
@@ -181,7 +181,7 @@ class LaneSection:
     def _borders_and_widths(
         self, road: Road, stations: RoadStations
     ) -> tuple[dict[int, Floats], dict[int, Floats]]:
-        """Return t coordinates of lane borders, and widths as in the file, by lane number.
+        """Return the border t coordinates, and the widths that the file states, by lane number.
 
         All arrays have shape (k,).
         """
@@ -238,7 +238,7 @@ class LaneSection:
 
 
 def _changes(is_above: Callable[[Floats], Bools], lower: Floats, upper: Floats) -> Floats:
-    """Find the distances at which a predicate changes between bounds, by bisection."""
+    """Find the distances between bounds at which a predicate changes, by bisection."""
     is_first = is_above(lower)
     for _ in range(_HALVINGS):
         middle = (lower + upper) / 2
@@ -321,7 +321,7 @@ def section_surfaces(
 
 
 class Strip(NamedTuple):
-    """The surface of a lane at the stations of its section, or of a curb beside the lane."""
+    """The surface of a lane, or of a curb beside it, at the stations of the lane section."""
 
     lane: Lane
     t: Floats  # (c, k) t coordinates of the point columns in meters
@@ -409,7 +409,7 @@ class SectionSurface:
         return [*self._curbs()]
 
     def to_sampled(self, intervals: Intervals) -> SampledSurface:
-        """Return this surface in the form from which stations are placed.
+        """Convert this surface to the form that the placement of stations requires.
 
         The stations of this surface must be the samples of `intervals`.
         """

@@ -191,7 +191,7 @@ class Road:
 
 
 class LateralShapes:
-    """Heights across a road, given by cubics of t and interpolated linearly between stations."""
+    """Heights across a road. They are cubics of t, interpolated linearly between stations."""
 
     def __init__(self, elements: Sequence[Element]) -> None:
         groups: dict[float, list[list[float]]] = {}
@@ -244,7 +244,7 @@ class LateralShapes:
         return np.unique(starts[:, 1:][is_step & np.isfinite(starts[:, 1:])])
 
     def max_bends(self, start: float, stop: float, knots: Floats) -> Floats:
-        """Return the largest second derivative between successive t coordinates, in 1/m."""
+        """Return the largest curvature of the heights between successive t coordinates, in 1/m."""
         row_range = self._row_range(start, stop)
         t = (knots[1:] + knots[:-1]) / 2
         pieces = np.maximum((self._starts[row_range, :, None] <= t).sum(axis=1) - 1, 0)  # (m, j)

@@ -131,7 +131,7 @@ def _knots_of(line: _Line, surface: SectionSurface, border: Floats) -> _Knots:
 
 
 def _dashed_knots(line: _Line, s: Floats, steps: Ints) -> tuple[Ints, Floats, Ints]:
-    """Return stations, fractions, and quadrilaterals for the cross sections of a dashed line.
+    """Return where a dashed line has cross sections, and which quadrilaterals are painted.
 
     `s` (k,) are the distances of the section's stations in meters, and `steps` (j,) the stations
     before a step, where the next station has the same distance.
@@ -253,7 +253,7 @@ def _explicit_line(line: Element, start: float, stop: float, width: float, color
 def _typed_line(
     line: Element, start: float, stop: float, width: float, color: str, allowance: Allowance
 ) -> _Line:
-    """Return a line that the type of a road mark defines by a repeated dash and gap."""
+    """Return a line from the definition of a road mark type, which repeats a dash and a gap."""
     first = start + max(0.0, read_number(line, "sOffset", 0.0))
     dashes = _dashes(
         first,

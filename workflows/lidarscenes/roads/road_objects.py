@@ -332,7 +332,7 @@ def _rail_pieces(network: RoadNetwork, sag_m: float, allowance: Allowance) -> di
 
 
 def _sampled(samples: SurfaceSamples, points: Floats, sag_m: float) -> SampledSurface:
-    """Return the surface between two lines of points that are given at the samples."""
+    """Return the surface between two lines, given their points at the samples."""
     columns = np.moveaxis(points, 1, 0)
     is_cell = np.ones(1, np.bool_)
     return SampledSurface(samples.intervals, columns, is_cell, HEIGHT_SHARE * sag_m)
@@ -510,7 +510,7 @@ def _flat_pieces(
     placement: _Placement,
     outlines: Sequence[_Outline],
 ) -> Iterator[Piece]:
-    """Yield the paint of a flat object, either stripes or the whole area of a mark."""
+    """Yield the paint of a flat object: the stripes of a crosswalk, or the area of a mark."""
     lift = np.array([0, 0, LIFT_M])
     rings = [outline.corners for outline in outlines]
     rings = rings or [transform_points(_rectangle(placement.size), frame.origin, frame.turn)]

@@ -156,7 +156,7 @@ def painted_strips(starts: Floats, stops: Floats, width: float, material: str) -
 
 
 def zebra_stripes(ring: Floats, stripe_m: float, material: str) -> Piece:
-    """Return every other stripe across the longest side of a convex, level outline."""
+    """Divide a convex outline into stripes across its longest side. Return every other one."""
     following = np.roll(ring, -1, axis=0)
     sides = following - ring
     longest = int(norm(sides).argmax())

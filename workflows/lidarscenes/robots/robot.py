@@ -533,7 +533,7 @@ class _LinkMotion(NamedTuple):
         return self._replace(positions=self.positions + moved[:, 3], rotations=moved[:, :3])
 
     def at_origin(self) -> _LinkMotion:
-        """Return the same motion, but with velocities at the origin of the frame."""
+        """Return the same motion, with the velocities of the frame's origin."""
         levers = self.positions - self.anchors
         moved = self.velocities + np.cross(self.rates, levers, axis=0)
         return self._replace(anchors=self.positions, velocities=moved)
@@ -546,7 +546,7 @@ class _LinkMotion(NamedTuple):
         return self._replace(rates=self.rates + added)
 
     def after_hinge(self, hinge: Hinge, value: Floats) -> _LinkMotion:
-        """Return the motion after a hinge, with the poses changed by the hinge's values."""
+        """Return the motion with poses moved by a hinge's values. Velocities do not change."""
         if hinge.slides:
             slide = _product(self.rotations, hinge.axis[:, None, None] * value)[:, 0]
             return self._replace(positions=self.positions + slide)

@@ -367,7 +367,7 @@ class _LinkMeshes:
         return as_bytes(_numbers(color, "rgba", 4, "1 1 1 1")[:3]).reshape(1, 1, 3)
 
     def _shape(self, shape: Element) -> tuple[Floats, list[SceneMesh]]:
-        """Return scale factors, some of which may be zero, and the meshes to which they apply."""
+        """Return a shape's scale factors, and its unscaled meshes. Factors may be zero."""
         if shape.tag == "mesh":
             if len(factors := shape.get("scale", "").split()) == 4:  # some public files have four
                 shape.set("scale", " ".join(factors[:3]))

@@ -174,7 +174,7 @@ class _Writer:
         return attributes
 
     def _array(self, values: AnyArray, kind: str) -> int:
-        """Add an accessor for attributes or, if scalar, for indices, and return its index."""
+        """Add an accessor and return its index. Scalars are indices, and vectors attributes."""
         view = self._view(values.tobytes(), target=34963 if kind == "SCALAR" else 34962)
         limits = {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
         return self._put(

@@ -121,7 +121,7 @@ def hit_density(scene: Scene, hit_counts: AnyArray) -> Floats:
 
 
 def _rounds(hit_counts: Floats) -> int:
-    """Choose how many times neighbors share their hits."""
+    """Choose how many times hits are distributed among neighboring triangles."""
     hit = hit_counts[hit_counts > 0]
     if not len(hit):
         return 0
@@ -178,7 +178,7 @@ def _density_colors(density: Floats, hit: Bools, limits: tuple[float, float]) ->
 def _divide(
     pieces: Floats32, hit: Bools, points: Floats32, max_pieces: int
 ) -> tuple[Floats32, Ints, Floats, Floats]:
-    """Divide triangles with hits while their grid cells contain enough points.
+    """Divide triangles with hits repeatedly, as long as their grid cells have enough points.
 
     Returns the pieces with their owners, areas, and points per square meter. The points per square
     meter are NaN for undivided triangles.
@@ -225,7 +225,7 @@ def _divide(
 
 
 class _WeightGrid:
-    """Sums of position weights in the cells of a grid."""
+    """Sum of the weights of all positions in each cell of a grid."""
 
     def __init__(self, positions: Floats32, weights: Floats, width: float, lower: Floats32) -> None:
         self._width = width

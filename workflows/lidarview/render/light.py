@@ -79,7 +79,7 @@ class LightMap:
 def surface_similarity(
     position: Floats32, normal: Floats32, spot: Floats32, facing: Floats32, tolerance: Floats32
 ) -> Floats32:
-    """Return the similarity, from 0 to 0.4, between points and the surface at other points.
+    """Return how similar the surfaces at pairs of points are, from 0 to 0.4.
 
     `spot` and `facing` (n, 3) are the positions and normals of the other points. Points on the same
     surface lie within `tolerance` (n,) meters of each other's plane.
@@ -90,7 +90,10 @@ def surface_similarity(
 
 
 def plane_tolerance(camera: Camera, position: Floats32, stride: int) -> Floats32:
-    """Return the tolerance in meters for points that are `stride` pixels apart on a plane."""
+    """Return the distance from a plane, in meters, at which points still count as on it.
+
+    The points are `stride` pixels apart.
+    """
     offset = position - camera.eye.astype(np.float32)
     distance = np.sqrt(dot(offset, offset))
     return (3 * stride * camera.footprint(distance)).astype(np.float32)
@@ -149,16 +152,16 @@ def make_light_map(
 
 
 def _quarters(has_surface: Bools) -> Ints:
-    """Return which quarter of its two-by-two block each grid point with a surface occupies.
+    """Return the quarter of a two-by-two block in which each grid point lies, from 0 to 3.
 
-    Quarters are numbered from 0 to 3. `has_surface` has shape (rows, columns).
+    Only grid points with a surface are included. `has_surface` has shape (rows, columns).
     """
     row, column = np.nonzero(has_surface)
     return np.asarray(row % 2 + 2 * (column % 2))
 
 
 def _rotated(direction: Floats, rotation: float) -> Floats:
-    """Rotate a direction about z, returning four directions that are `rotation` radians apart."""
+    """Rotate a direction about z by 0, 1, 2, and 3 times `rotation`, in radians."""
     x, y, z = direction
     angles = rotation * np.arange(4)
     cos = np.cos(angles)

@@ -493,7 +493,7 @@ def _label_in_full(axis: Axis) -> None:
 
 
 def _grid(shot: SurfaceView) -> Floats:
-    """Return the border of the ground and a line at each tick.
+    """Return lines on the ground: its border, and one line for each tick.
 
     The shape is (n, 2, 3).
     """

@@ -54,7 +54,7 @@ class RaySamples:
     weights: Floats32  # (n, 3) weights of the triangle's corners
 
     def scatter(self, which: Ints, count: int) -> RaySamples:
-        """Spread these samples over `count` samples, the rest of which show the sky.
+        """Return `count` samples: these at the given indices, and the sky at all others.
 
         `which` (n,) contains the new indices of these samples.
         """

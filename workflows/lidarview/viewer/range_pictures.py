@@ -79,7 +79,7 @@ def range_image(
 
 
 def _image_rows(points: Floats, ranges: Floats, channels: Ints | None) -> tuple[Ints, int]:
-    """Return the row of each point in a range image, from the top, and the number of rows."""
+    """Return each point's row in a range image, counted from the top, and the row count."""
     if channels is not None:
         count = int(channels.max()) + 1
         if _MIN_CHANNELS <= count <= _MAX_CHANNELS:
@@ -100,10 +100,10 @@ def _range_colors(ranges: Floats, limits: tuple[float, float]) -> Bytes:
 
 
 def surround_object(sensors: Floats, bounds: Floats) -> bool:
-    """Return whether there are several sensors, all of which are outside an object.
+    """Return whether several sensors surround an object.
 
-    They can be beside or above the object. `sensors` has shape (n, 3), and `bounds` has shape (2,
-    3).
+    All of them must be outside the bounds of the object, either beside or above the object.
+    `sensors` has shape (n, 3), and `bounds` has shape (2, 3).
     """
     outside = ((sensors < bounds[0]) | (sensors > bounds[1])).any(axis=1)
     return len(sensors) > 1 and bool(outside.all())
