@@ -103,7 +103,7 @@ def columns_for(columns: Mapping[str, AnyArray], name: str) -> dict[str, AnyArra
 
 
 def _known(name: str) -> tuple[str, int]:
-    """Return the standard name of a column and the rank of its alias.
+    """Return a column's standard name and the rank of its alias in `ALIASES`.
 
     The standard name is empty if the column has none.
     """

@@ -627,7 +627,7 @@ def random_depths(bits: NDArray[np.uint64]) -> Floats:
 
 @cache
 def _logs() -> Floats:
-    """Return a table of negative logarithms between 1/2 and 1, rounded to single precision."""
+    """Return a table of -log(x) for x from 1/2 to 1, rounded to single precision."""
     steps = (np.arange(1 << 15) + 0.5) / (1 << 16) + 0.5
     return -log(steps).astype(np.float32).astype(np.float64)
 
