@@ -87,7 +87,7 @@ def _standard_names(names: tuple[str, ...], among: frozenset[str] | None) -> tup
 def with_standard_names(
     columns: Mapping[str, AnyArray], among: Collection[str] | None = None
 ) -> dict[str, AnyArray]:
-    """Rename columns to their standard names as `standard_names` defines them."""
+    """Rename columns to the names that `standard_names` returns for them."""
     return dict(zip(standard_names(columns, among), columns.values(), strict=True))
 
 

@@ -245,5 +245,5 @@ class _Sweep(NamedTuple):
 
 
 def _unit_of(datagram: CapturedDatagram) -> tuple[str, int]:
-    """Return the address of a unit and the receiver's port, which together identify the unit."""
+    """Return the sender's address and the receiver's port, which together identify a sensor."""
     return datagram.source, datagram.port

@@ -711,7 +711,7 @@ def _sensor_sweeps(survey: Survey, number: int) -> _SensorSweeps:
 
 
 def _fired_rays(survey: Survey, first_steps: list[Ints]) -> FiredRays | None:
-    """Describe all rays in a survey, or return None unless every return is stored with its ray."""
+    """Describe all rays in a survey, or return None if any return is stored without its ray."""
     if survey.keep_every != 1 or all(c.name != "ray" for c in survey.stored_columns):
         return None
     max_returns = tuple(2 if returns.mode in TWO_RETURNS else 1 for returns in survey.returns_each)

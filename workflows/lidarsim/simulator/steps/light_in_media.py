@@ -605,7 +605,7 @@ def refract(directions: Floats, normals: Floats, cosines: Floats, ratio: Floats)
 
 
 def _crown_layers(bits: NDArray[np.uint64], cumulative: Floats) -> Indices:
-    """Choose the crown of each leaf at random, in proportion to the crowns' densities.
+    """Choose a random crown for each leaf, with probabilities proportional to the densities.
 
     `bits` (k,) are random bits, and `cumulative` (k, MAX_MEDIA) are cumulative sums of the
     densities of the media in the stacks. The result has columns of `MediaStack`.
