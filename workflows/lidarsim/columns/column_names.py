@@ -87,7 +87,7 @@ def _standard_names(names: tuple[str, ...], among: frozenset[str] | None) -> tup
 def with_standard_names(
     columns: Mapping[str, AnyArray], among: Collection[str] | None = None
 ) -> dict[str, AnyArray]:
-    """Rename columns to their standard names as `standard_names` defines them."""
+    """Rename columns to the names that `standard_names` returns for them."""
     return dict(zip(standard_names(columns, among), columns.values(), strict=True))
 
 
@@ -103,7 +103,7 @@ def columns_for(columns: Mapping[str, AnyArray], name: str) -> dict[str, AnyArra
 
 
 def _known(name: str) -> tuple[str, int]:
-    """Return the standard name of a column and the rank of its alias.
+    """Return a column's standard name and the rank of its alias in `ALIASES`.
 
     The standard name is empty if the column has none.
     """

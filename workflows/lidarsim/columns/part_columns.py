@@ -1,4 +1,4 @@
-"""Point columns of consecutive scans, as returned by a batch and stored in a part.
+"""Point columns of consecutive scans, which a batch returns and a part stores.
 
 `x`, `y` and `z` are stored as cells, which are integer multiples of the precision, relative to the
 scene's local origin. Positions are therefore rounded only once.
@@ -42,12 +42,12 @@ class PartColumns:
 
     @property
     def stop(self) -> int:
-        """Number of the scan after the last one."""
+        """Number of the last scan plus 1."""
         return self.first + len(self.counts)
 
     @property
     def cell_box(self) -> Ints | None:
-        """Minimum and maximum cells, or None if the part has no rows.
+        """Minimum and maximum positions as cells, or None if the part has no rows.
 
         The shape is (2, 3).
         """

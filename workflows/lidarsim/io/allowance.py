@@ -64,7 +64,7 @@ least 2.70 GiB, and the limit is 256.00 MiB. Export it again.
         self._size += size
 
     def add_file(self, file: Path) -> None:
-        """Raise the limit for another file to which the file refers.
+        """Raise the limit by the size of another file that the input file refers to.
 
         Each file is counted only once.
         """

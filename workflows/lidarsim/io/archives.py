@@ -110,7 +110,7 @@ class _StoredFile(NamedTuple):
 
 
 def archive_pieces(arrays: Mapping[str, AnyArray]) -> list[Piece]:
-    """Create an uncompressed archive of arrays as pieces to be written in order.
+    """Create an uncompressed archive of arrays. Return its pieces in order.
 
     Contiguous arrays are not copied. Their pieces are views, which must be written before the
     arrays change. Equal arrays result in equal bytes, which are the same as those that zipfile
@@ -226,7 +226,7 @@ def _entries(file: IO[bytes]) -> list[zipfile.ZipInfo]:
 
 
 def _stored_array(file: IO[bytes], entry: zipfile.ZipInfo) -> StoredArray:
-    """Locate the array in a file in an archive.
+    """Locate the array that a file in an archive contains.
 
     Raise ValueError if the file is damaged or compressed.
     """

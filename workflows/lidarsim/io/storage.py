@@ -149,7 +149,7 @@ class Storage:
         return path
 
     def _target(self, name: str) -> Path:
-        """Return the local path of a file or folder to replace or remove.
+        """Return the local path of a file or folder that will be replaced or removed.
 
         A link at this path is not followed.
         """
@@ -158,7 +158,7 @@ class Storage:
 
     @contextmanager
     def _remote(self) -> Iterator[tuple[Any, str]]:
-        """Provide the file system and folder of a URL.
+        """Provide the fsspec file system of the storage, and the folder in it.
 
         Exceptions that the storage library raises in the context are converted to OSError.
         """
@@ -175,7 +175,7 @@ class Storage:
 
     @cached_property
     def _opened(self) -> tuple[int, Any, str]:
-        """ID of the process that opened the storage, the file system, and the folder."""
+        """ID of the process that opened the URL, and the URL's file system and folder."""
         try:
             import fsspec
         except ImportError as error:

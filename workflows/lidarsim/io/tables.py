@@ -500,9 +500,9 @@ class _ColumnReader:
     def _unit(
         self, quantity: Quantity, cell: str, unit: str | None, units: Mapping[str, str]
     ) -> str | None:
-        """Return the unit of a column, or None if the bare unit of the quantity applies.
+        """Return the unit of a column, or None if neither the column nor an option states it.
 
-        In the latter case, the values must be checked as well.
+        In the latter case, the unit is `quantity.bare`, and the values must be checked as well.
         """
         if quantity.units is SECONDS and self.time_unit is not None:
             return self.time_unit
@@ -559,7 +559,7 @@ class _ColumnReader:
 
     @property
     def possible(self) -> str:
-        """Names of all quantities, followed by the names for their other units."""
+        """Names of all quantities, each with its names in other units."""
         names = []
         for quantity in self.quantities:
             first, *other_units = quantity.units
@@ -663,7 +663,10 @@ def _check_widths(lines: Sequence[str], header: Header) -> None:
 
 
 def _check_unnamed(rows: Sequence[str], header: Header) -> None:
-    """Raise ValueError unless columns without a name are empty or count the rows from 0."""
+    """Raise ValueError if a column without a name contains anything but row numbers.
+
+    Row numbers start at 0. Cells may also be empty.
+    """
     for index, cell in enumerate(header.cells):
         if cell and not re.fullmatch(r"unnamed: \d+", cell.lower()):
             continue

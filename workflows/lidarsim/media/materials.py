@@ -836,7 +836,7 @@ def wet_surface_factor(cosine: Any, reflectance: Any) -> Any:
 
 
 def water_film_factor(mirrored: Any, reflectance: Any) -> Any:
-    """Return the result of `wet_surface_factor`, given the reflectance of the film of water."""
+    """Compute `wet_surface_factor` from the reflectance of the film of water."""
     through = (1 - mirrored) / WATER_INDEX
     return through * through / (1 - WATER_INWARDS * reflectance)
 

@@ -127,7 +127,7 @@ class Weather(FileSection):
 
     @property
     def fog_returns_light(self) -> bool:
-        """Whether fog may return light to sensors with a detection range."""
+        """Whether fog may return light, given a sensor with a detection range."""
         return self.visibility_km is not None and self.fog_lidar_ratio_sr is not None
 
     @property

@@ -263,7 +263,7 @@ def _edges_of(bag: Reader, kinds: Mapping[str, str]) -> dict[str, _Edge]:
 
 
 def _chain(edges: Mapping[str, _Edge], frame: str) -> list[_Edge]:
-    """Return the edges on the way from a frame to the root."""
+    """Return the edges that lead from a frame to the root of its tree."""
     chain = []
     visited = set[str]()
     while frame in edges:
@@ -315,7 +315,7 @@ def _frame_poses(edges: Mapping[str, _Edge], frame: str) -> TimedPoses:
 
 
 def _edge_poses(edge_times: Ints, rows: Floats, times: Ints) -> tuple[Floats, Floats]:
-    """Interpolate the poses of an edge at the requested times.
+    """Interpolate the poses of a frame relative to its parent at the requested times.
 
     Parameters
     ----------

@@ -93,7 +93,7 @@ def _turns_between_legs(times_s: Floats, positions: Floats) -> _Turns:
 
 
 def _nonzero_turns(starts: Floats, stops: Floats, yaws: Floats) -> _Turns:
-    """Return the turns that change the heading, taking the shorter direction for each."""
+    """Return the turns between headings. Each turn takes the shorter direction."""
     changes = np.diff(yaws)
     changes -= 2 * np.pi * np.round(changes / (2 * np.pi))
     turning = np.abs(changes) > 1e-12
@@ -122,7 +122,7 @@ class _Stops(NamedTuple):
 
     @classmethod
     def between(cls, times_s: Floats, travels: Bools, first: Floats, last: Floats) -> _Stops:
-        """Create the intervals between the segments on which the platform travels.
+        """Create an interval for each stop between segments on which the platform travels.
 
         Parameters
         ----------
@@ -154,7 +154,7 @@ class _Stops(NamedTuple):
         )
 
     def at(self, times_s: Floats) -> Heading:
-        """Return the headings at the given times, at which the platform is stationary.
+        """Return the headings at times when the platform is stationary.
 
         Times and headings have shape (k,).
         """

@@ -1,4 +1,4 @@
-"""Reader for the oxts folders of the KITTI data set, from an inertial navigation system.
+"""Reader for oxts folders of KITTI, which contain data of an inertial navigation system.
 
 Each file contains a row of 30 numbers. The row starts with latitude and longitude in degrees,
 altitude in meters, and roll, pitch and yaw in radians, as described in dataformat.txt of KITTI's

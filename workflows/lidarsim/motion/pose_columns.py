@@ -22,7 +22,7 @@ _QUATERNIONS = (
 
 
 def _spelled(prefixes: tuple[str, ...], axis: str, *spellings: str) -> tuple[str, ...]:
-    """Return the spellings of an axis: each prefix with the axis, followed by `spellings`."""
+    """Return column names such as pos_x, one for each prefix, followed by `spellings`."""
     return *(f"{prefix}_{axis}" for prefix in prefixes), *spellings
 
 

@@ -74,7 +74,7 @@ def rotation_sines(rotations: Floats) -> Floats:
 
 
 def rotation_terms(rotations: Floats, axes: Floats) -> Floats:
-    """Return the coefficients of Rodrigues' formula for continuing rotations about the given axes.
+    """Return coefficients that rotate matrices further about the given axes (Rodrigues 1840).
 
     For rotations of shape (3, 3, s) and unit axes of shape (3, s), the result `terms` has shape
     (3, 9, s). After a further rotation by the angle a, the matrix is
@@ -124,7 +124,7 @@ def matrices(quaternions: Floats) -> Floats:
 
 
 def matrices_by_component(quaternions: Floats) -> Floats:
-    """Convert unit quaternions to rotation matrices, both with the components first.
+    """Convert unit quaternions to rotation matrices. The components are on the first axes.
 
     The quaternions (x, y, z, w) have shape (4, k), and the matrices have shape (3, 3, k).
     """

@@ -80,10 +80,11 @@ def is_stationary(steps: Floats, slopes: Floats) -> Bools:
 
 
 def _end_slopes(times: Floats, values: Floats) -> Floats:
-    """Return the slopes of cubic polynomials through four values at the first of their times.
+    """Return the initial slopes of cubic polynomials through four values each.
 
-    The polynomials are in Newton form. `values` has shape (d, 4), or fewer columns for a short
-    curve, and the result has shape (d,).
+    An initial slope is the slope at the first of the four times. The polynomials are in Newton
+    form. `values` has shape (d, 4), or fewer columns for a short curve, and the result has shape
+    (d,).
     """
     slopes = np.zeros(len(values))
     differences = values

@@ -554,7 +554,7 @@ class Track:
 
     @property
     def slack_s(self) -> float:
-        """Maximum time in seconds by which a pose may be requested before or after the track."""
+        """Time in seconds before and after the track within which poses may be requested."""
         return _FIRING_S if self.beyond == "refuse" else np.inf
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:

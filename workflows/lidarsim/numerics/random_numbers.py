@@ -130,7 +130,7 @@ def normal(
 
 @cache
 def quantiles() -> Floats:
-    """Return 65,536 quantiles of the standard normal distribution with equal probabilities."""
+    """Return 65,536 equally probable quantiles of the standard normal distribution."""
     fractions = (np.arange(2**15) + 0.5) / 2**16
     lower_half = np.array([NormalDist().inv_cdf(fraction) for fraction in fractions])
     table = np.concatenate([lower_half, -lower_half[::-1]])

@@ -166,7 +166,7 @@ class Capture:
             raise LidarError(f"{self.name} {self._why_empty(unknown_links)}")
 
     def _why_empty(self, unknown_links: set[int]) -> str:
-        """Return the end of the error message for a file without datagrams, with advice."""
+        """Return why the file has no datagrams, phrased as the end of an error message."""
         if self.cut_datagrams:
             return (
                 "contains only truncated datagrams. Capture whole frames, for example "
@@ -295,7 +295,7 @@ class Capture:
 
 
 def _link_of(head: bytes, order: str) -> int:
-    """Return the link type in a pcap file header, given without its magic number."""
+    """Return the link type in the header of a pcap file. `head` lacks the magic number."""
     (link,) = unpack_from(f"{order}I", head, 16)
     return int(link) & 0xFFFF  # the other bits describe the frame check sequence
 

@@ -53,7 +53,7 @@ class Datagrams:
 
 @dataclass(frozen=True, eq=False)
 class PacketSource:
-    """Properties of a sensor and its survey that, besides the shots, determine the packets."""
+    """Properties of a sensor and its survey that are required to encode its shots."""
 
     sensor: Sensor
     mode: str  # mode of the reported returns (`Returns`)
@@ -126,7 +126,7 @@ class PacketEncoder(ABC):
 
     @abstractmethod
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the datagrams that a sweep's shots complete, grouped by port."""
+        """Encode the shots of a sweep. Return the datagrams that are now complete, by port."""
 
     @abstractmethod
     def finish(self) -> list[Datagrams]:
@@ -166,7 +166,7 @@ class PacketEncoder(ABC):
         return LidarError(f"Packets of {self.source.sensor.model} {reason}.")
 
     def number(self, name: str) -> int:
-        """Return an identifier that must be an integer.
+        """Return an identifier in the packet settings as an integer.
 
         Raises LidarError for other values.
         """
@@ -176,11 +176,11 @@ class PacketEncoder(ABC):
         return value
 
     def text(self, name: str) -> str:
-        """Return an identifier as text."""
+        """Return an identifier in the packet settings as text."""
         return str(self.source.settings.identifiers[name])
 
     def decimal(self, name: str) -> float:
-        """Return an identifier that must be a number.
+        """Return an identifier in the packet settings as a number.
 
         Raises LidarError for other values.
         """

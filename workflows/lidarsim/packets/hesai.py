@@ -63,7 +63,7 @@ class HesaiEncoder(PacketEncoder):
         self._next_number = 1
 
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the data packets that a sweep's shots complete."""
+        """Encode the shots of a sweep. Return the data packets that are now full."""
         filled = self._carry.whole_packets(shots)
         if not len(filled):
             return []

@@ -158,7 +158,7 @@ class LivoxEncoder(PacketEncoder):
         self._to_sensor = _imu_axes(source)
 
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the point packets that a sweep's shots complete, and IMU packets."""
+        """Encode the shots of a sweep. Return the full point packets, and the IMU packets."""
         if not len(shots):
             return []
         imu = self._imu(self._samples.during(shots))

@@ -92,7 +92,7 @@ class CommandFrame(NamedTuple):
 
 @dataclass
 class CommandRefusedError(Exception):
-    """A request that is refused with an error code, and the key of the invalid parameter."""
+    """A refused request, with the error code and the key of the invalid parameter."""
 
     code: Code
     key: int = 0

@@ -111,7 +111,7 @@ class RangeUnits(NamedTuple):
 
 
 class ReturnImages(NamedTuple):
-    """Images of up to r returns per beam, nearest first.
+    """One image for each of up to r returns per beam. The first has the nearest returns.
 
     All arrays have shape (r, n, c) for n columns of c beams.
     """
@@ -123,7 +123,10 @@ class ReturnImages(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MeasurementBlocks:
-    """Columns in the order of measurement, with the highest beam first, that fill whole packets."""
+    """Columns in chronological order. Their number fills whole packets.
+
+    The highest beam comes first in each column.
+    """
 
     frames: Ints  # (n,): number of the revolution
     measurement_ids: Ints  # (n,): column in the revolution
@@ -332,7 +335,7 @@ class OusterEncoder(PacketEncoder):
             )
 
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the lidar packets that a sweep's shots complete, and IMU packets."""
+        """Encode the shots of a sweep. Return the full lidar packets, and the IMU packets."""
         if not len(shots):
             return []
         groups = []

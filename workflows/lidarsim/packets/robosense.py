@@ -190,7 +190,7 @@ class RobosenseEncoder(PacketEncoder):
             )
 
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the measurement packets that a sweep's shots complete, and device data packets."""
+        """Encode the shots of a sweep. Return device data packets and full measurement packets."""
         filling = self._carry.whole_packets(shots)
         if not len(filling):
             return []
@@ -233,7 +233,7 @@ class RobosenseEncoder(PacketEncoder):
         blocks["azimuth"] = azimuths.reshape(len(blocks), self._firings)[:, firing]
 
     def _planes_in_order(self, shots: Shots) -> Ints:
-        """Return the number of the return to store in each plane of a packet."""
+        """Return the index of the return that each plane of a packet stores."""
         first = np.zeros((1, *shots.range_m.shape[1:]), np.int64)
         if self._planes == 1:
             return first

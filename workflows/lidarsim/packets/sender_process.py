@@ -88,7 +88,7 @@ class Route:
 
 
 def _open_socket(source: str, port: int) -> socket.socket:
-    """Return a socket bound to a source address and port, or to any if these are unavailable."""
+    """Return a socket, bound to a source address and port if these are available."""
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     for number in (port, 0) if source else (port,):
         with suppress(OSError):

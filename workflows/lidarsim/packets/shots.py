@@ -43,7 +43,7 @@ class Shots:
 
     @property
     def return_mask(self) -> Bools:
-        """Whether each shot has a return of each number.
+        """Whether each shot has a first return, a second return, and so on.
 
         The shape is (r, n, c).
         """
@@ -93,7 +93,7 @@ class Shots:
 
     @classmethod
     def from_image(cls, image: RayImage, points: Cloud, columns: Iterable[str] = ()) -> Shots:
-        """Return the shots in an image of points, without sensor faults.
+        """Create shots from the points in a range image, ignoring sensor faults.
 
         Raises LidarError if the sensor has no packet format, or if the points lack a column.
         """

@@ -76,7 +76,7 @@ class VelodyneEncoder(PacketEncoder):
         self._positions = PositionPackets(source, self.port("position", POSITION_PORT))
 
     def encode(self, shots: Shots) -> list[Datagrams]:
-        """Return the data packets that a sweep's shots complete, and position packets."""
+        """Encode the shots of a sweep. Return the full data packets, and position packets."""
         whole = self._carry.whole_packets(shots)
         if not len(whole):
             return []
@@ -121,7 +121,7 @@ class VelodyneEncoder(PacketEncoder):
         return Datagrams(payloads, last_ns + self.firing_interval_ns, self._port)
 
     def _stamps_us(self, first_ns: Ints) -> Ints:
-        """Return packet timestamps in µs past the hour, from the start times of first firings."""
+        """Return packet timestamps in µs past the hour, given the times of their first firings."""
         settings = self.source.settings
         offset_ns = 0.0
         if len(settings.lasers) > _BLOCKS * _BLOCK_LASERS // 4:
@@ -245,5 +245,5 @@ class _Sweep(NamedTuple):
 
 
 def _unit_of(datagram: CapturedDatagram) -> tuple[str, int]:
-    """Return the address of a unit and the receiver's port, which together identify the unit."""
+    """Return the sender's address and the receiver's port, which together identify a sensor."""
     return datagram.source, datagram.port

@@ -95,7 +95,7 @@ class _Fixes(NamedTuple):
 
     @classmethod
     def from_source(cls, source: PacketSource) -> _Fixes | None:
-        """Return the platform's fixes, or None if it has none with latitudes."""
+        """Return the fixes of the platform, or None if they are missing or lack latitudes."""
         instruments = source.instruments
         rows = [] if instruments is None else list(instruments.rows(GNSS_FILE))
         if not rows or len(rows[0]) < 6:

@@ -255,7 +255,7 @@ class _Planes(NamedTuple):
         return cls(slope_rows, np.concatenate(blocks), bool(has_values.all()))
 
     def values_at(self, face_indices: Integers, points: Floats) -> tuple[Any, Floats]:
-        """Return the values at points on the given faces, and a selection of those points.
+        """Return the values at points on the given faces, and a selection of points with values.
 
         The selection contains the points that have values. It is a slice for all points, or indices
         of shape (m,). Face indices have shape (n,), points have shape (3, n), and values have shape

@@ -232,7 +232,7 @@ class Instances:
         return int(self.sizes.sum())
 
     def owners(self, condition: Callable[[MeshPart], bool]) -> Ints32:
-        """Return the object index of each instance whose part satisfies a condition.
+        """Return the object indices of the instances whose parts satisfy a condition.
 
         Indices are repeated if several of these instances belong to the same object.
         """

@@ -102,7 +102,7 @@ def revolve(profile: ArrayLike, segments: int, name: str = "Revolved") -> SceneM
 
 
 def capsule(radius: float, height: float, segments: int, name: str) -> SceneMesh:
-    """Create an upright capsule centered at zero.
+    """Create an upright capsule centered at the origin.
 
     The height in meters is the length of the cylindrical part. A height of zero creates a sphere.
     """
@@ -115,7 +115,7 @@ def capsule(radius: float, height: float, segments: int, name: str) -> SceneMesh
 
 
 def cylinder(radius: float, height: float, segments: int, name: str) -> SceneMesh:
-    """Create an upright cylinder centered at zero."""
+    """Create an upright cylinder centered at the origin."""
     half = height / 2
     return revolve([(0, -half), (radius, -half), (radius, half), (0, half)], segments, name)
 

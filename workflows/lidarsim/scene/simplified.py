@@ -218,7 +218,7 @@ def _piece_corners(steps: int) -> Floats:
 def _triangle_shares(
     shared: Instances, max_triangles: int, near_positions: Sequence[Floats]
 ) -> Floats:
-    """Return the fraction of its triangles that each instance keeps for drawing.
+    """Return the fraction of triangles that remain when each instance is drawn.
 
     Half of the triangles are distributed evenly. The other half is distributed by the squared
     distance to the nearest position, so that all triangles appear about equally large from there.
@@ -351,10 +351,10 @@ def _grid_cells(points: Floats, cell: float) -> tuple[Ints, Ints]:
 
 
 def _sort_keys(rows: AnyArray) -> Ints:
-    """Return numbers that have the same order as rows of nonnegative integers.
+    """Return one number for each row. The numbers sort in the same order as the rows.
 
-    Sorting the numbers is faster than sorting the rows. Rows have shape (n, 3), and the result has
-    shape (n,).
+    The rows consist of nonnegative integers. Sorting the numbers is faster than sorting the rows.
+    Rows have shape (n, 3), and the result has shape (n,).
     """
     row_numbers = np.zeros(len(rows), np.int64)
     for column in rows.T.astype(np.int64):
@@ -365,7 +365,7 @@ def _sort_keys(rows: AnyArray) -> Ints:
 
 
 def _compact(numbers: Ints) -> Ints:
-    """Renumber integers in the same order with values below 2³¹.
+    """Replace integers with values below 2³¹ that sort in the same order.
 
     A product of two such values fits into 64 bits.
     """

@@ -103,7 +103,7 @@ def about(description: str, *examples: Any, **limits: Any) -> Any:
 
 
 def declared_values(instance: Any, base: type) -> dict[str, Any]:
-    """Return an instance's values of the fields that a base class declares.
+    """Return the values of an instance in the fields that a base class declares.
 
     The result maps field names to values.
     """

@@ -66,7 +66,7 @@ def convert_validation_errors(
 
 
 def _alike(error: ValidationError) -> Iterable[Sequence[ErrorDetails]]:
-    """Group the errors in a file by type, combining the entries of each list."""
+    """Group the errors in a file by field and type. The entries of a list form one field."""
     details_by_path = {detail["loc"]: detail for detail in error.errors(include_url=False)}
     groups: dict[Any, list[ErrorDetails]] = {}  # {field and kind of error: errors}
     for path, detail in details_by_path.items():

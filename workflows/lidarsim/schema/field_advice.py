@@ -51,7 +51,10 @@ class Owner(NamedTuple):
 
 
 def owners_by_level(name: str, start: Owner) -> Iterator[list[Owner]]:
-    """Yield the sections that have a field as one list per nesting level below `start`."""
+    """Yield the sections that have a field, in one list for each nesting level.
+
+    The first list is for `start` itself.
+    """
     level = [start]
     for _ in range(_MAX_DEPTH):
         yield [owner for owner in level if name in fields_by_name(owner.kind)]
@@ -59,7 +62,7 @@ def owners_by_level(name: str, start: Owner) -> Iterator[list[Owner]]:
 
 
 def owner_of_file(kind: Any) -> Owner:
-    """Return the owner that represents the entire file."""
+    """Return an `Owner` for the entire file."""
     return Owner((), (), None, kind)
 
 
@@ -73,7 +76,7 @@ def _inner_sections(outer: Owner) -> Iterator[Owner]:
 
 
 def _forms_of(annotation: Any, key: str, form: str = "%s") -> Iterator[tuple[str, Any]]:
-    """Yield the sections in an annotation together with their forms.
+    """Yield the sections in an annotation, each with its form, such as "[%s]" in a list.
 
     `key` is an example of a name in a mapping.
     """
@@ -174,7 +177,7 @@ def _other_unit_elsewhere(name: str, value: Any, file: Any) -> str:
 def _in_words(
     path: FieldPath, suggestion: str, direct: Sequence[str], examples: Sequence[str]
 ) -> str:
-    """Phrase the advice on a field that is valid in the `direct` sections.
+    """Phrase the advice that a field belongs in one of the `direct` sections.
 
     An empty string in `direct` represents the top level of the file.
     """
@@ -195,7 +198,7 @@ def _in_words(
 
 
 def _right_value(kind: Any, name: str, value: Any) -> Any:
-    """Return the value if it is valid for a field, or else its corrected spelling, or None."""
+    """Return a field's value if it is valid, otherwise its corrected spelling or None."""
     fields = fields_by_name(kind)
     if value is None:
         return None

@@ -18,7 +18,7 @@ LIMITS = tuple(_LIMIT_WORDS)  # limits of numbers, with the names used by `pydan
 
 
 def fields_by_name(hint: Any) -> Fields:
-    """Return the fields of all sections in an annotation, including every kind of each section.
+    """Return the fields of all sections in an annotation and of the kinds of these sections.
 
     The result maps names in files to fields.
     """
@@ -28,7 +28,7 @@ def fields_by_name(hint: Any) -> Fields:
 
 
 def kinds_of(section: Any) -> Sequence[Any]:
-    """Return the kinds of a section, which are more specific sections that depend on its content.
+    """Return the more specific sections that a section may be, depending on its content.
 
     For example, the section for a file has one kind for each format with options. A section
     declares its kinds in a function `kinds`. This function is called only for messages and schemas

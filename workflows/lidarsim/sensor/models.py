@@ -193,9 +193,9 @@ class Performance(_ModelSection):
         return Noise(**values)
 
     def _range_sigmas_m(self, threshold_m: float) -> tuple[float, float]:
-        """Return the standard deviations of ranges for strong returns and at the threshold.
+        """Return the range noise of strong returns, and of returns at the detection threshold.
 
-        `threshold_m` is `Detection.threshold_m`.
+        Both are standard deviations in meters. `threshold_m` is `Detection.threshold_m`.
         """
         assert self.precision is not None
         # Ratio of the threshold to the energy, which increases with the square of the range.
@@ -274,7 +274,7 @@ class SensorModel(_ModelSection):
         return not (self.beams.elevation_deg or self.mirror or self.prisms)
 
     def datasheet(self) -> Datasheet:
-        """Return the noise and returns that the data sheet specifies.
+        """Return the noise and the settings of returns that the data sheet specifies.
 
         Raises
         ------
@@ -416,7 +416,7 @@ def _read(path: Path | Traversable) -> SensorModel:
 
 
 class Datasheet(NamedTuple):
-    """Noise and returns that a sensor's data sheet specifies."""
+    """Noise and settings of returns that a sensor's data sheet specifies."""
 
     noise: Noise
     returns: Returns

@@ -124,7 +124,7 @@ class PrismSensor(Sensor):
         return np.ascontiguousarray(ray.transpose(1, 2, 0))
 
     def _reflect(self, rays: Floats, minutes: Floats) -> Floats:
-        """Reflect rays off the mirror, and turn its axis into the z axis.
+        """Reflect rays off the mirror. The axis of the mirror is the z axis of the result.
 
         The rays and the result have shape (3, k, c). The times of the firings in minutes have
         shape (k,).

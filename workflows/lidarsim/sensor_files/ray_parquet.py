@@ -68,9 +68,10 @@ def read(path: Path) -> RayList | None:
 
 
 def _bytes_of(metadata: pq.FileMetaData) -> int:
-    """Return the memory of the columns at 8 bytes per number, or of the pages if that is larger.
+    """Return the memory in bytes that the columns of a table require.
 
-    The pages alone do not suffice, because a column of equal values occupies only a few bytes.
+    This is 8 bytes per number, or the size of the pages if that is larger. The pages alone do not
+    suffice, because a column of equal values occupies only a few bytes.
     """
     groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
     rows = max(metadata.num_rows, sum(group.num_rows for group in groups))

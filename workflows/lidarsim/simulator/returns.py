@@ -163,7 +163,7 @@ def merge_returns(returns: PulseReturns, additions: PulseReturns) -> PulseReturn
 
 @dataclass(frozen=True)
 class Keys:
-    """Mapping from rays to the scan and ray numbers that seed their random numbers."""
+    """Scan and ray numbers from which the random numbers of rays are derived."""
 
     scan: int  # number of the first scan; for a frozen sensor, of the older scan that is sent again
     scan_starts: Ints  # (scans,): first ray of each scan

@@ -318,7 +318,7 @@ class Rig:
     def ranges(
         self, specs: list[ScanSpec], positions: Floats, rotations: Floats | None
     ) -> Floats32:
-        """Return the ranges measured by the same firings from several poses of a static platform.
+        """Return the ranges that the same firings measure from each of several static poses.
 
         `specs` are consecutive scans of one station. Their scan numbers, which seed random numbers,
         increase from pose to pose. The poses are positions (k, 3) in meters and rotations (k, 3, 3)
@@ -351,7 +351,7 @@ class Rig:
         first_scan: int,
         image: Floats32,
     ) -> None:
-        """Write to `image` the ranges measured by the same firings from several poses.
+        """Write to `image` the ranges that the same firings measure from each pose.
 
         `pattern` has the rays of the firings in the platform frame. `image` has shape (poses *
         rays,), with all rays of the first pose first. `first_scan` is added to the scan number of

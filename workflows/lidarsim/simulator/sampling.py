@@ -112,7 +112,7 @@ def _sampled_scans(survey: Survey, scans: range) -> tuple[Ints, Ints]:
 
 
 def _with_few_rays(survey: Survey, every: int) -> list[Mounted]:
-    """Return a survey's sensors, reduced to one in `every` of their rays."""
+    """Return the sensors of a survey with only one in `every` of their rays."""
     return [
         replace(mounted, sensor=_FewRays.from_sensor(mounted.sensor, every), steps=steps)
         for mounted, steps in zip(survey.mounted_sensors, survey.steps_each, strict=True)
@@ -165,7 +165,7 @@ class _FewRays(Sensor):
         return first * channels // self.every, stop * channels // self.every
 
     def _rays(self, firings: Ints) -> _SampledRays:
-        """Return the sampled ray of the original sensor for each firing."""
+        """Return the ray of the original sensor that each firing samples."""
         # Multiples of the golden ratio spread the rays evenly over firings and channels.
         ray = firings * self.every + (firings * GOLDEN % 1 * self.every).astype(np.int64)
         fired, channel = np.divmod(ray, self.sampled.channels)

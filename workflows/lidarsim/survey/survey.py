@@ -689,7 +689,7 @@ class Survey(CloudOptions, Weather):
         }
 
     def sent_scan(self, index: int) -> ScanSpec:
-        """Return the scan whose returns a sensor sends as scan `index`.
+        """Return the scan that a sensor sends as scan `index`, which may be an older scan.
 
         A frozen sensor repeats older scans: a sweep that starts while the sensor is frozen repeats
         the last sweep that started before the fault. The repeated scan depends only on times, so

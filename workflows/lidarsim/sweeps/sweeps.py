@@ -193,7 +193,10 @@ class Sweeps:
         return exact if self.coordinates == "sensor" else self.pose.to_body_frame(sweep, exact)
 
     def columns_in_sensor(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
-        """Return the columns of a sweep, with vectors in the frame of `in_sensor`."""
+        """Return the columns of a sweep, with vectors in the sensor frame at its start.
+
+        Vectors that are already stored in the sensor frame are returned unchanged.
+        """
         if self.coordinates == "sensor":
             return dict(points.columns)
         return _with_vectors(
@@ -203,14 +206,17 @@ class Sweeps:
         )
 
     def columns_as_fired(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
-        """Return the columns of a sweep, with vectors in the frame of `as_fired`."""
+        """Return the columns of a sweep, with vectors in the sensor frame at the firing times."""
         if self.coordinates == "sensor":
             return dict(points.columns)
         poses = self.firing_poses(sweep, points)
         return _with_vectors(points, poses.rotate_to_body_frame, poses.to_body_frame)
 
     def columns_compensated(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
-        """Return the columns of a sweep, with vectors in the frame of `compensate_motion`."""
+        """Return the columns of a sweep, with vectors in the sensor frame at its start.
+
+        Vectors that are stored in the sensor frame are compensated for motion.
+        """
         if self.coordinates != "sensor":
             return self.columns_in_sensor(sweep, points)
         poses = self.firing_poses(sweep, points)
@@ -545,7 +551,7 @@ class Sweeps:
             yield self.with_actors_at_start(sweep, points)
 
     def _points(self, cloud: CloudLike, first: int, stop: int) -> Iterator[Cloud]:
-        """Yield the points of each sweep from `first` up to `stop` without moving any points."""
+        """Yield the points of each sweep from `first` up to `stop` at their stored positions."""
         sweep_parts: list[Cloud] = []
         empty = Cloud(np.empty((0, 3)), {c.name: np.empty(0, c.dtype) for c in cloud.table})
         current = first
@@ -709,7 +715,7 @@ def _sensor_sweeps(survey: Survey, number: int) -> _SensorSweeps:
 
 
 def _fired_rays(survey: Survey, first_steps: list[Ints]) -> FiredRays | None:
-    """Describe all rays in a survey, or return None unless every return is stored with its ray."""
+    """Describe all rays in a survey, or return None if any return is stored without its ray."""
     if survey.keep_every != 1 or all(c.name != "ray" for c in survey.stored_columns):
         return None
     max_returns = tuple(2 if returns.mode in TWO_RETURNS else 1 for returns in survey.returns_each)

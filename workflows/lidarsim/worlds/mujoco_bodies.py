@@ -240,7 +240,7 @@ def _materials_of(model: Any, geoms: list[int], counts: list[int]) -> FaceMateri
 
 
 def _key(model: Any, geom: int) -> Hashable:
-    """Return a key that is equal for geoms with equal meshes in their body frames."""
+    """Return a key for a geom. Geoms with the same mesh in the body frame have equal keys."""
     fields = ("type", "dataid", "matid", "size", "pos", "quat", "rgba")
     return tuple(np.asarray(getattr(model, f"geom_{field}")[geom]).tobytes() for field in fields)
 

@@ -178,7 +178,7 @@ class GltfMaterials:
         return self._file.image(index, read_opacity)
 
     def _coordinates(self, info: dict[str, Any], primitive: dict[str, Any], mesh: Any) -> Any:
-        """Return the texture coordinates to which a texture info of a primitive refers.
+        """Return the texture coordinates of a primitive that a texture info refers to.
 
         The shape is (v, 2).
         """

@@ -1,4 +1,4 @@
-"""Coordinate units according to the coordinate system that a file states.
+"""Units of coordinates, derived from the coordinate system that a file states.
 
 The system is stated as WKT or as GeoTIFF keys. OGC WKT 1 and 2 state the length of each unit.
 GeoTIFF keys refer to units or coordinate systems by EPSG codes. The units of a coordinate system

@@ -280,7 +280,7 @@ def plugin_endings() -> tuple[str, ...]:
 
 
 def split_options(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tuple[MeshOptions, Any]:
-    """Validate and split options into shared and format-specific options.
+    """Validate options, and split them into shared and format-specific options.
 
     Parameters
     ----------

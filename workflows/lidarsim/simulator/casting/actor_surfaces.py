@@ -81,7 +81,7 @@ class ActorSurfaces:
         times: Floats | Ints,
         trajectories: ActorTrajectories,
     ) -> None:
-        """Transform points on actors in place to the undeformed meshes of the actors.
+        """Replace points on actors, in place, by the same points on the undeformed meshes.
 
         `points` (n, 3) are in the scene frame. Points on actors are replaced by the corresponding
         points in the actors' frames. Other points do not change. `triangle` (n,) are the triangles

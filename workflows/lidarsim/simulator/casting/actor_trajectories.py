@@ -213,7 +213,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         return table[:3].T, table[3:].reshape(3, 3, -1).transpose(2, 0, 1)
 
     def pose_runs(self, number: Integers, times_ns: Floats) -> tuple[Floats, Ints]:
-        """Return one pose for each run of equal rows, and the run number of each row.
+        """Group rows into runs of the same pose. Return a pose per run, and the run of each row.
 
         A run consists of consecutive rows with the same trajectory and time, which therefore have
         the same pose. The poses have shape (12, m), as in `table`. Rows with a negative number have
@@ -255,5 +255,5 @@ class ActorTrajectories(tuple[Trajectory, ...]):
 
 
 def _no_tracks() -> _StraightTracks:
-    """Return an empty set of tracks, so that concatenation always has an operand."""
+    """Return an empty set of tracks. With it, there is always something to concatenate."""
     return _static_tracks([], [])

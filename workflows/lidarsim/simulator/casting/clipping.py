@@ -103,9 +103,10 @@ def _cut_polygon(polygon: Sequence[_Corner], plane: list[float]) -> list[_Corner
 
 
 def _crossing(first: tuple[_Corner, float], second: tuple[_Corner, float]) -> _Corner:
-    """Return the intersection of an edge with a plane, from the signed heights of its ends.
+    """Return the point where an edge crosses a plane, given its ends and their heights.
 
-    The corners are sorted so that both triangles that share the edge get the same point.
+    Heights are signed distances from the plane. The corners are sorted so that both triangles that
+    share the edge get the same point.
     """
     (start, start_height), (stop, stop_height) = sorted((first, second))
     fraction = start_height / (start_height - stop_height)

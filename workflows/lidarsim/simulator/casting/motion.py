@@ -55,7 +55,7 @@ class FiringClock:
         return times_ns
 
     def for_subrays(self, start: int, subrays: int) -> FiringClock:
-        """Return a clock for sub-rays that are numbered from 0 at ray `start`."""
+        """Return a clock for sub-rays. Sub-ray 0 is the first sub-ray of ray `start`."""
         return replace(self, start=start, subrays=subrays)
 
 

@@ -64,7 +64,10 @@ def _is_short(range_m: float) -> bool:
 
 
 class _Trees(NamedTuple):
-    """Caster of the static bodies, or of those within a region, with its triangle numbering."""
+    """Caster of the static bodies, and the mapping from its triangles to those of the scene.
+
+    If `region` is set, the caster only has the bodies within this region.
+    """
 
     caster: RayCaster
     region: Floats | None  # (2, 3), meters; None for the whole scene
@@ -77,7 +80,7 @@ class _Trees(NamedTuple):
 
     @property
     def face_bodies(self) -> int:
-        """Number of instances (0 or 1) in the caster that represent the scene's faces."""
+        """Number of caster instances that represent the scene's faces, either 0 or 1."""
         return self.caster.instance_count - len(self.instance_indices)
 
     def to_scene_triangles(self, hits: ScanReturns) -> Ints32:

@@ -73,7 +73,7 @@ class StoredTriangles:
         return triangles
 
     def locate(self, triangle: Integers) -> TriangleOwners:
-        """Return the stored row, object and instance of each triangle."""
+        """Return the object and instance of each triangle, and the row in which it is stored."""
         from . import surface_loops  # imported here because numba takes half a second to import
 
         count = len(triangle)

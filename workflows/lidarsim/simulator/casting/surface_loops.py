@@ -173,7 +173,7 @@ def _instance_of(t, instance_starts):
 
 @compiled()
 def find_owners(triangle, numbers, output):
-    """Write the stored row, object and instance of each triangle to `output`.
+    """Write each triangle's object, instance and row in the stored triangles to `output`.
 
     `numbers` is a `TriangleNumbers`, and `output` a `TriangleOwners`.
     """
@@ -376,7 +376,7 @@ def start_behind(origins, directions, step_m, clear_m, starts, onward):
 
 @compiled()
 def firing_times(ray, start, subrays, firing_starts, delays, times):
-    """Write the firing times of sub-rays `ray` to `times`, in nanoseconds.
+    """Write the firing times of the sub-rays in `ray` to `times`, in nanoseconds.
 
     Each beam has `subrays` sub-rays, and sub-ray 0 belongs to beam `start`. `firing_starts` are the
     start times of firings, and `delays` are the delays of beams within a firing.
@@ -423,8 +423,9 @@ def merge_hits(ray, triangle, nearest, actors, output):
 
 @compiled()
 def find_runs(trajectory, times, first_rows, run_numbers):
-    """Write the run of each row and the first row of each run. Return the number of runs.
+    """Group rows into runs, and return the number of runs.
 
+    The run of each row is written to `run_numbers`, and the first row of each run to `first_rows`.
     The rows of a run have the same trajectory and time. `trajectory` (n,) are trajectory numbers.
     Rows with a negative number get run -1 and do not interrupt a run.
     """

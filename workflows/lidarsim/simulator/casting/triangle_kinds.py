@@ -90,7 +90,7 @@ class TriangleKinds:
 
     @cached_property
     def _material_kind(self) -> Ints32:
-        """For each kind, the number of the first kind with the same object and material.
+        """Map from each kind to the first kind that has the same object and material.
 
         The shape is (kinds,). Several material names in an object's files may match a single
         material of the survey. Their faces then form a single kind, so that a body of water or

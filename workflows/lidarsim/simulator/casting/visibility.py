@@ -41,7 +41,7 @@ def unseen_objects(scene: Scene, survey: Survey) -> tuple[Bools | None, ...]:
 
 
 def static_key(scene: Scene, unseen: Bools | None) -> bytes:
-    """Return a key that is equal for masks with the same unseen static objects.
+    """Return a key that identifies the static objects that a mask marks as unseen.
 
     The key is empty if all static objects are visible.
     """

@@ -196,7 +196,7 @@ class Grids:
         length: Floats,
         depth: Floats,
     ) -> _GridRays:
-        """Return the rays of a block in the voxels where they start."""
+        """Return the initial state of a block of rays, in the voxels where they start."""
         to_grid = self._to_grid[instances].transpose(2, 3, 1, 0)  # (axis, axis, k, n)
         x, y, z = (starts[:, None] - self._origins[instances]).transpose(2, 1, 0)
         u, v, w = directions.T[:, None]

@@ -287,7 +287,7 @@ class BatchPoints:
 
     @cached_property
     def _pattern_rows(self) -> Ints:
-        """Pattern row of each return's ray."""
+        """Row of each return's ray in the repeating pattern."""
         return (self._start + self.pulse_returns.ray.astype(np.int64)) % len(self._pattern)
 
     @cached_property
@@ -439,7 +439,7 @@ class BatchPoints:
 
     @property
     def incidence_deg(self) -> Floats:
-        """Angle between the ray and the surface normal in degrees, or NaN as in `normals`."""
+        """Angle between the ray and the surface normal in degrees. It is NaN without a normal."""
         return np.degrees(arccos(np.minimum(self._facing_normals[1], 1.0)))
 
     @cached_property

@@ -77,7 +77,7 @@ def _device_column_names(scene: Scene, survey: Survey) -> set[str]:
 
 
 def needs_hits(scene: Scene, survey: Survey) -> bool:
-    """Return whether all reported hits must leave the device because NumPy computes a column."""
+    """Return whether NumPy computes a column, and therefore needs all reported hits."""
     names = {column.name for column in survey.stored_columns}
     return not names <= _device_column_names(scene, survey) | {*_CONSTANT_COLUMNS}
 
@@ -119,7 +119,7 @@ class DevicePoints:
 
 
 class VisibleBodies:
-    """Bodies that a sensor can see, in the numbering of its caster."""
+    """Bodies that a sensor can see, numbered as in its caster."""
 
     def __init__(self, caster: SceneCaster, bodies: Ints) -> None:
         self.caster = caster

@@ -101,7 +101,7 @@ class CastLight(NamedTuple):
 
 
 class SurfaceHits(NamedTuple):
-    """Surface hits, with one row for each row of light.
+    """Hits on surfaces. Each row belongs to the same row of the light.
 
     Arrays have shape (n,), and arrays of vectors have shape (n, 3).
     """
@@ -339,7 +339,7 @@ class CastStep(PulseStep):
         return CastLight(light, start_m, hits.distance, hits.triangle), rays
 
     def _light_of_rays(self, ray: Ints, rays: Floats, batch: PulseBatch) -> LightPaths:
-        """Return the light at the sensor for the sub-rays that hit a surface.
+        """Return the light of the sub-rays that hit a surface, as it leaves the sensor.
 
         `rays` has all sub-rays of the batch (`_cast_first`).
         """
@@ -753,7 +753,7 @@ def _range_rate_behind(
 def _pattern_behind(
     light: LightPaths, step_m: Floats, clear_m: Floats, outgoing: Floats
 ) -> tuple[Pattern, Floats]:
-    """Return rays that continue `clear_m` beyond the ends of light paths, and their origins.
+    """Return rays that start `clear_m` beyond the ends of light paths, and their origins.
 
     The light ends at distances `step_m` (n,) in meters from its origins. `outgoing` (n, 3) are the
     directions of the rays, whose lengths must be close to 1.

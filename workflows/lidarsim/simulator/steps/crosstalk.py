@@ -335,7 +335,7 @@ class CrosstalkStep(PulseStep):
 
 
 def _expanded(first: Indices, stop: Indices) -> tuple[Indices, Indices]:
-    """Return the range number and the value of each integer in half-open ranges."""
+    """List all integers in half-open ranges. Return the range number and value of each."""
     counts = np.maximum(stop - first, 0)
     row = np.repeat(np.arange(len(counts)), counts)
     return row, first[row] + np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)

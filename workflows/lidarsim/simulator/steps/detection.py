@@ -29,7 +29,7 @@ class DetectionStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return whether returns are found in waveforms and can be lost because of noise."""
+        """Return whether the receiver finds returns in waveforms and may lose some of them."""
         return setup.noise.loses_returns and setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:

@@ -605,7 +605,7 @@ def refract(directions: Floats, normals: Floats, cosines: Floats, ratio: Floats)
 
 
 def _crown_layers(bits: NDArray[np.uint64], cumulative: Floats) -> Indices:
-    """Choose the crown of each leaf at random, in proportion to the crowns' densities.
+    """Choose a random crown for each leaf, with probabilities proportional to the densities.
 
     `bits` (k,) are random bits, and `cumulative` (k, MAX_MEDIA) are cumulative sums of the
     densities of the media in the stacks. The result has columns of `MediaStack`.
@@ -627,7 +627,7 @@ def random_depths(bits: NDArray[np.uint64]) -> Floats:
 
 @cache
 def _logs() -> Floats:
-    """Return a table of negative logarithms between 1/2 and 1, rounded to single precision."""
+    """Return a table of -log(x) for x from 1/2 to 1, rounded to single precision."""
     steps = (np.arange(1 << 15) + 0.5) / (1 << 16) + 0.5
     return -log(steps).astype(np.float32).astype(np.float64)
 

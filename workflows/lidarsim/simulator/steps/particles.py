@@ -258,7 +258,7 @@ def light_reach(
 def add_air_hits(
     setup: Setup, returns: PulseReturns, batch: PulseBatch, air_hits: PulseReturns
 ) -> PulseReturns:
-    """Add hits in the air to the hits of a batch, and return its hits.
+    """Add hits in the air to a batch. Return the hits that the next step receives.
 
     With waveforms, hits in the air are inserted before the hits on surfaces. Otherwise they are
     stored in `batch.air` for `SeparationStep`.
@@ -280,7 +280,7 @@ def add_air_hits(
 
 
 def random_keys(seed: int, purposes: tuple[Purpose, ...], keys: Keys, first: int) -> RandomKeys:
-    """Return the random number keys of the beams from number `first`, for compiled loops."""
+    """Return the keys of random numbers for beams, starting with beam number `first`."""
     from .random_loops import RandomKeys
 
     return RandomKeys(
@@ -333,9 +333,10 @@ def _fog_hits(fog: FogCells, random: RandomKeys, subrays: int, reach: Floats) ->
 def insert_air_hits(
     hits: PulseReturns, planes: Planes | None, air_hits: PulseReturns
 ) -> tuple[PulseReturns, Planes | None]:
-    """Insert hits in the air before the surface hits of their rays, into both hits and planes.
+    """Insert hits in the air before the surface hits of the same rays.
 
-    Planes of hits in the air are 0. If `planes` is None, it stays None.
+    They are inserted into both `hits` and `planes`. Planes of hits in the air are 0. If `planes` is
+    None, it stays None.
     """
     order = np.argsort(np.concatenate([air_hits.ray, hits.ray]), kind="stable")
     if planes is not None:
@@ -389,7 +390,7 @@ def seen_by_range(
 
 
 def _poisson(mean: float) -> Floats:
-    """Return the cumulative Poisson probabilities of 0, 1, … events, the last of which is 1."""
+    """Return the Poisson probabilities of at most 0, 1, … events. The last probability is 1."""
     sums = []
     term = exp_of(-mean)
     count = 0
@@ -427,10 +428,10 @@ def _fog_cells(
 
 
 def highest_probabilities(signals: Floats) -> Floats:
-    """Return the cumulative probabilities that each of the first n signals is the highest.
+    """For each n, return the distribution of which of the first n signals is the highest.
 
-    `signals` (k,) are descending, with noise of standard deviation 1. Row n of the result (k + 1,
-    k) is for the first n signals, and row 0 is 1.
+    The probabilities are cumulative. `signals` (k,) are descending, with noise of standard
+    deviation 1. Row n of the result (k + 1, k) is for the first n signals, and row 0 is 1.
     """
     count = len(signals)
     probabilities = np.ones((count + 1, count))

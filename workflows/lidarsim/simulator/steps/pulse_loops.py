@@ -111,10 +111,10 @@ def thin_out(ray, scan_starts, keep_every, hit_counts, row_indices, number, retu
 
 @inlined
 def _half_way(hit, neighbor, inverse_distance, neighbors):
-    """Return the range of a hit's plane, in meters, midway to the ray of a neighboring hit.
+    """Return the range of the plane through a hit, halfway between two rays.
 
-    `hit` and `neighbor` are rows in `SubrayNeighbors`, and `inverse_distance` is that of `hit`, in
-    1/m.
+    These are the rays of the hit and of a neighboring hit. The range is in meters. `hit` and
+    `neighbor` are rows in `SubrayNeighbors`, and `inverse_distance` is that of `hit`, in 1/m.
     """
     normals = neighbors.normals
     directions = neighbors.directions

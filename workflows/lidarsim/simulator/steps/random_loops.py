@@ -44,7 +44,10 @@ def _mixed(x):
 
 @inlined
 def bits(start, scan, ray, number):
-    """Return 64 random bits for a purpose (given by its hash start), a ray and a number."""
+    """Return 64 random bits for a purpose, a ray and a number.
+
+    `start` is the initial hash state of the purpose.
+    """
     scan_state = _mixed(start + np.uint64(scan) * _GAMMA)
     return _mixed(scan_state + (np.uint64(ray) * _NUMBERS + np.uint64(number) + _NEXT) * _GAMMA)
 

@@ -28,7 +28,7 @@ class PulseExtents(NamedTuple):
 
 @compiled()
 def join_clipped(pulses, remains):
-    """Merge overlapping returns of a pulse if any is clipped, and mark the returns that remain.
+    """Merge returns of a pulse that overlap clipped returns, and mark those that remain.
 
     The highest of the merged returns remains, with the total energy of all merged returns, and with
     the outermost edges and the smallest distance of the clipped returns. These values are written

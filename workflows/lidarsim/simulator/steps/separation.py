@@ -129,7 +129,10 @@ def _receiver(subrays: int, gap_m: float, reporting: Reporting, *, with_velocity
 
 
 def _detection_keys(reporting: Reporting) -> RandomKeys:
-    """Return the random number keys of detection, without starts if no returns are lost."""
+    """Return the keys of the random numbers for detection.
+
+    Without loss of returns, the array `starts` is empty.
+    """
     from .random_loops import RandomKeys
 
     noise = reporting.noise
@@ -211,7 +214,7 @@ class SeparationStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return whether rays may have several returns or none, and waveforms are not used."""
+        """Return whether the number of returns per ray varies, and no waveforms are used."""
         return setup.return_count_varies and not setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:

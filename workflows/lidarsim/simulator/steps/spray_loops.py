@@ -180,7 +180,7 @@ def _column(ranges, guide, part_m, distance):
 
 @noinline
 def _guide(ranges, part_m):
-    """Return the columns at which searches for a distance start.
+    """Return a lookup table of the columns at which searches for a distance start.
 
     `guide[k]` is the first column at ``(k - 1) * part_m`` or farther. It is one part early, so that
     a rounded distance never starts its search too late.

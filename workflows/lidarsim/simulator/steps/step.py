@@ -107,7 +107,7 @@ class Setup:
 
     @property
     def in_waveforms(self) -> bool:
-        """Whether returns are found in waveforms."""
+        """Whether the receiver finds returns in waveforms."""
         return self.reporting.waveform != "none"
 
     @property
@@ -279,13 +279,16 @@ class PulseBatch:
 
     @property
     def window(self) -> tuple[int, int]:
-        """Start and stop of the batch's sub-rays in the repeating rows of `beams`."""
+        """Range of rows in `beams` with the batch's sub-rays, as start and stop.
+
+        The rows repeat, so the range may exceed their number.
+        """
         row = 0 if self.offsets is not None else (self.first + self.start) * self.subrays_per_beam
         return row, row + (self.stop - self.start) * self.subrays_per_beam
 
     @cached_property
     def subray_poses(self) -> CastPoses:
-        """Poses of the batch's sub-rays, numbered from 0."""
+        """Poses of the batch's sub-rays. The first sub-ray of the batch has number 0."""
         return self.poses.for_subrays(self.start, self.stop, self.subrays_per_beam)
 
     @cached_property

@@ -158,10 +158,11 @@ def bound_cells(origins, directions, cones):
 
 @noinline
 def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
-    """Return the tangent of the angle between a ray and a triangle, and the nearest point by angle.
+    """Return the angle between a ray and a triangle, as a tangent, and the nearest point.
 
-    `ray` is an origin and a direction. The point is a vector from the ray's origin. The tangent is
-    0 if the ray hits the triangle, and -1 if the triangle is not in front of the ray.
+    The nearest point is the point of the triangle at the smallest angle to the ray. `ray` is an
+    origin and a direction. The point is a vector from the ray's origin. The tangent is 0 if the ray
+    hits the triangle, and -1 if the triangle is not in front of the ray.
     """
     ox, oy, oz, dx, dy, dz = ray
     a, b, c, d, e, f = perpendicular_axes(dx, dy, dz)
@@ -207,11 +208,11 @@ def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
 
 @inlined
 def _reach_of_cell(rays, c, triangles, limits):
-    """Return whether a cell of rays may receive light from triangles, and a limiting cosine.
+    """Return whether rays of a cell may receive light from triangles, and up to which angle.
 
-    The cosine is that of the largest angle between a ray of the cell and the center of the
-    triangles at which the ray may receive light. At larger angles, the light of the nearest
-    triangle is too faint. All triangles are assumed to return as much light as the first.
+    The angle is returned as a cosine. It is the largest angle between a ray of the cell and the
+    center of the triangles at which the ray may receive light. At larger angles, the light of the
+    nearest triangle is too faint. All triangles are assumed to return as much light as the first.
     """
     cones = rays.cones
     first = c * CELL_RAYS

@@ -85,7 +85,7 @@ class WaveSampling(NamedTuple):
 
 
 class WavePeaks(NamedTuple):
-    """Peaks to which the hits in searched waveforms belong."""
+    """Waveform peaks to which hits belong, with one entry for each hit."""
 
     number: Ints  # (n,): number of the peak, counted over all waveforms; -1 without a peak
     # (3, n): time of the peak in samples from range 0, energy, and width as a multiple of the
@@ -586,7 +586,7 @@ def _has_several_surfaces(starts_surface, first, end):
 
 @compiled()
 def divide_into_waveforms(hits, sigma_m, neighbors, hit_ranges):
-    """Mark the starts of waveforms, and write the waveforms to be searched. Return their number.
+    """Divide hits into waveforms. Return the number of waveforms to be searched.
 
     A waveform starts at the first hit of a beam, and at each hit whose Gaussian does not overlap
     the previous hit's Gaussian. A waveform is searched if its hits are more than `NARROW` standard

@@ -189,7 +189,7 @@ def _wave_hits(hits: PulseReturns, subrays: int) -> WaveHits:
 
 
 def _search(hits: WaveHits, digitizer: Digitizer, subrays: int, hit_ranges: Ints) -> WavePeaks:
-    """Return the peaks of hits in the searched waveforms, and mark where peaks start.
+    """Search waveforms. Return the peak of each hit, and mark the first hit of each peak.
 
     `hit_ranges` (k, 2) are the first hit and one past the last hit of each waveform. This writes
     `hits.marks.starts`.

@@ -120,7 +120,7 @@ def _window_starts(distance: Floats, return_number: Ints, digitizer: Digitizer, 
 def _windows(
     returns: PulseReturns, batch: PulseBatch, digitizer: Digitizer, count: int
 ) -> tuple[Windows, Ints]:
-    """Return windows of `count` samples, and the row of each return's window."""
+    """Return windows of `count` samples around returns, and the window of each return."""
     return_number = number_within_ray(returns.ray)
     begin = _window_starts(returns.distance, return_number, digitizer, count)
     starts_window = (return_number == 0) | (np.diff(begin, prepend=-1) != 0)
@@ -154,7 +154,7 @@ def _signal_samples(
 
 
 def digitize(samples: Floats) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
-    """Round samples to integers around `ZERO`, with a power-of-two step in each row.
+    """Round samples to integers around `ZERO`. The step of each row is a power of two.
 
     Returns the integers as uint16 (n, k), and the exponents of the steps (n,).
     """
