@@ -39,7 +39,7 @@ class Charts:
             self._figures.add(row)
 
     def version(self, over: bool) -> int:
-        """Return how many jobs the charts would include if `drawn` were called now.
+        """Return the number of jobs that the charts would show if `drawn` were called now.
 
         The number only changes if the charts are due to be drawn again.
         """

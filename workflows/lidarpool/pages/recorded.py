@@ -86,7 +86,7 @@ def _native(name: str, values: AnyArray) -> AnyArray:
 
 
 def _describe_column(name: str, values: AnyArray) -> Column:
-    """Return a column's standard description if its type matches, or else a new description."""
+    """Describe a column. The standard description is used if its type matches."""
     known = TABLE.get(name)
     if known is not None and np.dtype(known.dtype) == values.dtype:
         return known

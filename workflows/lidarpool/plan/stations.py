@@ -344,7 +344,10 @@ def _visibility(
 
 
 class _Choice(NamedTuple):
-    """Selected rows of `_Visibility`, in the order of their selection."""
+    """Selected candidates, in the order of their selection.
+
+    The indices are rows of `_Visibility`.
+    """
 
     row_indices: list[int]
     shares: list[float]  # fraction of the area that is covered after each row

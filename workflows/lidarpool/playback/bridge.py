@@ -69,7 +69,7 @@ class Bridge(ABC):
 
     @classmethod
     def format_of(cls, settings: Mapping[str, Any]) -> ExportSpec | None:
-        """Return the format whose columns are sent. It may depend on `settings`.
+        """Return the format that determines which columns are sent. It may depend on `settings`.
 
         Raises
         ------

@@ -238,7 +238,10 @@ def _lost_positions(
 
 
 def _shifts(surfel: Ints, offset_m: Floats, count: int) -> Floats:
-    """Return the shift of each surfel, which is a damped median of the offsets of its rays."""
+    """Return how far to shift each surfel, using the median of the offsets of its rays.
+
+    The shift is reduced for surfels with few rays.
+    """
     shifts_m = np.zeros(count)
     order = np.lexsort((offset_m, surfel))
     surfel = surfel[order]

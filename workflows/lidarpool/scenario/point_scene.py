@@ -216,7 +216,7 @@ class _Surfels(NamedTuple):
 def _select_color(
     path: Path, points: Sweep, color: str | None, tell: Callable[[str], None]
 ) -> Sweep:
-    """Return points that have either colors or intensities, but not both.
+    """Remove either the colors or the intensities from points that have both.
 
     Raise LidarError if the selected quantity is missing.
     """

@@ -376,7 +376,7 @@ def _mount_pose(section: SensorSection, shapes: ShapeLoader) -> Pose:
 
 
 def _joint_arguments(entry: ActorSection, scenario: Scenario) -> dict[str, Any]:
-    """Return the arguments of `Robot.path` and `Robot.actors` that describe a joint table."""
+    """Return the joint table of an entry as arguments of `Robot.path` and `Robot.actors`."""
     if entry.joints is None:
         return {}
     return {
@@ -505,7 +505,7 @@ def _materials(
 
 
 class _ClassedObject(NamedTuple):
-    """Object whose class is set in `scene.copies` or `actors`."""
+    """Object to which an entry of `scene.copies` or `actors` assigns a class."""
 
     name: str  # name of the entry or the robot link
     patterns: list[str]  # match the names of the object and its numbered copies in the scene
@@ -513,7 +513,7 @@ class _ClassedObject(NamedTuple):
 
 
 def _classed_objects(scenario: Scenario, scene: Scene) -> list[_ClassedObject]:
-    """Return the objects whose entries in `scene.copies` or `actors` set a class.
+    """Return the objects to which entries of `scene.copies` or `actors` assign a class.
 
     All copies of an entry are treated as one object, and each link of a robot as a separate object.
     """

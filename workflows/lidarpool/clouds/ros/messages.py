@@ -267,7 +267,10 @@ def _numbered(name: str, plane: int) -> str:
 
 
 def _instruments(sweeps: Sweeps) -> list[tuple[str, str, SweepPoses, int]]:
-    """Return the instrument frames on the vehicle in the form that `_Messages.transforms` takes."""
+    """Return the frames of the IMU and the GNSS receiver, relative to the vehicle.
+
+    They are passed to `_Messages.transforms`.
+    """
     instruments = sweeps.instruments
     if instruments is None or instruments.folder is None:
         return []

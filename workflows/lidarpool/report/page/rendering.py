@@ -280,7 +280,7 @@ def _template(name: str) -> Template:
 
 
 def _with_names(row: str, head: Sequence[str]) -> Markup:
-    """Add column names to the cells of a table row for use by the style sheet.
+    """Add the name of its column to each cell of a table row, for the style sheet.
 
     The first column, which contains the name of the row (th), is skipped.
     """

@@ -213,7 +213,7 @@ class Cluster:
     def _request_slots(
         self, first: Job, store: RunStore, required_slots: Mapping[str, int]
     ) -> None:
-        """Request slots for the remaining scans, in case a partition is adaptive."""
+        """Request slots for the remaining scans. Only adaptive partitions react to the request."""
         scan_count = first.survey.scan_count * (len(store.jobs.numbers) - store.db.ended_count)
         if store.only_job is not None:
             scan_count = len(store.only_job.scans) - store.only_job.resumed

@@ -21,7 +21,7 @@ TELL_EVERY_S = 5.0  # minimum interval between messages, which become less frequ
 
 
 class WaitTimer:
-    """Time limit for waiting that starts when the object is first used.
+    """Time limit for waiting. The time starts when the object is first used.
 
     Parameters
     ----------
