@@ -1,4 +1,4 @@
-"""Recordings, which are sequences of sweeps, or parts of a large cloud, in any file format.
+"""Recordings in any file format. A recording consists of sweeps, or of parts of a cloud.
 
 When an item is read, its columns get standard names, its positions are converted to meters, the
 chosen column becomes the intensity, and withheld points are omitted. Rings and point times that a
@@ -54,7 +54,7 @@ class SeveralSensorsError(LidarError):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Recording:
-    """A sequence of sweeps of one sensor, or of parts of a cloud without sweeps.
+    """A sequence of sweeps of one sensor. A cloud without sweeps is divided into parts instead.
 
     ``len(recording)`` is the number of items, and ``recording[number]`` reads an item as a `Sweep`.
 

@@ -81,7 +81,7 @@ class WebDataset(MultiFileFormat):
     def write_range(self, storage: Storage, first: int, stop: int) -> WrittenRange:
         """Write the tar files of a range of sweeps, holding one file in memory at a time.
 
-        The files of each range that `spans` returns are written if it begins in the given range.
+        Each range that `spans` returns is written if it begins in the given range.
         Raises OSError if a file cannot be written.
         """
         count = 0

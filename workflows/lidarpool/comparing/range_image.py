@@ -63,7 +63,7 @@ class RangeImages:
 
     @property
     def returned(self) -> tuple[Bools, Bools]:
-        """Masks of the cells that have a return in A and in B.
+        """Two masks, of the cells with a return in A and of those with a return in B.
 
         Each mask has shape (r, c).
         """

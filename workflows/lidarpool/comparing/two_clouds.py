@@ -155,7 +155,7 @@ def compare(
 
 @contextmanager
 def _sensor_chosen_by(option: str) -> Iterator[None]:
-    """Add the command-line option that selects a sensor to errors about ambiguous sensors."""
+    """Extend errors about ambiguous sensors to name the option that selects a sensor."""
     try:
         yield
     except SeveralSensorsError as error:

@@ -384,7 +384,10 @@ def _choose_rows(
 
 
 def _default_spacing_m(scene: Scene) -> float:
-    """Return a round candidate spacing in meters that suits the size of the scene."""
+    """Return the distance between candidates in meters, as a round number.
+
+    The distance suits the size of the scene.
+    """
     width_m, depth_m, _ = np.ptp(scene.bounds, axis=0)
     spacing = max(math.sqrt(width_m * depth_m / _CANDIDATES), _MIN_SPACING_M)
     power = 10.0 ** math.floor(math.log10(spacing))

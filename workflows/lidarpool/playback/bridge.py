@@ -86,7 +86,7 @@ class Bridge(ABC):
     @property
     @abstractmethod
     def description(self) -> str:
-        """Address at which receivers find the sweeps, which is part of the "ready" message."""
+        """Address at which receivers find the sweeps. It is part of the "ready" message."""
 
     def due_ns(self, sweep: int) -> float:
         """Return the time at which a sweep is due, in nanoseconds since the start of the survey.

@@ -81,7 +81,7 @@ class Observations(NamedTuple):
 
 
 class SurfelHits(NamedTuple):
-    """Surfels hit by the rays of a sweep, as arrays of the k rays that hit a surfel."""
+    """Surfels that the rays of a sweep hit. The arrays describe the k rays with a hit."""
 
     rays: Ints  # indices of the points of the sweep
     surfel: Ints
@@ -93,7 +93,7 @@ class SurfelHits(NamedTuple):
 
     @property
     def ends(self) -> Bools:
-        """Mask of the rays that end on the surfel that they hit.
+        """Mask of the rays whose recorded return lies on the surfel that they hit.
 
         The array has shape (k,).
         """

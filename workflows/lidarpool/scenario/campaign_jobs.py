@@ -253,7 +253,7 @@ def _unique_names(stems: Iterable[str]) -> list[str]:
 
 
 class SampledJobs(JobSource):
-    """Source of the jobs in a campaign file, which are base scenarios with sampled values."""
+    """Source of the jobs in a campaign file. Each job is a base scenario with sampled values."""
 
     def __init__(self, section: CampaignSection, path: Path) -> None:
         self._vary = section.vary

@@ -310,7 +310,7 @@ def surfel_faces(count: int) -> Ints:
 
 @dataclass(frozen=True, eq=False)
 class PointVoxels:
-    """Assignment of points to voxels, of which only those with points are stored."""
+    """Assignment of points to voxels. Only voxels with points are stored."""
 
     order: Ints  # (n,), indices of the points, sorted by voxel
     starts: Ints  # (v,), index of the first point of each voxel in `order`

@@ -233,7 +233,7 @@ def _platform_track(shapes: ShapeLoader, support: SupportSurfaces) -> Track | No
 def _read_traffic(
     scenario: Scenario, first_s: float, last_s: float, travelers: TravelerFilter
 ) -> TrafficContent:
-    """Read the traffic between two times, which refer to the clock of the traffic file."""
+    """Read the traffic between two times. They refer to the clock of the traffic file."""
     section = scenario.traffic
     assert section is not None
     file = scenario.path(section.file)

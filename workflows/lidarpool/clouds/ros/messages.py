@@ -159,7 +159,7 @@ class SurveyMessages:
         return _sent("/clock", clock(self._make.stamp(time_ns)), time_ns)
 
     def sweep_messages(self, sweep: int, points: Cloud) -> Iterator[RosMessage]:
-        """Yield the messages at the start of a sweep and the frames during the sweep."""
+        """Yield all messages of a sweep, ending with the frames that follow its start."""
         sweeps = self._sweeps
         time_ns = self.sweep_start_ns(sweep)
         yield _sent("/tf", self._make.transforms(self._frames_in_world(sweep), time_ns), time_ns)

@@ -373,7 +373,10 @@ def _rotate_vectors(rotations: Floats, vectors: Floats) -> Floats:
 
 
 def _means_beside(values: Floats) -> Floats:
-    """Return the mean of the neighbors of each cell in its row, or NaN if all of them are NaN."""
+    """For each cell, return the mean of its neighbors in the same row.
+
+    Neighbors that are NaN are ignored. The mean is NaN if all of them are.
+    """
     shifts = [shift for shift in range(-_LIGHT_COLUMNS, _LIGHT_COLUMNS + 1) if shift]
     beside = np.stack([np.roll(values, shift, axis=1) for shift in shifts])
     known = np.isfinite(beside)

@@ -41,7 +41,7 @@ _CLUSTER_LOST = (OSError, FutureCancelledError, PipeClosed, PipeFailed)
 
 
 class ClusterConnection:
-    """Connection of a run to its cluster, which is opened only if there are scans to cast.
+    """Connection of a run to its cluster. It is opened only if there are scans to cast.
 
     When the context is entered, workers on this machine start in the background, unless the run may
     continue an earlier run that is already complete. When the context exits, workers that were
@@ -276,7 +276,7 @@ class Cluster:
 
     @contextmanager
     def stopping(self, stop: Callable[[str], None]) -> Iterator[None]:
-        """Call `stop` with the reason if the body raises an error, and convert cluster errors.
+        """If the body raises an error, call `stop` with the reason, and convert cluster errors.
 
         Finally, the partitions are allowed to shrink.
         """

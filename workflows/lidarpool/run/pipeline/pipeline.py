@@ -64,7 +64,7 @@ class Commits(Protocol):
 
 @dataclass
 class PipelineNews:
-    """Results of a pipeline step, which must be processed in the order of the fields."""
+    """Results of a pipeline step. They must be processed in the order of the fields."""
 
     parts: list[Receipt] = field(default_factory=list)  # newly committed parts
     # Next scans to deliver as frames. They may include scans that have already been delivered.

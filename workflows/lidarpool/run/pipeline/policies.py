@@ -276,7 +276,7 @@ class _OfferState:
         return address if address and fullness[address] < 1 else None
 
     def may_wait(self, first: Batch, group: Collection[Batch], worker: str) -> bool:
-        """Return True if a task would not be full, and would have to wait on its worker."""
+        """Return True if a task is not full yet and its worker is busy, so that it can wait."""
         busy = self.has_backlog or self.load[worker] >= self.slots[worker]
         if not busy or first.deaths:
             return False

@@ -1,4 +1,4 @@
-"""Stores of runs that consist of a database and parts, from which runs can be resumed."""
+"""Stores of runs, from which runs can be resumed. A store has a database and parts."""
 
 from __future__ import annotations
 
