@@ -375,7 +375,7 @@ def _rotate_vectors(rotations: Floats, vectors: Floats) -> Floats:
 def _means_beside(values: Floats) -> Floats:
     """For each cell, return the mean of its neighbors in the same row.
 
-    Neighbors that are NaN are ignored. The mean is NaN if all of them are.
+    Neighbors that are NaN are ignored. The mean is NaN if all neighbors are NaN.
     """
     shifts = [shift for shift in range(-_LIGHT_COLUMNS, _LIGHT_COLUMNS + 1) if shift]
     beside = np.stack([np.roll(values, shift, axis=1) for shift in shifts])

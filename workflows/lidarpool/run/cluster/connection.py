@@ -167,8 +167,8 @@ def local_client(
 class BackgroundClient(AbstractContextManager[Client]):
     """Context manager that starts to connect a client as soon as it is created.
 
-    The client is connected in a background thread. Entering this object waits for the thread. It may be exited without being entered, and more than
-    once.
+    The client is connected in a background thread. Entering this object waits for the thread. It
+    may be exited without being entered, and more than once.
     """
 
     def __init__(self, context: AbstractContextManager[Client]) -> None:
