@@ -10,7 +10,7 @@ ENDINGS = {".py", ".cu", ".js"}
 
 
 def main() -> None:
-    """Print one row for each package, the tests, the benchmarks, and the code of docs."""
+    """Print one row for each package, the tests, the benchmarks, and the documentation code."""
     packages = [path for root in ("kernels", "scheduler") for path in (ROOT / root).iterdir()]
     packages += (ROOT / "workflows").glob("*/*")
     packages += [ROOT / "tests", ROOT / "benchmarks", ROOT / "docs"]

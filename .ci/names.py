@@ -44,7 +44,7 @@ def _repeated_classes(texts: dict[Path, str]) -> Iterator[str]:
 
 
 def _missing_modules(texts: dict[Path, str]) -> Iterator[str]:
-    """Yield modules that comments or docstrings name but that do not exist."""
+    """Yield a message for each nonexistent module that a comment or docstring names."""
     paths = [*texts, *_files(OTHERS, "*.py"), *_files(SOURCES, "*.cu")]
     known = {"/".join(path.parts[-count:]) for path in paths for count in range(1, 5)}
     for path, text in texts.items():

@@ -104,9 +104,10 @@ def _parse_duration(text: str) -> float:
 
 
 def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Call a command with a Terminal, RunOptions, and the remaining options as keyword arguments.
+    """Return a wrapper that passes a Terminal and RunOptions to a command.
 
-    A fork server imports the modules that workers require in the background.
+    The remaining options are passed as keyword arguments. A fork server imports the modules that
+    workers require in the background.
     """
 
     @wraps(command)
@@ -170,7 +171,7 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 class _LiveCommand(click.Command):
-    """Command whose option --live has an optional value, even before an argument."""
+    """Command whose option --live works with or without a value, even before an argument."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Insert the default value of --live if it has no value, and parse the arguments."""

@@ -97,7 +97,7 @@ def bridges(ctx: click.Context, param: click.Parameter, incomplete: str) -> Item
 
 
 def live(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete the optional value of --live or, if it is omitted, the next argument."""
+    """Complete the value of --live. If it has no value, complete the next argument."""
     del param
     items = starting_with(incomplete, [PAGE, *VIEWERS])
     takes_file = any(isinstance(param, click.Argument) for param in ctx.command.params)

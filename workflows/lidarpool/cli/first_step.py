@@ -24,7 +24,7 @@ _LINES = _Lines()
 
 
 def print_first_step(step: str, *, quiet: bool = False) -> None:
-    """Print the first step of a command, and print a message if loops must be compiled.
+    """Print the first step of a command. If loops have to be compiled, announce this too.
 
     The step is only printed if stderr is not a terminal. A terminal shows a status instead. A
     `quiet` command prints neither.

@@ -1,4 +1,4 @@
-"""Detect whether several copies of lidarpool are installed, of which Python imports only one."""
+"""Detect whether several copies of lidarpool are installed. Python imports only one."""
 
 from __future__ import annotations
 

@@ -155,9 +155,9 @@ _mesh_options = combine(
 
 
 def mesh_options(command: Command) -> Command:
-    """Add the options for mesh files, which the command receives as the dictionary `of_mesh`.
+    """Add the options for mesh files, and pass their values to the command as `of_mesh`.
 
-    The mapping contains arguments of `mesh_data`.
+    `of_mesh` is a dictionary that contains arguments of `mesh_data`.
     """
 
     @wraps(command)
@@ -177,7 +177,7 @@ def mesh_options(command: Command) -> Command:
 
 
 def mesh_reading(command: Command) -> Command:
-    """Add --unit and --up-axis, which the command receives as the dictionary `of_mesh`."""
+    """Add --unit and --up-axis, and pass their values to the command as `of_mesh`."""
 
     @wraps(command)
     def with_options(*arguments: Any, **settings: Any) -> None:
@@ -198,7 +198,7 @@ def reject_mesh_options(of_mesh: Mapping[str, Any], path: Any) -> None:
 
 
 def command_arguments(of_mesh: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the command-line arguments that are equivalent to `of_mesh`."""
+    """Yield the command-line arguments that set the mesh options in `of_mesh`."""
     for name, value in of_mesh.items():
         for item in value if name == "pose" else [value]:
             yield f"--{name.replace('_', '-')}"

@@ -264,7 +264,10 @@ def _show_coverage(
     slant_deg: float,
     targets: Sequence[str],
 ) -> None:
-    """Print the fraction of the area visible from a scenario's stations that a cloud covers."""
+    """Print how much of the visible area a cloud covers.
+
+    The visible area is the area that can be seen from the stations of the scenario.
+    """
     from ..comparing.compared_sweep import compared_in_world
     from ..plan.stations import survey_coverage
     from ..recordings.opening import open_recording
@@ -352,9 +355,10 @@ def _object_figures(
 def _prepared_with_notes(
     scenario: Scenario, terminal: Terminal
 ) -> tuple[PreparedScenario, list[str]]:
-    """Prepare a scenario and print its notes and warnings, except those about automatic poses.
+    """Prepare a scenario, and print its notes and warnings.
 
-    Returns the prepared scenario with the notes and warnings.
+    Notes about default poses are omitted. Returns the prepared scenario with the notes and
+    warnings.
     """
     from ..scenario.advice import advice
     from ..scenario.default_poses import SensorPlacement

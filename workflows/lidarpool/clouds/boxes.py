@@ -59,7 +59,10 @@ class Boxes:
 
 @dataclass(frozen=True, eq=False)
 class SweepBoxes:
-    """Bounding boxes, at the start of a sweep, of the k actors that are present (see `Boxes`)."""
+    """Bounding boxes of the k actors that are present in a sweep, at the start of the sweep.
+
+    `Boxes` explains how boxes are defined.
+    """
 
     names: tuple[str, ...]
     types: tuple[str, ...]  # names without numbers, for example "Car" for "Car 1"

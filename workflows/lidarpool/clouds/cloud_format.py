@@ -118,7 +118,10 @@ class CloudFormat(ABC):
 
     @classmethod
     def option_columns(cls, spec: ExportSpec) -> tuple[str, ...]:
-        """Return the additional columns that the options require and store."""
+        """Return the additional columns that the options in `spec` require.
+
+        The format stores these columns.
+        """
         return ()
 
     @classmethod
@@ -131,7 +134,7 @@ class CloudFormat(ABC):
 
     @classmethod
     def optional_columns(cls, spec: ExportSpec, sweeps: Sweeps) -> tuple[str, ...]:
-        """Return the columns that can be stored in addition to `stored`."""
+        """Return the columns that the format can store, except those in `stored`."""
         return cls.option_columns(spec) + (cls.named if sweeps.classes else ())
 
     @classmethod
@@ -175,14 +178,17 @@ class CloudFormat(ABC):
 
     @classmethod
     def class_files(cls, classes: Mapping[int, str]) -> Mapping[str, bytes]:
-        """Return data set files with the class names of all jobs, keyed by file name."""
+        """Return the files of a data set that contain class names.
+
+        `classes` are the classes of all jobs. Returns {file name: content}.
+        """
         return {}
 
     @classmethod
     def merge_jobs(
         cls, storage: Storage, manifests: Iterable[Mapping[str, Any]]
     ) -> dict[str, list[int]]:
-        """Write the files that the jobs of a data set share, based on the jobs' manifests.
+        """Write the files that all jobs of a data set share, given the manifests of the jobs.
 
         Implementations must iterate over all manifests, because the iteration writes the index of
         the data set.
@@ -199,10 +205,10 @@ class CloudFormat(ABC):
     def renumber_labels(
         cls, name: str, read: Callable[[str], bytes], before: Sequence[int], after: Sequence[int]
     ) -> bytes | None:
-        """Renumber the labels in a label file and return its content, or None for other files.
+        """Renumber the labels in a label file.
 
-        Labels are positions in a list of classes. This list is `before` in the file and `after` in
-        the returned content.
+        Returns the new content, or None if the file is not a label file. Labels are positions in a
+        list of classes. This list is `before` in the file and `after` in the returned content.
         """
         return None
 

@@ -289,7 +289,10 @@ def _read_fields(file: Any, header: Any) -> dict[str, AnyArray]:
 
 
 def _states(kind: str) -> list[str]:
-    """Return the fields that mark points as invalid, starting with the coordinate field."""
+    """Return the names of the fields that mark invalid points.
+
+    The first field is the one for coordinates of the type `kind`.
+    """
     return [f"{of}InvalidState" for of in sorted(_COORDINATES, key=lambda of: of != kind)]
 
 

@@ -41,7 +41,10 @@ class E57Writer(pye57.E57):
 
     @property
     def root(self) -> Any:
-        """Root node of the file, or an object that intercepts fields while writing the header."""
+        """Root node of the file.
+
+        While the header is written, this is a stand-in that intercepts the fields.
+        """
         return SimpleNamespace(set=self._set_field) if self._in_header else super().root
 
     def _set_field(self, name: str, node: Any) -> None:

@@ -72,7 +72,7 @@ def firing_span_s(sensor: Sensor, steps: int) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class LineFields:
-    """LAS fields of k points that depend on scan lines and flight lines."""
+    """LAS fields of k points that describe their scan lines and flight lines."""
 
     # (k,): degrees from straight down, about the direction of flight, negative to the left.
     scan_angle_deg: Floats
@@ -130,7 +130,7 @@ class FlightLines:
             yield held
 
     def _fields(self, chunk: Cloud) -> LineFields:
-        """Return the fields of a chunk, assuming that its last line ends with it."""
+        """Return the fields of a chunk whose last scan line is complete."""
         fields = LineFields.empty(len(chunk))
         if not len(self.sweeps) or "scan" not in chunk.columns:
             return fields
@@ -153,7 +153,7 @@ class FlightLines:
         return fields
 
     def _fill(self, fields: LineFields, row_indices: Indices, sweep: int, points: Cloud) -> None:
-        """Set the fields of the points in a sweep, except `edge`."""
+        """Set all fields except `edge` for the points of a sweep."""
         sweeps = self.sweeps
         poses = sweeps.firing_poses(sweep, points)
         # Positions are rounded as in files, because those in parts and in cloud.ply differ in the

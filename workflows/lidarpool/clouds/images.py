@@ -1,4 +1,4 @@
-"""Range images that contain all rays of a sweep, by channel and firing.
+"""Range images of sweeps, with a row for each channel and a column for each firing.
 
 Rays without a return are included.
 """

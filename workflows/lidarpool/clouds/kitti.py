@@ -196,7 +196,7 @@ class KITTI(MultiFileFormat):
 
 
 def kitti_intensity(points: Cloud) -> Floats32:
-    """Return the reflectivity of points from 0 to 1, which KITTI stores as intensity."""
+    """Return the reflectivity of points, from 0 to 1. KITTI stores it as intensity."""
     return np.asarray(points["reflectivity"] / np.float32(255), np.float32)
 
 
@@ -280,7 +280,7 @@ def _sequence(source: RecordingSource, folder: Path, inner: str, name: str = "")
     notes = []
 
     def of_frames(rows: Floats, table: str) -> Floats:
-        """Return the rows that belong to point files, adding a note about any other rows."""
+        """Return the rows that belong to point files. If there are other rows, add a note."""
         indices = rows_of_frames(files, len(rows), table, "point files")
         if surplus := frames_without_file(files, len(rows)):
             notes.append(f"has no point file for {frames_in_words(surplus)} in {table}")

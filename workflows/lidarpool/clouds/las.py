@@ -69,7 +69,7 @@ _MAX_STEPS = 2**31 - 1  # maximum distance from the offset in steps of the preci
 
 
 def _extra_bytes(column: Column) -> laspy.ExtraBytesParams:
-    """Return the extra bytes of a column.
+    """Describe a column so that it can be stored in the extra bytes of a LAS file.
 
     The unit and meaning are limited to 32 characters.
     """
@@ -179,7 +179,10 @@ def _as_integers(intensities: Floats32, full_scale: float) -> NDArray[np.uint16]
 def _header(
     columns: set[str], sweeps: Sweeps, packets: _Packets | None, intensity_full_scale: float | None
 ) -> laspy.LasHeader:
-    """Return the header of a file with its records, but without the grid and the extra bytes."""
+    """Return a new header with its records.
+
+    Scales, offsets and extra bytes are set later.
+    """
     import laspy
     from laspy.vlrs.known import WktCoordinateSystemVlr
 
@@ -217,7 +220,7 @@ def _header(
 
 
 def _set_grid(header: laspy.LasHeader, cloud: CloudLike, precision_m: float, name: str) -> None:
-    """Set the grid of positions in a header.
+    """Set the scales and offsets that a header specifies for positions.
 
     Raises LidarError if the extent of the cloud is too large.
     """
@@ -331,7 +334,7 @@ def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], start_s: fl
 
 
 def _name(name: str) -> str:
-    """Return the name of a column in the extra bytes, given its name in other files."""
+    """Return the name under which a column is stored in the extra bytes of a LAS file."""
     return _NAMES.get(name, name[:32])
 
 

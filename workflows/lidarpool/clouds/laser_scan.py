@@ -36,7 +36,10 @@ def has_planar_sensors(survey: Survey) -> bool:
 
 
 def has_laser_scans(sweeps: Sweeps) -> bool:
-    """Return whether a bag can contain LaserScan messages, provided that the cloud has ranges."""
+    """Return whether there are sweeps of 2D scanners that can become LaserScan messages.
+
+    The messages also require a cloud with ranges.
+    """
     return sweeps.fired is not None and any(map(is_planar, sweeps.fired.sensors))
 
 

@@ -154,7 +154,10 @@ class MultiFileFormat(CloudFormat):
 
 @dataclass(frozen=True)
 class RangeWriter:
-    """Writer of ranges of a cloud, for use in any process with access to `storage`."""
+    """Callable that writes the files of one range of a cloud.
+
+    Any process with access to `storage` can call it.
+    """
 
     format: str
     cloud: CloudLike
@@ -189,7 +192,7 @@ class RangeWriter:
         return () if plugin is None else (plugin,)
 
     def start(self) -> None:
-        """Allow ranges to be written."""
+        """Write the mark file, which allows ranges to be written."""
         self.storage.write(_MARK, self._mark)
 
     def stop(self) -> None:

@@ -31,7 +31,10 @@ _MESSAGE_BYTES = 500  # message in a bag
 
 
 def instrument_bytes(survey: Survey, bags: int) -> int:
-    """Return the maximum size of the instrument files and of `bags` bags with their data."""
+    """Return the maximum size of a survey's instrument data in bytes.
+
+    The data is stored in the instrument files and in each of the `bags` bags.
+    """
     navigation = survey.navigation
     if navigation is None:
         return 0

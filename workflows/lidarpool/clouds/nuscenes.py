@@ -125,7 +125,10 @@ class NuScenes(MultiFileFormat):
         return files | {_MAP: _no_map()}
 
     def summary(self, boxes: Sequence[Boxes]) -> dict[str, Any]:
-        """Return the tables of a job and the classes in its labels, for `merge_jobs`."""
+        """Return the summary of a job that `merge_jobs` requires.
+
+        It contains the tables of the job and, if points have labels, the class numbers.
+        """
         labeled = {"lidarseg": sorted(self.sweeps.classes)} if self.labels else {}
         return {"tables": self._tables(boxes), **labeled}
 
@@ -195,7 +198,10 @@ class NuScenes(MultiFileFormat):
     def merge_jobs(
         cls, storage: Storage, manifests: Iterable[Mapping[str, Any]]
     ) -> dict[str, list[int]]:
-        """Write the tables of a data set and return the jobs whose labels must be renumbered."""
+        """Write the tables of a data set.
+
+        Returns the jobs whose labels must be renumbered.
+        """
         shared: set[str] = set()  # tokens of rows that are shared by several jobs
         with ExitStack() as stack:
             files = {
@@ -236,7 +242,10 @@ class NuScenes(MultiFileFormat):
     def renumber_labels(
         cls, name: str, read: Callable[[str], bytes], before: Sequence[int], after: Sequence[int]
     ) -> bytes | None:
-        """Renumber the labels in a nuScenes-lidarseg file to match the classes `after`."""
+        """Renumber the labels in a nuScenes-lidarseg file.
+
+        Returns None for other files.
+        """
         if not name.startswith(LABELS):
             return None
         table = _labels_of_classes(after)[[0, *before]]
@@ -354,10 +363,10 @@ class _JobClasses:
         return {number: "; ".join(names) for number, names in self._names.items()}
 
     def relabeled_jobs(self) -> dict[str, list[int]]:
-        """Return the jobs whose labels must be renumbered, with all classes of the data set.
+        """Return the jobs whose labels must be renumbered.
 
-        The result maps the name of each of these jobs to the classes. The jobs do not have all of
-        these classes themselves.
+        The result maps the name of each of these jobs to all classes of the data set. Each of these
+        jobs has only some of the classes.
         """
         numbers = sorted(self._names)
         _labels_of_classes(numbers)  # raises LidarError if there are too many

@@ -54,7 +54,11 @@ class PCD(MultiFileFormat):
         return {f"{number:06}.pcd": pcd_bytes(fields, position, (w, x, y, z), comment)}, None
 
     def _fields(self, number: int, points: Cloud, *, as_fired: bool) -> list[tuple[str, AnyArray]]:
-        """Return the names and values of a sweep's fields, as fired or compensated."""
+        """Return the names and values of the fields in the file of a sweep.
+
+        If `as_fired` is True, each point is in the sensor frame at the time of its firing.
+        Otherwise, the points are motion-compensated.
+        """
         sweeps = self.sweeps
         positions_of = sweeps.as_fired if as_fired else sweeps.compensate_motion
         columns_of = sweeps.columns_as_fired if as_fired else sweeps.columns_compensated
@@ -78,7 +82,10 @@ class PCD(MultiFileFormat):
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:
-        """Open a file, or the files in a folder, as sweeps whose pose is the VIEWPOINT."""
+        """Open a PCD file, or a folder with one file per sweep.
+
+        The pose of each sweep is the VIEWPOINT in its file.
+        """
         files = [source.path]
         if source.path.is_dir():
             inside = source.path.iterdir()

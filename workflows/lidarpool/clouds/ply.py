@@ -149,7 +149,7 @@ class PlyAppender:
 
     @property
     def has_layout(self) -> bool:
-        """Whether the first points have been written, which determines the row type `row`."""
+        """Whether points have been written. The first points determine the row type `row`."""
         return bool(self._start)
 
     def check_disk_space(self, count: int) -> None:

@@ -30,7 +30,7 @@ class Scale(NamedTuple):
 
 
 class _Columns(NamedTuple):
-    """Views of the memory that contains columns, as integers of different sizes in bytes."""
+    """Columns in memory, viewed as integers of 1, 2, 4 and 8 bytes."""
 
     of_1: AnyArray
     of_2: AnyArray
@@ -40,7 +40,10 @@ class _Columns(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """Views of the memory that contains rows, indexed by row and byte offset."""
+    """Rows in memory, viewed as integers of 1, 2, 4 and 8 bytes.
+
+    Each view is indexed by the row and by the byte offset in the row.
+    """
 
     of_1: AnyArray
     of_2: AnyArray
@@ -100,7 +103,10 @@ class PlyRowEncoder:
         self._tile = np.zeros(TILE_ROWS, self._positions.dtype)
 
     def _fields_of(self, dtype: np.dtype[Any]) -> AnyArray:
-        """View the rows as overlapping values of a dtype, indexed by row and byte offset."""
+        """Return a view in which values of a dtype can start at any byte of a row.
+
+        The view is indexed by the row and by the byte offset in the row.
+        """
         row_bytes = self._rows.itemsize
         shape = (len(self._rows), row_bytes - dtype.itemsize + 1)
         return np.ndarray(shape, dtype, self._rows.view(np.uint8), strides=(row_bytes, 1))

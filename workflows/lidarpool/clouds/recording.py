@@ -1,4 +1,4 @@
-"""Recordings, which are sequences of sweeps, or parts of a large cloud, in any file format.
+"""Recordings in any file format. A recording consists of sweeps, or of parts of a cloud.
 
 When an item is read, its columns get standard names, its positions are converted to meters, the
 chosen column becomes the intensity, and withheld points are omitted. Rings and point times that a
@@ -54,7 +54,7 @@ class SeveralSensorsError(LidarError):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Recording:
-    """A sequence of sweeps of one sensor, or of parts of a cloud without sweeps.
+    """A sequence of sweeps of one sensor. A cloud without sweeps is divided into parts instead.
 
     ``len(recording)`` is the number of items, and ``recording[number]`` reads an item as a `Sweep`.
 
@@ -170,7 +170,11 @@ class Recording:
             return self._resolved(number, self.read(number))
 
     def read_fired(self, number: int) -> Sweep:
-        """Read the returns of a sweep as fired if possible, or as stored otherwise."""
+        """Read the returns of a sweep without motion compensation, if possible.
+
+        Each return is then in the sensor frame at the time of its firing. If the recording does not
+        contain such points, the returns are as stored.
+        """
         if self.fired is None:
             return self[number].returns()
         with reading(self.name):
@@ -400,7 +404,7 @@ class RecordingSource:
         count: int | None = None,
         **fields: Any,
     ) -> Recording:
-        """Create a recording from a file that can only be read from its start.
+        """Create a recording from a file that can only be read sequentially.
 
         Reading the sweeps in order takes a single pass. To go back, the file is read again from its
         start.
@@ -453,7 +457,7 @@ class RecordingSource:
 
 @dataclass
 class _StreamPosition:
-    """Lock-protected position of a process in a stream."""
+    """Position at which a process reads a stream, protected by a lock."""
 
     next_number: int = 0  # number of the next sweep, or 0 to start again
     remaining: Iterator[Any] = field(default_factory=lambda: iter(()))  # from `next_number`

@@ -208,7 +208,10 @@ def _clusters(points: Floats) -> Floats | None:
 
 
 def _runs(points: Floats) -> tuple[Ints, Bools]:
-    """Return the starts of runs with monotonic azimuths and a mask of the runs that are rings."""
+    """Return the index at which each run starts, and a mask of the runs that are rings.
+
+    The azimuths of the points in a run are monotonic.
+    """
     azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
     steps = np.diff(azimuth)
     direction = np.sign(np.sum(np.sign(steps)))
@@ -222,7 +225,7 @@ def _medians(values: Floats, starts: Ints) -> Floats:
 
 
 def _runs_in_order(points: Floats) -> Floats | None:
-    """Return the median elevation of each run of points, or None if the runs are not rings."""
+    """Return the median elevation of each ring, or None if points are not sorted by ring."""
     if len(points) < _MAX_RINGS:
         return None
     starts, is_ring = _runs(points)

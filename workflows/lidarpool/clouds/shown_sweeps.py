@@ -75,7 +75,10 @@ class Surroundings:
 
     @property
     def origin(self) -> Floats:
-        """Position in world coordinates that viewers with float32 coordinates subtract."""
+        """Position in world coordinates that is subtracted from all positions.
+
+        Viewers store coordinates as float32, which is too imprecise for world coordinates.
+        """
         if self.surface is not None:
             return self.surface.origin
         positions = next(iter(self.trajectories.values()), np.zeros((1, 3)))

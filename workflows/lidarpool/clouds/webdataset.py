@@ -79,8 +79,9 @@ class WebDataset(MultiFileFormat):
         return super().spans()
 
     def write_range(self, storage: Storage, first: int, stop: int) -> WrittenRange:
-        """Write the tar files that begin in a range of sweeps, with one file in memory at a time.
+        """Write the tar files of a range of sweeps, holding one file in memory at a time.
 
+        Each range that `spans` returns is written if it begins in the given range.
         Raises OSError if a file cannot be written.
         """
         count = 0

@@ -159,7 +159,7 @@ class ExportSpec(FileSection):
         return self.cloud_format.required_columns(self)
 
     def configure_sweeps(self, sweeps: Sweeps) -> Sweeps:
-        """Configure sweeps to position their points according to the format's options."""
+        """Set how sweeps position their points, according to the options of the format."""
         return replace(sweeps, actors_at_start=True) if self.compensated_actors else sweeps
 
     def unsupported_columns(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:

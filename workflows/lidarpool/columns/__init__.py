@@ -1,1 +1,1 @@
-"""Parts, which are files that store points during a run, and point clouds read from parts."""
+"""Parts, which store the points of a run in files, and clouds that are read from parts."""

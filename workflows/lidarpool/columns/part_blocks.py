@@ -32,7 +32,7 @@ _ALIGNMENT = 64  # bytes, the size of a cache line
 
 
 class BlockMemory:
-    """Memory for the columns of a block of rows, which is reused for each block.
+    """Memory for the columns of one block of rows. It is reused for each block.
 
     Parameters
     ----------

@@ -68,12 +68,12 @@ def parse_part_name(name: str, mark: str) -> tuple[int, int, int] | None:
 
 
 def probe_name(mark: str, driver: str) -> str:
-    """Return the name of the file with which a driver tests that workers can access the folder."""
+    """Return the name of the file with which a driver tests access to the folder by workers."""
     return f"{mark}-probe-{driver}"
 
 
 def mark_name(mark: str) -> str:
-    """Return the name of the file that identifies the run that owns the folder of parts."""
+    """Return the name of the mark file, which identifies the run that owns the folder of parts."""
     return f"{mark}-mark"
 
 
@@ -93,7 +93,10 @@ def deletable_files(storage: Storage, mark: str | None) -> list[str]:
 
 
 def _mark_of(name: str) -> str:
-    """Return the mark in a file name, or an empty string if the file does not belong to a run."""
+    """Return the mark of the run that wrote a file, as stated in the file name.
+
+    Returns an empty string if the file does not belong to a run.
+    """
     match = _PART.fullmatch(name) or _OTHER.fullmatch(name)
     return match[1] if match else ""
 
@@ -249,7 +252,7 @@ class StoredCloud(CloudDisplay):
         return part.cloud(self.table, self.precision_m, self.origin, row_selection, self.sweeps)
 
     def positions_of(self, columns: Mapping[str, AnyArray]) -> Iterator[tuple[str, Floats]]:
-        """Yield the name of each axis and the world coordinates along that axis, in meters."""
+        """Yield the world coordinates of points along each axis, with the name of the axis."""
         for i, axis in enumerate(AXES):
             yield axis.name, cell_positions(columns[axis.name], self.precision_m, self.origin[i])
 

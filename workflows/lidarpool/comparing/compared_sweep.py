@@ -57,7 +57,7 @@ def _check_reach(recording: Recording, sweep: Sweep) -> None:
 
 
 def with_compared_columns(sweep: Sweep, *, with_rays: bool = False) -> Sweep:
-    """Return a sweep with only those columns that `compared_sweep` describes.
+    """Return a sweep with only the columns that a comparison or fit requires.
 
     If it has no column `channel`, its rings are determined when they are first requested.
     """

@@ -63,7 +63,7 @@ class RangeImages:
 
     @property
     def return_masks(self) -> tuple[Bools, Bools]:
-        """Masks of the cells that have a return in A and in B.
+        """Two masks, of the cells with a return in A and of those with a return in B.
 
         Each mask has shape (r, c).
         """
@@ -161,10 +161,11 @@ class _PolarSweep:
         return float(step)
 
     def phases(self, ring_rows: Ints, cells: _Cells) -> Floats:
-        """Return the mean phase of the pulses in each row and azimuth block, in azimuth steps.
+        """Return the mean phase of the pulses in each row and azimuth block.
 
-        The result has shape (rows, blocks) and is NaN where there are no pulses. `ring_rows`
-        contains the row of each ring of the sweep.
+        The phase is the azimuth of a pulse modulo the azimuth step, in azimuth steps. The result
+        has shape (rows, blocks) and is NaN where there are no pulses. `ring_rows` contains the row
+        of each ring of the sweep.
         """
         row_count, _ = cells.shape
         bins = ring_rows[self.ring_index] * _BLOCKS + self._block

@@ -157,7 +157,7 @@ def compare(
 
 @contextmanager
 def _sensor_chosen_by(option: str) -> Iterator[None]:
-    """Add the command-line option that selects a sensor to errors about ambiguous sensors."""
+    """Extend errors about ambiguous sensors to name the option that selects a sensor."""
     try:
         yield
     except SeveralSensorsError as error:
@@ -375,7 +375,7 @@ class _Comparing:
         self.cells.append(_CellPairs(range_a - range_b, rings[in_both], intensity_a, intensity_b))
 
     def _count_cells(self, images: RangeImages, in_a: Bools, in_b: Bools) -> None:
-        """Count the cells of each ring that are in each of the states in `CELLS`.
+        """Count the cells of each ring by their state (see `CELLS`).
 
         The masks `in_a` and `in_b` mark returns. Both have shape (k,).
         """
@@ -495,7 +495,10 @@ class _Comparing:
         return [f"{self.empty_pairs:,} of {total} of sweeps have an empty sweep and are skipped"]
 
     def _image_notes(self) -> list[str]:
-        """Return notes about pairs without range images, and how these pairs are compared."""
+        """Return notes about sweeps that cannot be shown as range images.
+
+        The notes state whether and how these sweeps are compared instead.
+        """
         instead = "Their ranges are compared ray by ray"
         first, second = self.recordings
         if not self.has_same_rays:

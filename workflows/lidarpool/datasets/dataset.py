@@ -440,7 +440,10 @@ class Listing(Storage):
 
 
 def read_ahead(read: Callable[[T], R], items: Iterator[T]) -> Iterator[tuple[T, R]]:
-    """Yield each item with the result of `read`, which is called ahead in background threads."""
+    """Yield each item with the result of `read`.
+
+    Background threads call `read` for the next items in advance.
+    """
     with ThreadPoolExecutor(_REQUESTS, "read") as pool:
         while group := [*islice(items, _AHEAD)]:
             yield from zip(group, pool.map(read, group), strict=True)
@@ -456,7 +459,10 @@ def _crc(manifest: Mapping[str, Any]) -> int:
 
 
 def _write_pieces(output: MultiFileFormat, storage: Storage) -> list[Any]:
-    """Write all pieces of a job in parallel, and return the details reported by the format."""
+    """Write all pieces of a job in parallel.
+
+    Returns the details that the format provides for each piece.
+    """
     # In an object store, each file requires a request, so files are written in parallel.
     spans = [(0, len(output))] if storage.is_local else output.spans(_REQUESTS)
     with ThreadPoolExecutor(_REQUESTS, "write") as pool:

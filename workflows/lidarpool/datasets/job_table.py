@@ -313,7 +313,7 @@ def _column_of(name: str) -> str:
 def _columns(
     names: Sequence[str], jobs: Iterable[JobRow]
 ) -> tuple[list[int], dict[str, set[type]]]:
-    """Return the classes that occur in any row, and the value types of each varied quantity."""
+    """Return all classes in the rows, and the types of the values of each varied quantity."""
     classes: set[int] = set()
     kinds: dict[str, set[type]] = {name: set() for name in names}
     for row in jobs:
@@ -368,7 +368,7 @@ def _row(header: Sequence[str], names: Sequence[str], cells: Sequence[str]) -> J
 
 
 def _with_plain_names(row: JobRow) -> JobRow:
-    """Return the row if its name and split are valid file names, or raise ValueError otherwise.
+    """Return the row, or raise ValueError if its name or split is not a valid file name.
 
     Both are used as parts of file names, so other values could lead outside the data set.
     """

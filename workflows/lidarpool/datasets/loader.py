@@ -50,7 +50,7 @@ class _Run:
 
 
 class SavedSweeps:
-    """Sequence of the sweeps in a data set, which is returned by `sweeps`.
+    """Sequence of the sweeps in a data set. The function `sweeps` returns it.
 
     Items are read when they are accessed, and iteration prefetches the next items in background
     threads. Items can be accessed from several threads, from forked processes, and from processes

@@ -1,4 +1,4 @@
-"""Create sweeps from the points of a job that were read from a file or received from a stream."""
+"""Create sweeps from the points of a job. The points come from a file or a stream."""
 
 from __future__ import annotations
 

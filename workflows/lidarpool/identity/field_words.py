@@ -114,7 +114,10 @@ def describe_changes(
 
 
 def _describe_change(name: str, earlier_text: str | None, text: str | None) -> str:
-    """Describe the change of a field, whose text is None if it is not set."""
+    """Describe how a field has changed.
+
+    A text is None if the field is not set.
+    """
     earlier_value = earlier_text and earlier_text.partition(_MARK)[0]
     value = text and text.partition(_MARK)[0]
     if earlier_value is None:

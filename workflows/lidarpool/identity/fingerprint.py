@@ -231,7 +231,10 @@ class _Digest:
 
 
 def _used_names(code: types.CodeType) -> list[str]:
-    """Return the sorted global and attribute names that are used in code, including nested code."""
+    """Return the sorted names of the globals and attributes that code uses.
+
+    Nested code is included.
+    """
     inner = [c for c in code.co_consts if isinstance(c, types.CodeType)]
     return sorted({*code.co_names, *(name for c in inner for name in _used_names(c))})
 

@@ -77,9 +77,10 @@ def _plugin_version(plugin: Plugin) -> str:
 
 
 def _top_package(module: str) -> str:
-    """Return the outermost regular package of a module, or the module itself if there is none.
+    """Return the outermost package that contains a module.
 
-    Namespace packages are skipped, because several distributions can share them.
+    Returns the module itself if there is no such package. Namespace packages are skipped, because
+    several distributions can share them.
     """
     parts = module.split(".")
     for count in range(1, len(parts)):
@@ -105,7 +106,10 @@ def _hash_packages(packages: Iterable[str]) -> str:
 
 
 def _package_files(package: str) -> Iterator[tuple[str, Path]]:
-    """Yield the path of each file in a package, preceded by a name that includes the package."""
+    """Yield the name and path of each file in a package.
+
+    Each name begins with the name of the package.
+    """
     try:
         spec = find_spec(package)
     except ModuleNotFoundError:  # the parent package is missing

@@ -1,4 +1,4 @@
-"""Views of the jobs of a run, showing points that were read or jobs that were written."""
+"""Views that show the points of a run's jobs, either from memory or from the data set."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ MAX_VIEWS = 4  # maximum number of jobs with points, since a browser may show an
 
 
 class JobViews:
-    """Views of jobs whose points have been read, and of jobs in a data set."""
+    """Views that show the points of jobs in the browser.
+
+    The points are in memory, or in the folder of a job that was written to a data set.
+    """
 
     def __init__(self) -> None:
         self.jobs: dict[int, LiveJob] = {}  # by job number, newest last
@@ -36,11 +39,11 @@ class JobViews:
 
     @property
     def opens_written(self) -> bool:
-        """Whether jobs can be opened once they have been written."""
+        """Whether a job can be opened after it has been written."""
         return self._written is not None
 
     def follow(self, dataset: DataSet) -> None:
-        """Make the jobs of a data set available for viewing, if each job has a local folder."""
+        """Let users open the written jobs of a data set, if each job has a local folder."""
         if dataset.format == "folder" and dataset.storage.is_local:
             self._written = dataset.storage
 
@@ -49,7 +52,7 @@ class JobViews:
         self._requested_at = time.monotonic()
 
     def read(self, row: JobRow, job: StoredJob, is_only: bool) -> None:
-        """Read the points of a job if it is the only one, or if a browser displays points of jobs.
+        """Read the points of a job if it is the only job or if a browser shows points of jobs.
 
         The points of the first job are always read. Those of other jobs are only read if the CPU
         share permits it.

@@ -39,7 +39,7 @@ class Charts:
             self._figures.add_job(row)
 
     def version(self, over: bool) -> int:
-        """Return how many jobs the charts would include if `draw` were called now.
+        """Return the number of jobs that the charts would show if `draw` were called now.
 
         The number only changes if the charts are due to be drawn again.
         """

@@ -182,7 +182,7 @@ class LiveJob:
 
 
 def _sample_rays(frames: list[ScanFrame]) -> Floats32:
-    """Return the sample rays of frames in local coordinates.
+    """Return the start and end points of sample rays, in local coordinates.
 
     The array has shape (n, 2, 3).
     """

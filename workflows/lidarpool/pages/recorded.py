@@ -1,4 +1,4 @@
-"""Views of recordings and of clouds from other programs, whose points are kept in memory."""
+"""Views of recordings and of clouds from other programs. Their points are kept in memory."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def _native(name: str, values: AnyArray) -> AnyArray:
 
 
 def _describe_column(name: str, values: AnyArray) -> Column:
-    """Return a column's standard description if its type matches, or else a new description."""
+    """Describe a column. The standard description is used if its type matches."""
     known = TABLE.get(name)
     if known is not None and np.dtype(known.dtype) == values.dtype:
         return known
@@ -182,7 +182,7 @@ def sampled_view(recording: Recording, title: str) -> tuple[View, Sweep]:
 def growing_view(
     recording: Recording, title: str, read: Callable[[OnPart], View]
 ) -> ProgressiveView:
-    """Return a view of a sample of a cloud, to which `read` adds points."""
+    """Return a view that first shows a sample of a cloud. `read` adds further points."""
     total = recording.point_count or 0
     sampled, sample = sampled_view(recording, title)
     parts = [sample]

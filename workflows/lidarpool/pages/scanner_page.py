@@ -329,7 +329,7 @@ class SweepFeed:
 
 
 def _actor_poses(scene: Scene, time_ns: float) -> dict[str, AnyArray]:
-    """Return the poses, animation frames and presence of the actors at a given time."""
+    """Return each actor's pose, animation frame, and presence at a given time."""
     poses = [pose_at(actor.trajectory, time_ns) for actor in scene.actors]
     rotations = np.array([pose.rotation_matrix for pose in poses]).reshape(-1, 3, 3)
     frames = np.zeros(len(poses))

@@ -74,7 +74,7 @@ class PathCost:
 
 
 def _enlarged_radii(centers: Floats, radii: Floats) -> Floats:
-    """Enlarge radii by a margin for rounding errors without covering the path's end points.
+    """Enlarge the radii of discs by a margin for rounding errors.
 
     The enlarged discs do not contain the end points of the path.
     """

@@ -110,7 +110,10 @@ class Planning(Search):
 def _checked(
     name: str, value: ArrayLike, fits: Callable[[Floats], bool], requirement: str
 ) -> Floats:
-    """Convert `value` to a new array of finite numbers that satisfy `fits`, or raise LidarError."""
+    """Convert `value` to a new array, or raise LidarError if it is invalid.
+
+    The numbers must be finite, and `fits` must return True for them.
+    """
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):

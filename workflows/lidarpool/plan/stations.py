@@ -344,7 +344,10 @@ def _visibility(
 
 
 class _Choice(NamedTuple):
-    """Selected rows of `_Visibility`, in the order of their selection."""
+    """Selected candidates, in the order of their selection.
+
+    The indices are rows of `_Visibility`.
+    """
 
     row_indices: list[int]
     shares: list[float]  # fraction of the area that is covered after each row
@@ -381,7 +384,10 @@ def _choose_rows(
 
 
 def _default_spacing_m(scene: Scene) -> float:
-    """Return a round candidate spacing in meters that suits the size of the scene."""
+    """Return the distance between candidates in meters, as a round number.
+
+    The distance suits the size of the scene.
+    """
     width_m, depth_m, _ = np.ptp(scene.bounds, axis=0)
     spacing = max(math.sqrt(width_m * depth_m / _CANDIDATES), _MIN_SPACING_M)
     power = 10.0 ** math.floor(math.log10(spacing))

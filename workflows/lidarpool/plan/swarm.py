@@ -144,7 +144,7 @@ def _group_count(particles: int) -> int:
 
 
 def _spreads(groups: int, widest: float) -> Floats:
-    """Return the initial spread of each group about the straight line."""
+    """Return how widely the initial paths of each group spread around the straight line."""
     widest = max(_MIN_LAST_SPREAD, widest)
     if groups == 1:
         return np.array([widest])

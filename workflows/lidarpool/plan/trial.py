@@ -69,7 +69,7 @@ def with_ends(planning: Planning, waypoints: Floats) -> Floats:
 
 
 def prepare_swarm(planning: Planning, axes: PathAxes, seed: int) -> Swarm:
-    """Return a swarm for `planning` that is spread as widely as a path around the discs can be."""
+    """Return a swarm that is spread widely enough for any useful path around the discs."""
     centers = axes.to_local(planning.centers)
     radii = planning.radii / axes.unit_m
     cost = PathCost(centers, radii, planning.waypoints, planning.particles)

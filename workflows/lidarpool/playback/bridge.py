@@ -69,7 +69,7 @@ class Bridge(ABC):
 
     @classmethod
     def format_of(cls, settings: Mapping[str, Any]) -> ExportSpec | None:
-        """Return the format whose columns are sent. It may depend on `settings`.
+        """Return the format that determines which columns are sent. It may depend on `settings`.
 
         Raises
         ------
@@ -86,7 +86,7 @@ class Bridge(ABC):
     @property
     @abstractmethod
     def description(self) -> str:
-        """Address at which receivers find the sweeps, which is part of the "ready" message."""
+        """Address at which receivers find the sweeps. It is part of the "ready" message."""
 
     def due_ns(self, sweep: int) -> float:
         """Return the time at which a sweep is due, in nanoseconds since the start of the survey.

@@ -115,7 +115,7 @@ def play(
 def _sweeps(
     scanner: Scanner, trajectory: Any, duration_s: float | None
 ) -> Iterator[Callable[[], _NumberedSweep]]:
-    """Yield functions that simulate consecutive sweeps until the trajectory or duration ends."""
+    """For each sweep until the trajectory or duration ends, yield a function that simulates it."""
     end_s = getattr(trajectory, "duration_ns", float("inf")) / 1e9
     for number in count():
         first_s, last_s = scanner.span_s(number)
@@ -137,7 +137,10 @@ def _send_all(
     ready: Callable[[str], Any] | None,
     note: Callable[[str], Any] | None,
 ) -> None:
-    """Pass the packets of all sweeps to the sending process, up to one sweep in advance."""
+    """Encode all sweeps, and pass their packets to the sending process.
+
+    Packets are passed at most one sweep in advance.
+    """
 
     def send(groups: list[Datagrams]) -> None:
         transmitter.sender.send(0, groups, deadlines_ns)

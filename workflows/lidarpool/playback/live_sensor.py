@@ -61,7 +61,7 @@ class PacketsBridge(Bridge):
         return float(self.sweeps.begins_ns[sweep])
 
     def prepare(self, sweep: int, points: Cloud) -> None:
-        """Encode a sweep with a temporary encoder, in order to compile the loops."""
+        """Compile the encoding loops by encoding a sweep with a temporary encoder."""
         source = PacketSource.for_sensor(self.sweeps, int(self.sweeps.sensor[sweep]))
         encoder = encoder_of(replace(source, instruments=None))
         encoder.encode(self._shots(encoder, sweep, points))

@@ -83,10 +83,11 @@ _START_NS = 50e6  # time between the start of the schedule and the first datagra
 def recorded_streams(
     recording: PcapRecording, to: Sequence[str], api: Sequence[str]
 ) -> list[Stream]:
-    """Return a stream for each sensor of the recording, named after the sensor's address.
+    """Return a stream for each sensor of the recording.
 
-    The streams are directed with `streams_to`. For an Ouster sensor, the sensor interface is
-    simulated if there is a .json file with its metadata next to the recording.
+    Each stream is named after the address of its sensor. The streams are directed with
+    `streams_to`. For an Ouster sensor, the sensor interface is simulated if there is a .json file
+    with its metadata next to the recording.
     """
     streams = [
         Stream(
@@ -102,7 +103,10 @@ def recorded_streams(
 
 
 def _service_of(recording: PcapRecording) -> Callable[..., Service | None]:
-    """Return a function that creates the sensor's interface, or returns None if it is unknown."""
+    """Return a function that creates a simulation of the sensor's interface.
+
+    The function returns None if the interface is unknown.
+    """
     path = recording.path.with_suffix(".json")
     if len(recording.sources) > 1 or not path.exists():
         return lambda *_: None

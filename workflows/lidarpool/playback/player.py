@@ -73,7 +73,7 @@ def play_sweeps(
 
 
 def _laps(played: PlaybackSource, *, loop: bool) -> Iterator[Callable[[], _ShiftedSweep]]:
-    """Yield functions that return the sweeps of each repetition."""
+    """For each sweep of each repetition, yield a function that reads the sweep."""
     period_ns = played.period_ns
     for lap in count() if loop else range(1):
         for sweep in played.order:

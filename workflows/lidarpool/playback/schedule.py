@@ -66,7 +66,7 @@ class Schedule:
         return (self.deadline_ns(0.0) + times_ns / self.rate).astype("<i8")
 
     def late_s(self, time_ns: float) -> float:
-        """Return the time since a survey time in seconds, which is negative before that time."""
+        """Return the time since a survey time in seconds. Before that time, it is negative."""
         return (time.monotonic_ns() - self.deadline_ns(time_ns)) / 1e9
 
     def wait_until(self, time_ns: float) -> None:

@@ -47,7 +47,7 @@ class ViewerBridge(Bridge):
 
     @property
     def description(self) -> str:
-        """Address at which users open the viewer, which is part of the "ready" message."""
+        """Address at which users open the viewer. It is part of the "ready" message."""
         return self._viewer.description
 
     def show_content(self, content: Callable[[], PictureContent | None]) -> None:

@@ -1,4 +1,4 @@
-"""Run garbage collection less often once this module has been imported.
+"""Importing this module makes garbage collection run less often.
 
 With Python's default threshold, a tenth of the import time is spent on garbage collection.
 """

@@ -75,7 +75,9 @@ class SharedHandle(NamedTuple):
 
 
 class SharedValue:
-    """Pickled value in shared memory, which is freed with this object and all loaded copies.
+    """Pickled value in shared memory.
+
+    The memory is freed when neither this object nor any loaded copy exists anymore.
 
     Raises
     ------

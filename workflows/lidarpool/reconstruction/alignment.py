@@ -101,7 +101,7 @@ class Alignment:
     def from_poses(
         cls, poses: RecordedPoses, voxel_m: float, motion: Motion, ring_count: int
     ) -> Alignment:
-        """Return an alignment in which the given poses are moved to the sweeps' timestamps.
+        """Create an alignment from poses, converting each pose to the timestamp of its sweep.
 
         The rings have no offsets.
         """
@@ -161,9 +161,10 @@ class Alignment:
         return compensated, origins
 
     def points_as_fired(self, sweep: Sweep, number: int) -> tuple[Floats, FiringPoses] | None:
-        """Return the calibrated points of a sweep as fired, and their firing poses.
+        """Return a sweep's calibrated points in the sensor frame at their firing times.
 
-        The points have shape (n, 3). Return None if they are motion-compensated.
+        Also returns the poses of the sensor at these times. The points have shape (n, 3). Return
+        None if they are motion-compensated.
         """
         from scipy.spatial.transform import Rotation
 
@@ -183,7 +184,10 @@ class Alignment:
     def _split_by_step(
         self, number: int, times_s: Floats
     ) -> Iterator[tuple[Bools, MotionStep, Floats]]:
-        """Yield a mask of points, the step that moves them, and their fractions of this step."""
+        """Divide points into groups that move with the step to the next or previous sweep.
+
+        Yields the mask of each group, its step, and the fraction of the step for each point.
+        """
         for backward, rows in ((False, times_s >= 0), (True, times_s < 0)):
             if rows.any():
                 step, step_s = self.step(number, backward=backward)
@@ -278,7 +282,9 @@ class AlignedSweeps:
 
 
 def first_alignment(sweeps: RecordedSweeps, poses: RecordedPoses) -> Alignment:
-    """Determine how the points are stored, and return the initial poses of all sweeps.
+    """Create the initial alignment of a recording from given poses.
+
+    Also determines whether the points are motion-compensated.
 
     Raises
     ------
@@ -323,12 +329,12 @@ def align(
 
 
 def _motion(sweeps: RecordedSweeps, poses: RecordedPoses, voxel_m: float) -> Motion:
-    """Determine how the points are stored.
+    """Determine whether the points are motion-compensated.
 
-    Surfaces that several sweeps observe share voxels if the points are compensated correctly. The
-    candidate is chosen for which some consecutive sweeps fill the fewest voxels. The thickness of
-    the planes is not a useful criterion, because a blurred wall is not detected as a plane, and a
-    level road stays thin.
+    If they are not, also determine how their firing times are known. Surfaces that several sweeps
+    observe share voxels if the points are compensated correctly. The candidate is chosen for which
+    some consecutive sweeps fill the fewest voxels. The thickness of the planes is not a useful
+    criterion, because a blurred wall is not detected as a plane, and a level road stays thin.
 
     Raise LidarError if the points fit the poses better with an inverted y axis.
     """
@@ -574,7 +580,7 @@ def _spherical_derivatives(points: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def transform_points(points: Floats, pose: Floats) -> Floats:
-    """Transform points from the frame of a pose.
+    """Transform points with a pose matrix.
 
     The points have shape (n, 3), and the pose has shape (4, 4).
     """

@@ -546,7 +546,7 @@ class _Building:
 
 
 class _BuiltSubmap(NamedTuple):
-    """Those results of a submap that are kept in memory."""
+    """Results of building a submap that are kept in memory."""
 
     surfels: SubmapSurfels
     held_out: HeldOutRays | None
@@ -565,7 +565,10 @@ class _Built:
         )
 
     def dark(self) -> list[SceneMesh]:
-        """Return a list with the mesh of all surfels that return no pulses, or an empty list."""
+        """Return the mesh of all surfels that return no pulses.
+
+        The list is empty if there are no such surfels.
+        """
         corners = np.concatenate([part.surfels.dark_corners for part in self.parts])
         return [surfel_mesh(NO_RETURN, corners)] if len(corners) else []
 
@@ -584,7 +587,7 @@ class _Built:
 
 
 class SweepTiming(NamedTuple):
-    """Time from a sweep's timestamp to its start, and the rotation of the sensor."""
+    """Timing of the sweeps, and rotation of the sensor."""
 
     rate_hz: float  # revolutions per second
     revolutions: int  # includes dropped sweeps

@@ -133,7 +133,10 @@ class FinishedSteps:
 
 
 def _record(kind: type, prefix: str, arrays: Any) -> Any:
-    """Create a record from arrays, or return None if there are no arrays with the given prefix."""
+    """Create a record from arrays whose names begin with a prefix.
+
+    Returns None if there are no such arrays.
+    """
     found = {name: arrays.get(prefix + name) for name in _names(kind)}
     return None if all(value is None for value in found.values()) else kind(**found)
 

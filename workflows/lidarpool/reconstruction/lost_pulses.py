@@ -161,7 +161,7 @@ class _Gaps(NamedTuple):
         return _Lost(azimuth, elevation, self.ring[before], self._ranges(before, fraction))
 
     def _ranges(self, before: Ints, share: Floats) -> Floats:
-        """Interpolate the ranges within the gaps that begin at the returns `before`.
+        """Interpolate ranges within gaps. `before` is the return before each gap.
 
         The ranges are NaN if the gap is wide or its ends lie on different surfaces.
         """

@@ -49,7 +49,7 @@ class Rotation(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RecordedSweeps:
-    """Sweeps of a recording, only one of which is read at a time.
+    """Sweeps of a recording. Only one sweep is read at a time.
 
     Rings, times and timestamps are stored here, so that other processes do not have to determine
     them again.

@@ -248,7 +248,7 @@ class _Factors(NamedTuple):
 
 
 def _ratios(row: Integers, values: AnyFloats, expected: AnyFloats, before: Floats) -> Floats:
-    """Return the sum of values divided by the sum of expected values, for each row.
+    """Divide the sum of the values in each row by the sum of the expected values.
 
     Rows with too little data keep their value in `before`.
     """

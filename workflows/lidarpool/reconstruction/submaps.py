@@ -94,7 +94,7 @@ def split_into_submaps(positions: Floats) -> list[Submap]:
 
 
 def _meters(positions: Floats) -> list[Ints]:
-    """Return the numbers of the sweeps that represent each one-meter section of a drive."""
+    """Divide a drive into one-meter sections, and choose sweeps that represent each section."""
     starts = [0]
     for number, position in enumerate(positions):
         if np.linalg.norm(position - positions[starts[-1]]) >= _METER_M:
@@ -107,7 +107,10 @@ def _meters(positions: Floats) -> list[Ints]:
 
 
 def _reach(meters: Sequence[Ints], positions: Floats, beyond: range, end: int) -> int:
-    """Return how many sections in `beyond` contain the same surfaces as the end of a submap."""
+    """Return how many of the sections in `beyond` belong to the surroundings of a submap.
+
+    These sections are close enough to contain the same surfaces as the end of the submap.
+    """
     count = 0
     sweeps = 0
     for meter in beyond:

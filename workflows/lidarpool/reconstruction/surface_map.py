@@ -81,7 +81,7 @@ class Observations(NamedTuple):
 
 
 class SurfelHits(NamedTuple):
-    """Surfels hit by the rays of a sweep, as arrays of the k rays that hit a surfel."""
+    """Surfels that the rays of a sweep hit. The arrays describe the k rays with a hit."""
 
     rays: Ints  # indices of the points of the sweep
     surfel: Ints
@@ -93,7 +93,7 @@ class SurfelHits(NamedTuple):
 
     @property
     def ends(self) -> Bools:
-        """Mask of the rays that end on the surfel that they hit.
+        """Mask of the rays whose recorded return lies on the surfel that they hit.
 
         The array has shape (k,).
         """
@@ -238,7 +238,10 @@ def _lost_positions(
 
 
 def _shifts(surfel: Ints, offset_m: Floats, count: int) -> Floats:
-    """Return the shift of each surfel, which is a damped median of the offsets of its rays."""
+    """Return how far to shift each surfel, using the median of the offsets of its rays.
+
+    The shift is reduced for surfels with few rays.
+    """
     shifts_m = np.zeros(count)
     order = np.lexsort((offset_m, surfel))
     surfel = surfel[order]

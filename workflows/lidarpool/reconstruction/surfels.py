@@ -200,7 +200,7 @@ class _Planes(NamedTuple):
 
     @classmethod
     def around(cls, centers: Floats, tree: object, means: Floats) -> _Planes:
-        """Fit planes to the neighbors of `centers`, given a k-d tree of all means."""
+        """Fit a plane to the neighbors of each center. `tree` is a k-d tree of `means`."""
         count = len(centers)
         axes = np.empty((count, 3, 3))
         halves = np.empty((count, 2))

@@ -135,9 +135,10 @@ class _Layout(NamedTuple):
 
 
 def _dot_colors(informative: VariedQuantity | None, count: int) -> Floats:
-    """Return an RGB color for each job, based on the labels of the informative quantity if given.
+    """Return an RGB color for each job.
 
-    The result has shape (jobs, 3).
+    If `informative` is given, jobs are colored by their labels in this quantity. The result has
+    shape (jobs, 3).
     """
     colors = np.tile(theme.rgb(DOT), (count, 1))
     if informative is not None:
@@ -352,7 +353,7 @@ def _group_similar_jobs(x: Floats, jobs: Indices) -> list[Indices]:
 
 
 def _adjoining_bars(groups: Sequence[Floats]) -> Floats:
-    """Return the left and right ends of each group's bar, followed by NaN.
+    """Return the left and right ends of the bar of each group.
 
     Bars of adjacent groups meet halfway between the groups. NaN interrupts the line that is drawn
     through the ends. The result has shape (groups, 3).

@@ -145,12 +145,12 @@ class CloudCounts:
 
     @property
     def pixel_m(self) -> float:
-        """Side length of each pixel in `above`, in meters."""
+        """Side length of a pixel in the top view `above`, in meters."""
         return self._pixels.side * self._precision_m
 
     @property
     def corner(self) -> Floats:
-        """World position of the southwest corner of `above`, in meters.
+        """World position of the southwest corner of the top view `above`, in meters.
 
         The array has shape (2,).
         """
@@ -158,7 +158,7 @@ class CloudCounts:
 
     @property
     def _pixels(self) -> GridCounts:
-        """Grid for `above`, with pixels large enough to contain about one point each."""
+        """Grid for the top view `above`, with pixels large enough for about one point each."""
         pixels = deepcopy(self._squares)
         across = max(_MIN_SQUARES, (2 * pixels.total) ** 0.5)
         while max(pixels.shape) > across:
@@ -274,7 +274,7 @@ class GridCounts:
 
     @property
     def lowest(self) -> Ints:
-        """Lowest cell of `counts` along each axis.
+        """Smallest x and y of the cells that `counts` covers.
 
         The array has shape (2,).
         """

@@ -18,7 +18,10 @@ _TILE = 1024  # points per iteration, so that their indices stay in the L1 cache
 
 @noinline
 def _find_parts(cells, level, bits, indices):
-    """Append the number of each cell's square along one axis to the bits of the square's index."""
+    """Update the indices of the squares that contain cells with the positions along one axis.
+
+    The number of the square along the axis is appended to the bits of its index.
+    """
     mask = np.int32((1 << bits) - 1)
     shift = np.int32(level)
     wide = np.uint32(bits)

@@ -212,7 +212,10 @@ def _read_folder(storage: Storage) -> _ShardFolder:
 
 
 def _read_dataset(storage: Storage, shard_count: int = 1) -> _ShardFolder:
-    """Read a data set, treating a complete data set as `shard_count` shards."""
+    """Read a data set that consists of shards.
+
+    A complete data set counts as `shard_count` shards.
+    """
     record = read_record(storage)
     shards = [Shard.parse(text) for text in record["shards"]]
     if shards == [ALL]:
@@ -470,7 +473,10 @@ def _read_casting_times(shard_folder: _ShardFolder, notes: list[str]) -> Mapping
 
 
 def _missing_manifests(shard_folders: Sequence[_ShardFolder], db: RunDatabase) -> list[str]:
-    """Describe the missing manifests of jobs that have no row in the database."""
+    """Describe the missing manifests.
+
+    The jobs of these manifests have no row in the database.
+    """
     return [
         f"the manifest of job {number} in {folder.storage}"
         for folder in shard_folders

@@ -381,10 +381,10 @@ def _write_formats(
     workers: LidarWorkers | None,
     show: WritingProgress,
 ) -> dict[str, float]:
-    """Write formats to a temporary folder, ending with those that consist of many files.
+    """Write a result to a temporary folder in several formats.
 
-    Returns {format: intensity} for formats with integer intensities. The value is the intensity
-    that is stored as the largest integer.
+    Formats that consist of many files are written last. Returns {format: intensity} for formats
+    with integer intensities. The value is the intensity that is stored as the largest integer.
     """
     full_scales: dict[str, float] = {}
     for output_format in sorted(formats, key=lambda entry: entry.has_many_files):
@@ -454,7 +454,7 @@ def _formats_of_files(names: Collection[str]) -> list[str]:
 
 
 def _known_optional_files(names: Collection[str]) -> list[str]:
-    """Return the names that belong to a format or an instrument, in the order of the formats."""
+    """Return those names that are files of a format or an instrument, sorted by format."""
     measured = [name for name in INSTRUMENT_FILES if name in names]
     return [format_row(name).file for name in _formats_of_files(names)] + measured
 

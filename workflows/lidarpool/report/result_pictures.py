@@ -400,9 +400,9 @@ def _classify_by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
 
 
 def _initial_kinds(shot: SurfaceView, plan: StationPlan, samples: RaySamples) -> tuple[Ints, Ints]:
-    """Return HIDDEN or OTHER for each sample, and the indices of samples on targets.
+    """Classify samples as HIDDEN or OTHER before their visibility is tested.
 
-    The first array has shape (n,).
+    Also returns the indices of the samples on targets. The first array has shape (n,).
     """
     is_target = plan.targets[plan.scene.face_object[shot.part.parents]]  # one value per triangle
     on_surface = samples.triangle >= 0
@@ -426,7 +426,7 @@ def _choose_block_pixels(shot: SurfaceView, pixels: Ints) -> tuple[Ints, Ints]:
 
 
 def _replace_triangles(samples: RaySamples, kinds: Ints) -> RaySamples:
-    """Replace the triangle indices of samples that hit a surface with their kinds."""
+    """Replace the triangle index of each sample that hit a surface with the sample's kind."""
     return replace(samples, triangle=np.where(samples.triangle >= 0, kinds, samples.triangle))
 
 

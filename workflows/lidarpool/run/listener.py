@@ -59,7 +59,10 @@ class Listener:
             self._on_parts(receipts)
 
     def _show_parts(self, stop: int) -> None:
-        """Show the pending parts that contain scans before `stop`, because their frames are due."""
+        """Show the pending parts that contain scans before `stop`.
+
+        The frames of these scans are due.
+        """
         due = sorted((part for part in self._unshown if part.first < stop), key=lambda p: p.first)
         if due:
             self._unshown = [part for part in self._unshown if part.first >= stop]

@@ -75,7 +75,7 @@ def format_duration(seconds: float) -> str:
 
 
 class ProgressRate:
-    """Rate at which a count has increased since its first value, and the remaining time."""
+    """Rate at which a count increases, and the time that remains."""
 
     def __init__(self) -> None:
         self._first: tuple[float, int] | None = None

@@ -77,7 +77,7 @@ class RunResult:
 
     @property
     def thinning_note(self) -> str:
-        """Clause about omitted points, which follows the number of points in messages.
+        """Clause about omitted points, which messages append to the number of points.
 
         The clause is empty if all points are kept.
         """

@@ -1,4 +1,4 @@
-"""Writing of data set jobs, and of ranges of multi-file formats, by LIDAR workers."""
+"""Let LIDAR workers write the jobs of a data set, and the files of multi-file formats."""
 
 from __future__ import annotations
 

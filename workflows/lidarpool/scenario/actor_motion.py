@@ -304,7 +304,10 @@ class TrajectorySection(Section):
     def _track_without_surfaces(
         self, path: ResolvePath, origin: Floats, start_s: float | None
     ) -> Track:
-        """Return the trajectory in local coordinates, with heights as in the file or pose list."""
+        """Return the trajectory in local coordinates, without placing it on surfaces.
+
+        Heights are as in the file or pose list.
+        """
         options: dict[str, Any] = {
             "smooth": self.interpolation == "smooth",
             "start_s": self.start_s if start_s is None else start_s,

@@ -115,7 +115,7 @@ def _is_mesh_survey(scenario: Scenario) -> bool:
 
 
 def _with_command_option(remark: str) -> str:
-    """Replace the field in a remark about axes with the corresponding command-line option."""
+    """Rewrite a remark about axes to name the command-line option instead of the field."""
     return re.sub(r'<file\.up_axis="(\w)">', r"`--up-axis \1`", remark).replace(
         "set up_axis explicitly", "pass `--up-axis` explicitly"
     )

@@ -254,7 +254,7 @@ class CampaignSpec:
         return self._for_dataset(self._jobs.job(number, cache, columns, self._fields(number)))
 
     def prepare(self, number: int, columns: Sequence[str] = ()) -> PreparedScenario:
-        """Create a job like `job`, and return it with its prepared scenario.
+        """Prepare the scenario of a job, and create the job from it.
 
         This method must not be called if a function creates the jobs, because such jobs have no
         scenario.
@@ -264,7 +264,7 @@ class CampaignSpec:
         return replace(prepared, job=self._for_dataset(prepared.job))
 
     def _fields(self, number: int) -> dict[str, Any]:
-        """Return those fields of a job that depend only on its number."""
+        """Return the number, name and split of a job as fields of `Job`."""
         return {"number": number, "name": self.name(number), "split": self.split(number)}
 
     def _for_dataset(self, job: Job) -> Job:

@@ -57,7 +57,10 @@ _UNSAFE = re.compile(r"[^\w.-]+", re.ASCII)  # characters that file names must n
 
 
 class JobSource:
-    """Base class of sources that create the jobs of a campaign by number."""
+    """Base class of sources, which create the jobs of a campaign.
+
+    A job is created when it is requested by its number.
+    """
 
     count: int
     names: tuple[str, ...] = ()
@@ -83,7 +86,7 @@ class JobSource:
 
     @property
     def fields(self) -> dict[str, str]:
-        """Fields, as text, of the scenarios from which jobs are created."""
+        """Text of the fields in the scenarios from which jobs are created."""
         return {}
 
     def message_prefix(self, file: Path) -> str:
@@ -106,7 +109,7 @@ class JobSource:
     def job(
         self, number: int, cache: SceneCache | None, columns: Sequence[str], fields: Any
     ) -> Job:
-        """Create a job, adding cloud columns and fields of `Job`."""
+        """Create a job with additional columns. `fields` contains further fields of `Job`."""
         return self.prepare(number, cache, columns, fields).job
 
 
@@ -218,7 +221,7 @@ class ScenarioJobs(JobSource):
 
     @property
     def fields(self) -> dict[str, str]:
-        """Fields of the first scenarios, as text."""
+        """Text of the fields in the first scenarios."""
         paths = self.paths[:_MAX_DESCRIBED]
         return _describe_scenarios({path.name: Scenario.load(path) for path in paths})
 
@@ -251,7 +254,7 @@ def _unique_names(stems: Iterable[str]) -> list[str]:
 
 
 class SampledJobs(JobSource):
-    """Source of the jobs in a campaign file, which are base scenarios with sampled values."""
+    """Source of the jobs in a campaign file. Each job is a base scenario with sampled values."""
 
     def __init__(self, section: CampaignSection, path: Path) -> None:
         self._vary = section.vary
@@ -308,7 +311,7 @@ class SampledJobs(JobSource):
 
     @property
     def fields(self) -> dict[str, str]:
-        """Fields of the bases and rows of the tables, as text."""
+        """Text of the fields in the bases and of the rows in the tables."""
         bases = self._bases[:_MAX_DESCRIBED]
         tables = {f"rows of {text}": rows for base in bases for text, rows in base.tables.items()}
         words = describe_fields({name: to_json(rows).decode() for name, rows in tables.items()})
@@ -348,7 +351,10 @@ class SampledJobs(JobSource):
             ) from error
 
     def _draw(self, number: int) -> tuple[dict[str, Value | None], dict[str, Any]]:
-        """Draw the values of a job, as written to the job table and as used in the scenario."""
+        """Draw the values of a job.
+
+        Returns the values for the job table, and the changes to the base scenario.
+        """
         base = self._bases[number % len(self._bases)]
         values: dict[str, Value | None] = {"base": base.name} if len(self._bases) > 1 else {}
         changes: dict[str, Any] = {}  # {path: value, or rows to append}
@@ -506,7 +512,10 @@ def _noise_seed(seed: int, number: int) -> int:
 
 
 def _with_seed(noise: Any, seed: int) -> Any:
-    """Return noise in which `seed` replaces a seed of 0, or return None if `noise` is None."""
+    """Return noise with the given seed if its own seed is 0.
+
+    Returns None if `noise` is None.
+    """
     return noise if noise is None or noise.seed else replace(noise, seed=seed)
 
 

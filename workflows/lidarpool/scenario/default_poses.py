@@ -76,7 +76,7 @@ class SensorPlacement:
 
     @property
     def notes(self) -> list[str]:
-        """Notes about the choice of poses, including a list of any poses."""
+        """Notes for the user about the default poses, including the poses themselves."""
         if not self.poses:
             return [self.note]
         return [
@@ -148,7 +148,10 @@ def place_sensor(
 
 
 def _object_note(scene: Scene, poses: Sequence[Pose], grid: Mapping[str, Any]) -> str:
-    """Return a note about default poses around an object and about any default sensor grid."""
+    """Return a note about the default poses around an object.
+
+    If the default sensor is a grid, the note also describes the grid.
+    """
     lower_m, upper_m = scene.bounds + scene.origin
     distance_m = np.linalg.norm(poses[-1].position - (lower_m + upper_m) / 2)
     lengths_m = (*(upper_m - lower_m), distance_m)
@@ -170,7 +173,7 @@ def _object_note(scene: Scene, poses: Sequence[Pose], grid: Mapping[str, Any]) -
 def _narrow_grid(
     scene: Scene, surroundings: PlacementChecker, poses: Sequence[Pose]
 ) -> dict[str, Any]:
-    """Return arguments of `Sensor.grid` that yield about `_POINTS` points on an object."""
+    """Return arguments of `Sensor.grid` such that about `_POINTS` points are on an object."""
     placed = [
         *zip(_local_positions(poses, scene), [pose.rotation_matrix for pose in poses], strict=True)
     ]

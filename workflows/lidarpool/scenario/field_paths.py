@@ -126,7 +126,7 @@ def _path_in(scenario: Scenario, names: Sequence[str], name: str) -> str:
 
 
 def _match_name(names: Sequence[str], path_parts: Sequence[str], path: str) -> tuple[str, int]:
-    """Return the longest name with which a path starts, and the number of its parts.
+    """Return the longest name that is at the start of a path, and its number of parts.
 
     Names may contain dots, and therefore consist of several parts. Raise LidarError if no name
     matches.
@@ -141,10 +141,10 @@ def _match_name(names: Sequence[str], path_parts: Sequence[str], path: str) -> t
 
 
 def _match_entry(entries: Sequence[Any], path_parts: Sequence[str], path: str) -> tuple[int, int]:
-    """Return the index of the list entry with which a path starts, and its number of parts.
+    """Find the list entry to which the start of a path refers.
 
-    The path contains the index or the name of the entry. Raise LidarError if there is no such
-    entry.
+    Returns the index of the entry, and the number of parts that refer to it. The path contains the
+    index or the name of the entry. Raise LidarError if there is no such entry.
     """
     if path_parts[0].isdecimal():
         digits = path_parts[0].lstrip("0") or "0"  # Python does not convert thousands of digits
@@ -163,10 +163,11 @@ def _match_entry(entries: Sequence[Any], path_parts: Sequence[str], path: str) -
 
 
 def replace_value(node: Any, steps: FieldSteps, change: Callable[[Any], Any]) -> Any:
-    """Return a section in which `change(value)` replaces the value at the end of `steps`.
+    """Return a copy of a section in which the value at the end of `steps` is changed.
 
-    The section itself is not modified. In the result, sections along the steps are mappings from
-    field names to values, which have to be validated again. Other sections are unchanged.
+    The new value is `change(value)`. The section itself is not modified. In the result, sections
+    along the steps are mappings from field names to values, which have to be validated again. Other
+    sections are unchanged.
     """
     if not steps:
         return change(node)

@@ -199,7 +199,7 @@ def follow_surfaces(track: Track, support: SupportSurfaces) -> list[Track]:
 
 
 def _step_times(track: Track) -> Floats:
-    """Return pose times in seconds, such that poses are at most `STEP_M` apart.
+    """Return times in seconds at which poses along a trajectory are at most `STEP_M` apart.
 
     Raise LidarError if there are too many.
     """
@@ -219,7 +219,7 @@ def _step_times(track: Track) -> Floats:
 def _surface_poses(
     positions: Floats, forward: Floats, support: SupportSurfaces
 ) -> tuple[Floats, Floats]:
-    """Return the surface height at each position, and the axes of a pose on its slope.
+    """Return the heights and axes of poses that stand on surfaces and follow their slope.
 
     Parameters
     ----------

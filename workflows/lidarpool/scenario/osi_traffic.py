@@ -39,7 +39,7 @@ _ROW = 6
 
 @dataclass(frozen=True, eq=False)
 class OsiPassage:
-    """Consecutive messages of a trace that contain the same moving object."""
+    """A moving object during a series of consecutive messages that contain it."""
 
     name: str  # ID of the object
     kind: str  # type of the object, such as "heavy_truck"

@@ -282,7 +282,10 @@ def _inside_actor(actor: Actor, samples: list[_SensorPosition]) -> Bools:
 def _visible_range_m(
     scene: Scene, surroundings: PlacementChecker | None, positions: Floats
 ) -> float:
-    """Return a typical maximum distance to the scene, for sensors without a range limit."""
+    """Return a typical distance to the farthest surfaces of the scene.
+
+    It is used for sensors that have no range limit.
+    """
     if surroundings is not None:
         distances = surroundings.cast_around(positions).distance
         if len(distances := distances[np.isfinite(distances)]):

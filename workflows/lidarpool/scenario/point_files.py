@@ -193,7 +193,7 @@ def _check_count(count: int) -> None:
 
 
 def _without_zeros(scan: Sweep) -> Sweep:
-    """Return a scan without points at the origin, which drivers write for lost pulses.
+    """Remove points at the origin, which drivers write for lost pulses.
 
     If there are fewer than `MIN_POINTS` points at the origin, they are kept, because they may have
     been measured.
@@ -326,14 +326,17 @@ def _convert_points(stored: Sweep, to_meters: Callable[[Floats], Floats]) -> Swe
 
 
 def _unused_columns(stored: Sweep, used: Collection[str]) -> list[str]:
-    """Return the unused names in `skipped`, except those of columns that contain only zeros."""
+    """Return the names in `skipped` that are not used.
+
+    Columns that contain only zeros are omitted.
+    """
     names = [name for name in stored.skipped if name not in used]
     columns = stored.columns
     return [name for name in names if name not in columns or _has_values(columns[name])]
 
 
 def _column_groups(columns: Columns, names: Sequence[str]) -> list[Columns]:
-    """Return groups of columns, each of which stores the components of the same quantity.
+    """Group the columns that store the components of the same quantity.
 
     If there are several groups, the group with the standard names is the first.
     """

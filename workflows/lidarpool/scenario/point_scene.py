@@ -216,7 +216,7 @@ class _Surfels(NamedTuple):
 def _select_color(
     path: Path, points: Sweep, color: str | None, report: Callable[[str], None]
 ) -> Sweep:
-    """Return points that have either colors or intensities, but not both.
+    """Remove either the colors or the intensities from points that have both.
 
     Raise LidarError if the selected quantity is missing.
     """
@@ -310,7 +310,7 @@ def surfel_faces(count: int) -> Ints:
 
 @dataclass(frozen=True, eq=False)
 class PointVoxels:
-    """Assignment of points to voxels, of which only those with points are stored."""
+    """Assignment of points to voxels. Only voxels with points are stored."""
 
     order: Ints  # (n,), indices of the points, sorted by voxel
     starts: Ints  # (v,), index of the first point of each voxel in `order`

@@ -233,7 +233,7 @@ def _platform_track(shapes: ShapeLoader, support: SupportSurfaces) -> Track | No
 def _read_traffic(
     scenario: Scenario, first_s: float, last_s: float, travelers: TravelerFilter
 ) -> TrafficContent:
-    """Read the traffic between two times, which refer to the clock of the traffic file."""
+    """Read the traffic between two times. They refer to the clock of the traffic file."""
     section = scenario.traffic
     assert section is not None
     file = scenario.path(section.file)
@@ -376,7 +376,7 @@ def _mount_pose(section: SensorSection, shapes: ShapeLoader) -> Pose:
 
 
 def _joint_arguments(entry: ActorSection, scenario: Scenario) -> dict[str, Any]:
-    """Return the arguments of `Robot.path` and `Robot.actors` that describe a joint table."""
+    """Return the joint table of an entry as arguments of `Robot.path` and `Robot.actors`."""
     if entry.joints is None:
         return {}
     return {
@@ -507,7 +507,7 @@ def _materials(
 
 
 class _ClassedObject(NamedTuple):
-    """Object whose class is set in `scene.copies` or `actors`."""
+    """Object to which an entry of `scene.copies` or `actors` assigns a class."""
 
     name: str  # name of the entry or the robot link
     patterns: list[str]  # match the names of the object and its numbered copies in the scene
@@ -515,7 +515,7 @@ class _ClassedObject(NamedTuple):
 
 
 def _classed_objects(scenario: Scenario, scene: Scene) -> list[_ClassedObject]:
-    """Return the objects whose entries in `scene.copies` or `actors` set a class.
+    """Return the objects to which entries of `scene.copies` or `actors` assign a class.
 
     All copies of an entry are treated as one object, and each link of a robot as a separate object.
     """

@@ -58,7 +58,7 @@ class _CompactGenerator(GenerateJsonSchema):
 
 
 def scenario_schema() -> dict[str, Any]:
-    """Return the JSON Schema of scenario files, including short forms and empty sections.
+    """Return the JSON Schema of scenario files, which allows short forms and empty sections.
 
     The schema does not check combinations of fields, such as a range that stops before its start.
     `Scenario.load` checks them.
@@ -163,7 +163,7 @@ def scenario_template(data: Mapping[str, Any], note: str) -> str:
 
 
 def _section_lines(name: str, field: FieldInfo, values: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines of a section or top-level field, replacing default values by `values`."""
+    """Yield the lines of a section or top-level field. `values` replaces default values."""
     section = field.annotation
     if not (isinstance(section, type) and is_section(section)):
         yield from _field_lines(name, field, "", values)

@@ -219,7 +219,7 @@ MeshEntries = Several[MeshEntry]
 
 
 def _as_pose_mapping(value: Any) -> Any:
-    """Convert a list with the position of a pose to a mapping."""
+    """Convert a position, which is the short form of a pose, to a mapping."""
     if isinstance(value, list):
         return {"position": value}
     if not isinstance(value, (dict, Pose)):
@@ -775,7 +775,7 @@ Obstacles = Several[Annotated[Obstacle, accept_text("object", Obstacle)]]
 
 
 class _Route:
-    """Fields of `PlanningSection` before the fields of `Search`.
+    """First fields of `PlanningSection`, which are followed by those of `Search`.
 
     Positions are in world coordinates, and obstacles may be selected by name.
     """
@@ -838,7 +838,7 @@ class TaskOptions:
 
 
 class _WorkerCounts:
-    """Fields of `PoolSection` before the fields of `TaskOptions`."""
+    """First fields of `PoolSection`, which are followed by those of `TaskOptions`."""
 
     gpu: Annotated[
         int | None,

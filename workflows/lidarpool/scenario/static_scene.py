@@ -86,11 +86,11 @@ class FileFindings:
     without_angles: dict[str, bool] = field(default_factory=dict)
 
     def copy(self) -> FileFindings:
-        """Return a copy whose lists and dictionaries can be extended independently."""
+        """Return a copy with its own lists and dictionaries."""
         return FileFindings(*(values.copy() for values in vars(self).values()))
 
     def class_patterns(self, number: int) -> tuple[str, ...]:
-        """Return name patterns of the objects to which files assign the class `number`."""
+        """Return patterns that match the objects to which files assign the class `number`."""
         patterns = dict.fromkeys(
             pattern
             for classes in self.classes.values()
@@ -165,10 +165,10 @@ class _LeastRecentlyUsedCache(Generic[Value]):
 
 
 def _cache_key(scenario: Scenario) -> object:
-    """Return a key that is equal for all scenarios that can share their static objects.
+    """Return the key under which the static objects of a scenario are cached.
 
-    The key consists of the scene section, the reading options, and the sizes and modification times
-    of the files.
+    Scenarios with equal keys can share their static objects. The key consists of the scene section,
+    the reading options, and the sizes and modification times of the files.
     """
     section = scenario.scene
     files: list[str] = [entry.file for entry in section.files]
@@ -425,7 +425,7 @@ def _place_copies(
 
 
 def _copy_extents(section: SceneSection) -> list[Floats]:
-    """Return the corners of scatter rectangles and the given positions of copies.
+    """Return the given positions of copies, and the corners of rectangles for random copies.
 
     Each array has shape (n, 2) and contains world coordinates in meters.
     """

@@ -63,14 +63,14 @@ def expected_loss(positions: Floats, scanners: Floats, corners: Floats) -> float
 
 
 class _Rays(NamedTuple):
-    """Rays from a scanner at the origin, with directions between the scanner's points."""
+    """Rays from a scanner at the origin. Their directions lie between those of its points."""
 
     directions: Floats  # (k, _RAYS, 3), unit vectors
     nearest: Floats  # (k,), minimum range of the neighbors, meters
     farthest: Floats  # (k,), maximum range of the neighbors, meters
 
     def covered_by(self, corners: Floats) -> Bools:
-        """Mark the rays that hit one of their surfels.
+        """Mark the rays that hit at least one of the surfels listed for them.
 
         `corners` has shape (k * _RAYS, s, 4, 3) and contains s surfels for each ray. The result has
         shape (k, _RAYS).
@@ -93,10 +93,10 @@ class _Rays(NamedTuple):
 
 
 def _rays_between(points: Floats, count: int, rng: np.random.Generator) -> Iterator[_Rays]:
-    """Yield rays near about `count` random points of a scanner at the origin.
+    """Yield rays that pass close to about `count` random points.
 
-    Points at the edge of the visible area, for example against the sky, are skipped. `points` has
-    shape (n, 3).
+    The scanner is at the origin. Points at the edge of the visible area, for example against the
+    sky, are skipped. `points` has shape (n, 3).
     """
     points = points[points.any(axis=1)]
     if len(points) < _NEIGHBORS:

@@ -193,7 +193,7 @@ class TrafficContent(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SumoPassage:
-    """Consecutive SUMO time steps that contain the same vehicle or person."""
+    """A vehicle or person during a series of consecutive SUMO time steps that contain it."""
 
     name: str
     kind: str

@@ -211,7 +211,10 @@ class _SubscriptionListener(ServerListener):
 
 
 def packed_points(shown: ShownSweep) -> Records:
-    """Pack a sweep's points into records, with x, y and z as float32 and all columns."""
+    """Pack a sweep's points into records.
+
+    Each record contains all columns, and x, y and z as float32.
+    """
     values: dict[str, AnyArray] = dict(zip("xyz", shown.positions.T, strict=True))
     values |= shown.columns
     kinds = [(name, column.dtype.newbyteorder("<")) for name, column in values.items()]
@@ -250,7 +253,7 @@ def _transform(transform: FramePose, stamp: Any) -> Any:
 
 
 def _actors(boxes: ActorBoxes, stamp: Any) -> Any:
-    """Return boxes for the actors that are present, and deletions for those that are not."""
+    """Return the boxes of present actors, and messages that delete the boxes of other actors."""
     entities = []
     deletions = []
     for number, name in enumerate(boxes.names):

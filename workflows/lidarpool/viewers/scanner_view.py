@@ -143,7 +143,7 @@ class Foxglove(_ExternalScannerView):
     Raises
     ------
     LidarError
-        If foxglove-sdk is not installed (extra `live`), if the address cannot be used, or if the
+        If foxglove-sdk is not installed (`live` extra), if the address cannot be used, or if the
         address can be reached from other machines.
     """
 
@@ -157,7 +157,7 @@ class Rerun(_ExternalScannerView):
 
     The object is used like `Foxglove`. It prints the link of the viewer in the browser. By default,
     it listens on 127.0.0.1:9876, and the page is served on the next port. It requires rerun-sdk
-    (extra `rerun`).
+    (`rerun` extra).
     """
 
     def __init__(self, scanner: Scanner, to: str | None = None) -> None:

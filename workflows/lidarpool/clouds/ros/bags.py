@@ -156,7 +156,10 @@ class Rosbag2(CloudFormat):
 
     @classmethod
     def survey_columns(cls, survey: Survey) -> tuple[str, ...]:
-        """Return the columns of LaserScan messages if a survey has 2D scanners and all returns."""
+        """Return the columns that LaserScan messages require.
+
+        Returns no columns unless the survey has 2D scanners and keeps all returns.
+        """
         has_scans = survey.keep_every == 1 and laser_scan.has_planar_sensors(survey)
         return laser_scan.COLUMNS if has_scans else ()
 

@@ -159,7 +159,7 @@ class SurveyMessages:
         return _sent("/clock", clock(self._make.stamp(time_ns)), time_ns)
 
     def sweep_messages(self, sweep: int, points: Cloud) -> Iterator[RosMessage]:
-        """Yield the messages at the start of a sweep and the frames during the sweep."""
+        """Yield all messages of a sweep, ending with the frames that follow its start."""
         sweeps = self._sweeps
         time_ns = self.sweep_start_ns(sweep)
         yield _sent("/tf", self._make.transforms(self._frames_in_world(sweep), time_ns), time_ns)
@@ -267,7 +267,10 @@ def _numbered(name: str, plane: int) -> str:
 
 
 def _instruments(sweeps: Sweeps) -> list[tuple[str, str, SweepPoses, int]]:
-    """Return the instrument frames on the vehicle in the form that `_Messages.transforms` takes."""
+    """Return the frames of the IMU and the GNSS receiver, relative to the vehicle.
+
+    They are passed to `_Messages.transforms`.
+    """
     instruments = sweeps.instruments
     if instruments is None or instruments.folder is None:
         return []

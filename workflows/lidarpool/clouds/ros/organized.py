@@ -67,7 +67,7 @@ def _rays(
     sweeps: Sweeps,
     sweep: int,
 ) -> Records:
-    """Return points for all rays as if no ray had a return.
+    """Return a point for each ray, with the values for a ray without a return.
 
     The shape is (channels, firings).
     """
@@ -86,7 +86,7 @@ def _rays(
 
 
 def _looking_ahead(image: RayImage) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:
-    """Return the firings of all pixels such that the pixels in a column have the same direction.
+    """Return the firing of each pixel. All pixels in a column have the same direction.
 
     The shape is (channels, firings).
     """

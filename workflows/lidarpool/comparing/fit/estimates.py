@@ -61,7 +61,10 @@ class Estimate(NamedTuple):
         return cls(fraction, float(lower), float(upper))
 
     def is_within(self, share: float) -> bool:
-        """Return True if half of the confidence interval is at most `share` times the value."""
+        """Return whether the estimate is precise enough.
+
+        Half of the confidence interval must be at most `share` times the value.
+        """
         return self.high - self.low <= 2 * share * abs(self.value)
 
     def power(self, exponent: float, scale: float = 1.0) -> Estimate:

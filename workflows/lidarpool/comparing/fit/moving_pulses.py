@@ -79,7 +79,7 @@ class ScenePulses:
         return ~(np.abs(self.residual) > limit_m)  # NaN is marked, too
 
     def rays(self, sigma: Floats) -> SmoothRays:
-        """Convert each pulse to a ray with a single pulse.
+        """Convert pulses to rays, each of which consists of a single pulse.
 
         `sigma` is the standard deviation of each range. The variances of the rays are derived from
         differences between neighboring pulses, in which errors of the poses and of the scene cancel
@@ -140,7 +140,10 @@ def measure_pulses(
 
 
 class _CellReturns(NamedTuple):
-    """Each cell's return or, if the cell has none, the closest return of the same ring."""
+    """Returns that are assigned to the cells of a sweep.
+
+    A cell without its own return is assigned the closest return of the same ring.
+    """
 
     points: Floats  # (r, c, 3): meters, in the sensor frame at the firing of each point
     beside: Floats  # (2, r, c, 3): returns of the ring before and after the cell, like `points`
@@ -172,7 +175,7 @@ class _CellReturns(NamedTuple):
 
 
 class _NearestReturns(NamedTuple):
-    """Returns that are closest in azimuth to each cell of a sweep, on the same ring.
+    """For each cell of a sweep, the return on the same ring that is closest in azimuth.
 
     Distances are infinite in rings without a return.
     """
@@ -233,7 +236,7 @@ class _NearestReturns(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _RayPoses:
-    """Trajectory that consists of one pose for each ray in a list.
+    """Poses of individual rays, in the form of a trajectory.
 
     The time of ray i is i nanoseconds.
     """
@@ -370,7 +373,10 @@ def _rotate_vectors(rotations: Floats, vectors: Floats) -> Floats:
 
 
 def _means_beside(values: Floats) -> Floats:
-    """Return the mean of the neighbors of each cell in its row, or NaN if all of them are NaN."""
+    """For each cell, return the mean of its neighbors in the same row.
+
+    Neighbors that are NaN are ignored. The mean is NaN if all neighbors are NaN.
+    """
     shifts = [shift for shift in range(-_LIGHT_COLUMNS, _LIGHT_COLUMNS + 1) if shift]
     beside = np.stack([np.roll(values, shift, axis=1) for shift in shifts])
     known = np.isfinite(beside)

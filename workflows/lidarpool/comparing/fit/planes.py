@@ -161,11 +161,11 @@ class RangeChanges:
         return evidence
 
     def axes(self) -> tuple[Floats, Floats]:
-        """Return the principal axes of the normals of unchanged surfaces, with their fractions.
+        """Return the principal axes of the surface normals, and the fraction of each axis.
 
-        The fraction of an axis is the mean square of the normals' components along it. Fractions
-        are in ascending order. A shift along an axis with a small fraction changes few of these
-        ranges.
+        Only surfaces whose range has not changed are used. The fraction of an axis is the mean
+        square of the normals' components along it. Fractions are in ascending order. A shift along
+        an axis with a small fraction changes few of these ranges.
         """
         ranges = np.linalg.norm(self.points, axis=-1)
         with np.errstate(invalid="ignore"):
@@ -223,7 +223,10 @@ def _rigid_motion(design: Floats, change: Floats, noise: Floats) -> Floats:
 
 
 class Creep(NamedTuple):
-    """Steady motion of a sensor during a recording, or 0 if noise can explain the range changes."""
+    """Steady motion of a sensor during a recording.
+
+    The motion is 0 if noise can explain the range changes.
+    """
 
     shift: Floats  # (3,): meters from sweep to sweep
     rotation: Floats  # (3,): rotation vector from sweep to sweep, radians
@@ -314,7 +317,7 @@ class _CreepRays:
         )
 
     def steady_motion(self, contrast: Floats) -> _SweepMotion:
-        """Return the weighted sum of the motions of all sweeps, with `contrast` as the weights."""
+        """Combine the motions of all sweeps into a single motion, using `contrast` as weights."""
         motions = [self._sweep_motion(change) for change in self.change]
         return _SweepMotion(
             np.tensordot(contrast, [motion.values for motion in motions], 1),

@@ -26,7 +26,7 @@ _STRICT_SIGMAS = 2.0  # stricter limit; the change in the solution is used as an
 
 
 class _PlaneRays(NamedTuple):
-    """Rays that hit large planes, each of which several rings cross.
+    """Rays that hit large planes. Each of these planes is crossed by several rings.
 
     Both arrays have shape (n,).
     """

@@ -79,10 +79,10 @@ def _is_shown(motion: RigidMotion, pair: VisibilityPair, changes: RangeChanges) 
 def _search_by_visibility(
     pair: VisibilityPair, changes: RangeChanges, max_shift_m: float
 ) -> RigidMotion | None:
-    """Search for motions supported by objects, until few changed objects remain.
+    """Find a sensor motion that enough objects support, or return None if there is none.
 
     The motion that explains most points may belong to a car beside the sensor, in which case the
-    points that it explains are removed and the search is repeated.
+    points that it explains are removed. The search is repeated until few changed objects remain.
     """
     remaining = pair
     for _ in range(_THINGS):

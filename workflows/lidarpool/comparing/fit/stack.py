@@ -59,7 +59,7 @@ class SweepStack:
 
     @cached_property
     def trials(self) -> Ints:
-        """Number of sweeps in which each cell has a return or a lost pulse.
+        """Number of sweeps that emitted a pulse into each cell, whether or not it returned.
 
         The array has shape (r, c).
         """

@@ -155,7 +155,7 @@ def _reduce_neighbors(values: Floats, reduce: np.ufunc) -> Floats:
 
 
 def _reduce_row_pairs(values: Floats, reduce: np.ufunc) -> Floats:
-    """Reduce values over each pair of adjacent rows.
+    """Combine each pair of adjacent rows with a function such as `np.minimum`.
 
     The result has shape (r - 1, c). A single row is returned unchanged.
     """
@@ -184,7 +184,10 @@ def _is_wide(ranges: Floats, tolerance_m: float) -> Bools:
 
 
 class Evidence(NamedTuple):
-    """Number of objects visible in both sweeps, grouped by the motion that explains them."""
+    """Numbers of objects that support a motion, a stationary sensor, or neither.
+
+    Only objects that are visible in both sweeps are counted.
+    """
 
     moved: int  # explained only by the motion
     stayed: int  # explained only by a stationary sensor
@@ -272,7 +275,7 @@ class VisibilityPair:
         return count_objects(points, kinds, _LONGEST_VEHICLE_M)
 
     def without_explained(self, motion: RigidMotion) -> VisibilityPair:
-        """Return the pair without changed points that are explained by a motion."""
+        """Return a copy in which changed points are unknown if a motion explains them."""
         seen_first, seen_second = (
             np.where((at_rest == _EMPTY) & (in_motion == _SURFACE), _UNKNOWN, at_rest)
             for at_rest, in_motion in zip(

@@ -280,7 +280,7 @@ def _template(name: str) -> Template:
 
 
 def _with_names(row: str, head: Sequence[str]) -> Markup:
-    """Add column names to the cells of a table row for use by the style sheet.
+    """Add the name of its column to each cell of a table row, for the style sheet.
 
     The first column, which contains the name of the row (th), is skipped.
     """
@@ -383,7 +383,7 @@ def _partition_groups(stages: Sequence[StageTotals], axis: _TimeAxis) -> list[di
 
 
 def _worker_rows(tasks: WorkerTasks, axis: _TimeAxis) -> list[dict[str, str]]:
-    """Return rows for the combinations of worker and stage that were the busiest in a partition."""
+    """Return a row for each of the busiest pairs of worker and stage in a partition."""
     busy_s = {key: sum(task.seconds for task in records) for key, records in tasks.items()}
     rows = []
     for worker, stage in sorted(

@@ -41,7 +41,7 @@ _CLUSTER_LOST = (OSError, FutureCancelledError, PipeClosed, PipeFailed)
 
 
 class ClusterConnection:
-    """Connection of a run to its cluster, which is opened only if there are scans to cast.
+    """Connection of a run to its cluster. It is opened only if there are scans to cast.
 
     When the context is entered, workers on this machine start in the background, unless the run may
     continue an earlier run that is already complete. When the context exits, workers that were
@@ -213,7 +213,7 @@ class Cluster:
     def _request_slots(
         self, first: Job, store: RunStore, required_slots: Mapping[str, int]
     ) -> None:
-        """Request slots for the remaining scans, in case a partition is adaptive."""
+        """Request slots for the remaining scans. Only adaptive partitions react to the request."""
         scan_count = first.survey.scan_count * (len(store.jobs.numbers) - store.db.ended_count)
         if store.only_job is not None:
             scan_count = len(store.only_job.scans) - store.only_job.resumed
@@ -278,7 +278,7 @@ class Cluster:
 
     @contextmanager
     def stop_on_error(self, stop: Callable[[str], None]) -> Iterator[None]:
-        """Call `stop` with the reason if the body raises an error, and convert cluster errors.
+        """If the body raises an error, call `stop` with the reason, and convert cluster errors.
 
         Finally, the partitions are allowed to shrink.
         """

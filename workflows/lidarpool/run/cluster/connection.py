@@ -165,10 +165,10 @@ def local_client(
 
 
 class BackgroundClient(AbstractContextManager[Client]):
-    """Context manager of a client that is entered in a background thread upon creation.
+    """Context manager that starts to connect a client as soon as it is created.
 
-    Entering this object waits for the thread. It may be exited without being entered, and more than
-    once.
+    The client is connected in a background thread. Entering this object waits for the thread. It
+    may be exited without being entered, and more than once.
     """
 
     def __init__(self, context: AbstractContextManager[Client]) -> None:

@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 
 class TaskGroup(Generic[T]):
-    """Group of tasks on a partition, each of which has a purpose, such as a job.
+    """Tasks on a partition. Each task is associated with its purpose, such as a job.
 
     Each task returns its result and its record. The records of finished tasks are added to `book`.
 

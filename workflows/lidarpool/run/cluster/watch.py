@@ -21,7 +21,7 @@ REPORT_EVERY_S = 5.0  # minimum interval between messages, which become less fre
 
 
 class WaitTimer:
-    """Time limit for waiting that starts when the object is first used.
+    """Time limit for waiting. The time starts when the object is first used.
 
     Parameters
     ----------

@@ -20,7 +20,10 @@ class BatchState(Enum):
 
 
 class Outcome(Enum):
-    """Outcome of a casting task, whose value can be the reason for casting its batches again."""
+    """Outcome of a casting task.
+
+    If the batches of the task must be cast again, the value is the reason.
+    """
 
     PENDING = "pending"
     DONE = "done"

@@ -97,7 +97,10 @@ class CastingWorkers:
 
     @property
     def slots(self) -> dict[str, int]:
-        """Number of concurrent tasks of each accepted worker that accepts tasks, by address."""
+        """Number of concurrent tasks for each usable worker, by address.
+
+        A worker is usable if it passed all checks and accepts tasks.
+        """
         free = self.locations.free
         return {
             a: worker.slots for a, worker in self._workers.items() if worker.slots and a in free
@@ -331,7 +334,7 @@ class CastingWorkers:
                 self._accept(address, software, identities[address])
 
     def request_slots(self, slots: int) -> None:
-        """Request a number of slots from an adaptive partition, or 0 after all jobs have ended.
+        """Tell an adaptive partition how many slots are needed. Pass 0 after all jobs have ended.
 
         The request is necessary because each batch is restricted to an existing worker, so that no
         tasks wait for further workers.
@@ -400,7 +403,7 @@ class CastingWorkers:
 
 
 class _Payload:
-    """Value that casting tasks carry to workers that do not have a copy yet.
+    """Value that is sent with a casting task if the worker does not have a copy yet.
 
     Small values are sent with the tasks. Large values are stored in shared memory, which workers on
     this machine can map. Other workers receive a future of the pickled value.
@@ -483,7 +486,7 @@ def _is_local(address: str) -> bool:
 
 
 def submit_value(partition: Partition, value: Any, **options: Any) -> Future:
-    """Submit a task that returns a value, so that Dask can recompute the value for other tasks.
+    """Make a value available to other tasks by submitting a task that returns it.
 
     In contrast to scattered data, the value is not lost if the worker that holds it dies.
     """

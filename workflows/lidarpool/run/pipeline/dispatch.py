@@ -94,7 +94,7 @@ class Dispatcher:
         return policies.max_weight_in_flight(slots, self._collector_count, self.per_task)
 
     def room(self, job: PipelineJob) -> float:
-        """Return the total weight of the batches that can still be added for a job.
+        """Return how many batches can still be added for a job, as their total weight.
 
         There is no room if the result is 0 or negative, or if too many batches have been created
         since the oldest batch of the job, because their scans have to be kept until it is done.
@@ -105,7 +105,7 @@ class Dispatcher:
         return self.max_weight - policies.weight(self.batches.values(), self.per_task)
 
     def slots_wanted(self, scan_count: int) -> int:
-        """Return the number of casting slots, at least 1, to request for a number of scans."""
+        """Return how many casting slots to request for a number of scans, at least 1."""
         scan_s = self._cast_seconds / self._cast_scans if self._cast_scans else None
         return max(1, policies.slots_wanted(scan_count, scan_s))
 
@@ -131,7 +131,10 @@ class Dispatcher:
     # -- casting ---------------------------------------------------------------------------
 
     def add_scans(self, job: PipelineJob, first: int, stop: int) -> None:
-        """Create batches for the uncommitted scans in a range that stage 1 has described."""
+        """Create batches for the scans in a range, except for scans that are already committed.
+
+        Stage 1 has described these scans.
+        """
         first = max(first, job.generated)  # stage 1 repeats scans after a restart
         if first < stop:
             job.trace("take", GENERATE, range(first, stop))
@@ -228,7 +231,7 @@ class Dispatcher:
         self.failed.pop(job, None)
 
     def _forget_task(self, batch: Batch) -> None:
-        """Detach a batch from its casting task, and release the task after its last batch."""
+        """Separate a batch from its casting task, and release the task if it was the last batch."""
         key = batch.key
         batch.key = ""
         if (task_batches := self._tasks.get(key)) is not None:

@@ -188,7 +188,10 @@ class LongStages:
         set_advice(self._scans, scans)
 
     def store_held(self, receipt: Receipt) -> bool:
-        """Store a part that a worker holds in memory, and return False if the part is lost."""
+        """Store a part that a worker holds in memory.
+
+        Returns False if the part is lost.
+        """
         self._hidden.add(receipt.held_at)
         data = fetch_held_bytes(self.client, receipt.held_at, receipt.name)
         if data is None:
@@ -304,7 +307,10 @@ class LongStages:
         return self._restart(now_s)
 
     def _restart(self, now_s: float) -> tuple[dict[str, str], list[str]]:
-        """Restart stages that have died or are waiting for a slot, with the result of `refresh`."""
+        """Restart stages that have died or are waiting for a slot.
+
+        Returns the same values as `refresh`.
+        """
         died: dict[str, str] = {}
         started: list[str] = []
         locations = self._locate()

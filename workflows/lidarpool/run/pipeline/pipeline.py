@@ -64,7 +64,7 @@ class Commits(Protocol):
 
 @dataclass
 class PipelineNews:
-    """Results of a pipeline step, which must be processed in the order of the fields."""
+    """Results of a pipeline step. They must be processed in the order of the fields."""
 
     parts: list[Receipt] = field(default_factory=list)  # newly committed parts
     # Next scans to deliver as frames. They may include scans that have already been delivered.
@@ -302,7 +302,7 @@ class Pipeline:
         self._end_complete(parts_of_jobs)
 
     def _is_stored(self, receipt: Receipt) -> bool:
-        """Return whether a part is in the storage, and store it first if a worker holds it."""
+        """Store a part if only a worker holds it, and return whether it is in the storage."""
         if not receipt.held_at or self.stages.store_held(receipt):
             return True
         self.dispatcher.recast_part(receipt)
@@ -333,7 +333,10 @@ class Pipeline:
             self._sort_again(self.jobs.values())
 
     def _describe(self, jobs: Iterable[PipelineJob]) -> None:
-        """Order stage 1 to describe the remaining scans of jobs, starting at `job.generated`."""
+        """Instruct stage 1 to describe the remaining scans of each job.
+
+        These scans start at `job.generated`.
+        """
         orders = [
             Description(job.number, job.packed, job.generated, job.scans.stop)
             for job in jobs

@@ -108,7 +108,7 @@ def batches_per_task(recent_casts: Sequence[tuple[float, int]], slots: int) -> i
 
 
 def weight(batches: Iterable[Batch], per_task: int) -> float:
-    """Return the total weight of batches, measured in small batches.
+    """Return the total weight of batches. A small batch has the weight 1.
 
     A full task has the weight `per_task`. All batches of a task are in the memory of a worker at
     the same time, so a batch that fills half of the memory of a task (`batch.share` is 0.5) has the
@@ -276,7 +276,7 @@ class _OfferState:
         return address if address and fullness[address] < 1 else None
 
     def may_wait(self, first: Batch, group: Collection[Batch], worker: str) -> bool:
-        """Return True if a task would not be full, and would have to wait on its worker."""
+        """Return True if a task is not full yet and its worker is busy, so that it can wait."""
         busy = self.has_backlog or self.load[worker] >= self.slots[worker]
         if not busy or first.deaths:
             return False
@@ -291,7 +291,7 @@ class _OfferState:
 
 
 def _group_key(batch: Batch) -> object:
-    """Return a key that is equal for all batches that may share a task.
+    """Return the group of a batch. Batches in the same group may share a task.
 
     Normally, batches of all jobs with the same scene may share a task. After a task with several
     jobs has failed, its batches only share tasks with batches of the same job. If a worker died

@@ -97,7 +97,7 @@ class Scans:
 
 
 class ScanRange(Scans):
-    """Message from stage 1 about scans that can be described, so that they may be cast."""
+    """Message from stage 1 that a range of scans is ready to be cast."""
 
     __slots__ = ()
 

@@ -1,4 +1,4 @@
-"""Records of where and when a task ran, which the task itself creates."""
+"""Records of where and when a task ran. Each task creates its own record."""
 
 from __future__ import annotations
 

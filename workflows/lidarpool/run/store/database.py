@@ -1,4 +1,4 @@
-"""Database of a run, which records the parts and trials that the result consists of.
+"""Database of a run, which records the parts and trials of the result.
 
 The database is a single SQLite file. A batch belongs to the result once its receipt has been
 committed to the database. Before that, work may be lost or repeated. Afterwards, a second receipt
@@ -331,7 +331,7 @@ class RunDatabase:
         job.reset()
 
     def save_frames(self, jobs: Iterable[CommittedResults]) -> None:
-        """Commit the number of delivered frames of each job for which it has changed."""
+        """Commit the number of delivered frames for each job in which the number has changed."""
         unsaved = [job for job in jobs if self._has_unsaved_frames(job)]
         if unsaved:
             with self._transaction():
@@ -416,7 +416,10 @@ def _explained(path: Path) -> Iterator[None]:
 
 
 def _crc32(*values: Any) -> int:
-    """Return the CRC-32 of a row's values, which must have the types that SQLite returns."""
+    """Return the CRC-32 of a row's values.
+
+    The values must have the types that SQLite returns.
+    """
     crc = 0
     for value in values:
         crc = zlib.crc32(value if isinstance(value, bytes) else f"{value!r},".encode(), crc)

@@ -23,10 +23,11 @@ COPY_REST = 20  # minimum pause after a copy as a multiple of the time that the 
 
 
 class RemoteRun:
-    """Copies of a run's database in a remote storage, with the mark of the run that owns them.
+    """Remote storage that contains a copy of a run's database.
 
-    A resumed run takes over the files of an earlier run. If the earlier run is still alive, it
-    detects this before its next copy and then exits.
+    A mark in the storage identifies the run that owns the copy. A resumed run takes over the files
+    of an earlier run. If the earlier run is still alive, it detects this before its next copy and
+    then exits.
 
     All methods raise LidarError if the storage fails or is not writable.
     """

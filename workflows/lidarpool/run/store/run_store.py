@@ -1,4 +1,4 @@
-"""Stores of runs that consist of a database and parts, from which runs can be resumed."""
+"""Stores of runs, from which runs can be resumed. A store has a database and parts."""
 
 from __future__ import annotations
 
@@ -192,11 +192,12 @@ class RunStore:
     def _recover_meta(
         self, path: Path, earlier_mark: str, parts_location: str | Path | Storage | None
     ) -> dict[str, str] | None:
-        """Restore the initial values of a lost database from the mark file in the parts folder.
+        """Restore the initial values of a lost database.
 
-        Return None if there is no mark file. `earlier_mark` is the mark of an existing database
-        without results, or an empty string. Raise LidarError if the database belongs to a different
-        program, or if the earlier run differs from this run.
+        They are read from the mark file in the parts folder. Return None if there is no mark file.
+        `earlier_mark` is the mark of an existing database without results, or an empty string.
+        Raise LidarError if the database belongs to a different program, or if the earlier run
+        differs from this run.
         """
         meta = self._read_mark(parts_location)
         if meta is None or (earlier_mark and self._difference(meta)):
@@ -344,7 +345,7 @@ class RunStore:
 
     @property
     def committed_text(self) -> str:
-        """Number of committed scans, trials or jobs as text, or an empty string for none."""
+        """Description of what has been committed, such as "3 of 10 jobs", or an empty string."""
         if self.only_job is not None:
             return self.only_job.committed_text
         return (
@@ -355,7 +356,7 @@ class RunStore:
 
     @property
     def advice(self) -> str:
-        """Last sentences of the error message for an unavailable backend."""
+        """Advice at the end of the error message about an unavailable backend."""
         if not self.committed_text:
             return AUTO_ADVICE
         return (
@@ -386,7 +387,7 @@ class RunStore:
     # -- jobs --------------------------------------------------------------------------------
 
     def open_job(self, job: Job) -> StoredJob:
-        """Check any parts from an earlier run of a job, and return the stored job."""
+        """Open a job, and check any parts that an earlier run has stored for it."""
         number = job.number
         if number in self.in_flight:
             return self.in_flight[number]
@@ -422,15 +423,16 @@ class RunStore:
         return stored
 
     def reassign_points(self, job: Job) -> None:
-        """Assign all committed points to `job`, as if they had been cast in this run."""
+        """Use all committed points for `job`, as if they had been cast in this run."""
         assert self.only_job is not None, "the run is a survey"
         self.only_job.committed.advance_frames(self.only_job.scans.stop)
         self.only_job = self._add(replace(self.only_job, job=job, resumed=0))
 
     def commit_jobs(self, rows: Sequence[JobRow]) -> list[tuple[JobRow, StoredJob]]:
-        """Commit the rows of ended jobs, and return those that were in flight, with their jobs.
+        """Commit the rows of ended jobs.
 
-        The models and rates of their sensors are also stored, for the data set card.
+        Returns the rows of the jobs that were in flight, each with its job. The models and rates of
+        their sensors are also stored, for the data set card.
         """
         ended = [(row, self.in_flight[row.number]) for row in rows if row.number in self.in_flight]
         named = (
@@ -455,7 +457,7 @@ class RunStore:
             self.resumed = self.db.ended_count
 
     def add_finished(self, rows: Iterable[JobRow], **meta: str) -> None:
-        """Add jobs that are already finished in the data set, and store values of `meta`."""
+        """Add jobs that the data set already contains, and store values of `meta`."""
         if meta:
             self.db.set(**meta)
         self.commit_jobs([row for row in rows if not self.db.has_ended(row.number)])
@@ -491,7 +493,7 @@ class RunStore:
         self.db.close()
 
     def remove_orphaned_parts(self) -> None:
-        """Remove parts of dead or replaced collectors that do not belong to a job in flight."""
+        """Remove parts of dead or replaced collectors, unless a job in flight needs them."""
         mark = self.db.meta["mark"]
         part_names = [part.name for job in self.in_flight.values() for part in job.parts.ordered]
         needed_names = {mark_name(mark), *part_names}
