@@ -93,7 +93,8 @@ def build_instance_tree(boxes: Floats, width: int) -> WideTree:
 def join_trees(trees: list[WideTree]) -> tuple[WideTree, Ints]:
     """Join several trees into one, and return it together with the root of each tree.
 
-    Triangles are numbered consecutively over all trees.
+    Triangles are numbered consecutively over all trees. Empty slots, which have an inverted box,
+    contain the root of their tree instead of 0.
     """
     roots = np.cumsum([0, *(len(tree.child) for tree in trees)])
     if len(trees) == 1:

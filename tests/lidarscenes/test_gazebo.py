@@ -200,6 +200,27 @@ def test_included_models_take_name_pose_and_the_newest_version(tmp_path):
     assert bounds(objects["ground_plane/link"]) == [[-50, -50, 0], [50, 50, 0]]
 
 
+def test_merged_models_with_the_same_links_keep_their_positions(tmp_path):
+    text = sdf(model("crate", link(), model("lid", "<pose>0 0 3 0 0 0</pose>", link())))
+    add_model(tmp_path / "models", "crate", text=text)
+    merged = [
+        include("model://crate", f"<pose>{x} 0 0 0 0 0</pose>").replace(
+            "<include>", "<include merge='true'>"
+        )
+        for x in (5, 9)
+    ]
+    objects, _, notes = load(tmp_path / "worlds", world(model("m", link(), *merged)))
+    assert not notes
+    found = {name: center(mesh).tolist() for name, mesh in objects.items()}
+    assert found == {
+        "m/link": [0, 0, 0],
+        "m/link_0": [5, 0, 0],
+        "m/link_1": [9, 0, 0],
+        "m/lid/link": [5, 0, 3],
+        "m/lid_0/link": [9, 0, 3],
+    }
+
+
 def test_models_are_looked_for_in_variables_and_downloads(tmp_path, monkeypatch):
     add_model(tmp_path / "a", "one")
     add_model(tmp_path / "b", "two")

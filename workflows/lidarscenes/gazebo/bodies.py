@@ -168,7 +168,11 @@ class BodyReader:
     def _define(
         self, body: GazeboBody, name: str, nested: GazeboBody, posed: Element, placing: Element
     ) -> tuple[str, GazeboBody, RelativePose]:
-        """Define the frame of a nested model, and return the model's name, body, and pose."""
+        """Define the frame of a nested model, and return the model's name, body, and pose.
+
+        `posed` is the element whose <pose> applies, and `placing` may name the placement frame. If
+        the name is already used, the returned name has a number.
+        """
         placement = _placement_frame(placing, posed)
         pose = read_pose(posed)
         pose = pose._replace(matrix=placement_matrix(pose.matrix, nested.frames, placement))
@@ -185,16 +189,18 @@ class BodyReader:
         frames = body.frames
         matrix = placement_matrix(pose.matrix, nested.frames, _placement_frame(placing, posed))
         matrix = matmul(frames.matrix(pose.frame or frames.root), matrix)
-        frames.merge(nested.frames, matrix)
-        body.links += nested.links
+        names = frames.merge(nested.frames, matrix)
+        body.links += [link._replace(name=names[link.name]) for link in nested.links]
         body.children += [
-            child._replace(matrix=matmul(matrix, child.matrix)) for child in nested.children
+            child._replace(name=names[child.name], matrix=matmul(matrix, child.matrix))
+            for child in nested.children
         ]
 
     def model(self, element: Element, source: Source) -> GazeboBody:
         """Read a <model> as a body.
 
-        Raises LidarError if includes are circular.
+        Raises LidarError if includes are circular, if models are nested too deeply, or if the model
+        has too many links.
         """
         key = id(element)
         if key in self._open_elements:

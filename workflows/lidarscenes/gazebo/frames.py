@@ -134,12 +134,17 @@ class FrameGraph:
         """Return the names of all defined frames."""
         return [self.root, *self._poses]
 
-    def merge(self, nested: FrameGraph, placement: Floats) -> None:
-        """Add the frames of a merged model, given the matrix that places its root."""
+    def merge(self, nested: FrameGraph, placement: Floats) -> dict[str, str]:
+        """Add the frames of a merged model, and return their new names by their names in the model.
+
+        `placement` is the matrix from the root of the merged model to the root of this graph.
+        """
+        names = {}
         for name in nested.names()[1:]:
             matrix = matmul(placement, nested.matrix(name))
-            self.define(name, RelativePose(matrix, self.root), self.root)
-        self.nested.update(nested.nested)
+            names[name] = self.define(name, RelativePose(matrix, self.root), self.root)
+        self.nested.update({names[name]: graph for name, graph in nested.nested.items()})
+        return names
 
     def matrix(self, name: str) -> Floats:
         """Return the 4 x 4 matrix that transforms from a frame to the root.

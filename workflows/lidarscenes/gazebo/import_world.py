@@ -73,6 +73,7 @@ def _unseen_objects(
     one of the visuals.
     """
     visuals = [shape for link in world.links for shape in link.link.element.findall("visual")]
+    # Visuals with flags of 0 are invisible to all lidars, and never part of the scene.
     flags = {read_flags(visual) for visual in visuals} - {0}
     if all(mask and all(mask & value for value in flags) for mask in masks):
         return {}

@@ -256,14 +256,14 @@ def _world_element(root: Element, notes: Notes) -> Element:
 
 
 def _roads(world: World, meshes: LinkMeshes) -> Iterator[PlacedNode]:
-    """Yield all roads in a world."""
+    """Yield the roads in a world that have a surface."""
     for road in world.element.findall("road"):
         world.notes.check_children(road)
         name = printable(road.get("name", "")) or "road"
         with prefix_errors(f"road {name!r}"):
             mesh: SceneMesh | None = road_mesh(road)
             if mesh is not None:
-                mesh = meshes.with_appearance(mesh, read_appearance(road, 0.0))
+                mesh = meshes.with_appearance(mesh, read_appearance(road, retro=0.0))
                 matrix = world.body.frames.matrix(world.body.frames.root)
                 yield PlacedNode(replace(mesh, name=name), matrix, name)
 

@@ -208,12 +208,12 @@ def _choices(ending: str) -> str:
 
 
 def read_rays(path: Path) -> RayList | None:
-    """Read the rays in a file. Return None if its extension belongs to no readable format.
+    """Read the rays in a file. Return None if the file has no readable format.
 
     Raises
     ------
     ValueError
-        If the file has none of the formats with its extension.
+        If the content of the file is invalid.
     LidarError
         If a package is missing, or the file exceeds the memory limit.
     OSError
