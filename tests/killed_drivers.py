@@ -25,7 +25,7 @@ from lidarpool.run.store.run_store import RunStore
 CALLS = {
     "OPEN": (RunDatabase, "__init__"),
     "COMMIT": (RunDatabase, "commit"),
-    "END": (RunStore, "end"),
+    "END": (RunStore, "commit_jobs"),
     "TABLE": (campaign_output, "write_table"),
     "FINISH": (DataSet, "finish"),
     "GROW": (CloudWriter, "append"),

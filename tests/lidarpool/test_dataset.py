@@ -270,7 +270,7 @@ def test_what_cannot_be_written_is_told_in_a_line(job, sweeps, tmp_path, monkeyp
     with pytest.raises(LidarError, match=r"Job 0 cannot be written to .*file") as told:
         DataSet(Storage.at(tmp_path / "file"), "kitti").write_job(JobRow(0, "0"), job(0), sweeps)
     assert "\n" not in str(told.value)
-    monkeypatch.setattr("lidarpool.clouds.format_table.find_spec", lambda name: None)
+    monkeypatch.setattr("lidarpool.clouds.format_row.find_spec", lambda name: None)
     with pytest.raises(LidarError, match=r'pip install -e "\.\[parquet\]"'):
         DataSet(place, "parquet").write_job(JobRow(0, "0"), job(0), sweeps)
 

@@ -557,7 +557,7 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
     assert len(laspy.read(tmp_path / "cloud.laz")) == len(cloud)
     with pytest.raises(LidarError, match=r"gone does not exist\. Create it first"):
         ExportSpec("pcd").write(tmp_path / "gone/pcd", cloud, sweeps)
-    monkeypatch.setattr("lidarpool.clouds.format_table.find_spec", lambda name: None)
+    monkeypatch.setattr("lidarpool.clouds.format_row.find_spec", lambda name: None)
     with pytest.raises(LidarError, match=r'laspy and lazrs\. Run pip install -e "\.\[las\]"'):
         ExportSpec("las").check_installed()
     assert {path.name for path in tmp_path.iterdir()} == {"cloud.laz"}

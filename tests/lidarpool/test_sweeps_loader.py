@@ -241,7 +241,7 @@ def test_what_is_no_data_set_is_told_in_a_line(written, tmp_path, monkeypatch):
     index.unlink()
     told(lambda: lidarpool.sweeps(place), "contains an unfinished data set.*--resume")
     written("parquet"), written("mcap")
-    monkeypatch.setattr("lidarpool.clouds.format_table.find_spec", lambda name: None)
+    monkeypatch.setattr("lidarpool.clouds.format_row.find_spec", lambda name: None)
     told(lambda: lidarpool.sweeps(written("parquet")), r'pip install -e "\.\[parquet\]"')
     told(lambda: lidarpool.sweeps(written("mcap")), r'pip install -e "\.\[ros\]"')
 

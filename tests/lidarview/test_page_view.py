@@ -420,7 +420,7 @@ def test_the_points_that_are_shown_are_written_to_a_file(tmp_path, spun, kind, m
     pytest.importorskip({"las": "laspy", "parquet": "pyarrow"}.get(kind, "numpy"))
     result = result_in(tmp_path / "one", spun)
     with monkeypatch.context() as without:
-        without.setattr("lidarpool.clouds.format_table.find_spec", lambda package: None)
+        without.setattr("lidarpool.clouds.format_row.find_spec", lambda package: None)
         view = open_views([result])
         assert told(view, "state")[0]["exports"] == ["ply"]  # which needs no extra
     view = open_views([result])

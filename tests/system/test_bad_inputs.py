@@ -281,7 +281,7 @@ def test_what_does_not_fit_into_the_memory_of_a_worker(place, lidarpool, refused
 
 
 def test_workers_that_are_waited_for_are_named_meanwhile(place, lidarpool, monkeypatch):
-    monkeypatch.setattr(lidarpool_watch, "TELL_EVERY_S", 0.0)
+    monkeypatch.setattr(lidarpool_watch, "REPORT_EVERY_S", 0.0)
     with thread_cluster({"GPU": 1}, {"OTHER": 1}) as cluster:
         address = cluster.scheduler_address
         outcome = lidarpool("run", "good.yaml", "--scheduler", address, "--startup-timeout", "1s")

@@ -78,7 +78,7 @@ def test_waiting_for_a_scheduler_ends_with_an_interrupt(waiting_run):
 
 
 def test_a_scheduler_that_never_starts_is_named_with_the_time(address, monkeypatch):
-    monkeypatch.setattr(watch, "TELL_EVERY_S", 0.0)
+    monkeypatch.setattr(watch, "REPORT_EVERY_S", 0.0)
     told: list[str] = []
     with (
         pytest.raises(LidarError, match=rf"responded at '{address}' within 1.5 s \("),

@@ -53,7 +53,7 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     assert report["tasks"]["LIDAR"]["export"] == 1 and report["placement_violations"] == 0
     cloud = read_cloud(out / "cloud.ply")
     assert {"intensity", "time", "range", "class", "reflectivity"} <= set(cloud.columns)
-    assert "sweeps of the survey" in cloud.sweeps.__doc__
+    assert "survey's sweeps" in cloud.sweeps.__doc__
     assert [*cloud.sweeps().sensors] == ["front", "rear"]
     np.testing.assert_allclose(laspy.read(out / "cloud.laz").xyz, cloud.positions, atol=1e-5)
     assert len(list((out / "kitti/sequences/01/velodyne").iterdir())) == 3  # turns of 0.1 s

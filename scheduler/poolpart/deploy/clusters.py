@@ -270,7 +270,7 @@ class _JobStarter:
         """Apply the scheduler's advice on jobs, and return whether any jobs must start."""
         jobs = {name: part.workers(self._cluster) for name, part in self._parts.items()}
         advice = await run_on_cluster_scheduler(self._cluster, advise_jobs, jobs=jobs)
-        for name, advice_of_part in advice.items():
+        for name, advice_of_part in advice.items():  # adaptive partitions only
             part = self._parts[name]
             to_start = advice_of_part.jobs_to_start
             await asyncio.gather(
@@ -314,7 +314,8 @@ async def _start_workers(cluster: SpecCluster) -> None:
         for name, worker in list(cluster.workers.items()):
             if worker.status == Status.created:  # the next call will try to start it again
                 del cluster.workers[name]
-            # A cluster refuses to close while it has jobs that were not submitted.
+            # A cluster refuses to close while it has jobs that were not submitted. The status has
+            # no other use, so that of running jobs does not matter.
             worker.status = Status.failed
         raise
 
@@ -357,7 +358,11 @@ def _describe_job(
     index: int,
     partition_options: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return the specification of a dask-jobqueue job."""
+    """Return the specification of a dask-jobqueue job.
+
+    Each process of the job declares the slots as a resource. The options `cores` and `processes`
+    determine its number of threads. `index` is not used, because the queue selects the host.
+    """
     options = {**cluster.new_spec["options"], **partition_options}
     defaults = {"processes": 1, "worker_extra_args": [], "log_directory": None}
     for option, default in defaults.items():

@@ -140,7 +140,7 @@ def format_row(name: str) -> FormatRow:
 
 
 def load_format(name: str) -> type[CloudFormat]:
-    """Import the class of a writable format.
+    """Import the class of a writable format, without checking whether its packages are installed.
 
     Raises LidarError like `format_row`.
     """

@@ -107,7 +107,7 @@ class Bridge(ABC):
     ) -> None:
         """Show the scene and the planned path before the first sweep is sent.
 
-        `content` is a function that returns both.
+        `content` returns the scene with the path, or None if the result does not contain them.
         """
 
     @abstractmethod

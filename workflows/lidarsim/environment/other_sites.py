@@ -1,4 +1,4 @@
-"""Protection of HTTP services against cross-site requests and DNS rebinding.
+"""Protect HTTP services against cross-site requests and DNS rebinding.
 
 With an image, a form or a script, any website can make a visitor's browser send requests to
 services on the visitor's machine and network. Browsers prevent the website from reading the
@@ -29,7 +29,7 @@ _BROWSER = "mozilla/"  # every browser's User-Agent begins with this
 
 
 def names_of_machine(listens_at: str) -> frozenset[str]:
-    """Return the names that clients may use for a service that listens at an address.
+    """Return the host names by which clients may address a service.
 
     If the service listens on a network, the names include the fully qualified domain name of the
     machine, whose lookup may take seconds.
@@ -49,7 +49,7 @@ def refusal(
     changes_state: bool = False,
     is_page: bool = False,
 ) -> str:
-    """Return the reason why a cross-site request is rejected, or "" if the request is accepted.
+    """Return why a cross-site request is rejected, or "" if the request is accepted.
 
     Parameters
     ----------
@@ -89,13 +89,13 @@ def refusal(
 
 
 def _host_of(authority: str) -> str | None:
-    """Return the host of HOST[:PORT] in lower case, or None if the text has another form."""
+    """Return the host in HOST[:PORT] in lower case, or None if the text has another form."""
     match = _AUTHORITY.fullmatch(authority)
     return match[1].lower().removesuffix(".") if match else None
 
 
 def _is_of(url: str, authorities: Collection[str]) -> bool:
-    """Return whether a URL has the host and port that a request is addressed to."""
+    """Return whether a URL has one of the hosts and ports to which a request is addressed."""
     try:
         return urlsplit(url).netloc.lower() in [authority.lower() for authority in authorities]
     except ValueError:
@@ -112,5 +112,5 @@ def _is_address(host: str) -> bool:
 
 
 def _is_loopback(host: str) -> bool:
-    """Return whether a host is a numeric loopback address or localhost."""
+    """Return whether a host is "localhost" or a numeric loopback address."""
     return host == "localhost" or (_is_address(host) and ip_address(host.strip("[]")).is_loopback)

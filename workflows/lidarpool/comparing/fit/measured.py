@@ -49,7 +49,7 @@ class SensorMeasurement:
     # {field: estimate}. Fields of `Noise` (see `fit_performance`), and for a stationary sensor also
     # `false_alarms`, a field of `Performance`. Empty for one sweep of a stationary sensor.
     estimates: dict[str, Estimate]
-    bias: dict[int, Estimate]  # {row: range bias in meters}
+    bias: dict[int, Estimate]  # {row: range bias in meters}; relative without a scene
     lost_by_range: Curve | None = None  # fraction of lost pulses; None without a scene
     moves: bool = False  # whether the sensor moves
 
@@ -174,8 +174,12 @@ def _check_rays(count: int, name: str) -> None:
 
 
 def _scene_ranges(stack: SweepStack, scene: Scene, poses: KnownPoses | None) -> Floats:
-    """Return the distance of the scene in each cell in meters, or NaN if the ray hits nothing."""
+    """Return the distance of the scene in each cell in meters, or NaN if the ray hits nothing.
+
+    The sensor is at the first of the poses, or at the origin if no poses are known.
+    """
     rays = stack.directions.reshape(-1, 3)
+    # All rays are fired in a single time step.
     sensor = ListedSensor(head=Spin(len(rays), 360), rays=rays, shot_ns=np.zeros(len(rays)))
     pose = np.eye(4) if poses is None else poses.matrices[0]
     ranges = Scanner(scene, sensor).ranges(pose[None], number=0).reshape(stack.rough_sigma.shape)
@@ -205,8 +209,9 @@ def _lost_by_range(stack: SweepStack, expected: Floats) -> Curve:
 def _pulse_energies(rays: SmoothRays, white: float | None, are_energies: bool) -> Floats | None:
     """Return the mean energy of each ray's returns, or None if it is unknown.
 
-    A white surface at 10 m has an energy of 1. If `are_energies` is true, the recorded intensities
-    are already energies. `white` is the intensity of a white surface, or None if it is unknown.
+    A white surface at 10 m has an energy of 1. If `white`, the intensity of a white surface, is
+    given, intensities are proportional to the reflectance. Otherwise they are energies if
+    `are_energies` is true.
     """
     if not np.isfinite(rays.intensity).all():
         return None
@@ -221,8 +226,10 @@ def _bias(
 ) -> dict[int, Estimate]:
     """Estimate the range bias of each row in meters, using rays with a small angle of incidence.
 
-    The bias is the difference from the scene's ranges `expected` if they are known, otherwise from
-    fitted planes. `sigma` is the standard deviation of ranges in meters. Both have shape (r, c).
+    If the ranges of the scene, `expected`, are known, the bias is the mean difference from them.
+    Otherwise it is relative to the mean of all rows (see `ring_bias`), and the result is empty if
+    fewer than three rows hit planes. `expected` and `sigma`, the standard deviation of ranges, are
+    in meters and have shape (r, c).
     """
     flat = rays.select(rays.slope < FLAT_TANGENT * rays.distance)
     cell = flat.row, flat.column
