@@ -128,9 +128,7 @@ class TileBackend(Backend):
         if len(origins) > 1:
             origins = np.ascontiguousarray(origins[ray])
         directions = np.ascontiguousarray(rays.directions[ray])
-        weight_loops.barycentric_weights(
-            cast.record, origins, directions, row, instance, u=u, v=v
-        )
+        weight_loops.barycentric_weights(cast.record, origins, directions, row, instance, u=u, v=v)
         t = distance * self._scene.frame.scale  # exact, because the scale is a power of two
         return ClosestHits(ray, t, self._index[row], u, v, instance)
 

@@ -22,7 +22,7 @@ from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 
 from lidarpool import read_cloud
 from lidarpool.cli.terminal import Terminal
-from lidarpool.report.output import FILES
+from lidarpool.report.result_files import FILES
 
 COMMAND = [sys.executable, "-c", "from lidarpool.cli.commands import main; main()"]
 PLAIN = "scene: seed\nsensor: {layers: 8}\n"

@@ -89,7 +89,7 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
 
     from ..clouds.folder import local_folder, local_result, upload
     from ..processes.fork_server import keep_freed_memory
-    from ..report.output import CLOUD, PAGE
+    from ..report.result_files import CLOUD, PAGE
     from ..report.result_pictures import draw_pictures
 
     target = result if out is None else out

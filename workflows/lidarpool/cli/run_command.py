@@ -32,8 +32,9 @@ from ..report.campaign_output import (
     verify_dataset,
 )
 from ..report.campaign_output import run_campaign as cast_campaign
-from ..report.output import CLOUD, SurveyOutput, run_survey
+from ..report.output import SurveyOutput, run_survey
 from ..report.report import summarize_report
+from ..report.result_files import CLOUD
 from ..run.job_source import SingleJob
 from ..run.options import RunOptions
 from ..run.run_result import RunResult
