@@ -7,13 +7,14 @@ from typing import NoReturn, TextIO, cast
 
 from lidarsim.environment.interrupts import exit_on_signals
 
+from .processes import rare_collections  # noqa: F401 - makes the imports below faster
+
 
 def main() -> NoReturn:
     """Run the command (`cli.main`)."""
     exit_on_signals()
     # A second of imports, during which an interrupt would print Python's traceback.
     from .cli.commands import main as command
-    from .processes import rare_collections  # noqa: F401
     from .processes.streams import TolerantStream
 
     if sys.stdout is not None:  # `lidarpool run … | head -3` runs to its end
