@@ -330,7 +330,6 @@ def run(
     """  # noqa: D301 - Click requires the character \b
     from lidarsim.io.storage import Storage
 
-    from ..report.campaign_output import verify_dataset
     from ..run.store.run_store import RUN_FOLDER
     from ..scenario.campaign import CampaignSpec
     from ..scenario.campaign_sections import is_campaign
@@ -343,6 +342,8 @@ def run(
         raise click.UsageError("`--retry-failed` cannot be combined with `--job`.")
     paths = [*map(Path, scenarios)]
     if options.verify and not paths[0].is_file():
+        from ..report.campaign_output import verify_dataset
+
         click.echo(verify_dataset(Storage.at(scenarios[0])))
         return
     options = replace(options, folder=Storage.at(out).below(RUN_FOLDER))

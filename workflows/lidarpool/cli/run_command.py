@@ -20,18 +20,10 @@ from lidarsim.simulator.casting.scene_caster import check_backend_here
 from lidarsim.words import format_scan_counts, plural
 
 from ..clouds.folder import local_result, output_destination, result_folder
-from ..datasets.dataset import DataSet
 from ..datasets.job_table import Tally, read_table
 from ..identity.shard import Shard, describe_shard
 from ..pages import page_of
 from ..processes import timeline
-from ..report.campaign_output import (
-    CAMPAIGN_FILE,
-    check_same_campaign,
-    describe_failures,
-    verify_dataset,
-)
-from ..report.campaign_output import run_campaign as cast_campaign
 from ..report.output import SurveyOutput, run_survey
 from ..report.report import summarize_report
 from ..report.result_files import CLOUD
@@ -144,6 +136,10 @@ def run_campaign(
     LidarError
         If the run or one of the jobs fails.
     """
+    # Imported late, because surveys do not need the formats of data sets.
+    from ..report.campaign_output import describe_failures
+    from ..report.campaign_output import run_campaign as cast_campaign
+
     if options.pace is not None:
         raise click.UsageError(
             "`--pace` can only be used with a single survey, not with a campaign."
@@ -207,6 +203,9 @@ def run_job(
         If the points differ, or if they cannot be compared because the data set was created with
         different software or the files of the job are damaged.
     """
+    from ..datasets.dataset import DataSet  # imported late, as in `run_campaign`
+    from ..report.campaign_output import CAMPAIGN_FILE, check_same_campaign, verify_dataset
+
     target = Storage.at(out)
     name = campaign.name(number)
     dataset = DataSet(target, **asdict(campaign.keep))
