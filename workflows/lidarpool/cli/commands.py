@@ -331,8 +331,7 @@ def run(
     from lidarsim.io.storage import Storage
 
     from ..run.store.run_store import RUN_FOLDER
-    from ..scenario.campaign import CampaignSpec
-    from ..scenario.campaign_sections import is_campaign
+    from ..scenario.campaign_file import is_campaign
     from ..scenario.scenario import Scenario
     from .run_command import run_campaign, run_job, run_scenario
 
@@ -354,6 +353,8 @@ def run(
             "the files one by one."
         )
     if is_several or (not of_mesh and is_campaign(paths[0])):
+        from ..scenario.campaign import CampaignSpec
+
         campaign = CampaignSpec.from_scenarios(paths) if is_several else CampaignSpec.load(paths[0])
         if number is not None:
             run_job(campaign, number, out, terminal, options, backend, extent)

@@ -22,8 +22,7 @@ from ..run.job_source import SingleJob
 from ..run.options import RunOptions
 from ..run.pipeline.stage_names import GPU
 from ..scenario.advice import advice, unlabeled_notes
-from ..scenario.campaign import CampaignSpec
-from ..scenario.campaign_sections import is_campaign
+from ..scenario.campaign_file import is_campaign
 from ..scenario.job import Job
 from ..scenario.plausibility import plausibility_warnings
 from ..scenario.prepare import prepare
@@ -33,6 +32,8 @@ from .terminal import Terminal
 
 if TYPE_CHECKING:
     from distributed import Client
+
+    from ..scenario.campaign import CampaignSpec
 
 FORECAST_JOBS = 5  # number of campaign jobs that are checked
 _JOB_COUNTS = ("objects", "triangles", "scans", "sweeps", "rays", "estimate")
@@ -78,7 +79,11 @@ def forecast_scenario(
     LidarError
         If the scenario is invalid, or if `number` is passed for a file that is not a campaign.
     """
-    campaign = CampaignSpec.load(path) if not of_mesh and is_campaign(path) else None
+    campaign = None
+    if not of_mesh and is_campaign(path):
+        from ..scenario.campaign import CampaignSpec  # imported late because scenarios need less
+
+        campaign = CampaignSpec.load(path)
     if campaign is None and number is not None:
         raise LidarError(
             f"{path} is not a campaign. `--job {number}` can only be used with a campaign."

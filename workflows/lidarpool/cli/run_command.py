@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -33,13 +33,15 @@ from ..run.run_result import RunResult
 from ..run.runner import cast_to_store
 from ..run.store.run_store import RUN_FOLDER
 from ..scenario.advice import advice
-from ..scenario.campaign import CampaignSpec
 from ..scenario.job import Job
 from ..scenario.plausibility import plausibility_warnings
 from ..scenario.prepare import PreparedScenario, prepare
 from ..scenario.scenario import Scenario
 from .shared_options import show
 from .terminal import Terminal
+
+if TYPE_CHECKING:
+    from ..scenario.campaign import CampaignSpec
 
 
 def run_scenario(
