@@ -31,6 +31,7 @@ from lidarsim.words import plural
 
 from ..identity.shard import ALL
 from ..processes.logs import set_logs
+from ..processes.rare_collections import no_collections
 from ..viewers.viewer_table import PAGE, VIEWERS
 from . import completion
 from . import shared_options as shared
@@ -139,7 +140,8 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
         if cluster is None and settings.get("scheduler") is None:
             start_fork_server()
         try:
-            with defer_interrupts():  # an interrupted import cannot be repeated
+            # An interrupted import cannot be repeated.
+            with defer_interrupts(), no_collections():
                 from ..run.cluster_file import ClusterFile
                 from ..run.options import RunOptions
                 from . import run_command  # noqa: F401

@@ -17,6 +17,7 @@ from lidarsim.schema.vocabulary import UNITS_M
 from lidarsim.sensor_files.format_table import FORMATS
 from lidarsim.words import plural
 
+from ..processes.rare_collections import no_collections
 from . import completion
 from . import shared_options as options
 from .first_step import print_first_step
@@ -232,9 +233,10 @@ def check(
       lidarpool check part.stl --unit mm --sensor ouster/os1-64 --pose 0,0,1.9
     """  # noqa: D301 - Click requires the character \b
     print_first_step("reading the scene", quiet=as_json)
-    from ..run.cluster_file import ClusterFile
-    from ..run.options import RunOptions
-    from .forecast_text import forecast_scenario
+    with no_collections():
+        from ..run.cluster_file import ClusterFile
+        from ..run.options import RunOptions
+        from .forecast_text import forecast_scenario
 
     try:
         file = None if cluster is None else ClusterFile.load(cluster)
