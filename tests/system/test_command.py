@@ -289,6 +289,20 @@ def test_help_and_completion_load_nothing_of_a_run(words):
     assert not {"numpy", "dask", "distributed", "pydantic", "rich", "trimesh"} & loaded
 
 
+def test_checking_a_scenario_loads_neither_dask_nor_loops_for_moving_bodies(tmp_path):
+    """They take a third of its time."""
+    (tmp_path / "s.yaml").write_text(PLAIN)
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", *COMMAND[1:], "check", "s.yaml"],
+        capture_output=True, text=True, cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0 and done.stdout
+    loaded = {line.split("|")[-1].strip() for line in done.stderr.splitlines()}
+    assert "lidarsim.simulator.sampling" in loaded
+    absent = {"dask", "distributed", "poolpart", "lidarpool.report.output"}
+    assert not (absent | {"raybeam.moving_loops", "raybeam.pair_casts"}) & loaded
+
+
 @pytest.mark.extended
 @pytest.mark.parametrize(
     "arguments",
