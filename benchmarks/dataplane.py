@@ -34,8 +34,8 @@ from distributed import Client
 from lidarpool import Scene, Sensor, Survey
 from lidarpool.columns.parts import pack
 from lidarpool.report.output import CLOUD, SurveyOutput, run_survey
-from lidarpool.run.cluster.checks import slots_needed
 from lidarpool.run.cluster.cluster import local_client
+from lidarpool.run.cluster.requirements import slots_needed
 from lidarpool.run.job_source import SingleJob
 from lidarpool.run.options import RunOptions
 from lidarpool.run.pipeline import rigs

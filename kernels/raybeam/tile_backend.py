@@ -50,7 +50,7 @@ class TileBackend(Backend):
     def __init__(
         self, scene: LocalScene, threads: int | None = None, device: int | None = None
     ) -> None:
-        from . import cast_record, mesh_loops, tile_casts, tile_memory, tile_tree
+        from . import cast_record, tile_casts, tile_memory, tile_tree
 
         super().__init__(scene, threads, device)
         self._count = threads or os.cpu_count() or 1
@@ -58,7 +58,6 @@ class TileBackend(Backend):
         self._threads = ThreadPoolExecutor(self._count, "tiles")
         self._process = os.getpid()
         self._loops = tile_casts
-        self._weigh = mesh_loops.barycentric_weights
         self._memory = cast_record
         self._tiles = tile_memory.thread_tiles
         self._top_nodes = tile_tree.build_instance_nodes
@@ -119,6 +118,8 @@ class TileBackend(Backend):
 
     def closest_hits(self, rays: Rays) -> ClosestHits:
         """Return the closest hits of at most `chunk` rays."""
+        from . import weight_loops  # imported late because scans need no weights
+
         cast = self._ray_cast(rays)
         cast.record["index"] = 0  # Return rows of the corners, for `barycentric_weights`.
         ray, distance, row, instance = self._cast(cast, 0, len(rays), plan_consecutive(1))
@@ -127,17 +128,19 @@ class TileBackend(Backend):
         if len(origins) > 1:
             origins = np.ascontiguousarray(origins[ray])
         directions = np.ascontiguousarray(rays.directions[ray])
-        self._weigh(cast.record, origins, directions, row, instance, u=u, v=v)
+        weight_loops.barycentric_weights(cast.record, origins, directions, row, instance, u=u, v=v)
         t = distance * self._scene.frame.scale  # exact, because the scale is a power of two
         return ClosestHits(ray, t, self._index[row], u, v, instance)
 
     def cast_pairs(self, pairs: RayBodyPairs, nearest: NearestHits) -> None:
         """Cast rays at bodies with this shape, and record closer hits in `nearest`."""
+        from . import pair_casts  # imported late because static scenes do not need its loops
+
         record = self._base.copy()
         scale = self._scene.frame.scale
         record["t_min"], record["t_max"] = self._local_limits(pairs.limits, scale)
         record["tile"] = self._tile_address(_BODY_RAYS)
-        self._loops.cast_pairs(record, pairs.contiguous(), nearest)
+        pair_casts.cast_pairs(record, pairs.contiguous(), nearest)
 
     def scan_parts(self, scan: Scan) -> Iterator[tuple[int, int, HitColumns]]:
         """Yield (start, stop, hits) for consecutive ranges of rays in a scan.

@@ -13,8 +13,9 @@ import pytest
 import yaml
 
 from lidarpool import Campaign, Job, LidarError, Noise, Scene, Survey, load_sensor
+from lidarpool.scenario.campaign_file import is_campaign
 from lidarpool.scenario.campaign_jobs import file_hashes
-from lidarpool.scenario.campaign_sections import JobRandom, is_campaign
+from lidarpool.scenario.campaign_sections import JobRandom
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.sensor.models import model_names
 

@@ -16,7 +16,8 @@ from tests.clusters import import_jobqueue
 
 from lidarpool import LidarError
 from lidarpool.run.cluster.checks import gpu_note
-from lidarpool.run.cluster.connection import default_workers, local_cluster
+from lidarpool.run.cluster.connection import local_cluster
+from lidarpool.run.cluster.requirements import default_workers
 from lidarpool.run.cluster_file import ClusterFile
 from poolpart import PoolError, WorkerInfo
 

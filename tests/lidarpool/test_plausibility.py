@@ -14,7 +14,7 @@ from trimesh.transformations import rotation_matrix
 
 from lidarpool import Scene, SceneMesh
 from lidarpool.scenario.campaign import CampaignSpec
-from lidarpool.scenario.campaign_sections import is_campaign
+from lidarpool.scenario.campaign_file import is_campaign
 from lidarpool.scenario.plausibility import plausibility_warnings
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario

@@ -14,7 +14,7 @@ from jsonschema import Draft202012Validator
 from lidarpool import LidarError
 from lidarpool.identity.fingerprint import fingerprint
 from lidarpool.scenario.campaign import CampaignSpec
-from lidarpool.scenario.campaign_sections import is_campaign
+from lidarpool.scenario.campaign_file import is_campaign
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.schema import (

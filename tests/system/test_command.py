@@ -22,7 +22,7 @@ from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 
 from lidarpool import read_cloud
 from lidarpool.cli.terminal import Terminal
-from lidarpool.report.output import FILES
+from lidarpool.report.result_files import FILES
 
 COMMAND = [sys.executable, "-c", "from lidarpool.cli.commands import main; main()"]
 PLAIN = "scene: seed\nsensor: {layers: 8}\n"
@@ -287,6 +287,19 @@ def test_help_and_completion_load_nothing_of_a_run(words):
     loaded = {line.split("|")[-1].strip().split(".")[0] for line in done.stderr.splitlines()}
     assert "click" in loaded
     assert not {"numpy", "dask", "distributed", "pydantic", "rich", "trimesh"} & loaded
+
+
+def test_checking_a_scenario_loads_neither_reports_nor_loops_for_moving_bodies(tmp_path):
+    (tmp_path / "s.yaml").write_text(PLAIN)
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", *COMMAND[1:], "check", "s.yaml"],
+        capture_output=True, text=True, cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0 and done.stdout
+    loaded = {line.split("|")[-1].strip() for line in done.stderr.splitlines()}
+    assert "lidarsim.simulator.sampling" in loaded
+    absent = {"lidarpool.report.output", "raybeam.moving_loops", "raybeam.pair_casts"}
+    assert not absent & loaded
 
 
 @pytest.mark.extended

@@ -12,7 +12,7 @@ import yaml
 from distributed import Client
 
 from lidarpool import LidarError, save_cloud, simulate
-from lidarpool.report.output import FILES
+from lidarpool.report.result_files import FILES
 from lidarpool.run import forecast
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from tests.commands import RunningCommand
 
-from lidarpool.report.output import FILES
+from lidarpool.report.result_files import FILES
 from lidarsim.io import storage
 
 pytestmark = pytest.mark.skipif(

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lidarpool.clouds.folder import result_folder
-from lidarpool.report.output import FILES
+from lidarpool.report.result_files import FILES
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="forks")
 

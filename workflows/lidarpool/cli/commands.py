@@ -31,6 +31,7 @@ from lidarsim.words import plural
 
 from ..identity.shard import ALL
 from ..processes.logs import set_logs
+from ..processes.rare_collections import no_collections
 from ..viewers.viewer_table import PAGE, VIEWERS
 from . import completion
 from . import shared_options as shared
@@ -140,7 +141,8 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
         if cluster is None and settings.get("scheduler") is None:
             start_fork_server()
         try:
-            with defer_interrupts():  # an interrupted import cannot be repeated
+            # An interrupted import cannot be repeated.
+            with defer_interrupts(), no_collections():
                 from ..run.cluster_file import ClusterFile
                 from ..run.options import RunOptions
                 from . import run_command  # noqa: F401
@@ -330,10 +332,8 @@ def run(
     """  # noqa: D301 - Click requires the character \b
     from lidarsim.io.storage import Storage
 
-    from ..report.campaign_output import verify_dataset
     from ..run.store.run_store import RUN_FOLDER
-    from ..scenario.campaign import CampaignSpec
-    from ..scenario.campaign_sections import is_campaign
+    from ..scenario.campaign_file import is_campaign
     from ..scenario.scenario import Scenario
     from .run_command import run_campaign, run_job, run_scenario
 
@@ -343,6 +343,8 @@ def run(
         raise click.UsageError("`--retry-failed` cannot be combined with `--job`.")
     paths = [*map(Path, scenarios)]
     if options.verify and not paths[0].is_file():
+        from ..report.campaign_output import verify_dataset
+
         click.echo(verify_dataset(Storage.at(scenarios[0])))
         return
     options = replace(options, folder=Storage.at(out).below(RUN_FOLDER))
@@ -353,6 +355,8 @@ def run(
             "the files one by one."
         )
     if is_several or (not of_mesh and is_campaign(paths[0])):
+        from ..scenario.campaign import CampaignSpec
+
         campaign = CampaignSpec.from_scenarios(paths) if is_several else CampaignSpec.load(paths[0])
         if number is not None:
             run_job(campaign, number, out, terminal, options, backend, extent)

@@ -26,7 +26,7 @@ from raybeam.installation import install_command
 
 from ..open3d_access.open3d_module import load_open3d
 from ..report.report import versions
-from ..run.cluster.checks import slots_needed
+from ..run.cluster.requirements import slots_needed
 from ..run.pipeline.stage_names import GPU, LIDAR
 from ..scenario.sections import TaskOptions
 from .installed_copies import find_second_copy

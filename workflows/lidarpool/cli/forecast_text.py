@@ -6,31 +6,34 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import Any
-
-from dask.utils import format_bytes
-from distributed import Client
+from typing import TYPE_CHECKING, Any
 
 from lidarsim.errors import LidarError
+from lidarsim.io.allowance import bytes_of
 from lidarsim.io.storage import Storage
 from lidarsim.words import format_rounded, format_scan_counts, list_names, plural
 
 from ..identity.job_errors import summarize_errors
-from ..report.output import SurveyOutput
+from ..report.result_files import check_existing
 from ..run.forecast import forecast
 from ..run.job_source import SingleJob
 from ..run.options import RunOptions
 from ..run.pipeline.stage_names import GPU
 from ..scenario.advice import advice, unlabeled_notes
-from ..scenario.campaign import CampaignSpec
-from ..scenario.campaign_sections import is_campaign
+from ..scenario.campaign_file import is_campaign
 from ..scenario.job import Job
 from ..scenario.plausibility import plausibility_warnings
 from ..scenario.prepare import prepare
 from ..scenario.scenario import Scenario
 from .shared_options import world_lines
 from .terminal import Terminal
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+    from ..scenario.campaign import CampaignSpec
 
 FORECAST_JOBS = 5  # number of campaign jobs that are checked
 _JOB_COUNTS = ("objects", "triangles", "scans", "sweeps", "rays", "estimate")
@@ -76,7 +79,11 @@ def forecast_scenario(
     LidarError
         If the scenario is invalid, or if `number` is passed for a file that is not a campaign.
     """
-    campaign = CampaignSpec.load(path) if not of_mesh and is_campaign(path) else None
+    campaign = None
+    if not of_mesh and is_campaign(path):
+        from ..scenario.campaign import CampaignSpec  # imported late because scenarios need less
+
+        campaign = CampaignSpec.load(path)
     if campaign is None and number is not None:
         raise LidarError(
             f"{path} is not a campaign. `--job {number}` can only be used with a campaign."
@@ -93,14 +100,13 @@ def forecast_scenario(
         with terminal.status("reading the scene", logged=False):
             prepared = prepare(scenario, plans=campaign is None)
             job = prepared.job
-        output = SurveyOutput(out, job.survey, job.outputs)
         with terminal.status("casting sample rays"):
             figures = forecast(
                 job,
                 out,
                 options.with_pool(scenario.pool, {"backend": backend}),
                 client,
-                refuse=None if has_jobs else lambda: output.check_existing(SingleJob(job)),
+                refuse=None if has_jobs else partial(_check_existing, job, out),
             )
         figures["notes"] += advice(prepared)
         figures["warnings"] += plausibility_warnings(prepared)
@@ -119,6 +125,11 @@ def forecast_scenario(
         return figures, _job_lines(job, figures)
     figures = _campaign_figures(campaign, out, lambda number: forecast_job(number)[1])
     return figures, _campaign_lines(campaign, figures)
+
+
+def _check_existing(job: Job, out: Path | Storage) -> None:
+    """Raise LidarError if the output folder contains something that a run must not replace."""
+    check_existing(out, job.survey, job.outputs, SingleJob(job))
 
 
 def _campaign_figures(
@@ -329,8 +340,8 @@ def _resource_lines(figures: dict[str, Any]) -> Iterator[str]:
         count = plural(slots["there"], "slot")
         yield f"{label:<10}  {count}{partition}, at least {slots['needed']:,} needed"
     available = figures["memory"]["there"]
-    limit = f" of {format_bytes(available)}" if available else ""
-    yield f"memory      about {format_bytes(figures['memory']['needed'])}{limit}"
+    limit = f" of {bytes_of(available)}" if available else ""
+    yield f"memory      about {bytes_of(figures['memory']['needed'])}{limit}"
     disk = figures["disk"]
-    parts, result, free = (format_bytes(disk[name]) for name in ("parts", "result", "free"))
+    parts, result, free = (bytes_of(disk[name]) for name in ("parts", "result", "free"))
     yield f"disk        about {parts} during the run and {result} for the result; {free} free"

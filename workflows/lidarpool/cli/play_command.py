@@ -7,16 +7,17 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
-
-from lidarsim.io.storage import Storage
 
 from ..clouds.format_table import LAYOUTS
 from . import completion
 from . import shared_options as options
 from .first_step import print_first_step
+
+if TYPE_CHECKING:
+    from lidarsim.io.storage import Storage
 
 _PACKETS = "packets"
 _NOW_NS = 2_000_000_000  # time to prepare the playback before the first sweep, with --now

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lidarsim.errors import LidarError
-from lidarsim.io.storage import Storage
 from lidarsim.schema.vocabulary import PICTURES, UNITS_M
 
 from ..clouds.format_table import EXPORTS, LAYOUTS, format_row, load_format
@@ -20,6 +19,8 @@ from . import completion
 from . import shared_options as options
 
 if TYPE_CHECKING:
+    from lidarsim.io.storage import Storage
+
     from ..clouds.writing import ExportSpec
 
 
@@ -82,7 +83,7 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
 
     from ..clouds.folder import local_folder, local_result, upload
     from ..processes.fork_server import keep_freed_memory
-    from ..report.output import CLOUD, PAGE
+    from ..report.result_files import CLOUD, PAGE
     from ..report.result_pictures import draw_pictures
 
     target = result if out is None else out
@@ -216,6 +217,8 @@ def export(
 
 def _check_not_existing(target: Path | Storage, file: str, *, overwrite: bool) -> None:
     """Raise LidarError if a storage already contains a file that must not be overwritten."""
+    from lidarsim.io.storage import Storage  # imported late to keep --help fast
+
     if isinstance(target, Storage) and not overwrite and file in target.entries():
         raise LidarError(
             f"{target.path(file)} already exists. Pass another folder with `--out`, or pass "

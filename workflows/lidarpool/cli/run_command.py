@@ -9,7 +9,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -20,33 +20,28 @@ from lidarsim.simulator.casting.scene_caster import check_backend_here
 from lidarsim.words import format_scan_counts, plural
 
 from ..clouds.folder import local_result, output_destination, result_folder
-from ..datasets.dataset import DataSet
 from ..datasets.job_table import Tally, read_table
 from ..identity.shard import Shard, describe_shard
 from ..pages import page_of
 from ..processes import timeline
-from ..report.campaign_output import (
-    CAMPAIGN_FILE,
-    check_same_campaign,
-    describe_failures,
-    verify_dataset,
-)
-from ..report.campaign_output import run_campaign as cast_campaign
-from ..report.output import CLOUD, SurveyOutput, run_survey
+from ..report.output import SurveyOutput, run_survey
 from ..report.report import summarize_report
+from ..report.result_files import CLOUD
 from ..run.job_source import SingleJob
 from ..run.options import RunOptions
 from ..run.run_result import RunResult
 from ..run.runner import cast_to_store
 from ..run.store.run_store import RUN_FOLDER
 from ..scenario.advice import advice
-from ..scenario.campaign import CampaignSpec
 from ..scenario.job import Job
 from ..scenario.plausibility import plausibility_warnings
 from ..scenario.prepare import PreparedScenario, prepare
 from ..scenario.scenario import Scenario
 from .shared_options import print_results
 from .terminal import Terminal
+
+if TYPE_CHECKING:
+    from ..scenario.campaign import CampaignSpec
 
 
 def run_scenario(
@@ -143,6 +138,10 @@ def run_campaign(
     LidarError
         If the run or one of the jobs fails.
     """
+    # Imported late, because surveys do not need the formats of data sets.
+    from ..report.campaign_output import describe_failures
+    from ..report.campaign_output import run_campaign as cast_campaign
+
     if options.pace is not None:
         raise click.UsageError(
             "`--pace` can only be used with a single survey, not with a campaign."
@@ -206,6 +205,9 @@ def run_job(
         If the points differ, or if they cannot be compared because the data set was created with
         different software or the files of the job are damaged.
     """
+    from ..datasets.dataset import DataSet  # imported late, as in `run_campaign`
+    from ..report.campaign_output import CAMPAIGN_FILE, check_same_campaign, verify_dataset
+
     target = Storage.at(out)
     name = campaign.name(number)
     dataset = DataSet(target, **asdict(campaign.keep))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,12 +17,15 @@ from lidarsim.schema.vocabulary import UNITS_M
 from lidarsim.sensor_files.format_table import FORMATS
 from lidarsim.words import plural
 
+from ..processes.rare_collections import no_collections
 from . import completion
 from . import shared_options as options
 from .first_step import print_first_step
 from .shared_options import WARNED, Command, combine, overwrite
 
 if TYPE_CHECKING:
+    from distributed import Client
+
     from lidarsim.io.storage import Storage
     from lidarsim.scene.scene import Scene
     from lidarsim.sensor import Sensor
@@ -181,6 +184,15 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     click.echo(f"next: lidarpool check {shlex.quote(str(file))}")
 
 
+def _connect(scheduler: str | None, files: TlsFiles) -> AbstractContextManager[Client | None]:
+    """Return a context manager that yields a client, or None if there is no scheduler."""
+    if scheduler is None:
+        return nullcontext()
+    from ..run.cluster.connection import connect_client  # imported here because it imports Dask
+
+    return connect_client(scheduler, files)
+
+
 @click.command()
 @click.argument("scenario", type=click.Path(path_type=Path))
 @options.mesh_options
@@ -221,14 +233,14 @@ def check(
       lidarpool check part.stl --unit mm --sensor ouster/os1-64 --pose 0,0,1.9
     """  # noqa: D301 - Click requires the character \b
     print_first_step("reading the scene", quiet=as_json)
-    from ..run.cluster.connection import connect_client
-    from ..run.cluster_file import ClusterFile
-    from ..run.options import RunOptions
-    from .forecast_text import forecast_scenario
+    with no_collections():
+        from ..run.cluster_file import ClusterFile
+        from ..run.options import RunOptions
+        from .forecast_text import forecast_scenario
 
     try:
         file = None if cluster is None else ClusterFile.load(cluster)
-        with nullcontext() if scheduler is None else connect_client(scheduler, files) as client:
+        with _connect(scheduler, files) as client:
             run_options = RunOptions(cluster=file)
             figures, lines = forecast_scenario(
                 scenario,

@@ -12,7 +12,6 @@ from typing import Any
 import click
 
 from lidarsim.errors import LidarError, explain_os_errors
-from lidarsim.io.storage import Storage, is_url
 from lidarsim.schema.vocabulary import BACKENDS, UNITS_M
 
 from ..connection.scheduler_address import (
@@ -36,6 +35,8 @@ class StoragePath(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Convert a local path to a Path, and a URL to a Storage."""
+        from lidarsim.io.storage import Storage, is_url  # imported late to keep --help fast
+
         return Storage.at(value) if is_url(value) else super().convert(value, param, ctx)
 
 

@@ -8,10 +8,9 @@ from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
-from distributed import Client
 from rich.console import Console
 
 from lidarsim.io.writing_progress import WritingProgress
@@ -21,6 +20,9 @@ from ..processes.logs import set_logs
 from ..processes.streams import TolerantStream
 from ..run.progress import Progress, ProgressRate, Screen, Show, bars, progress_rows, waiting_reason
 from .shared_options import WARNED
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 # Minimum and maximum interval between progress lines in a log. Within these limits, the interval is
 # a tenth of the elapsed time, so that long surveys do not fill the log.

@@ -22,7 +22,6 @@ from lidarsim.environment.extras import reading
 from lidarsim.errors import LidarError
 from lidarsim.io.input_files import read_input
 from lidarsim.numerics.arrays import AnyArray, AnyFloats
-from lidarsim.scene.files.polygon_files import ply_comments, read_ply_columns
 from lidarsim.scene.files.stated_system import StatedSystem
 from lidarsim.sweeps.sweeps import AS_FIRED, SWEEPS_FILE, Sweeps
 from lidarsim.words import printable
@@ -410,6 +409,8 @@ def _open_foreign(source: RecordingSource) -> Recording:
 
     Positions are in the units of the coordinate system that the file declares.
     """
+    # Imported late, because results of this package need no reader for other programs' files.
+    from lidarsim.scene.files.polygon_files import ply_comments, read_ply_columns
 
     def read(_: int) -> Sweep:
         return sweep_from_columns(read_ply_columns(read_input(source.path)))

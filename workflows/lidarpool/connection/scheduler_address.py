@@ -13,7 +13,6 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from lidarsim.errors import LidarError, MissingFileError, convert_errors, explain_os_errors
-from lidarsim.io.input_files import read_input_text
 
 from .tls_files import TlsFiles
 
@@ -70,6 +69,8 @@ def read_scheduler_file(
 
 def _read(path: Path) -> str:
     """Read the address from a scheduler file, or raise LidarError if this is not possible."""
+    from lidarsim.io.input_files import read_input_text  # imported late to keep --help fast
+
     if not path.exists():
         raise MissingFileError(
             f"The scheduler file {path} does not exist. Start the scheduler with "

@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 import psutil
-from distributed import get_worker
 
 from lidarsim._version import __version__
 from lidarsim.environment.plugins import Plugin, find_plugin
@@ -209,6 +208,8 @@ def _call_if_compatible(
     *arguments: Any,
 ) -> T:
     if differs := describe_difference(installed, required):
+        from distributed import get_worker  # imported late because it takes long
+
         worker = get_worker()
         raise LidarError(
             f"Worker {worker.name} at {worker.address} has {differs}. Install the same version on "

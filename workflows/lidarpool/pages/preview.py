@@ -22,7 +22,7 @@ from lidarview.viewer.view import View
 from ..report.picture_content import planning_picture
 from ..scenario.advice import advice
 from ..scenario.campaign import CampaignSpec
-from ..scenario.campaign_sections import is_campaign
+from ..scenario.campaign_file import is_campaign
 from ..scenario.job import Job
 from ..scenario.prepare import prepare
 from ..scenario.scenario import Scenario

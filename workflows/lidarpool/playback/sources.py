@@ -32,7 +32,7 @@ from ..clouds.navigation_files import write_instruments
 from ..clouds.writing import ExportSpec
 from ..scenario.advice import advice
 from ..scenario.campaign import CampaignSpec
-from ..scenario.campaign_sections import is_campaign
+from ..scenario.campaign_file import is_campaign
 from ..scenario.job import Job
 from ..scenario.prepare import prepare
 from ..scenario.scenario import Scenario

@@ -7,31 +7,26 @@ complete result or none.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 from lidarsim.columns.table import optional_columns
 from lidarsim.environment.interrupts import defer_interrupts
-from lidarsim.errors import LidarError, explain_os_errors
+from lidarsim.errors import explain_os_errors
 from lidarsim.io.storage import Storage, flush
 from lidarsim.io.writing_progress import WritingProgress
-from lidarsim.schema.vocabulary import PICTURES
 from lidarsim.survey.survey import Survey
-from lidarsim.sweeps.instruments import INSTRUMENT_FILES, Instruments
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.picture_file import PICTURE_FILE
 
-from ..clouds.folder import LAST_FILE, result_folder, staging
-from ..clouds.format_table import FORMATS, format_row, plugin_formats
+from ..clouds.folder import result_folder, staging
 from ..clouds.navigation_files import write_instruments
 from ..clouds.writing import ExportSpec, check_foreign_files
 from ..columns.parts import StoredCloud
-from ..identity.field_words import describe_changes
 from ..open3d_access.open3d_module import load_open3d
 from ..processes import timeline
 from ..run.cluster.cluster import Cluster, ClusterConnection
@@ -49,14 +44,17 @@ from .cloud_counts import CloudCounts
 from .growing_cloud import GrowingCloud, write_cloud
 from .picture_content import picture_content
 from .report import make_report
-
-CLOUD = FORMATS["ply"].file
-PAGE = "report.html"
-REPORT = LAST_FILE
-_PICTURES = tuple(f"{name}.png" for name in PICTURES)
-FILES = (CLOUD, *_PICTURES, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
-_SURVEY_ENTRIES = ("scene", "survey")  # entries of the identity that must match for the same survey
-_FORMAT_OF_FILE = {row.file: name for name, row in FORMATS.items() if row.file != CLOUD}
+from .result_files import (
+    CLOUD,
+    FILES,
+    PAGE,
+    REPORT,
+    check_existing,
+    formats_of_files,
+    known_optional_files,
+    optional_files,
+    read_earlier,
+)
 
 
 def run_survey(
@@ -165,35 +163,7 @@ class SurveyOutput:
             also if the target contains a damaged result, the result of a different survey, or a
             file that would be replaced but does not belong to a result.
         """
-        target = self.target
-        storage = Storage.at(target)
-        advice = (
-            "Specify another folder with `--out`, or replace the result with `--overwrite` "
-            "(`overwrite=True` in Python)."
-        )
-        with explain_os_errors(f"{target} cannot be read"):
-            try:
-                entries = set(storage.entries())
-            except NotADirectoryError:
-                return
-        earlier, listed, earlier_fields = _read_earlier(storage)
-        if REPORT in entries and not overwrite:
-            expected = inputs.identity  # slow for large scenes
-            if earlier != {name: expected[name] for name in _SURVEY_ENTRIES}:
-                changed = describe_changes(earlier_fields, inputs.fields) if earlier_fields else ""
-                raise LidarError(
-                    f"{target} contains the result of a different "
-                    f"survey{f' ({changed})' * bool(changed)}. {advice}"
-                )
-        further = _optional_files(self.survey, self.formats)
-        foreign = [name for name in (*FILES, *further) if name in entries and name not in listed]
-        if foreign and not overwrite:
-            lists = (
-                f"{target} contains {foreign[0]}, which would be replaced although it does not "
-                "belong to a result."
-            )
-            raise LidarError(f"{lists} {advice}")
-        check_foreign_files(storage, _formats_of_files({*further, *listed}))
+        check_existing(self.target, self.survey, self.formats, inputs, overwrite=overwrite)
 
     def publish(
         self,
@@ -290,8 +260,8 @@ class SurveyOutput:
             If a file cannot be written.
         """
         target = Storage.at(self.target)
-        earlier = _read_earlier(target).files
-        further = _optional_files(result.survey, self.formats)
+        earlier = read_earlier(target).files
+        further = optional_files(result.survey, self.formats)
         sweeps = Sweeps.from_survey(result.survey, result.scene)
         sent: list[ExportSpec] = []  # formats that workers write directly to the storage
         if workers is not None and isinstance(self.target, Storage):
@@ -303,7 +273,7 @@ class SurveyOutput:
             ),
             staging(folder, self.target) as staged,
         ):
-            check_foreign_files(target, _formats_of_files({*further, *earlier}))
+            check_foreign_files(target, formats_of_files({*further, *earlier}))
             sweeps = _write_sweeps(staged, result, sweeps)
             points = _points_with_progress(result, CLOUD, show)
             counts = _write_cloud(staged / CLOUD, points, sweeps, result, growing)
@@ -433,50 +403,9 @@ def _write_report(staged: Path, report: dict[str, Any], further: Sequence[str]) 
 
 def _upload(staged: Path, storage: Storage, further: Collection[str]) -> None:
     """Upload the files of a result to a storage, ending with report.json."""
-    for name in (*_known_optional_files(further), *FILES):
+    for name in (*known_optional_files(further), *FILES):
         if (staged / name).exists():
             storage.put(staged / name, name)
-
-
-def _optional_files(survey: Survey, formats: Sequence[ExportSpec]) -> list[str]:
-    """Return the names of files and folders that only some results have."""
-    instruments = Instruments.from_survey(survey)
-    measured = [] if instruments is None else instruments.files
-    return [*(output_format.row.file for output_format in formats), *measured]
-
-
-def _formats_of_files(names: Collection[str]) -> list[str]:
-    """Return the formats whose file or folder is in `names`."""
-    unknown = {*names} - {*FILES, *INSTRUMENT_FILES, *_FORMAT_OF_FILE}
-    return [name for file, name in _FORMAT_OF_FILE.items() if file in names] + plugin_formats(
-        unknown
-    )
-
-
-def _known_optional_files(names: Collection[str]) -> list[str]:
-    """Return those names that are files of a format or an instrument, sorted by format."""
-    measured = [name for name in INSTRUMENT_FILES if name in names]
-    return [format_row(name).file for name in _formats_of_files(names)] + measured
-
-
-class _EarlierResult(NamedTuple):
-    """Properties of a result that exists before the run."""
-
-    identity: Mapping[str, str] = MappingProxyType({})  # hashes of the scene and the survey
-    files: frozenset[str] = frozenset()  # files that may be removed
-    fields: Mapping[str, str] = MappingProxyType({})  # {scenario field: value as text}
-
-
-def _read_earlier(storage: Storage) -> _EarlierResult:
-    """Return the properties of an existing result, or empty ones if it is missing or damaged."""
-    try:
-        report = json.loads(storage.read(REPORT))
-        identity = {name: report["identity"][name] for name in _SURVEY_ENTRIES}
-        files = frozenset(report["files"])
-        files |= {*_PICTURES} if PICTURE_FILE in files else set()  # may have been drawn later
-        return _EarlierResult(identity, files, dict(report.get("fields", {})))
-    except (OSError, ValueError, TypeError, LookupError):
-        return _EarlierResult()
 
 
 def _move_into_place(
@@ -494,7 +423,7 @@ def _move_into_place(
         flush(staged / name)
     with defer_interrupts():
         _remove_earlier(Storage.at(folder), files, earlier)
-        for name in (*_known_optional_files(files), *FILES):
+        for name in (*known_optional_files(files), *FILES):
             if name in files:
                 (staged / name).replace(folder / name)
         flush(folder)  # makes the renames durable before the parts are removed
@@ -510,7 +439,7 @@ def _remove_earlier(target: Storage, files: Collection[str], earlier: Collection
     report.json, the list is lost, and the files of other formats remain. Finally, those of the
     `FILES` that the new result does not have are removed.
     """
-    further = _known_optional_files({*files, *earlier})
+    further = known_optional_files({*files, *earlier})
     # Remaining pictures of an earlier result would appear to belong to the new result.
     missing = [name for name in FILES if name not in files]
     for name in (REPORT, PAGE, *further, *missing):

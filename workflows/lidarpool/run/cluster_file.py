@@ -6,10 +6,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from distributed import SpecCluster, SSHCluster
-from distributed.deploy import ssh
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
 from lidarsim.environment.extras import install_command
@@ -18,10 +16,11 @@ from lidarsim.errors import LidarError
 from lidarsim.io.yamlfile import read_yaml
 from lidarsim.schema.error_sentences import convert_validation_errors
 from lidarsim.words import did_you_mean, plural
-from poolpart.deploy import start_partitions
-from poolpart.deploy.clusters import INFO_MARK
 
 from .pipeline.stage_names import GPU, LIDAR, OTHER
+
+if TYPE_CHECKING:
+    from distributed import SpecCluster
 
 # A scheduler that was started over SSH keeps running if the driver is killed, so it exits after
 # being idle for this time.
@@ -147,6 +146,12 @@ class ClusterFile(BaseModel):
         LidarError
             If the cluster does not start or does not accept an argument.
         """
+        # These modules are imported late, because a run without a cluster file needs none of them.
+        from distributed import SSHCluster
+
+        from poolpart.deploy import start_partitions
+        from poolpart.deploy.clusters import INFO_MARK
+
         arguments = dict(self.arguments)
         partitions = self.model_dump(exclude_unset=True)["partitions"]
         factory = self._import_class()
@@ -183,6 +188,8 @@ class ClusterFile(BaseModel):
 
     def _import_class(self) -> Any:
         """Import the cluster's class, or raise LidarError if it is not supported."""
+        from distributed import SpecCluster, SSHCluster  # imported late, as in `start`
+
         package, _, name = self.cluster.rpartition(".")
         try:
             # dask-jobqueue installs signal handlers, which must not replace those of this process.
@@ -214,6 +221,7 @@ def _capture_ssh_output(lines: list[str]) -> Iterator[None]:
 
     Dask only logs this output.
     """
+    from distributed.deploy import ssh  # imported late, as in `start`
 
     def info(line: str, *arguments: object) -> None:
         lines.append(line)

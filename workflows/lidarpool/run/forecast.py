@@ -8,16 +8,15 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from dask.system import CPU_COUNT
-from dask.utils import format_bytes
-from distributed import Client
 from distributed.system import MEMORY_LIMIT
 
 from lidarsim.columns.cloud import CHUNK_POINTS
 from lidarsim.errors import LidarError, Mistakes
+from lidarsim.io.allowance import bytes_of
 from lidarsim.io.storage import Storage
 from lidarsim.scene.simplified import DRAWN_TRIANGLES
 from lidarsim.sensor.noise import Noise
@@ -35,7 +34,6 @@ from lidarsim.simulator.memory import (
 from lidarsim.simulator.sampling import sample_survey
 from lidarsim.survey.survey import Survey
 from lidarsim.words import join_names
-from poolpart import Pool
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
@@ -43,13 +41,15 @@ from ..clouds.flight_lines import firing_span_s, flight_lines, summarize_flight_
 from ..clouds.navigation_files import instrument_bytes
 from ..scenario.empty_cloud import EMPTY, empty_cloud_reason
 from ..scenario.job import Job
-from .cluster.checks import check_memory, check_workers, find_workers, gpu_note, slots_needed
-from .cluster.connection import default_workers
+from .cluster.requirements import check_memory, default_workers, slots_needed
 from .options import RunOptions
 from .pipeline.policies import max_scans_per_batch
 from .pipeline.stage_names import GPU, LIDAR, OTHER
 from .store.database import FILE
 from .store.run_store import RUN_FOLDER
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 # Memory of a worker process in which Dask is loaded, measured on Linux. It includes 110 MiB for
 # numba, which compiles loops.
@@ -194,6 +194,11 @@ def _cluster_of(
         with mistakes.collect():
             file.require(required)
     elif client is not None:
+        # Imported late, because estimates for a cluster on this machine do not need Dask.
+        from poolpart import Pool
+
+        from .cluster.checks import check_workers, find_workers, gpu_note
+
         held = [worker.resources for worker in Pool.from_client(client)]
         present = {name: int(sum(slots.get(name, 0) for slots in held)) for name in required}
         with mistakes.collect():
@@ -268,14 +273,14 @@ def _shortages(
     disk_bytes = disk["result"] + (0 if stored else disk["parts"])
     if disk["free"] < disk_bytes:
         messages.append(
-            f"The disk of {disk['folder']} has {format_bytes(disk['free'])} free, but the run "
-            f"needs about {format_bytes(disk_bytes)}. Free disk space, choose a different folder "
+            f"The disk of {disk['folder']} has {bytes_of(disk['free'])} free, but the run "
+            f"needs about {bytes_of(disk_bytes)}. Free disk space, choose a different folder "
             f"with {'`TMPDIR`' if stored else '`--out`'}, or increase `keep_every`."
         )
     if 0 < available_bytes < required_bytes:
         messages.append(
-            f"{format_bytes(available_bytes)} of memory are available, but the run needs about "
-            f"{format_bytes(required_bytes)}. Use a smaller scene, reduce the number of casting "
+            f"{bytes_of(available_bytes)} of memory are available, but the run needs about "
+            f"{bytes_of(required_bytes)}. Use a smaller scene, reduce the number of casting "
             "workers (`pool.gpu`), `batch_mb`, `rays_per_revolution` or `planning.particles`, or "
             "use a machine with more memory."
         )

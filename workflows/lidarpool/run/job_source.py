@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from queue import Empty, Full, Queue
 from threading import Event, Thread
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -25,10 +25,12 @@ from ..identity.field_words import describe_fields
 from ..identity.fingerprint import fingerprint
 from ..identity.shard import ALL, Shard
 from ..plan import Planning
-from ..scenario.campaign import CampaignSpec
 from ..scenario.job import Job
 from ..scenario.static_scene import SceneCache
 from .pipeline.failures import JobError
+
+if TYPE_CHECKING:
+    from ..scenario.campaign import CampaignSpec
 
 MAX_READY = 16  # jobs that are created in advance, because small jobs are cast together
 MAX_SCENES = 2  # maximum number of scenes in the jobs that are created in advance
@@ -107,12 +109,12 @@ class SingleJob:
         return describe_inputs(job.scene, job.survey, job.planning)
 
 
-Jobs = SingleJob | CampaignSpec  # source of the jobs in a run
+Jobs: TypeAlias = "SingleJob | CampaignSpec"  # source of the jobs in a run
 
 
 def failed_row(jobs: Jobs, number: int, error: object) -> JobRow:
     """Return the table row of a campaign job that has failed."""
-    assert isinstance(jobs, CampaignSpec), "a survey fails together with its job"
+    assert not isinstance(jobs, SingleJob), "a survey fails together with its job"
     values: Mapping[str, Value | None] = {}
     with suppress(Exception):  # the values may be the cause of the error
         values = jobs.values(number)
@@ -134,7 +136,7 @@ class JobProducer:
     """
 
     def __init__(self, jobs: Jobs, numbers: Iterable[int], columns: Sequence[str]) -> None:
-        assert isinstance(jobs, CampaignSpec), "the job of a survey already exists"
+        assert not isinstance(jobs, SingleJob), "the job of a survey already exists"
         self._campaign = jobs
         self._numbers = numbers
         self._columns = columns

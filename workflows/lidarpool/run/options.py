@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import Annotated, Any, Literal, TypedDict
+from types import MappingProxyType, NoneType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
-from distributed import Client
 from pydantic import Field
 
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
-from lidarsim.schema.checks import check_fields
+from lidarsim.schema.checks import check_fields, check_type
 from lidarsim.schema.declared import declared_values
 from lidarsim.schema.value_texts import one_line
 from lidarsim.schema.vocabulary import BACKENDS, PATIENCE_S, WAIT_S
@@ -23,6 +22,11 @@ from ..connection.tls_files import TlsFiles
 from ..scenario.sections import PoolSection, TaskOptions
 from .cluster_file import ClusterFile
 from .store.database import FILE
+
+if TYPE_CHECKING:
+    from distributed import Client
+else:
+    Client = Any  # `RunOptions` checks the class, because importing distributed takes long
 
 # Live view of a run: a page in the browser (True or "page"), a viewer, or False for none.
 Live = bool | Literal["page", "foxglove", "rerun"]
@@ -62,6 +66,10 @@ class RunOptions(TaskOptions):
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if self.client is not None:
+            from distributed import Client  # imported late because commands pass no client
+
+            check_type("client", self.client, Client, NoneType)
         if (self.restart or self.overwrite) and self.may_continue:
             raise LidarError(
                 "The options `restart` and `overwrite` cannot be combined with `resume`, "

@@ -6,8 +6,8 @@ import logging
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from distributed import Client
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn
 from rich.progress import Progress as Bars
@@ -15,6 +15,9 @@ from rich.progress import Progress as Bars
 from lidarsim.environment.notebook import cell_display
 from lidarsim.io.writing_progress import WritingProgress
 from lidarsim.words import plural
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 # Label, name of the count, and name of the total for each progress bar. The total is also the unit.
 STAGES: tuple[tuple[str, str, str], ...] = (

@@ -14,13 +14,12 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from operator import itemgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lidarsim.errors import LidarError
 from lidarsim.simulator.memory import MB, scans_that_fit
 from lidarsim.words import list_names, plural
 
-from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
 from ..plan import Planning, Trial
 from ..processes import timeline
@@ -42,6 +41,9 @@ from .progress import Progress, Show
 from .store.run_store import RunStore
 from .store.stored_job import StoredJob
 from .writer import DataSetWriter, WriteRequest
+
+if TYPE_CHECKING:
+    from ..datasets.dataset import DataSet
 
 PROGRESS_EVERY_S = 0.1
 SAVE_EVERY_S = 1.0  # interval at which the number of delivered frames is stored

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, nullcontext
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ..datasets.dataset import DataSet
 from ..datasets.job_table import JobRow
 from ..scenario.job import Job
 from .cluster.cluster import ClusterConnection
@@ -24,6 +23,9 @@ from .run_loop import RunLoop
 from .run_page import RunPage
 from .run_result import RunResult
 from .store.run_store import RunStore, remove_run
+
+if TYPE_CHECKING:
+    from ..datasets.dataset import DataSet
 
 
 def cast_to_store(

@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from distributed import Reschedule
 
@@ -22,7 +22,6 @@ from poolpart.task_context import own_client
 from ..clouds.multi_file_format import PieceRange, RangeWriter
 from ..clouds.multi_file_format import WrittenRange as Range
 from ..columns.parts import StoredCloud
-from ..datasets.dataset import DataSet, Listing
 from ..datasets.job_table import JobRow
 from ..identity.software import plugin_versions
 from .cluster.cluster import Cluster
@@ -33,6 +32,9 @@ from .pipeline.stage_names import EXPORT, LIDAR
 from .pipeline.task_records import Recorder, TaskRecord
 from .run_result import RunResult
 from .store.run_store import RunStore
+
+if TYPE_CHECKING:
+    from ..datasets.dataset import DataSet
 
 TASKS_PER_SLOT = 2  # submitted tasks per free slot of LIDAR
 MAX_JOBS_PER_TASK = 32
@@ -89,6 +91,8 @@ def _write_job(dataset: DataSet, job: WriteRequest) -> JobOutcome:
 
     If this fails, return a LidarError for a storage error, or a JobError for any other error.
     """
+    from ..datasets.dataset import Listing  # imported late, because surveys write no data set
+
     listing = Listing.from_storage(dataset.storage)
     try:
         return dataset.write_job(*job, listing=listing)

@@ -34,12 +34,12 @@ from ..datasets.job_table import Value
 from ..identity.field_words import describe_fields
 from ..identity.fingerprint import fingerprint
 from ..identity.software import plugin_versions
+from .campaign_file import is_campaign
 from .campaign_sections import (
     MAX_JOBS,
     CampaignSection,
     JobRandom,
     ValueRule,
-    is_campaign,
     read_rows,
 )
 from .field_paths import FieldSteps, find_field, replace_value

@@ -30,10 +30,10 @@ from pydantic import (
 )
 
 from lidarsim.errors import LidarError, MissingFileError, Mistakes, message_of
-from lidarsim.io.input_files import not_found, read_input_text
+from lidarsim.io.input_files import not_found
 from lidarsim.io.tables import ignored_columns
 from lidarsim.io.textfile import read_text
-from lidarsim.io.yamlfile import load_yaml, read_yaml
+from lidarsim.io.yamlfile import load_yaml
 from lidarsim.schema.checks import check_fields
 from lidarsim.schema.declared import (
     FileSection,
@@ -65,9 +65,6 @@ from .sections import IgnoredColumns, Section, allow_empty
 SIGMAS = 6.0
 MIN_SHARE = 0.01  # minimum share of a normal distribution within its limits
 
-_CAMPAIGN_SUFFIXES = (".yaml", ".yml")
-# Matches the keys `base` and `vary`, and the start of a flow mapping, which may contain them.
-_KEYS = re.compile(r"""^(?:["']?(?:base|vary)["']?\s*:|\{)""", re.MULTILINE)
 _EXACT = Context(prec=40)
 _DIGITS = 12  # numbers are rounded, so that tables are readable and contain the exact values
 
@@ -756,19 +753,3 @@ def _entry_types(kind: Any) -> Iterator[Any]:
     else:
         for inner in args:
             yield from _entry_types(inner)
-
-
-def is_campaign(path: str | Path) -> bool:
-    """Return whether a file is a campaign file, which is YAML with the key `base` or `vary`.
-
-    Files that cannot be read are not campaign files.
-    """
-    path = Path(path)
-    if path.suffix.lower() not in _CAMPAIGN_SUFFIXES:
-        return False
-    try:
-        if not _KEYS.search(read_input_text(path)):
-            return False  # avoids parsing all poses of a large scenario as YAML
-        return bool({"base", "vary"} & read_yaml(path).keys())
-    except (OSError, ValueError, LidarError):
-        return False  # loading the file as a scenario reports the error

@@ -13,7 +13,6 @@ import time
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from multiprocessing import resource_tracker
 from types import FrameType
 from typing import NoReturn
 
@@ -131,6 +130,8 @@ def block_child_signals() -> Iterator[None]:
     be stopped cleanly. Threads and processes inherit blocked signals, which includes workers that a
     nanny restarts.
     """
+    from multiprocessing import resource_tracker  # imported late, because --help needs no processes
+
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGQUIT})
     try:
         # Starting the tracker unblocks SIGINT, so it must not start later with the first process.

@@ -15,7 +15,6 @@ from distributed import Client
 from lidarsim._version import __version__
 from lidarsim.errors import LidarError
 from lidarsim.simulator.casting.scene_caster import AUTO_ADVICE
-from lidarsim.simulator.memory import MB, cast_bytes
 from poolpart import Pool, PoolError, WorkerInfo
 from poolpart.task_locations import take_snapshot
 from poolpart.workers import run_on_workers, worker_identities
@@ -25,8 +24,8 @@ from ...clouds.writing import ExportSpec
 from ...identity.software import describe_difference, software, software_query
 from ...scenario.job import Job
 from ...scenario.sections import TaskOptions
-from ..pipeline.failures import JobError
 from ..pipeline.stage_names import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
+from .requirements import check_memory
 from .watch import WaitTimer, queued_clause
 
 LOOK_EVERY_S = 0.2
@@ -43,11 +42,6 @@ class SurveyWorkers(NamedTuple):
     casting: list[WorkerInfo]  # workers in the GPU partition
     backend: str
     software: dict[str, str]  # software of the casting workers
-
-
-def slots_needed(tasks: TaskOptions, *, planning: bool, writing: bool = False) -> dict[str, int]:
-    """Return the number of slots that a run requires in each partition."""
-    return {GPU: 1, LIDAR: 2 + tasks.collectors + writing} | ({OTHER: 1} if planning else {})
 
 
 def find_workers(
@@ -109,38 +103,6 @@ def find_workers(
             shortage = re.split(r"(?i)[:.] start ", str(error), maxsplit=1)[0]
             waiting.report("workers", shortage + (f"; {queued_clause(coming)}" if coming else ""))
         time.sleep(LOOK_EVERY_S)
-
-
-def check_memory(
-    job: Job, tasks: TaskOptions, backend: str, available_bytes: float, worker: str
-) -> None:
-    """Raise JobError if a worker has too little memory for the scans or batches of a job.
-
-    The error is a JobError, because other jobs may require less memory.
-
-    Parameters
-    ----------
-    available_bytes
-        Memory of the worker for each slot, in bytes.
-    worker
-        Description of the worker for the message.
-    """
-    peak_bytes = partial(cast_bytes, job.scene, job.survey, on_device=backend == "cuda")
-    if (all_scans := peak_bytes(job.survey.scan_count)) <= available_bytes:
-        return
-    scan_bytes = peak_bytes(1)
-    limit = f"{worker} has only {available_bytes / MB:,.0f} MB for each slot"
-    if scan_bytes > available_bytes:
-        raise JobError(
-            f"Casting one scan takes about {scan_bytes / MB:,.0f} MB, but {limit}. Use a smaller "
-            "`step_deg`, fewer rays or fewer columns, or start the casting workers with a larger "
-            "`--memory-limit`."
-        )
-    if min(tasks.batch_mb * MB, all_scans) > available_bytes:
-        raise JobError(
-            f"`batch_mb` is {tasks.batch_mb:,}, but {limit}. Reduce it, or start the casting "
-            "workers with a larger `--memory-limit`."
-        )
 
 
 def check_workers(

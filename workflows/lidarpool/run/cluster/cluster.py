@@ -23,7 +23,7 @@ from ..options import RunOptions
 from ..pipeline.stage_names import GPU, LIDAR, OTHER
 from ..progress import Screen
 from ..store.run_store import RunStore
-from .checks import check_formats, check_workers, find_workers, gpu_note, slots_needed
+from .checks import check_formats, check_workers, find_workers, gpu_note
 from .connection import (
     BackgroundClient,
     check_starts_workers,
@@ -31,6 +31,7 @@ from .connection import (
     local_client,
     start_client,
 )
+from .requirements import slots_needed
 from .tasks import TaskGroup
 from .watch import WaitTimer, Watch
 

@@ -36,6 +36,7 @@ from ...processes.fork_server import start_fork_server
 from ..cluster_file import ClusterFile
 from ..pipeline.stage_names import GPU, LIDAR, OTHER
 from .checks import LOOK_EVERY_S, TooFewWorkersError
+from .requirements import default_workers
 from .watch import WaitTimer
 
 CONNECT_TIMEOUT_S = 10
@@ -53,22 +54,6 @@ _QUIET = {
     "distributed.admin.system-monitor.interval": "5s",
     "distributed.admin.low-level-log-length": 100,  # the default is 1,000 messages
 }
-
-
-def default_workers(cores: int, gpus: int) -> dict[str, int]:
-    """Return the default numbers of GPU and OTHER workers on a machine.
-
-    The GPU partition has one worker per GPU or, on a machine without GPUs, CPU workers for three
-    quarters of the cores. OTHER has workers for the remaining cores. The LIDAR stages mostly wait,
-    so they share one process.
-
-    Examples
-    --------
-    >>> default_workers(cores=2, gpus=0), default_workers(cores=16, gpus=2)
-    ({'GPU': 2, 'OTHER': 1}, {'GPU': 2, 'OTHER': 13})
-    """
-    casting = gpus or max(1, cores - cores // 4)
-    return {GPU: casting, OTHER: max(1, cores - casting - (1 if gpus and cores > 2 else 0))}
 
 
 def local_cluster(

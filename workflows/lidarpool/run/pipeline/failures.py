@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager
-
-from distributed import Client, Future, KilledWorker
+from typing import TYPE_CHECKING
 
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
-from poolpart.task_context import WorkerLeavingError
 
 from .stage_messages import format_scans
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
 
 ASK_S = 10.0  # time limit for fetching an error from the scheduler
 
@@ -44,6 +45,8 @@ def naming_scans(first: int, stop: int) -> Iterator[None]:
     In contrast to arbitrary errors, a ScanError can always be pickled. A WorkerLeavingError is not
     converted, because it is not caused by the scans.
     """
+    from poolpart.task_context import WorkerLeavingError  # imported late, as in `was_killed`
+
     try:
         yield
     except WorkerLeavingError:
@@ -66,6 +69,11 @@ def error_of(future: Future) -> BaseException | None:
 
 def was_killed(future: Future) -> bool:
     """Return True if a task failed because its worker left or its workers kept dying."""
+    # These modules are imported late, because commands that run no tasks do not need Dask.
+    from distributed import KilledWorker
+
+    from poolpart.task_context import WorkerLeavingError
+
     return isinstance(error_of(future), (KilledWorker, WorkerLeavingError))
 
 

@@ -30,7 +30,7 @@ keep_freed_memory()
 logging.getLogger("distributed.diskutils").setLevel(logging.CRITICAL)
 with suppress(ImportError):  # a later check reports why the module cannot be loaded
     from lidarsim.numerics import elementary_loops  # noqa: F401
-    from raybeam import moving_loops, tile_casts  # noqa: F401
+    from raybeam import tile_casts
 
     if tile_casts.COMPILED:
         print("note: the ray caster was compiled for this processor", file=sys.stderr)  # noqa: T201

@@ -10,12 +10,13 @@ import statistics
 from collections import Counter, deque
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
-
-from poolpart.task_locations import PartitionSnapshot
+from typing import TYPE_CHECKING, NamedTuple
 
 from .batches import Batch, BatchState, Outcome
 from .stage_names import COLLECT, INTERSECT
+
+if TYPE_CHECKING:
+    from poolpart.task_locations import PartitionSnapshot
 
 BATCH_SECONDS = 0.2  # casting time of a batch for which its overhead is negligible
 SMALL_SECONDS = 0.05  # casting time of batches that need not be smaller to balance the load

@@ -7,10 +7,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from distributed import get_worker
-
-from poolpart.workers import declared_resources
-
 T = TypeVar("T")
 
 
@@ -49,6 +45,11 @@ class Recorder:
 
     def finish(self, items: int = 1) -> TaskRecord:
         """Return the record of the task until now, with the number of processed items."""
+        # Imported late, because commands that read records but run no tasks do not need Dask.
+        from distributed import get_worker
+
+        from poolpart.workers import declared_resources
+
         worker = get_worker()
         return TaskRecord(
             stage=self.stage,
