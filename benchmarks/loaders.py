@@ -1,4 +1,4 @@
-"""Sweeps per second of `lidarpool.sweeps`, compared with the loader of each format.
+"""Compare the rate of `lidarpool.sweeps` with the usual loader of each format.
 
     python -m benchmarks.loaders [FORMAT ...]
 
@@ -80,7 +80,7 @@ PEERS = {webdataset: "webdataset", kitti: "pykitti", nuscenes: "nuscenes", parqu
 
 
 def write_data_set(folder, name, cloud, sweeps):
-    """Write a data set of jobs with the same sweeps, like a campaign."""
+    """Write a data set of jobs that have the same sweeps, like a campaign."""
     from lidarpool.datasets.dataset import DataSet  # other versions may not have these modules
     from lidarpool.datasets.job_table import JobRow, write_table
     from lidarsim.io.storage import Storage
@@ -92,7 +92,7 @@ def write_data_set(folder, name, cloud, sweeps):
 
 
 def write(folder, name):
-    """Write a data set of sweeps past a car."""
+    """Write a data set of sweeps of a sensor that passes a car."""
     from lidarsim.sweeps.sweeps import Sweeps
 
     track = lp.Track([0, 60], [[0, 0, 1], [60, 5, 1]])
@@ -114,7 +114,7 @@ def write(folder, name):
 
 
 def main(arguments=None):
-    """Print a row for each format."""
+    """Measure all formats and print a row for each."""
     parser = argument_parser(__doc__, repeat=15)
     known = [peer.__name__ for peer in PEERS]
     parser.add_argument("formats", metavar="FORMAT", nargs="*", help=f"of {', '.join(known)}")
@@ -141,7 +141,7 @@ def main(arguments=None):
 
 
 def sweep_rate(read):
-    """Return the number of sweeps that are read per second of CPU time."""
+    """Return the number of sweeps read per second of CPU time."""
     seconds, count = time_call(lambda: sum(1 for _ in read()))
     return count / seconds
 

@@ -12,7 +12,6 @@ from poolpart.deploy import start_partitions
 
 
 def worker_name(number: int) -> str:
-    """Return the name of the worker that runs the task."""
     return str(get_worker().name)
 
 

@@ -190,7 +190,7 @@ class SavedSweeps:
 
 
 class _OpenJob:
-    """Poses, boxes and reader of a job that is open."""
+    """An open job, with its poses, its boxes and a function that reads its points."""
 
     def __init__(self, dataset: DataSet, job: JobRow, classes: Mapping[int, str]) -> None:
         self.storage = storage = dataset.storage

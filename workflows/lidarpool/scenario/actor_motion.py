@@ -106,9 +106,9 @@ class MountedSensorSection(SensorSection):
         returns: ReturnsSection,
         name: str = "",
     ) -> Mounted:
-        """Return the sensor on its platform, with its start and time steps.
+        """Return the mounted sensor.
 
-        The parameters are those of `SensorSection.mounted_sensor`. Raise LidarError if a file
+        It has the start time and the number of time steps of this section. The parameters are those of `SensorSection.mounted_sensor`. Raise LidarError if a file
         cannot be used.
         """
         mounted = super().mounted_sensor(path, mount, noise, returns, name)
