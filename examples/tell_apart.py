@@ -133,7 +133,7 @@ class Network:
         self.slopes = [(np.zeros_like(w), np.zeros_like(w)) for w in self.weights]
 
     def layers(self, features):
-        """Yield the inputs of each layer, plus a 1 for the bias, and then the outputs of the network."""
+        """Yield the inputs of each layer, with a 1 for the bias, and then the final outputs."""
         inputs = (features - self.mean) / self.scale
         for weights in self.weights:
             yield (inputs := np.column_stack([inputs, np.ones(len(inputs))]))

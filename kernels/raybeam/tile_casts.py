@@ -42,8 +42,9 @@ _TILE_RAYS = 8 * SUBTILES  # rays per tile if rays are cast at bodies
 def _number_rays(tile, rays, lanes, first, count):  # type: ignore[no-untyped-def]
     """Write the ray indices of a tile.
 
-    Return whether any of these rays belong to the call. The indices are `first` plus the numbers at the address `lanes`. An index below 0, or not below
-    `count`, belongs to a ray that is cast with the tile but ignored.
+    Return whether any of these rays belong to the call. The indices are `first` plus the numbers at
+    the address `lanes`. An index below 0, or not below `count`, belongs to a ray that is cast with
+    the tile but ignored.
     """
     numbers = int64s(tile)
     lane_numbers = int64s(lanes)

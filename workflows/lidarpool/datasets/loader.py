@@ -190,7 +190,7 @@ class SavedSweeps:
 
 
 class _OpenJob:
-    """An open job, with its poses, its boxes and a function that reads its points."""
+    """Open job with its poses, its boxes and the reader of its files."""
 
     def __init__(self, dataset: DataSet, job: JobRow, classes: Mapping[int, str]) -> None:
         self.storage = storage = dataset.storage

@@ -194,8 +194,9 @@ class StaticBodies:
     def move_instances(self, instances: Instances, instance_indices: Indices) -> None:
         """Apply the new transforms of the given instances.
 
-        The transforms are those in `instances`. No cast may be in progress. Trees are rebuilt if an instance enters or leaves the region
-        that sensors can reach, as a body that falls forever does, or if it was clipped.
+        The transforms are those in `instances`. No cast may be in progress. Trees are rebuilt if an
+        instance enters or leaves the region that sensors can reach, as a body that falls forever
+        does, or if it was clipped.
         """
         self._instances = instances
         if self._instance_is_seen is not None:
