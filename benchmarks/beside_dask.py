@@ -6,12 +6,12 @@ Each row does the same work on two equal clusters in turn. One uses a Dask resou
 is divided by poolpart. The schedulers are separate processes.
 
 - `submit`: `Partition.submit` and `Client.submit(resources=)`;
-- `map`: `Partition.map(chunk=1)`, and `Client.map(resources=)` with `gather`; `map_items` is the
+- `map`: `Partition.map(chunk=1)`, and `Client.map(resources=)` with `gather`. `map_items` is the
   same without `chunk`, so that several items share a task;
 - `busy_map`: 300 tasks that sleep 50 ms, on two slots, while other processes keep all cores busy.
   In `busy_map_slow`, the client sleeps 20 ms after each result. `quiet_map` and `quiet_map_slow`
   are the same without the other processes;
-- `pipe`: round trips of an item through a task, by two `Pipe`s and by two `Queue`s;
+- `pipe`: round trips of an item through a task, with two `Pipe`s or two `Queue`s;
 - `wide_submit` and `wide_map`: 20,000 tasks on 200 workers, which are threads of one process.
 
 CPU time is the sum for driver and scheduler. Each row's ratio is our cost divided by Dask's, as the

@@ -136,7 +136,7 @@ def repeated(part: PartColumns, scans: int) -> PartColumns:
 def first_scans(part: PartColumns, first: int, scans: int) -> PartColumns:
     """Return the first `scans` scans of a part, numbered from `first`.
 
-    The columns are views.
+    The columns of the result are views.
     """
     rows = int(part.counts[:scans].sum())
     return replace(

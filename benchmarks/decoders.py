@@ -100,7 +100,7 @@ def python_of(program: str, pythons: list[str]) -> str | None:
 def read_files(program: str, python: str, files: list[Path], folder: Path) -> Arrays:
     """Let a program read files, and return the arrays it has read, including its `version`.
 
-    RuntimeError if the program fails.
+    Raise RuntimeError if the program fails.
     """
     script = Path(__file__).with_name("decoders_peers.py")
     out = folder / f"{program}.npz"

@@ -109,8 +109,8 @@ def _annotations(tables: Any) -> Arrays:
 def _boxes_of_sweeps(tables: Any) -> Arrays:
     """Yield boxes of key frames in the sensor frame, and of other sweeps in the world frame.
 
-    Rows have the number of the sweep, or the time of the sweep in seconds, and the box's instance
-    and center.
+    Rows contain the sweep's number (key frames) or its time in seconds (other sweeps), the box's
+    instance, and its center.
     """
 
     def instance(box: Any) -> int:

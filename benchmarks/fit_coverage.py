@@ -152,9 +152,9 @@ def trial(
 ) -> tuple[dict[str, float], Any]:
     """Fit a recording and return the true and the fitted parameters, keyed by name.
 
-    Every second sensor has noise by range and errors of its channels, the others noise by energy,
-    a threshold and false alarms. With `place_name`, an entry of `PLACES`, the second result is the
-    error message of a refused fit.
+    Half of the sensors have range-dependent noise and channel errors. The others have
+    energy-dependent noise, a threshold and false alarms. With `place_name`, an entry of `PLACES`,
+    the second result is an error message if the fit fails.
     """
     rng = np.random.default_rng(number)
     truth = {

@@ -67,7 +67,7 @@ class Session:
 def milliseconds(session: Session, launch: Callable[[], object]) -> dict[str, float]:
     """Time a launch with CUDA events, and return the median, minimum and maximum.
 
-    A time is the mean of a batch of launches that takes at least 50 ms, or `seconds` of the sizes.
+    Each time is the mean over a batch of launches that takes at least 50 ms or `sizes.seconds`.
     """
     events = session.cupy.cuda.Event
 

@@ -165,7 +165,7 @@ def beam_directions(beams: int, rays: int) -> Float:
 def track(firings: int) -> tuple[Float, Float]:
     """Return positions (k, 3) and rotations (k, 3, 3) of a head that moves 1 m and turns 5 degrees.
 
-    It is tilted by 2 degrees, so that no rotation is about an axis.
+    The head is tilted by 2 degrees, so that it does not rotate about a coordinate axis.
     """
     part = np.linspace(-0.5, 0.5, firings)
     yaw = np.radians(5) * part

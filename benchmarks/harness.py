@@ -57,9 +57,7 @@ def argument_parser(
 def write_results(path: Path | None, results: Any) -> None:
     """Write results and a description of the machine to a JSON file.
 
-    Do nothing if there is no path.
-
-    The file is complete at all times.
+    Do nothing if there is no path. The file is replaced atomically.
     """
     if path is None:
         return
@@ -110,9 +108,9 @@ def run_rounds(
 ) -> dict[str, list[Result]]:
     """Call functions in rounds, and return their results by name, without the warm-up rounds.
 
-    All functions run once in each round, so that other programs on the machine slow them down
-    alike. Each random order is followed by its reverse, so that of two functions either is first
-    in every second round.
+    All functions run once in each round, so that other programs on the machine slow all of them
+    down equally. Each random order is followed by its reverse, so that each of two functions runs
+    first in half of the rounds.
 
     Parameters
     ----------

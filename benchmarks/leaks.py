@@ -2,8 +2,8 @@
 
     python -m benchmarks.leaks [--rays N] [--triangles N]
 
-All rays are aimed from inside at edges and corners, where rays escape if each triangle is rounded
-on its own. The exit code is 1 if a ray escapes from an exact backend.
+All rays start inside the mesh and are aimed at edges and corners. Rays escape there if triangles
+are rounded independently of each other. The exit code is 1 if a ray escapes from an exact backend.
 """
 
 from __future__ import annotations

@@ -4,9 +4,9 @@
 
 An OS1-64 among 20 moving cars and a VLP-16 among 100 moving cars send packets, one at a time, with
 7 sub-rays, rain and range noise in a city of 100,000 triangles. A receiver on the loopback
-interface runs in its own process. It counts the packets and measures how late they arrive after
-their timestamps. The sender measures its delay after the schedule, which starts when the first
-sweeps are cast.
+interface runs in its own process. It counts the packets and measures the delay between their
+timestamps and their arrival. The sender measures how late packets are sent, relative to a schedule
+that starts when the first sweeps have been cast.
 """
 
 from __future__ import annotations

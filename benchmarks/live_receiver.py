@@ -46,9 +46,7 @@ def open_socket(port: int) -> socket.socket:
 def main(maker: str, rate: str, *ports: str) -> None:
     """Receive on the given ports until stdin ends and no more datagrams arrive.
 
-    The first port is that of the returns.
-
-    Stamps advance `rate` times as fast as the clock.
+    The first port is that of the returns. Timestamps advance `rate` times as fast as the clock.
     """
     period_ns = HOUR_NS / float(rate)  # after which stamps repeat
     sockets = [open_socket(int(port)) for port in ports]

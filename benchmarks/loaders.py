@@ -2,17 +2,17 @@
 
     python -m benchmarks.loaders [FORMAT ...]
 
-Both open the same data set again in each round, in one process, and read all sweeps in order. Files
-are cached in memory. `lidarpool.sweeps` provides points, all columns of the format and the pose of
-each sweep, and boxes if the other loader provides them. For each sweep, the other loaders provide
+In each round, both loaders open the same data set again in one process and read all sweeps in
+order. Files are cached in memory. For each sweep, `lidarpool.sweeps` provides points, all columns
+of the format, the pose, and boxes if the other loader provides them. The other loaders provide
 
-- webdataset: the whole sample, which is points, columns, pose and boxes as arrays, and parsed JSON;
+- webdataset: the whole sample with points, columns, pose and boxes as arrays, and parsed JSON;
 - pykitti: points with intensities and poses; NumPy reads labels as semantic-kitti-api does, and
   separates classes from objects;
 - nuscenes-devkit: points with intensities, without the channel, and the boxes of actors;
 - pyarrow: all columns with positions in world coordinates.
 
-Formats whose package is not installed are skipped.
+Formats are skipped if their package is not installed.
 """
 
 import tempfile

@@ -2,11 +2,11 @@
 
     python -m benchmarks.model --driver MS MS --scheduler MS MS --collectors MS MS --casting MS MS
 
-A fixed number of tasks is in flight: the driver offers a task, the scheduler sends it, the next
-free GPU worker casts its batches, a collector stores them, and scheduler and driver receive the
-receipts. Each process does one thing at a time. Their CPU times, per task and per receipt in it,
-come from `benchmarks.scale`. `--read` compares the model with other results of that benchmark,
-whose processes share `--cores`, and `--picture` draws how busy the GPUs of one scheduler are.
+A fixed number of tasks is in flight. The driver offers a task, the scheduler sends it, the next
+free GPU worker casts its batches, a collector stores them, and the scheduler and the driver receive
+the receipts. Each process does one thing at a time. The CPU times per task and per receipt were
+measured by `benchmarks.scale`. `--read` compares the model with other results of that benchmark,
+whose processes share `--cores` cores. `--picture` plots how busy the GPUs of one scheduler are.
 """
 
 from __future__ import annotations
@@ -37,9 +37,8 @@ SECONDS = (0.05, 0.2, 1.0)  # of casting a batch
 class Costs:
     """CPU time of each process for one step of a task, in seconds.
 
-    {name: (per task, per receipt of the task)}
-
-    Of the scheduler's, `member` comes with each GPU worker, for Dask looks at all of them.
+    The times have the form {name: (per task, per receipt of the task)}. The scheduler also spends
+    `member` per GPU worker on each task, because Dask examines all of these workers.
     """
 
     per_step: dict[str, tuple[float, float]]
@@ -64,9 +63,8 @@ def batches_a_second(
 ) -> float:
     """Return the number of batches per second that `shards` clusters cast in total.
 
-    Each batch takes `seconds` to cast.
-
-    Their processes share `cores`; None: each has its own.
+    Each batch takes `seconds` to cast. All processes share `cores` cores. If it is None, each
+    process has its own core.
     """
     clusters = _Clusters(gpus, seconds, costs, cores, shards)
     tasks_under_way = shards * max_weight_in_flight(gpus, collectors_of(gpus))

@@ -5,10 +5,10 @@
 A car drives along a street of the generated city and turns left. A bag contains each point in the
 sensor frame at its firing, as drivers publish it. KISS-ICP (Vizzo et al., 2023) estimates the
 motion and moves the points of a sweep to its end. The table lists the distances of these points
-from their true positions. With deskewing, they are small only if the points in the bag are not
-compensated.
+from their true positions. With deskewing, the distances are only small if the points in the bag are
+not motion-compensated.
 
-Requires KISS-ICP (`pip install kiss-icp`) and the extra `ros` of lidarpool.
+The benchmark requires KISS-ICP (`pip install kiss-icp`) and the `ros` extra of lidarpool.
 """
 
 from __future__ import annotations

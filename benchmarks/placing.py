@@ -2,12 +2,12 @@
 
     python -m benchmarks.placing [--workers N ...]
 
-A real scheduler has simulated workers, which never respond: tasks are placed and ended by the
-scheduler's own transitions. Half of the workers belong to an exclusive partition. For each
-cluster size, the benchmark lists
+A real scheduler has simulated workers that never respond. Tasks are placed and ended by the
+scheduler's own transitions. Half of the workers belong to an exclusive partition. For each cluster
+size, the benchmark lists
 
-- the microseconds to place a task of the partition, and any other task, with the rule of poolpart
-  and without it, both behind the same fence;
+- the time to place a task of the partition or any other task in microseconds, with and without
+  poolpart's rule, both behind the same fence;
 - the mean end of tasks with random durations, relative to the mean end with Dask's own choice, and
   the longest queue of a worker.
 """

@@ -2,9 +2,9 @@
 
     python -m benchmarks.raycast [--large] [--scene NAME] [--mesh FILE] [--threads N]
 
-All engines cast the same rays in one process, in turns. Rates are medians over the rounds, with
-the minimum and the maximum. Ratios are medians of the ratios within a round. On a machine that
-other programs use, `--clock cpu` measures CPU time.
+All engines cast the same rays in one process, in turn. Rates are medians over the rounds, with the
+minimum and the maximum. Ratios are medians of the ratios within each round. Use `--clock cpu` to
+measure CPU time on a machine that also runs other programs.
 """
 
 from __future__ import annotations

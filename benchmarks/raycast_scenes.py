@@ -143,7 +143,7 @@ def jobs(
 ) -> dict[str, Callable[[], Job]]:
     """Return functions that make jobs, keyed by their scene name in `--scene`.
 
-    With `large`, they include a city of ten million triangles, which needs 13 GB and minutes.
+    With `large`, they include a city of ten million triangles, which takes minutes and 13 GB.
     """
     cities = [2_000] if quick else [100_000, 1_000_000]
     if large:

@@ -1,7 +1,4 @@
-"""Ray query with NVIDIA Warp for benchmarks/gpu_warp.py.
-
-This module requires warp-lang.
-"""
+"""Ray query with NVIDIA Warp for benchmarks/gpu_warp.py (requires warp-lang)."""
 
 import warp as wp
 

@@ -11,12 +11,12 @@ FOLDER contains the recordings, each in the folder of its repository:
 | `kitti360` | heisenberg141/Pointcloud-Segmentation | HDL-64E |
 | `hdl32` | cwchen1102/map_reconstruction | HDL-32E |
 
-Sweeps are held out by two rules: `easy` holds out every second sweep, `hard` blocks of 20. The
-static mask does not come from the twin: a point is static if other sweeps, a second away, have
-points in its neighborhood. `next` compares each held-out sweep with the following recorded one,
-pulse by pulse: a scale, since the sensor moved between the two.
+There are two rules for held-out sweeps: `easy` holds out every second sweep, and `hard` holds out
+blocks of 20 sweeps. The static mask is independent of the twin. A point is static if sweeps that
+are a second apart have points in its neighborhood. For scale, `next` compares each held-out sweep
+with the next recorded sweep pulse by pulse, although the sensor moves between the two.
 
-The recordings are not part of lidarpool, and none states a license: fetch them yourself.
+The recordings are not included in lidarpool, because they state no license. Download them yourself.
 """
 
 from __future__ import annotations

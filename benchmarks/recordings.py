@@ -2,11 +2,11 @@
 
     python -m benchmarks.recordings [--against CHECKOUT] [--folder FOLDER]
 
-The inputs are written once: an airborne survey (.las), the drive of a rotating sensor (.mcap), a
-sequence in KITTI format, and a data set of a campaign. Each measurement runs in a new process,
-which first performs the action on a small input, so that imports and compilation are not measured.
-Short actions are then repeated, and the minimum counts. The processes of both checkouts run in
-turns. The ratio is less than 1 if this checkout is faster. Times are CPU time.
+The inputs are written once. They are an airborne survey (.las), the drive of a rotating sensor
+(.mcap), a sequence in KITTI format, and a data set of a campaign. Each measurement runs in a new
+process, which first performs the action on a small input, so that imports and compilation are not
+measured. Short actions are then repeated, and the minimum counts. Processes of the two checkouts
+alternate. The ratio is less than 1 if this checkout is faster. Times are CPU times.
 """
 
 import argparse

@@ -14,11 +14,11 @@ divided into four partitions, and run tasks that do nothing:
 - The CPU time of the scheduler excludes heartbeats, which are measured separately.
 - Growth is the growth of driver and scheduler together, from the smallest to the largest cluster.
 
-With `--receipts`, surveys are cast by GPU workers whose batches, of one scan with four rays, take
-so many seconds: casting ends with a sleep, and the rest of the pipeline is real. The values are
-per receipt, with the share of a minute in which the workers are busy. `--shards N` runs N of these
-clusters at a time. `--jobs N` runs the tiny jobs of `benchmarks.campaign`. Both measure from a
-fifth of the work on, to exclude the start and the end of a run.
+With `--receipts SECONDS`, GPU workers cast surveys in batches of one scan with four rays. Each
+batch takes the given time, because casting ends with a sleep. The rest of the pipeline is real. The
+values are per receipt, with the fraction of a minute in which the workers are busy. `--shards N`
+runs N of these clusters at a time. `--jobs N` runs the tiny jobs of `benchmarks.campaign`. Both
+skip the first fifth of the work, to exclude the start of a run.
 """
 
 from __future__ import annotations

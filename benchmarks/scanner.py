@@ -12,7 +12,7 @@ different poses, as in a loop:
 
 With `--peers`, MuJoCo's `mj_multiRay` and the CPU and Warp backends of MuJoCo-LiDAR (Warp on the
 CPU) run in a separate Python environment, which needs mujoco-lidar and warp-lang. They are called
-once for each pose, with directions that were rotated before.
+once for each pose, with directions that are already rotated.
 """
 
 from __future__ import annotations

@@ -33,8 +33,8 @@ def escaped(
 ) -> int:
     """Count escaping rays among `count` rays from a point and `count` rays from points around it.
 
-    `inside` is a point (3,) inside the closed mesh, and `room` the distance by which it may be
-    moved along each axis.
+    `inside` is a point (3,) inside the closed mesh. `room` is the distance by which this point may
+    be moved along each axis.
     """
     leaks = 0
     for origins in (inside, inside + room * rng.uniform(-1, 1, (count, 3))):

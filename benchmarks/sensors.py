@@ -68,7 +68,7 @@ def surveys(name: str, share: float) -> dict[str, Survey]:
     name
         Name of the sensor model.
     share
-        Share of a revolution that is cast.
+        Fraction of a revolution that is cast.
     """
     sensor = load_sensor(name, step_deg=360 * share)
     first, stop = sensor.firings(0)

@@ -5,7 +5,7 @@
 Two equal clusters of worker processes have their schedulers in separate processes. The same tasks
 are sent to one cluster by `client.submit(resources=)` and to the other by `Partition.submit`, in
 alternating blocks. CPU time is the sum for driver and scheduler. With `--delay 2`, the scheduler
-responds to requests 2 s late, like a busy scheduler; messages that nobody waits for are not
+responds to requests 2 s late, like a busy scheduler. Messages that require no response are not
 delayed.
 """
 

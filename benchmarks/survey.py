@@ -4,7 +4,7 @@
 
 The script runs in one process: Open3D casts rays on all cores, NumPy thins and rounds the points,
 and Open3D writes the PLY file. lidarpool runs as a command with `--cloud-only` on a cluster that it
-starts itself. Both are complete processes and run in turns. Their clouds are compared.
+starts itself. Both are complete processes, which run in turn. Their clouds are compared.
 """
 
 from __future__ import annotations

@@ -2,11 +2,11 @@
 
     python -m benchmarks.trees [--scene NAME] [--mesh FILE]
 
-Three trees are traversed by the same code, intersect.cu compiled for the CPU: ours; a tree that is
-clustered up to its root (ploc.py without the sweep); and a tree from a full sweep with the surface
-area heuristic, which is at least as good as what Embree builds. Leaves and width are equal. The
-table lists nodes (of four boxes), triangle tests and decisions in double precision per ray.
-Requires g++.
+The same code, intersect.cu compiled for the CPU, traverses three trees: our tree, a tree that is
+clustered up to its root (ploc.py without the sweep), and a tree built by a full sweep with the
+surface area heuristic, which is at least as good as Embree's trees. All have the same leaf size and
+width. The table lists visited nodes (four boxes each), triangle tests, and decisions in double
+precision per ray. The benchmark requires g++.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     python block.py [FOLDER]
 
-It requires the extras [usd] and [geo].
+It requires the `usd` and `geo` extras.
 """
 
 from __future__ import annotations

@@ -125,7 +125,7 @@ def _relinked(text: str, file: str, page: str, files: Files, config: Any) -> str
 def _page_of(path: str, files: Files, config: Any) -> str:
     """Return the location of a repository file on the site.
 
-    Sources get pages, and input files are copied.
+    Source files have pages on the site, and input files are copied to it.
     """
     if shown := (_ELSEWHERE | _SHOWN).get(path):
         return shown

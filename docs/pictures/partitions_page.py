@@ -82,7 +82,7 @@ def _until_it_fails(gpu: Partition, pipe: Pipe) -> None:
 def draw(url: str, picture: Path) -> None:
     """Take a screenshot of a page with a browser and save it as PNG.
 
-    Raise RuntimeError if there is no browser or if it fails.
+    Raise RuntimeError if no browser is installed or if the browser fails.
     """
     program = next(filter(None, map(shutil.which, BROWSERS)), None)
     if program is None:

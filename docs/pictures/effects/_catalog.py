@@ -17,8 +17,8 @@ from lidarpool import Survey
 class Effect(Protocol):
     """Interface of an effect's module or object.
 
-    It may also have `with_actors(scene)`, which returns the scene with moving objects, for runs
-    with and without the effect.
+    An effect may also have `with_actors(scene)`, which returns the scene with moving objects. These
+    are used for runs with and without the effect.
     """
 
     def with_effect(self, survey: Survey) -> Survey:

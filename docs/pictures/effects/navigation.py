@@ -31,7 +31,7 @@ GNSS = Gnss(
 def with_effect(survey: Survey) -> Survey:
     """Return the survey with errors of the navigation instruments.
 
-    Stage 2 takes as long as without instruments.
+    The instruments do not affect the duration of stage 2.
     """
     return replace(survey, navigation=Navigation(imu=IMU, gnss=GNSS))
 
@@ -62,7 +62,7 @@ def parts(tau: np.ndarray) -> dict[str, np.ndarray]:
 def outage(axes: Any, still: SimpleNamespace) -> None:
     """Plot an IMU's position errors during a 15 s outage, with the closed-form solution.
 
-    Each seed is a line.
+    Each seed is plotted as one line.
     """
     imu = Imu(accelerometer_bias=0.01, accelerometer_noise_density=0.02)
     gnss = Gnss(rate_hz=10, outages=[(10, 25)])

@@ -57,7 +57,7 @@ def tree() -> list[SceneMesh]:
 def section(axes: Any, leaves: Material, title: str) -> None:
     """Draw a vertical slice of a tree.
 
-    The sensor is 9 m to the left.
+    The sensor is 9 m to the left of the tree.
     """
     head = Beams(np.radians(np.linspace(-14, 50, 160)))
     scan = cast(tree(), Sensor(head, Spin(2400, 360)), (-9, 0, 2), [leaves, Material("*", 0.3)])
