@@ -222,14 +222,14 @@ def compare(work: Work, clusters: Clusters, count: int, pairs: int) -> dict[str,
 def main(arguments: list[str] | None = None) -> dict[str, dict[str, float]]:
     """Measure all rows, print them, and return the results."""
     parser = argument_parser(__doc__, repeat=9, quick=True)
-    parser.add_argument("--tasks", type=int, default=4_000, help="of submit and map")
+    parser.add_argument("--tasks", type=int, default=4_000, help="tasks of `submit` and `map`")
     parser.add_argument("--trips", type=int, default=1_000, help="round trips of an item")
     parser.add_argument("--short-tasks", type=int, default=300, help="tasks of 50 ms")
-    parser.add_argument("--short-repeat", type=int, default=5, help="rounds of these tasks")
+    parser.add_argument("--short-repeat", type=int, default=5, help="rounds of the short tasks")
     parser.add_argument(
         "--busy", type=int, default=os.cpu_count(), help="processes that keep cores busy"
     )
-    parser.add_argument("--workers", type=int, default=200, help="of the wide clusters")
+    parser.add_argument("--workers", type=int, default=200, help="workers of the wide clusters")
     parser.add_argument("--wide-tasks", type=int, default=20_000)
     parser.add_argument("--wide-repeat", type=int, default=3)
     options = parser.parse_args(arguments)

@@ -161,7 +161,12 @@ def drive_rows(program: str, python: str, folder: Path, drive: Drive) -> tuple[s
 def main(arguments: list[str] | None = None) -> int:
     """Print the table, and return 1 if a program is missing."""
     parser = argument_parser(__doc__, quick=True)
-    parser.add_argument("--python", action="append", default=[], help="a Python with programs")
+    parser.add_argument(
+        "--python",
+        action="append",
+        default=[],
+        help="Python interpreter to search for programs (repeatable)",
+    )
     parser.add_argument("--only", nargs="+", choices=PROGRAMS, default=[*PROGRAMS])
     options = parser.parse_args(arguments)
     scene = city(TOY_TRIANGLES if options.quick else TRIANGLES)

@@ -40,7 +40,7 @@ class Mover(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """Name without its number."""
+        """Name of the actor without its number, such as 'Walker'."""
         return self.mesh.name.rpartition(" ")[0]
 
     @property

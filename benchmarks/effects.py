@@ -46,8 +46,8 @@ def costs(effects: Mapping[str, Any], repeat: int, triangles: int) -> dict[str, 
 
 def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
     parser = argument_parser(__doc__, repeat=5)
-    parser.add_argument("--only", nargs="*", default=[], help="names of effects")
-    parser.add_argument("--triangles", type=int, default=20_000, help="of the street")
+    parser.add_argument("--only", nargs="*", default=[], help="measure only these effects")
+    parser.add_argument("--triangles", type=int, default=20_000, help="triangles of the street")
     options = parser.parse_args(arguments)
     ratios = costs(load_effects(options.only), options.repeat, options.triangles)
     for name, ratio in ratios.items():

@@ -153,7 +153,7 @@ def measure_call(write, *arguments):
 
 def main(arguments=None):
     parser = argument_parser(__doc__)
-    parser.add_argument("--points", type=float, default=1e7, help="points of the cloud")
+    parser.add_argument("--points", type=float, default=1e7, help="number of points")
     options = parser.parse_args(arguments)
     points = int(options.points)
     results = {}

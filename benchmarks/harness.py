@@ -149,5 +149,5 @@ def has_modules(python: str, *modules: str) -> bool:
 
 
 def print_row(*cells: object) -> None:
-    """Print a row of a Markdown table."""
+    """Print a Markdown table row."""
     print("|", " | ".join(map(str, cells)), "|", flush=True)

@@ -75,8 +75,12 @@ def terrain_box(triangles: int) -> Closed:
 def main(arguments: list[str] | None = None) -> int:
     """Print the table, and return 1 if a ray escapes from an exact backend."""
     parser = argument_parser(__doc__)
-    parser.add_argument("--rays", type=int, default=10_000_000, help="rays of each backend")
-    parser.add_argument("--triangles", type=int, default=2_000_000, help="of the terrain box")
+    parser.add_argument(
+        "--rays", type=int, default=10_000_000, help="number of rays for each backend"
+    )
+    parser.add_argument(
+        "--triangles", type=int, default=2_000_000, help="triangles of the terrain box"
+    )
     options = parser.parse_args(arguments)
     backends = [name for name, reason in available_backends().items() if not reason]
     meshes = list(closed_meshes(options.triangles))

@@ -114,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     parser = argument_parser(__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--only", choices=[*CASES], nargs="*", default=[*CASES])
-    parser.add_argument("--triangles", type=int, default=100_000, help="of the city")
+    parser.add_argument("--triangles", type=int, default=100_000, help="triangles of the city")
     parser.add_argument("--rate", type=float, default=1.0, help="speed; 0.1 is ten times as slow")
     options = parser.parse_args(arguments)
     results = {}

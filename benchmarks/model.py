@@ -175,10 +175,16 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
         parser.add_argument(
             f"--{name}", type=float, nargs=2, required=True, metavar="MS", help=words
         )
-    parser.add_argument("--member", type=float, default=3.5, help="µs of the scheduler per worker")
-    parser.add_argument("--read", type=Path, nargs="*", default=[], help="JSON files of `scale`")
+    parser.add_argument(
+        "--member", type=float, default=3.5, help="scheduler time per GPU worker in µs"
+    )
+    parser.add_argument(
+        "--read", type=Path, nargs="*", default=[], help="JSON files written by `scale`"
+    )
     parser.add_argument("--cores", type=int, help="cores of the machine that wrote these files")
-    parser.add_argument("--picture", type=Path, help="draw the busy share to this file")
+    parser.add_argument(
+        "--picture", type=Path, help="save a plot of the GPU utilization to this file"
+    )
     options = parser.parse_args(arguments)
     per_step = {name: tuple(ms / 1e3 for ms in getattr(options, name)) for name in STEPS}
     costs = Costs(per_step, options.member / 1e6)

@@ -221,8 +221,10 @@ def main(arguments: list[str] | None = None) -> None:
     """Measure all cluster sizes and print the results."""
     parser = argument_parser(__doc__)
     parser.add_argument("--workers", type=int, nargs="+", default=[40, 4000])
-    parser.add_argument("--tasks", type=int, default=400, help="tasks that are placed at a time")
-    parser.add_argument("--per-worker", type=int, default=2, help="tasks of random durations")
+    parser.add_argument("--tasks", type=int, default=400, help="number of tasks to place at a time")
+    parser.add_argument(
+        "--per-worker", type=int, default=2, help="tasks of random duration per worker"
+    )
     options = parser.parse_args(arguments)
     logging.getLogger("distributed").setLevel(logging.ERROR)
     results = []

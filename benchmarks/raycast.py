@@ -215,7 +215,7 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mesh", action="append", type=Path, default=[], help="an additional mesh file"
     )
-    parser.add_argument("--rays", type=int, default=1 << 17, help="rays of a scan")
+    parser.add_argument("--rays", type=int, default=1 << 17, help="number of rays per scan")
 
 
 def chosen_jobs(

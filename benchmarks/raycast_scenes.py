@@ -58,7 +58,7 @@ class Job:
 
 
 def _tilted_rotation(degrees: float) -> Float:
-    """Return the rotation of a tilted sensor: about z, then by two degrees about x."""
+    """Return the rotation of a sensor: by an angle about z, then by two degrees about x."""
     a = np.radians(degrees)
     b = np.radians(2.0)
     about_z = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])

@@ -343,7 +343,7 @@ def _line(row: dict[str, Any]) -> str:
 def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
     """Measure the recordings in a folder, and print and return the rows."""
     parser = argument_parser(__doc__)
-    parser.add_argument("folder", type=Path, help="folder with the folders of the repositories")
+    parser.add_argument("folder", type=Path, help="folder that contains the repositories")
     parser.add_argument("names", nargs="*", help=f"of {', '.join(SOURCES)} (default: all)")
     parser.add_argument("--rules", default="easy,hard", help="easy, hard, or both")
     options = parser.parse_args(arguments)

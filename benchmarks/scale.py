@@ -75,7 +75,7 @@ def name_of_worker(_: object = None) -> str:
 
 
 def divide(client: Client) -> tuple[list[Partition], float]:
-    """Divide all workers into four partitions; return the partitions and the elapsed seconds."""
+    """Divide all workers into four partitions, and return these and the elapsed seconds."""
     start = time.perf_counter()
     remaining = Pool.from_client(client)
     workers_per_partition = len(remaining) // len(NAMES)
@@ -290,10 +290,16 @@ def growth(smallest: dict[str, float], largest: dict[str, float]) -> float | Non
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser = argument_parser(__doc__)
     parser.add_argument("--workers", type=int, nargs="+", default=[10, 50, 200])
-    parser.add_argument("--tasks", type=int, default=20_000, help="tasks of each way to submit")
+    parser.add_argument(
+        "--tasks", type=int, default=20_000, help="number of tasks for each way to submit"
+    )
     parser.add_argument("--receipts", type=float, help="seconds to cast a batch of one scan")
-    parser.add_argument("--scans", type=int, default=3_000, help="with --receipts, of a survey")
-    parser.add_argument("--shards", type=int, default=1, help="with --receipts, clusters at a time")
+    parser.add_argument(
+        "--scans", type=int, default=3_000, help="scans per survey (with --receipts)"
+    )
+    parser.add_argument(
+        "--shards", type=int, default=1, help="number of simultaneous clusters (with --receipts)"
+    )
     parser.add_argument("--jobs", type=int, help="number of tiny jobs")
     options = parser.parse_args(arguments)
     rows: dict[str, Any] = {}

@@ -269,7 +269,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--backend", choices=backends, default=backends[0])
     parser.add_argument("--triangles", type=int, default=100_000)
     parser.add_argument("--robots", type=int, default=1000)
-    parser.add_argument("--peers", default="", metavar="PYTHON", help="Python that has the peers")
+    parser.add_argument(
+        "--peers", default="", metavar="PYTHON", help="Python interpreter with the peers"
+    )
     options = parser.parse_args(arguments)
     if options.quick:
         options.triangles = 10_000

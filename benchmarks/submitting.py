@@ -105,7 +105,7 @@ def answer_late(delay_s: float, dask_scheduler: Any = None) -> None:
 
 
 def measure(kind: str, tasks: int, pairs: int, delay_s: float) -> dict[str, Floats]:
-    """Return the costs (fields, pairs) of each way to submit tasks."""
+    """Return the costs of both ways to submit tasks, as arrays (fields, pairs)."""
     with cluster_of("declared") as (plain, plain_pid), cluster_of(kind) as (client, pid):
         part = Partition(NAME, client)
         if kind == "divided":
@@ -134,7 +134,9 @@ def main(arguments: list[str] | None = None) -> dict[str, float]:
     """Measure all pairs, then print and return the medians."""
     parser = argument_parser(__doc__, repeat=9)
     parser.add_argument("--tasks", type=int, default=10_000)
-    parser.add_argument("--delay", type=float, default=0.0, help="of the scheduler, seconds")
+    parser.add_argument(
+        "--delay", type=float, default=0.0, help="response delay of the scheduler in seconds"
+    )
     parser.add_argument("--kind", choices=["declared", "divided"], default="divided")
     parser.add_argument("--serve", choices=["declared", "divided"], help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)

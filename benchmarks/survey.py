@@ -137,7 +137,7 @@ def time_side(side: str, rays: int, folder: Path) -> tuple[float, float]:
 def main(arguments: list[str] | None = None) -> None:
     parser = argument_parser(__doc__, repeat=3)
     parser.add_argument("--rays", type=lambda text: int(float(text)), default=100_000_000)
-    parser.add_argument("--pictures", action="store_true", help="also run with pictures and report")
+    parser.add_argument("--pictures", action="store_true", help="also run with plots and report")
     parser.add_argument("--script", type=Path, metavar="FOLDER", help="only run the script")
     options = parser.parse_args(arguments)
     if options.script:

@@ -44,7 +44,7 @@ _BLOCK = 128
 
 
 def compile_kernels(folder: Path) -> ctypes.CDLL:
-    """Compile intersect.cu for the CPU, with counters."""
+    """Compile intersect.cu for the CPU, with counters of nodes, triangles and decisions."""
     library = folder / "intersect.so"
     files = importlib.resources.files("raybeam")
     with importlib.resources.as_file(files / "intersect.cu") as kernels:

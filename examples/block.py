@@ -42,7 +42,7 @@ def height(x: Array, y: Array) -> Array:
 
 
 def ring(distance_m: Array, aside: Array | float = 0.0) -> tuple[Array, Array, Array]:
-    """Return x, y and heading of points along the center line, counterclockwise."""
+    """Return the x, y and heading of points on the center line in counterclockwise order."""
     straight = 2 * (HALF - CORNER)
     arc = np.pi / 2 * CORNER
     side, along_side = np.divmod(distance_m % (4 * (straight + arc)), straight + arc)

@@ -69,7 +69,7 @@ def _with_pages(nav: list[Any], docs: Path) -> list[Any]:
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add README and similar files, the reference, and the sources that pages link to."""
+    """Add the README and similar files, the reference, and all sources that pages link to."""
     pages = {
         page: _relinked((ROOT / file).read_text("utf-8"), file, page, files, config)
         for file, page in _ELSEWHERE.items()
@@ -123,7 +123,7 @@ def _relinked(text: str, file: str, page: str, files: Files, config: Any) -> str
 
 
 def _page_of(path: str, files: Files, config: Any) -> str:
-    """Return the location of a repository file on the site.
+    """Return the path on the site that shows a repository file.
 
     Source files have pages on the site, and input files are copied to it.
     """

@@ -164,7 +164,7 @@ def _schema_page(head: str, schema: dict[str, Any], sections: dict[str, str]) ->
 
 
 def columns_page() -> str:
-    """Generate tables of a cloud's columns from the package's column table."""
+    """Generate tables of all columns of a cloud from the column definitions in the package."""
     return "\n".join(
         [
             "# Columns of a cloud\n",

@@ -19,5 +19,7 @@ def folder_parser(doc: str | None, folder: Path) -> argparse.ArgumentParser:
     """Return the parser of a program that writes one image for each name into a folder."""
     parser = argparse.ArgumentParser(description=doc)
     parser.add_argument("folder", nargs="?", type=Path, default=folder, help="output folder")
-    parser.add_argument("--only", nargs="*", default=[], help="only the pictures of these names")
+    parser.add_argument(
+        "--only", nargs="*", default=[], help="draw only the images with these names"
+    )
     return parser

@@ -65,7 +65,7 @@ def judge(
     rows: Sequence[int],
     expected_rows: Sequence[int],
 ) -> Verdict:
-    """Judge one run.
+    """Find lost, duplicated and unexpected scans of a run.
 
     `events` is the log of the run, grouped by process and in order of time. `scans` is the number
     of requested scans, which are numbered from 0. `rows` contains the scan of each row in the

@@ -95,7 +95,7 @@ class Fault:
         return cls(**{**row, "columns": tuple(row["columns"])})
 
     def plant(self, source: str) -> str:
-        """Return the source with the fault.
+        """Plant the fault in a source text.
 
         Raises ValueError if the expression is not where it was.
         """

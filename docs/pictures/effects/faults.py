@@ -48,7 +48,7 @@ def approach(*faults: Fault) -> tuple[np.ndarray, np.ndarray]:
 
 
 def picture() -> Figure:
-    """Plot the effect of faults on range images, and on ranges over time."""
+    """Plot how faults affect range images and ranges over time."""
     figure = Figure((11, 5.2), layout="constrained", dpi=100)
     images, charts = figure.subfigures(1, 2, width_ratios=[1.7, 1])
     bare = survey_without()

@@ -26,7 +26,7 @@ COLUMNS = ("range", "intensity", "amplitude", "pulse_width", "object")
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with saturation."""
+    """Return the survey with a receiver that saturates."""
     return replace(survey, noise=NOISE)
 
 

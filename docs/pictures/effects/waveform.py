@@ -28,7 +28,7 @@ _LANES = {
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with 19 sub-rays per beam and a Gaussian decomposition."""
+    """Return the survey with 19 sub-rays per beam and returns from a Gaussian decomposition."""
     returns = Returns("all", subrays=19, waveform="gaussian")
     return replace(survey, returns=returns)
 
