@@ -1,4 +1,4 @@
-"""Measurements; each module runs with `python -m benchmarks.NAME` and prints what it read."""
+"""Benchmarks, each of which runs with `python -m benchmarks.NAME` and prints its results."""
 
 import os
 

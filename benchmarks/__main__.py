@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def summaries() -> dict[str, str]:
-    """Return the first line of each benchmark's docstring, by name."""
+    """Return the first docstring line of each benchmark, keyed by module name."""
     docstrings = {
         path.stem: ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
         for path in sorted(Path(__file__).parent.glob("*.py"))

@@ -1,22 +1,22 @@
-"""Cost of poolpart, compared with plain Dask, in pairs.
+"""Compare the cost of poolpart with that of plain Dask.
 
     python -m benchmarks.beside_dask
 
-Each row does the same work on two equal clusters, in turns: one uses a resource of Dask, and one is
-divided by poolpart. The schedulers are separate processes.
+Each row does the same work on two equal clusters in turn. One uses a Dask resource, and the other
+is divided by poolpart. The schedulers are separate processes.
 
 - `submit`: `Partition.submit` and `Client.submit(resources=)`;
-- `map`: `Partition.map(chunk=1)`, and `Client.map(resources=)` with `gather`; `map_items` is the
+- `map`: `Partition.map(chunk=1)`, and `Client.map(resources=)` with `gather`. `map_items` is the
   same without `chunk`, so that several items share a task;
 - `busy_map`: 300 tasks that sleep 50 ms, on two slots, while other processes keep all cores busy.
   In `busy_map_slow`, the client sleeps 20 ms after each result. `quiet_map` and `quiet_map_slow`
   are the same without the other processes;
-- `pipe`: round trips of an item through a task, by two `Pipe`s and by two `Queue`s;
+- `pipe`: round trips of an item through a task, with two `Pipe`s or two `Queue`s;
 - `wide_submit` and `wide_map`: 20,000 tasks on 200 workers, which are threads of one process.
 
-CPU time is the sum for driver and scheduler. The ratio of a row is the median over its pairs of our
-cost divided by Dask's. To compare with another version of poolpart, put its folder first on
-`PYTHONPATH`.
+CPU time is the sum for driver and scheduler. Each row's ratio is our cost divided by Dask's, as the
+median over all pairs of measurements. To compare with another version of poolpart, put its folder
+first on `PYTHONPATH`.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ RESOURCES = {NAME: 1}
 
 
 class Cost(NamedTuple):
-    """CPU time of driver and scheduler, and elapsed time; seconds."""
+    """CPU time of the driver and the scheduler, and elapsed time, in seconds."""
 
     cpu: float
     wall: float
 
 
 class Clusters(NamedTuple):
-    """Two equal clusters: of plain Dask, and divided."""
+    """Two equal clusters: one with plain Dask, and one that is divided by poolpart."""
 
     plain: Client
     plain_scheduler: psutil.Process
@@ -67,7 +67,10 @@ class Clusters(NamedTuple):
 
 
 class Work(NamedTuple):
-    """The same work done by poolpart and by Dask; each function takes the number of items."""
+    """The same work for poolpart and for Dask.
+
+    Each function takes the number of items.
+    """
 
     ours: Callable[[int], object]
     theirs: Callable[[int], object]
@@ -75,7 +78,7 @@ class Work(NamedTuple):
 
 @contextmanager
 def small_clusters() -> Iterator[Clusters]:
-    """Yield two clusters of two worker processes."""
+    """Yield two clusters, each with two worker processes."""
     with cluster_of("declared") as (plain, plain_pid), cluster_of("divided") as (client, pid):
         rules = {NAME: n_workers(WORKERS, slots=SLOTS)}
         partition = Pool.from_client(client).divide(rules)[NAME]
@@ -84,7 +87,7 @@ def small_clusters() -> Iterator[Clusters]:
 
 @contextmanager
 def wide_clusters(workers: int) -> Iterator[Clusters]:
-    """Yield two clusters of many workers in one process each."""
+    """Yield two clusters, each with many workers in a single process."""
     with (
         process(run_scheduler) as (plain_scheduler, plain_address),
         process(run_workers, plain_address, workers, (NAME, 1)),
@@ -121,12 +124,15 @@ def map_work(clusters: Clusters, chunk: int | None) -> Work:
 
 
 def sleep_briefly(_: int) -> None:
-    """Do a short task, which takes no processor time."""
+    """Run a short task that uses no CPU time."""
     time.sleep(0.05)
 
 
 def short_map_work(clusters: Clusters, client_sleeps_s: float) -> Work:
-    """Return a map of short tasks, each on both slots of a worker, so that two run at a time."""
+    """Return work that maps short tasks.
+
+    Each task uses both slots of a worker, so two tasks run at a time.
+    """
 
     def read(results: Iterable[Any]) -> None:
         for _ in results:
@@ -145,7 +151,7 @@ def short_map_work(clusters: Clusters, client_sleeps_s: float) -> Work:
 
 @contextmanager
 def busy_cores(count: int) -> Iterator[None]:
-    """Keep a number of cores busy."""
+    """Keep `count` cores busy while the body runs."""
     command = [sys.executable, "-c", "while True: pass"]
     processes = [subprocess.Popen(command) for _ in range(count)]
     try:
@@ -157,7 +163,7 @@ def busy_cores(count: int) -> Iterator[None]:
 
 
 def echo(incoming: Any, outgoing: Any, count: int) -> None:
-    """Pass items on, in a task."""
+    """Copy items from one pipe to another."""
     for _ in range(count):
         outgoing.put(incoming.get())
 
@@ -187,7 +193,7 @@ def pipe_work(clusters: Clusters) -> Work:
 
 
 def cost_of(work: Callable[[int], object], count: int, scheduler: psutil.Process) -> Cost:
-    """Return what some work costs."""
+    """Measure the CPU time and the elapsed time of the work."""
     gc.collect()
     processes = psutil.Process(), scheduler
     before = sum(map(cpu_seconds, processes))
@@ -196,7 +202,7 @@ def cost_of(work: Callable[[int], object], count: int, scheduler: psutil.Process
 
 
 def compare(work: Work, clusters: Clusters, count: int, pairs: int) -> dict[str, float]:
-    """Return the median costs of each side in microseconds per item, and the median ratios."""
+    """Return the median costs per item of both sides in microseconds, and their median ratios."""
     work.ours(min(count, 50))  # both have done everything once
     work.theirs(min(count, 50))
     calls = {
@@ -214,14 +220,16 @@ def compare(work: Work, clusters: Clusters, count: int, pairs: int) -> dict[str,
 
 
 def main(arguments: list[str] | None = None) -> dict[str, dict[str, float]]:
-    """Measure, print and return the results of each row."""
+    """Measure all rows, print them, and return the results."""
     parser = argument_parser(__doc__, repeat=9, quick=True)
-    parser.add_argument("--tasks", type=int, default=4_000, help="of submit and map")
+    parser.add_argument("--tasks", type=int, default=4_000, help="tasks of `submit` and `map`")
     parser.add_argument("--trips", type=int, default=1_000, help="round trips of an item")
     parser.add_argument("--short-tasks", type=int, default=300, help="tasks of 50 ms")
-    parser.add_argument("--short-repeat", type=int, default=5, help="rounds of these tasks")
-    parser.add_argument("--busy", type=int, default=os.cpu_count(), help="processes beside them")
-    parser.add_argument("--workers", type=int, default=200, help="of the wide clusters")
+    parser.add_argument("--short-repeat", type=int, default=5, help="rounds of the short tasks")
+    parser.add_argument(
+        "--busy", type=int, default=os.cpu_count(), help="processes that keep cores busy"
+    )
+    parser.add_argument("--workers", type=int, default=200, help="workers of the wide clusters")
     parser.add_argument("--wide-tasks", type=int, default=20_000)
     parser.add_argument("--wide-repeat", type=int, default=3)
     options = parser.parse_args(arguments)
@@ -236,9 +244,9 @@ def main(arguments: list[str] | None = None) -> dict[str, dict[str, float]]:
     def row(name: str, work: Work, clusters: Clusters, count: int, pairs: int) -> None:
         rows[name] = values = compare(work, clusters, count, pairs)
         print(
-            f"{name:<14} CPU {values['cpu_us']:7.0f} µs, beside Dask "
+            f"{name:<14} CPU {values['cpu_us']:7.0f} µs, Dask "
             f"{values['cpu_us_dask']:7.0f} ({values['cpu_ratio']:.3f}); elapsed "
-            f"{values['wall_us']:7.0f} µs, beside {values['wall_us_dask']:7.0f} "
+            f"{values['wall_us']:7.0f} µs, Dask {values['wall_us_dask']:7.0f} "
             f"({values['wall_ratio']:.3f})",
             flush=True,
         )

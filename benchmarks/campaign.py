@@ -1,12 +1,11 @@
-"""Time and memory per job of a campaign, in addition to ray casting.
+"""Measure the time and memory per job of a campaign, excluding ray casting.
 
     python -m benchmarks.campaign [--jobs N] [--toy] [--picture FILE]
 
-Each job has 20 scans, which are one revolution of a sensor with 64 channels. The jobs run on a
-local cluster that is already running. The cost of a job is the wall time, minus the casting time
-of all tasks divided by the number of casting workers. `--toy` makes the jobs very small, and
-`--picture` draws the memory of the driver, whose process contains the scheduler, and of the LIDAR
-worker.
+Each job consists of 20 scans that form one revolution of a sensor with 64 channels. The jobs run on
+a local cluster that is already running. The cost per job is the wall time minus the casting time of
+each casting worker, divided by the number of jobs. `--toy` makes the jobs very small. `--picture`
+plots the memory of the driver, whose process contains the scheduler, and that of the LIDAR worker.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ splits: {train: 0.8, val: 0.1, test: 0.1}
 
 
 class Samples:
-    """Memory samples of the driver and of LIDAR's worker, MiB, by finished jobs."""
+    """Memory of the driver and of the LIDAR worker in MiB, with the number of finished jobs."""
 
     def __init__(self, lidar: int) -> None:
         self.jobs: list[int] = []
@@ -64,14 +63,17 @@ class Samples:
 
     @property
     def growth(self) -> float:
-        """Growth of the driver's memory, MiB per job: slope of a line through the last half."""
+        """Growth of the driver's memory in MiB per job.
+
+        This is the slope of a line fitted to the last half of the samples.
+        """
         half = len(self.jobs) // 2
         if len({*self.jobs[half:]}) < 2:
             return 0.0
         return float(np.polyfit(self.jobs[half:], self.driver[half:], 1)[0])
 
     def __call__(self, progress: Progress) -> None:
-        """Take a sample if the last sample is old enough, or if all jobs are finished."""
+        """Take a sample if the last one is old enough or all jobs are finished."""
         now_s = time.monotonic()
         if now_s >= self._next or progress.jobs_done == progress.jobs:
             self._next = now_s + EVERY_S
@@ -82,7 +84,7 @@ class Samples:
 
 
 def measure(jobs: int, rays: int, layers: int, folder: Path) -> tuple[dict[str, Any], Samples]:
-    """Run a campaign; return its figures and the samples of memory."""
+    """Run a campaign and return its results and the memory samples."""
     (folder / "base.yaml").write_text(BASE % (rays, layers))
     (folder / "campaign.yaml").write_text(CAMPAIGN % jobs)
     campaign = Campaign.load(folder / "campaign.yaml")
@@ -115,14 +117,16 @@ def measure(jobs: int, rays: int, layers: int, folder: Path) -> tuple[dict[str, 
 
 
 def draw(samples: Samples, path: Path) -> None:
-    """Draw memory against finished jobs into `path`."""
+    """Plot memory over finished jobs, and save the plot to `path`."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 4), layout="constrained")
     axes = figure.subplots()
-    axes.plot(samples.jobs, samples.driver, color="#2a6fb0", label="driver, with the scheduler")
-    axes.plot(samples.jobs, samples.lidar, color="#e4752e", label="worker of LIDAR")
-    axes.set(xlabel="jobs done", ylabel="memory, MiB", ylim=(0, None), xlim=(0, samples.jobs[-1]))
+    axes.plot(samples.jobs, samples.driver, color="#2a6fb0", label="driver and scheduler")
+    axes.plot(samples.jobs, samples.lidar, color="#e4752e", label="LIDAR worker")
+    axes.set(
+        xlabel="finished jobs", ylabel="memory (MiB)", ylim=(0, None), xlim=(0, samples.jobs[-1])
+    )
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
     axes.grid(visible=True, color="0.9")
     axes.spines[["top", "right"]].set_visible(False)
@@ -131,11 +135,10 @@ def draw(samples: Samples, path: Path) -> None:
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    """Run from the command line; return the results."""
     parser = argument_parser(__doc__)
     parser.add_argument("--jobs", type=int, default=1000)
     parser.add_argument("--toy", action="store_true", help="jobs of 1,000 rays")
-    parser.add_argument("--picture", type=Path, help="draw the memory usage to this file")
+    parser.add_argument("--picture", type=Path, help="save a plot of the memory usage to this file")
     options = parser.parse_args(arguments)
     rays, layers = (100, 10) if options.toy else (1024, 64)
     with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:

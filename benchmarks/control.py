@@ -1,11 +1,11 @@
-"""Bytes that the scheduler and the driver exchange with other processes.
+"""Measure the bytes that the scheduler and the driver exchange with other processes.
 
     python -m benchmarks.control [--scans N]
 
-A survey runs on a local cluster whose scheduler is in the process of the driver, so that all of
-their messages can be counted here by kind. The survey runs with every fifth point and with all
-points, which shows what grows with the number of points. It also runs in batches of one scan,
-which shows the cost of a batch.
+A survey runs on a local cluster whose scheduler is in the driver's process, so that this process
+can count all of their messages by kind. The survey runs with every fifth point and with all points,
+to show what grows with the number of points. It also runs with one scan per batch, to show the cost
+of a batch.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ UPKEEP = {"heartbeat", "setup", "transfers"}
 
 
 class TrafficCounts:
-    """Bytes of messages by kind and by local address of the connection."""
+    """Bytes of messages by message kind and local address."""
 
     def __init__(self) -> None:
         self._bytes: dict[str, Counter[str]] = {}  # {address here: {kind: bytes}}
@@ -42,11 +42,14 @@ class TrafficCounts:
 
     @property
     def scheduler(self) -> Counter[str]:
-        """Bytes at the scheduler by kind; all its connections share a local address."""
+        """Bytes at the scheduler by message kind.
+
+        All connections of the scheduler share a local address.
+        """
         return max(self._bytes.values(), key=lambda counts: sum(counts.values()))
 
     def work(self, *, driver: bool = False) -> int:
-        """Return the bytes of task messages, at the scheduler or at the driver."""
+        """Return the bytes of task messages at the scheduler, or at the driver if `driver`."""
         counts_by_address = self._bytes.values()
         counted = [
             counts for counts in counts_by_address if (counts is not self.scheduler) == driver
@@ -105,14 +108,13 @@ def count_traffic() -> Iterator[TrafficCounts]:
 
 
 def small_survey(scans: int, keep_every: int) -> Survey:
-    """Return a survey of `scans` scans of 128 rays."""
     sensor = Sensor.grid(rays_per_revolution=360, layers=32, step_deg=4)
     poses = [(0.01 * index, 0.0, 1.0) for index in range(-(-scans // 90))]
     return Survey(sensor, poses, steps=90, keep_every=keep_every)
 
 
 def count_bytes(scans: int) -> dict[str, float]:
-    """Print and return the scheduler's bytes per additional scan and per scan with all points."""
+    """Print and return the scheduler's bytes per additional scan, and per scan with all points."""
     sides = {
         "every 5th point": (scans, 5),
         "all points": (scans, 1),
@@ -127,31 +129,34 @@ def count_bytes(scans: int) -> dict[str, float]:
         work[side] = Counter({k: n for k, n in counted.scheduler.items() if k not in UPKEEP})
         print(
             f"{side:16} {survey.scan_count:,} scans, {len(result.points):,} points: "
-            f"{sum(work[side].values()) / 1e6:.2f} MB in and out of the scheduler, the scene's "
-            f"among them, and {upkeep / 1e6:.2f} MB of heartbeats and set-up"
+            f"{sum(work[side].values()) / 1e6:.2f} MB to and from the scheduler, including the "
+            f"scene, plus {upkeep / 1e6:.2f} MB for heartbeats and setup"
         )
     base = work["every 5th point"]
     doubled = work["twice the scans"]
     points = work["all points"]
     for kind, count in (doubled - base).most_common(5):
-        print(f"    {kind:24} {count / scans:6.1f} bytes a further scan")
+        print(f"    {kind:24} {count / scans:6.1f} bytes per additional scan")
     scan_bytes, point_bytes = (
         (sum(counts.values()) - sum(base.values())) / scans for counts in (doubled, points)
     )
     print(
-        f"a further scan adds {scan_bytes:.0f} bytes; five times the points add "
-        f"{point_bytes:.0f} bytes a scan"
+        f"each additional scan adds {scan_bytes:.0f} bytes; five times as many points add "
+        f"{point_bytes:.0f} bytes per scan"
     )
     return {"bytes_a_scan": scan_bytes, "bytes_a_scan_of_points": point_bytes}
 
 
 def single_scans() -> Any:
-    """Return a patch that limits each batch to one scan; tasks still have several batches."""
+    """Return a patch that limits each batch to one scan.
+
+    Tasks still contain several batches.
+    """
     return patch.object(lidarpool.run.pipeline.policies, "scans_per_batch", lambda *_: 1)
 
 
 def count_batches(batches: int) -> dict[str, float]:
-    """Print and return the bytes per additional batch, at the scheduler and at the driver."""
+    """Print and return the bytes per additional batch for the scheduler and the driver."""
     bytes_by_batches = {}
     for count in (batches, 3 * batches):
         with count_traffic() as counted, single_scans():
@@ -161,14 +166,13 @@ def count_batches(batches: int) -> dict[str, float]:
         2 * batches
     )
     print(
-        f"a further batch of one scan adds {scheduler:,.0f} bytes at the scheduler and "
+        f"each additional batch of one scan adds {scheduler:,.0f} bytes at the scheduler and "
         f"{driver:,.0f} at the driver"
     )
     return {"scheduler_bytes": scheduler, "driver_bytes": driver}
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Count the bytes of scans and of batches."""
     parser = argument_parser(__doc__)
     parser.add_argument("--scans", type=int, default=20_000)
     options = parser.parse_args(arguments)

@@ -1,16 +1,16 @@
-"""The path of points from casting to the cloud, without casting, compared with plain writing.
+"""Compare the rate at which points reach the cloud file with plain writing of the same bytes.
 
     python -m benchmarks.dataplane [--points 16e6] [--folder FOLDER]
 
 A local cluster runs the real pipeline up to cloud.ply and report.json, but the casting workers
-return columns that are already in their memory. In each round, the bytes of the parts and of the
-cloud are also written plainly, in files of the same sizes that are flushed as often, twice after
-the run. One thread also packs parts, and packs and writes parts, as a collector does.
+return columns that are already in their memory. After each run, files of the same sizes as the
+parts and the cloud are written plainly twice, and flushed as often. One thread also packs parts,
+and packs and writes parts, as a collector does.
 
-A small run that is not measured imports what the processes need. CPU times are of whole processes;
-the scheduler is in the process of the driver. Bytes are those that system calls read from and wrote
-to files, and those that casting workers sent to collectors. `--folder /dev/shm` keeps all files in
-memory.
+A small run that is not measured imports what the processes need. CPU times are those of whole
+processes, and the driver's process contains the scheduler. Bytes are counted when system calls read
+or write files, and when casting workers send results to collectors. `--folder /dev/shm` keeps all
+files in memory.
 """
 
 from __future__ import annotations
@@ -59,16 +59,16 @@ from .harness import argument_parser, cpu_seconds, write_results
 HALL = Scene.from_meshes([box("Hall", (160, 120, 30))])  # all rays hit
 _PIECE_BYTES = 1 << 25  # written at a time to the cloud
 _BESIDE = {
-    "plain": "writing the same bytes",
-    "pack": "a thread packs parts",
-    "pack_and_write": "a thread packs and writes parts",
+    "plain": "plain writing of the same bytes",
+    "pack": "packing parts in one thread",
+    "pack_and_write": "packing and writing parts in one thread",
 }
 _PROCESSES = {GPU: "casting", LIDAR: "collectors"}
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of a measurement."""
+    """Sizes of the measured survey and its cluster."""
 
     points: int = 16_000_000
     rays_per_scan: int = 131_072
@@ -85,7 +85,7 @@ QUICK = Sizes(points=16_000, rays_per_scan=1_024)
 
 
 def still_survey(sizes: Sizes, scans: int) -> Survey:
-    """Return a survey of revolutions of the hall, with range and intensity."""
+    """Return a survey whose scans are whole revolutions in the hall, with range and intensity."""
     layers = 64 if sizes.rays_per_scan >= 1 << 16 else 8
     sensor = Sensor.grid(
         rays_per_revolution=sizes.rays_per_scan // layers, layers=layers, step_deg=360
@@ -98,7 +98,7 @@ def still_survey(sizes: Sizes, scans: int) -> Survey:
 
 
 def replay_casting(dask_worker: Any) -> None:
-    """Let a casting worker return columns that it has in memory.
+    """Let a casting worker return columns that are already in memory.
 
     Only the first scan of a run is cast. The columns of several scans repeat its columns, and
     batches are views of these.
@@ -123,7 +123,7 @@ def replay_casting(dask_worker: Any) -> None:
 
 
 def repeated(part: PartColumns, scans: int) -> PartColumns:
-    """Return a part of one scan that is repeated."""
+    """Return a part that repeats a part of one scan `scans` times."""
     return replace(
         part,
         counts=np.tile(part.counts, scans),
@@ -134,7 +134,10 @@ def repeated(part: PartColumns, scans: int) -> PartColumns:
 
 
 def first_scans(part: PartColumns, first: int, scans: int) -> PartColumns:
-    """Return the first scans of a part, numbered from `first`, without copying columns."""
+    """Return the first `scans` scans of a part, numbered from `first`.
+
+    The columns of the result are views.
+    """
     rows = int(part.counts[:scans].sum())
     return replace(
         part,
@@ -150,19 +153,19 @@ def first_scans(part: PartColumns, first: int, scans: int) -> PartColumns:
 
 
 class CountingPage(RunPage):
-    """Page of a run that notes the sizes of the parts."""
+    """Run page that records the sizes of the parts."""
 
     def __init__(self) -> None:
         self.part_sizes: list[int] = []  # bytes of each committed part
 
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
-        """Note the sizes of committed parts."""
+        """Record the sizes of committed parts."""
         self.part_sizes += [part.size for part in receipts]
 
 
 @dataclass(frozen=True)
 class Usage:
-    """Sums over the processes of a kind."""
+    """CPU time, file bytes and memory of all processes of a kind."""
 
     cpu_s: float  # processor time
     read: int  # bytes that were read from files
@@ -171,7 +174,7 @@ class Usage:
 
     @classmethod
     def of(cls, processes: Sequence[psutil.Process]) -> Usage:
-        """Read the usage of processes."""
+        """Return the total usage of the given processes."""
         counters = [process.io_counters() for process in processes]
         return cls(
             sum(map(cpu_seconds, processes)),
@@ -187,12 +190,12 @@ def _peak_bytes(pid: int) -> int:
 
 
 def sent_bytes(dask_worker: Any) -> int:
-    """Return the bytes that a worker has sent with results."""
+    """Return the number of bytes that a worker has sent with results."""
     return sum(transfer["compressed"] for transfer in dask_worker.transfer_outgoing_log)
 
 
 class Cluster:
-    """A cluster of this machine whose casting workers replay columns."""
+    """Local cluster whose casting workers replay columns."""
 
     def __init__(self, client: Client, sizes: Sizes) -> None:
         self._client = client
@@ -209,15 +212,18 @@ class Cluster:
         client.run(replay_casting, workers=self._casting)
 
     def usage(self) -> dict[str, Usage]:
-        """Return the usage of each kind of process."""
+        """Return the usage by process kind."""
         return {name: Usage.of(processes) for name, processes in self._processes.items()}
 
     def sent(self) -> int:
-        """Return the bytes that casting workers have sent so far."""
+        """Return the number of bytes that casting workers have sent so far."""
         return sum(self._client.run(sent_bytes, workers=self._casting).values())
 
     def run(self, folder: Path, scans: int) -> tuple[int, float, CountingPage]:
-        """Run a survey into a folder; return its points, the seconds until stage 4 has ended."""
+        """Run a survey in a folder.
+
+        Return its number of points, the seconds until stage 4 ended, and its page.
+        """
         survey = still_survey(self._sizes, scans)
         output = SurveyOutput(folder, survey, (), "cloud")
         options = RunOptions(
@@ -234,7 +240,10 @@ class Cluster:
 
 @contextmanager
 def replaying_cluster(sizes: Sizes) -> Iterator[Cluster]:
-    """Start a cluster, run a small survey that imports what its processes need, and yield it."""
+    """Start a cluster and yield it.
+
+    A small survey runs first, so that all processes have imported what they need.
+    """
     slots = slots_needed(TaskOptions(collectors=sizes.collectors), planning=False)
     with (
         local_client(slots, gpu_workers=sizes.casting) as client,
@@ -246,7 +255,10 @@ def replaying_cluster(sizes: Sizes) -> Iterator[Cluster]:
 
 
 def measure_run(cluster: Cluster, sizes: Sizes, folder: Path) -> tuple[dict[str, Any], list[int]]:
-    """Run a survey; return its figures, and the sizes of its files: the parts, and the cloud."""
+    """Run a survey and return its results and file sizes.
+
+    The file sizes are those of the parts, followed by that of the cloud.
+    """
     before = cluster.usage()
     sent = cluster.sent()
     start = time.perf_counter()
@@ -278,14 +290,14 @@ def measure_run(cluster: Cluster, sizes: Sizes, folder: Path) -> tuple[dict[str,
 
 
 class Spent(NamedTuple):
-    """Time that calls have taken."""
+    """Elapsed time and CPU time of function calls."""
 
     wall_s: float
     cpu_s: float  # processor time of the thread
 
 
 def spent_in(call: Callable[[], object], count: int = 1) -> Spent:
-    """Return the time that calls of a function take in this thread."""
+    """Call a function `count` times in this thread and return the time spent."""
     start_s = time.perf_counter()
     start_cpu_s = time.thread_time()
     for _ in range(count):
@@ -294,7 +306,10 @@ def spent_in(call: Callable[[], object], count: int = 1) -> Spent:
 
 
 def write_plainly(folder: Path, sizes: Sequence[int]) -> Spent:
-    """Write files of these sizes, the last in pieces, each file flushed; return the time."""
+    """Write and flush files of the given sizes, and return the time spent.
+
+    The last file is written in pieces.
+    """
     folder.mkdir()
     content = memoryview(np.random.default_rng(0).bytes(max(_PIECE_BYTES, *sizes[:-1])))
     *parts, cloud = sizes
@@ -315,7 +330,7 @@ def write_plainly(folder: Path, sizes: Sequence[int]) -> Spent:
 
 
 def pack_alone(part: PartColumns, folder: Path, points: int) -> dict[str, float]:
-    """Pack parts, and pack and write parts, in this thread; return rates and processor times."""
+    """Pack parts in this thread, with and without writing them; return rates and CPU times."""
     storage = Storage.at(folder)
     storage.prepare()
     count = max(1, points // len(part))
@@ -336,7 +351,7 @@ def pack_alone(part: PartColumns, folder: Path, points: int) -> dict[str, float]
 def measure_round(
     cluster: Cluster, sizes: Sizes, part: PartColumns, folder: Path
 ) -> dict[str, Any]:
-    """Return the figures of a run and of plain writing before and after it."""
+    """Measure one run, and plain writing of the same bytes after the run."""
     figures, file_sizes = measure_run(cluster, sizes, folder / "result")
     points = figures["points"]
     after = write_plainly(folder / "after", file_sizes)
@@ -351,7 +366,7 @@ def measure_round(
 
 
 def medians(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the median of each figure of rounds."""
+    """Return the median of each value over the rounds."""
     return {
         name: medians([row[name] for row in rows])
         if isinstance(value, dict)
@@ -361,32 +376,31 @@ def medians(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def report(figures: dict[str, Any], sizes: Sizes, repeat: int) -> None:
-    """Print the medians of all rounds."""
     print(
-        f"{figures['points']:,.0f} points, {sizes.casting} casting and {sizes.collectors} "
-        f"collectors, medians of {repeat}"
+        f"{figures['points']:,.0f} points, casting workers: {sizes.casting}, collectors: "
+        f"{sizes.collectors}, medians of {repeat} rounds"
     )
     print(
         f"survey: {figures['mpoints_s']:.2f} million points/s from start to end, "
-        f"{figures['survey_mpoints_s']:.2f} to the last part; {figures['to_plain']:.2f} of writing "
-        f"the same {figures['file_bytes']:.1f} bytes a point plainly"
+        f"{figures['survey_mpoints_s']:.2f} until the last part; {figures['to_plain']:.2f} x the "
+        f"rate of plain writing of the same {figures['file_bytes']:.1f} bytes per point"
     )
     for name, words in _BESIDE.items():
         print(
             f"  {words}: {figures[f'{name}_mpoints_s']:.1f} million points/s, "
-            f"{figures[f'{name}_ns']:.1f} ns of processor time a point"
+            f"{figures[f'{name}_ns']:.1f} ns of CPU time per point"
         )
-    print(f"processor time a point: {figures['ns']:.0f} ns")
+    print(f"CPU time per point: {figures['ns']:.0f} ns")
     for name, process in figures["processes"].items():
         print(
-            f"  {name:11} {process['ns']:6.1f} ns, bytes of files {process['read']:6.1f} read and "
-            f"{process['written']:6.1f} written, at most {process['peak_mb']:,.0f} MB"
+            f"  {name:11} {process['ns']:6.1f} ns, {process['read']:6.1f} bytes read and "
+            f"{process['written']:6.1f} bytes written, peak memory {process['peak_mb']:,.0f} MB"
         )
-    print(f"  casting workers sent {figures['sent']:.1f} bytes a point")
+    print(f"  casting workers sent {figures['sent']:.1f} bytes per point")
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    """Measure, print and return the medians of all rounds."""
+    """Measure all rounds, then print and return the medians."""
     parser = argument_parser(__doc__, repeat=3, quick=True)
     parser.add_argument("--points", type=lambda text: int(float(text)), default=Sizes.points)
     parser.add_argument("--collectors", type=int, default=Sizes.collectors)
@@ -412,7 +426,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
 
 
 def _of_scans() -> dict[str, Any]:
-    """Return arrays of one scan that casting tasks add to its columns."""
+    """Return the arrays that casting tasks add to the columns of one scan."""
     return {"scan_hits": np.zeros(1, np.uint32), "samples": np.zeros((1, 4, 3), np.float32)}
 
 

@@ -1,12 +1,12 @@
-"""Exported files, as third-party decoders and devkits read them.
+"""Compare exported files with what third-party decoders and devkits read from them.
 
     python -m benchmarks.decoders [--python PYTHON ...] [--only PROGRAM ...]
 
-The packets of static Velodyne and Ouster sensors in a city are written, and a drive with two lidars
-past actors is written in six formats. Each program reads its files in its own process. The results
-are compared with the cloud of the survey and with the exact trajectories of the actors. A program
-runs in the first Python environment that has it: the current one, then those of `--python`, because
-some programs require packages that conflict with lidarpool.
+The benchmark writes the packets of static Velodyne and Ouster sensors in a city. It also writes a
+drive of two lidars past actors in six formats. Each program reads its files in its own process. The
+results are compared with the survey's cloud and the exact trajectories of the actors. Because some
+programs require packages that conflict with lidarpool, each program runs in the first Python
+environment that has it: the current one, then those given by `--python`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ TOY_REVOLUTIONS = 1
 
 
 class PacketProgram(NamedTuple):
-    """A decoder of packets."""
+    """Third-party decoder of packets."""
 
     maker: str
     models: tuple[str, ...]
@@ -54,7 +54,7 @@ class PacketProgram(NamedTuple):
 
 
 class FileProgram(NamedTuple):
-    """A reader of files of the drive."""
+    """Third-party reader of the drive's files."""
 
     files: dict[str, str]  # {name: format}
     compare: Callable[[Drive, Arrays], Iterator[Row]]
@@ -81,14 +81,14 @@ PROGRAMS: dict[str, PacketProgram | FileProgram] = {
 
 
 def packages_of(program: str) -> list[str]:
-    """Return the names of the packages that a program needs, on the package index."""
+    """Return the PyPI names of the packages that a program needs."""
     description = PROGRAMS[program]
     companion = description.companion if isinstance(description, FileProgram) else ""
     return [program, *filter(None, [companion])]
 
 
 def python_of(program: str, pythons: list[str]) -> str | None:
-    """Return the first Python that has the packages of a program, or None."""
+    """Return the first Python interpreter that has a program's packages, or None."""
     look = f"from importlib.metadata import version; [*map(version, {packages_of(program)!r})]"
     for python in pythons:
         ended = subprocess.run([python, "-c", look], capture_output=True, check=False)
@@ -98,9 +98,9 @@ def python_of(program: str, pythons: list[str]) -> str | None:
 
 
 def read_files(program: str, python: str, files: list[Path], folder: Path) -> Arrays:
-    """Have a program read files; return the arrays that it has read, and its `version`.
+    """Let a program read files, and return the arrays it has read, including its `version`.
 
-    RuntimeError if the program fails.
+    Raise RuntimeError if the program fails.
     """
     script = Path(__file__).with_name("decoders_peers.py")
     out = folder / f"{program}.npz"
@@ -116,7 +116,10 @@ def read_files(program: str, python: str, files: list[Path], folder: Path) -> Ar
 def packet_rows(
     program: str, python: str, folder: Path, scene: Scene, revolutions: int
 ) -> tuple[str, list[Row]]:
-    """Compare packets of a maker's models with what a program reads: its version, and rows."""
+    """Compare packets with what a program decodes from them.
+
+    Return the program's version and the table rows.
+    """
     description = PROGRAMS[program]
     assert isinstance(description, PacketProgram)
     drives = {}
@@ -142,7 +145,10 @@ def packet_rows(
 
 
 def drive_rows(program: str, python: str, folder: Path, drive: Drive) -> tuple[str, list[Row]]:
-    """Compare files of the drive with what a program reads: its version, and rows."""
+    """Compare the drive's files with what a program reads from them.
+
+    Return the program's version and the table rows.
+    """
     description = PROGRAMS[program]
     assert isinstance(description, FileProgram)
     for name, file_format in description.files.items():
@@ -153,9 +159,14 @@ def drive_rows(program: str, python: str, folder: Path, drive: Drive) -> tuple[s
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run from the command line; return 1 if a program is missing."""
+    """Print the table, and return 1 if a program is missing."""
     parser = argument_parser(__doc__, quick=True)
-    parser.add_argument("--python", action="append", default=[], help="a Python with programs")
+    parser.add_argument(
+        "--python",
+        action="append",
+        default=[],
+        help="Python interpreter to search for programs (repeatable)",
+    )
     parser.add_argument("--only", nargs="+", choices=PROGRAMS, default=[*PROGRAMS])
     options = parser.parse_args(arguments)
     scene = city(TOY_TRIANGLES if options.quick else TRIANGLES)
@@ -163,7 +174,7 @@ def main(arguments: list[str] | None = None) -> int:
     revolutions = TOY_REVOLUTIONS if options.quick else REVOLUTIONS
     missing = []
     results = {}
-    print_row("program", "file", "compared", "number", "greatest difference")
+    print_row("program", "file", "compared", "count", "maximum difference")
     print("|---|---|---|--:|---|")
     for program in options.only:
         python = python_of(program, [sys.executable, *options.python])
@@ -180,9 +191,10 @@ def main(arguments: list[str] | None = None) -> int:
             words = "; ".join(f"{name} {value}" for name, value in row.differences.items())
             print_row(f"{program} {version}", row.file, row.things, f"{row.count:,}", words)
     for program in missing:
+        packages = " ".join(packages_of(program))
         print(
-            f"{program} was left out: pip install {' '.join(packages_of(program))}, or give "
-            "--python with the Python of an environment that has it",
+            f"{program} was skipped. Install it with `pip install {packages}`, "
+            "or pass --python with the Python interpreter of an environment that has it.",
             file=sys.stderr,
         )
     write_results(options.json, results)

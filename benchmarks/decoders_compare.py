@@ -1,4 +1,4 @@
-"""What programs have read, beside the clouds and trajectories of benchmarks/decoders_surveys.py."""
+"""Comparison of what programs have read with the simulated clouds and trajectories."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Arrays = dict[str, AnyArray]
 
 
 class Row(NamedTuple):
-    """A row of the table: what of a file was compared, how many, and the greatest differences."""
+    """Table row that states what was compared, how many items, and the maximum differences."""
 
     file: str
     things: str
@@ -33,12 +33,12 @@ class Row(NamedTuple):
 
 
 def greatest(differences: AnyArray) -> float:
-    """Return the greatest absolute value; 0 without values."""
+    """Return the maximum absolute value, or 0 if there are no values."""
     return float(np.abs(differences).max(initial=0))
 
 
 def meters(length_m: float) -> str:
-    """Return a length in words."""
+    """Format a length as text, for example '3.2 mm'."""
     for factor, unit in ((1, "m"), (1e3, "mm"), (1e6, "µm")):
         if factor * length_m >= 0.1:
             return f"{factor * length_m:.2g} {unit}"
@@ -46,12 +46,12 @@ def meters(length_m: float) -> str:
 
 
 def apart(first: Any, second: Any) -> str:
-    """Return the greatest distance between points (n, 3) in words."""
+    """Return the maximum distance between corresponding points (n, 3), as text."""
     return meters(greatest(np.linalg.norm(np.asarray(first) - np.asarray(second), axis=1)))
 
 
 def equality(first: Any, second: Any) -> str:
-    """Return whether values (n,) are equal in words."""
+    """Return "equal", or how many values differ, as text."""
     wrong = np.count_nonzero(np.asarray(first) != np.asarray(second))
     return f"{wrong:,} differ" if wrong else "equal"
 
@@ -60,7 +60,7 @@ def equality(first: Any, second: Any) -> str:
 
 
 def compare_velodyne(drive: Drive, model: str, arrays: Arrays) -> Iterator[Row]:
-    """Compare points of packets, of each ring in the order of their times."""
+    """Compare decoded points ring by ring, in order of time."""
     cloud = drive.cloud
     file = f"packets, {model}"
     times_s = arrays["times_s"] - START_NS / 1e9
@@ -79,7 +79,7 @@ def compare_velodyne(drive: Drive, model: str, arrays: Arrays) -> Iterator[Row]:
     half = meters(float(np.median(off_m)))
     lag_us = 1e6 * greatest(times_s[by_ring_and_time] - cloud["time"][sent] / 1e9)
     differences = {
-        "position": f"{meters(greatest(off_m))} (half: {half})",
+        "position": f"{meters(greatest(off_m))} (median {half})",
         "ring, reflectivity": equality(rows[:, 3], cloud["reflectivity"][sent]),
         "time": f"{lag_us:.1f} µs",
     }
@@ -87,7 +87,7 @@ def compare_velodyne(drive: Drive, model: str, arrays: Arrays) -> Iterator[Row]:
 
 
 def compare_ouster(drive: Drive, model: str, arrays: Arrays) -> Iterator[Row]:
-    """Compare points of packets, of each column from the highest beam to the lowest."""
+    """Compare decoded points column by column, from the top beam to the bottom beam."""
     cloud = drive.cloud
     file = f"packets, {model}"
     rows = drive.survey.sensor.channels - 1 - cloud["channel"].astype(np.int64)
@@ -110,7 +110,7 @@ def compare_ouster(drive: Drive, model: str, arrays: Arrays) -> Iterator[Row]:
 
 
 def compare_nuscenes(drive: Drive, arrays_of_files: Arrays) -> Iterator[Row]:
-    """Compare points, labels and boxes of a data set."""
+    """Compare the points, labels and boxes of a data set."""
     arrays = {name.partition("/")[2]: array for name, array in arrays_of_files.items()}
     yield _nuscenes_points(drive, arrays)
     yield _joined_sweeps(drive, arrays)
@@ -121,7 +121,7 @@ def compare_nuscenes(drive: Drive, arrays_of_files: Arrays) -> Iterator[Row]:
 
 
 def _nuscenes_points(drive: Drive, arrays: Arrays) -> Row:
-    """Compare points and classes of all sweeps."""
+    """Compare the points and classes of all sweeps."""
     sweeps = drive.sweeps
     parts: dict[str, list[AnyArray]] = {"read": [], "true": [], "classes": []}
     for number in range(len(sweeps)):
@@ -139,7 +139,7 @@ def _nuscenes_points(drive: Drive, arrays: Arrays) -> Row:
 
 
 def _joined_sweeps(drive: Drive, arrays: Arrays) -> Row:
-    """Compare the sweeps of the first lidar that the devkit joins."""
+    """Compare the first lidar's sweeps, which the devkit has merged into one cloud."""
     poses = drive.sweeps.pose
     off_m = []
     for number in range(int((drive.sweeps.sensor == 0).sum())):
@@ -156,7 +156,7 @@ def _joined_sweeps(drive: Drive, arrays: Arrays) -> Row:
 
 
 def _actors_of(drive: Drive, arrays: Arrays) -> Ints:
-    """Return the actors (n,) of annotations: of the same type, the nearest."""
+    """Return the index of the nearest actor of the same type for each annotation."""
     actors = []
     columns = (arrays[f"boxes/{name}"] for name in ("names", "times_s", "centers"))
     for name, time_s, center in zip(*columns, strict=True):
@@ -168,7 +168,7 @@ def _actors_of(drive: Drive, arrays: Arrays) -> Ints:
 
 
 def _annotations(drive: Drive, arrays: Arrays, actors: Ints) -> Row:
-    """Compare boxes, velocities and numbers of points of annotations."""
+    """Compare the boxes, velocities and point counts of annotations."""
     times_s = arrays["boxes/times_s"]
     velocities = drive.velocities(actors)
     speeds = np.linalg.norm(velocities, axis=1)
@@ -188,7 +188,7 @@ def _annotations(drive: Drive, arrays: Arrays, actors: Ints) -> Row:
 
 
 def _point_counts(drive: Drive, times_s: Floats, actors: Ints) -> Ints:
-    """Count the points (n,) on actors in the key frames of the samples at times (n,)."""
+    """Count the points on the given actors in the key frames at the given times."""
     sweeps = drive.sweeps
     starts_s = sweeps.begins_ns / 1e9
     stops_s = np.append(starts_s[sweeps.sensor == 0][1:], np.inf)  # of samples
@@ -207,7 +207,7 @@ def _point_counts(drive: Drive, times_s: Floats, actors: Ints) -> Ints:
 
 
 def _boxes_of_key_frames(drive: Drive, arrays: Arrays) -> Row:
-    """Compare boxes in the axes of the first lidar."""
+    """Compare boxes in the frame of the first lidar."""
     rows = arrays["boxes/in_sensor"]
     sweep = rows[:, 0].astype(np.int64)
     pose = drive.sweeps.pose
@@ -218,7 +218,7 @@ def _boxes_of_key_frames(drive: Drive, arrays: Arrays) -> Row:
 
 
 def _interpolated_boxes(drive: Drive, arrays: Arrays, actors: Ints) -> Row:
-    """Compare boxes of sweeps between samples, where there is a box before and behind."""
+    """Compare boxes of sweeps between two samples that both contain the box."""
     rows = arrays["boxes/between_samples"]
     actor = rows[:, 1].astype(np.int64)
     times_s = arrays["boxes/times_s"]
@@ -234,7 +234,7 @@ def _interpolated_boxes(drive: Drive, arrays: Arrays, actors: Ints) -> Row:
 
 
 def compare_kitti(drive: Drive, arrays: Arrays) -> Iterator[Row]:
-    """Compare points in the world by poses and calibration, and times."""
+    """Compare times, and points that are transformed to the world by poses and calibration."""
     sweeps = drive.sweeps
     for sensor in range(len(sweeps.sensors)):
         sequence = f"{sensor:02}"
@@ -255,7 +255,7 @@ def compare_kitti(drive: Drive, arrays: Arrays) -> Iterator[Row]:
 
 
 def compare_e57(drive: Drive, arrays: Arrays) -> Iterator[Row]:
-    """Compare points in the world by the poses of scans, and intensities."""
+    """Compare intensities, and points that are transformed to the world by the scans' poses."""
     numbers = [number for number, points in enumerate(drive.points) if len(points)]
     rows = np.concatenate([arrays[f"e57/points/{scan}"] for scan in range(len(numbers))])
     truth = np.concatenate([drive.in_world(number) for number in numbers])
@@ -267,7 +267,7 @@ def compare_e57(drive: Drive, arrays: Arrays) -> Iterator[Row]:
 
 
 def compare_las(drive: Drive, arrays: Arrays) -> Iterator[Row]:
-    """Compare positions, GPS time and columns."""
+    """Compare positions, GPS times and other columns."""
     cloud = drive.cloud
     start_s = (START - _GPS_EPOCH).total_seconds() + _LEAP_S - 1e9
     columns = {"classification": "class", "object": "object", "time": "time", "ring": "channel"}
@@ -287,7 +287,7 @@ def compare_las(drive: Drive, arrays: Arrays) -> Iterator[Row]:
 
 
 def compare_bag(drive: Drive, arrays: Arrays) -> Iterator[Row]:
-    """Compare points at their firings, their times, and the boxes of actors."""
+    """Compare points at their firing times, the times, and the boxes of actors."""
     sweeps = drive.sweeps
     start_ns = round(START.timestamp()) * 10**9
     parts = []

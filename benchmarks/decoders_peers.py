@@ -1,7 +1,7 @@
-"""The peers' side of benchmarks/decoders.py, in their Python: needs NumPy and the program itself.
+"""Readers that use third-party programs, for benchmarks/decoders.py.
 
-It reads files by a program, and writes what this has read as arrays. Names of arrays begin with the
-stem of their file.
+The script runs in the program's own Python environment, which also needs NumPy. It reads files
+with the program and saves what it has read as arrays, whose names begin with the stem of the file.
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ Arrays = Iterator[tuple[str, Any]]  # (name, array)
 
 
 def read_velodyne(path: Path) -> Arrays:
-    """Yield the points of a .pcap of Velodyne: x, y, z, reflectivity, ring; and times, s."""
+    """Yield the points of a Velodyne .pcap file and their times.
+
+    Points are x, y, z, reflectivity and ring. Times are in seconds.
+    """
     import velodyne_decoder
 
     config = velodyne_decoder.Config(min_range=0.0, max_range=300.0, timestamp_first_packet=True)
@@ -33,7 +36,7 @@ def read_velodyne(path: Path) -> Arrays:
 
 
 def read_ouster(path: Path) -> Arrays:
-    """Yield the points of a .pcap of Ouster, a column of the image after the other."""
+    """Yield the points of an Ouster .pcap file, column by column of the range image."""
     from ouster.sdk.core import XYZLut
     from ouster.sdk.pcap import PcapFrameSetSource
 
@@ -56,7 +59,7 @@ def read_ouster(path: Path) -> Arrays:
 
 
 def read_nuscenes(path: Path) -> Arrays:
-    """Yield points, classes, boxes and velocities of a data set, by functions of the devkit."""
+    """Yield the points, classes, boxes and velocities of a data set, read with the devkit."""
     from nuscenes.nuscenes import NuScenes
 
     gray = defaultdict(lambda: (160, 160, 160))
@@ -68,7 +71,7 @@ def read_nuscenes(path: Path) -> Arrays:
 
 
 def _nuscenes_points(tables: Any) -> Arrays:
-    """Yield points and classes of each sweep, and five sweeps of the first lidar as one cloud."""
+    """Yield the points and classes of each sweep, and the first lidar's sweeps merged in fives."""
     from nuscenes.utils.data_classes import LidarPointCloud
     from nuscenes.utils.data_io import load_bin_file
 
@@ -88,7 +91,7 @@ def _nuscenes_points(tables: Any) -> Arrays:
 
 
 def _annotations(tables: Any) -> Arrays:
-    """Yield a row for each annotation: its box, velocity and number of points."""
+    """Yield the box, velocity and point count of each annotation."""
     columns: dict[str, list[Any]] = defaultdict(list)
     for row in tables.sample_annotation:
         box = tables.get_box(row["token"])
@@ -104,10 +107,10 @@ def _annotations(tables: Any) -> Arrays:
 
 
 def _boxes_of_sweeps(tables: Any) -> Arrays:
-    """Yield boxes of key frames in the sensor's axes, and of further sweeps in the world.
+    """Yield boxes of key frames in the sensor frame, and of other sweeps in the world frame.
 
-    Rows have the number of the sweep, or the time of the sweep in seconds, and the box's instance
-    and center.
+    Rows contain the sweep's number (key frames) or its time in seconds (other sweeps), the box's
+    instance, and its center.
     """
 
     def instance(box: Any) -> int:
@@ -129,7 +132,7 @@ def _boxes_of_sweeps(tables: Any) -> Arrays:
 
 
 def _check_lists(tables: Any) -> None:
-    """Run further functions of the devkit that need neither pictures nor nuScenes' own splits."""
+    """Call more devkit functions that need neither images nor the official nuScenes splits."""
     from nuscenes.eval.common.data_classes import EvalBoxes
     from nuscenes.eval.common.loaders import add_center_dist
     from nuscenes.eval.detection.data_classes import DetectionBox
@@ -149,12 +152,12 @@ def _check_lists(tables: Any) -> None:
 
 
 def number_of(file: str) -> int:
-    """Return the number in the name of a sweep's file."""
+    """Return the number in the name of a sweep file."""
     return int(Path(file).name.partition(".")[0])
 
 
 def read_kitti(path: Path) -> Arrays:
-    """Yield the points of a sequence in the frame of the first camera, times and calibration."""
+    """Yield the calibration and times of a sequence, and its points in the first camera's frame."""
     import pykitti
 
     drive = pykitti.odometry(str(path.parent.parent), path.name)
@@ -168,7 +171,7 @@ def read_kitti(path: Path) -> Arrays:
 
 
 def read_e57(path: Path) -> Arrays:
-    """Yield the points of each scan in the world, and intensities."""
+    """Yield the intensities and world coordinates of each scan's points."""
     import pye57
 
     with pye57.E57(str(path)) as file:
@@ -179,7 +182,7 @@ def read_e57(path: Path) -> Arrays:
 
 
 def read_las(path: Path) -> Arrays:
-    """Yield positions and columns of a .las or .laz."""
+    """Yield the positions and columns of a .las or .laz file."""
     import laspy
 
     cloud = laspy.read(path)
@@ -189,7 +192,7 @@ def read_las(path: Path) -> Arrays:
 
 
 def read_bag(path: Path) -> Arrays:
-    """Yield the points of each PointCloud2, and the boxes of each MarkerArray."""
+    """Yield the points of each PointCloud2 and the boxes of each MarkerArray."""
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
@@ -208,7 +211,7 @@ def read_bag(path: Path) -> Arrays:
 
 
 def _bag_points(topic: str, message: Any) -> Arrays:
-    """Yield the points of a PointCloud2 as float64 (n, fields), and the names of the fields."""
+    """Yield a PointCloud2's points as a float64 array (n, fields), and its field names."""
     kinds = {2: "u1", 4: "u2", 5: "<i4", 6: "<u4", 7: "<f4", 8: "<f8"}
     names = [field.name for field in message.fields]
     row = np.dtype(
@@ -226,7 +229,7 @@ def _bag_points(topic: str, message: Any) -> Arrays:
 
 
 def _bag_box(marker: Any) -> tuple[int, tuple[float, ...]]:
-    """Return the stamp of a marker, ns, and its number, center and size."""
+    """Return a marker's timestamp in nanoseconds, its number, its center and its size."""
     center = marker.pose.position
     size = marker.scale
     row = (marker.id, center.x, center.y, center.z, size.x, size.y, size.z)
@@ -234,7 +237,7 @@ def _bag_box(marker: Any) -> tuple[int, tuple[float, ...]]:
 
 
 def _stamp_ns(message: Any) -> int:
-    """Return the stamp of a message's header, nanoseconds since 1970."""
+    """Return the timestamp in a message header, in nanoseconds since 1970."""
     stamp = message.header.stamp
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 

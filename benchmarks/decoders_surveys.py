@@ -1,4 +1,4 @@
-"""The surveys of benchmarks/decoders.py: sensors whose packets are written, and a drive."""
+"""Surveys for benchmarks/decoders.py: sensors whose packets are written, and a drive."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _PEDESTRIAN = Path(__file__).resolve().parents[1] / "examples/pedestrian.glb"
 
 
 class Mover(NamedTuple):
-    """An actor that moves evenly."""
+    """Actor that moves at constant velocity."""
 
     mesh: SceneMesh
     start: tuple[float, float, float]  # position at time 0, meters
@@ -40,18 +40,21 @@ class Mover(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """Name without its number."""
+        """Name of the actor without its number, such as 'Walker'."""
         return self.mesh.name.rpartition(" ")[0]
 
     @property
     def actor(self) -> Actor:
-        """The actor on its trajectory, whose axes are level and look ahead."""
+        """The actor on its trajectory.
+
+        Its axes are level, and its x axis points ahead.
+        """
         times_s = np.array(self.present_s)
         positions = np.array(self.start) + np.outer(times_s, self.velocity)
         return Actor(self.mesh, Track(times_s, positions, start_s=0.0, beyond="absent"))
 
     def center(self, time_s: float) -> Floats:
-        """Return the middle (3,) of the box at a time, by closed form, meters."""
+        """Return the exact center (3,) of the box at the given time, in meters."""
         x, y, z = self.actor.bounds.mean(axis=0)
         heading = np.arctan2(self.velocity[1], self.velocity[0])
         cos, sin = np.cos(heading), np.sin(heading)
@@ -61,7 +64,7 @@ class Mover(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A survey with its scene, its actors and its cloud."""
+    """Survey with its scene, its actors and its cloud."""
 
     survey: Survey
     scene: Scene
@@ -74,7 +77,7 @@ class Drive:
 
     @cached_property
     def cloud(self) -> Cloud:
-        """Points of the survey, cast in this process."""
+        """Cloud of the survey, which is cast in this process."""
         return cloud_of(self.survey, self.scene)
 
     @cached_property
@@ -84,31 +87,31 @@ class Drive:
 
     @cached_property
     def as_fired(self) -> Floats:
-        """Points (n, 3) in the sensor's axes at their firings, meters."""
+        """Points (n, 3) in the sensor frame at their firing times, in meters."""
         sweeps = enumerate(self.points)
         return np.concatenate([self.sweeps.as_fired(number, points) for number, points in sweeps])
 
     def in_world(self, sweep: int) -> Floats:
-        """Return the points (n, 3) of a sweep in the world, meters."""
+        """Return the points (n, 3) of a sweep in world coordinates, in meters."""
         return self.points[sweep].positions.astype(np.float64)
 
     def centers(self, times_s: Floats, actors: Ints) -> Floats:
-        """Return the middles (n, 3) of boxes of actors (n,) at times (n,), meters."""
+        """Return the box centers (n, 3) of the given actors at the given times, in meters."""
         rows = zip(times_s.tolist(), actors.tolist(), strict=True)
         return np.array([self.movers[int(actor)].center(time_s) for time_s, actor in rows])
 
     def sizes(self, actors: Ints) -> Floats:
-        """Return the sizes (n, 3) of boxes of actors (n,), meters."""
+        """Return the box sizes (n, 3) of the given actors, in meters."""
         bounds = np.array([mover.actor.bounds for mover in self.movers])
         return np.ptp(bounds, axis=1)[actors]
 
     def velocities(self, actors: Ints) -> Floats:
-        """Return the velocities (n, 3) of actors (n,), m/s."""
+        """Return the velocities (n, 3) of the given actors in m/s."""
         return np.array([mover.velocity for mover in self.movers])[actors]
 
 
 def packets_of(model: str, scene: Scene, revolutions: int) -> Drive:
-    """Return a static sensor of a model whose packets are written."""
+    """Return a survey of a static sensor whose packets are written."""
     survey = Survey(
         load_sensor(model),
         [(-20.0, -3.0, 2.0)],
@@ -121,7 +124,10 @@ def packets_of(model: str, scene: Scene, revolutions: int) -> Drive:
 
 
 def drive_of(scene: Scene, sweeps: int) -> Drive:
-    """Return a car with two lidars that turns to the left, the second lidar twice as fast."""
+    """Return the drive of a car with two lidars that turns left.
+
+    The second lidar rotates twice as fast.
+    """
     walker = join_meshes("Walker 1", load_objects(_PEDESTRIAN, animation="Walk").static)
     assert walker.animation is not None
     walker = replace(walker, animation=replace(walker.animation, speed_m_s=1.4))

@@ -1,9 +1,9 @@
-"""Casting time of each effect in docs/effects.md, compared with the same survey without it.
+"""Measure the casting time of each effect relative to the same survey without the effect.
 
     python -m benchmarks.effects [--only rain fog]
 
-Casting and columns of a survey in a street are measured with the effect and without it, in turns.
-The values are median ratios of CPU times. The surveys come from `docs/pictures/effects/`.
+Casting a survey in a street and making its columns are measured with and without each effect, in
+turn. The values are median ratios of CPU times. The surveys come from `docs/pictures/effects/`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .harness import argument_parser, median_ratio, run_rounds, time_call, write
 
 
 def cast_survey(rig: Rig, _: int) -> float:
-    """Return the CPU time of casting all scans and making their columns, in seconds."""
+    """Measure the CPU time for casting all scans and making their columns, in seconds."""
     seconds, _part = time_call(lambda: columns_of(list(rig.cast(0, rig.survey.scan_count))))
     return seconds
 
@@ -45,10 +45,9 @@ def costs(effects: Mapping[str, Any], repeat: int, triangles: int) -> dict[str, 
 
 
 def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
-    """Print the relative time of each effect."""
     parser = argument_parser(__doc__, repeat=5)
-    parser.add_argument("--only", nargs="*", default=[], help="names of effects")
-    parser.add_argument("--triangles", type=int, default=20_000, help="of the street")
+    parser.add_argument("--only", nargs="*", default=[], help="measure only these effects")
+    parser.add_argument("--triangles", type=int, default=20_000, help="triangles of the street")
     options = parser.parse_args(arguments)
     ratios = costs(load_effects(options.only), options.repeat, options.triangles)
     for name, ratio in ratios.items():

@@ -1,4 +1,4 @@
-"""How often the confidence intervals of `lidarpool fit` contain the true values.
+"""Measure how often the confidence intervals of `lidarpool fit` contain the true values.
 
     python -m benchmarks.fit_coverage [--trials 200]
     python -m benchmarks.fit_coverage --places [--trials 40] [--cache FOLDER]
@@ -32,7 +32,7 @@ PLACES = ("room", "street", "hall", "forest")
 
 
 def street() -> Scene:
-    """Make the ground, two side walls and an end wall below an open sky."""
+    """Make a scene with the ground, two side walls and an end wall."""
     corners = {
         "ground": [(-80, -60, -1.7), (80, -60, -1.7), (80, 60, -1.7), (-80, 60, -1.7)],
         "left": [(-80, 4, -1.7), (80, 4, -1.7), (80, 4, 6), (-80, 4, 6)],
@@ -47,7 +47,7 @@ def street() -> Scene:
 
 
 def box(name: str, lower_m: Any, upper_m: Any) -> SceneMesh:
-    """Create a box between two corners, in meters."""
+    """Create a box between two corners, given in meters."""
     x, y, z = np.transpose([lower_m, upper_m]).astype(float)
     corners = np.array([(a, b, c) for a in x for b in y for c in z])
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -56,7 +56,7 @@ def box(name: str, lower_m: Any, upper_m: Any) -> SceneMesh:
 
 
 def place(name: str, seed: int) -> tuple[Scene, tuple[float, float, float]]:
-    """Make a scene of `PLACES`; return the scene, and the position of a sensor, meters."""
+    """Make a scene of `PLACES`, and return it with the sensor position in meters."""
     rng = np.random.default_rng(seed)
     if name == "street":
         return city(30_000, seed=seed), (0.0, 0.0, 1.8)
@@ -70,7 +70,7 @@ def place(name: str, seed: int) -> tuple[Scene, tuple[float, float, float]]:
 
 
 def forest(rng: np.random.Generator) -> Scene:
-    """Make trees on flat ground; 2.5 m around the origin are free."""
+    """Make trees on flat ground, except within 2.5 m of the origin."""
     ground = box("ground", (-80, -80, -1), (80, 80, 0))
     count = 120
     positions = np.column_stack([rng.uniform(-40, 40, (count, 2)), np.zeros(count)])
@@ -89,7 +89,7 @@ def furnished_box(
     count: int,
     max_size: tuple[float, float, float],
 ) -> Scene:
-    """Make a closed room of a size with `count` boxes of up to `max_size` in it, meters."""
+    """Make a closed room that contains `count` boxes of up to `max_size`, in meters."""
     x, y, z = size
     meshes = [box("shell", (-x / 2, -y / 2, 0), (x / 2, y / 2, z))]
     for number in range(count):
@@ -109,7 +109,7 @@ def recorded(
     columns: int = COLUMNS,
     cache: Path | None = None,
 ) -> Recording:
-    """Record sweeps of a standing sensor, with an error of each channel in meters."""
+    """Record sweeps of a stationary sensor with a range error for each channel, in meters."""
     if cache is None or not cache.exists():
         sensor = Sensor.grid(columns, LAYERS, vertical_fov_deg=40, max_range_m=FARTHEST_M)
         scanner = Scanner(
@@ -150,11 +150,11 @@ def recorded(
 def trial(
     number: int, cache: Path | None = None, place_name: str = ""
 ) -> tuple[dict[str, float], Any]:
-    """Fit a recording; return the true figures and the fitted figures: {name: …}.
+    """Fit a recording and return the true and the fitted parameters, keyed by name.
 
-    Every second sensor has noise by range and errors of its channels, the others noise by energy,
-    a threshold and false alarms. With `place_name`, an entry of `PLACES`, the second result is the
-    error message of a refused fit.
+    Half of the sensors have range-dependent noise and channel errors. The others have
+    energy-dependent noise, a threshold and false alarms. With `place_name`, an entry of `PLACES`,
+    the second result is an error message if the fit fails.
     """
     rng = np.random.default_rng(number)
     truth = {
@@ -226,7 +226,7 @@ def main(arguments: list[str] | None = None) -> None:
                 half = (estimate["high"] - estimate["low"]) / 2 / abs(true)
                 rows[key].append((held, estimate["value"] / true - 1, half))
     results = {}
-    print_row("place", "figure", "trials", "not determined", "held", "error", "half-width")
+    print_row("place", "parameter", "trials", "not determined", "covered", "error", "half-width")
     print("|---|---|--:|--:|--:|--:|--:|")
     for place_name, name in sorted({*rows, *missing}):
         trials_held = rows[place_name, name]

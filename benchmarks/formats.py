@@ -1,4 +1,4 @@
-"""Points per second of each export, compared with a minimal script that uses the same library.
+"""Compare the rate of each export with a minimal script that uses the same library.
 
     python -m benchmarks.formats [--points 1e7]
 
@@ -43,7 +43,7 @@ REVOLUTIONS = 100
 
 
 def write_inputs(folder, points):
-    """Write a cloud of `points` points, and the 100 sweeps of a moving sensor."""
+    """Write a cloud of `points` points and 100 sweeps of a moving sensor."""
     track = Track([0, 100], [[0, 0, 1], [300, 50, 1]])
     survey = Survey(Sensor.grid(360, 4), trajectory=track, steps=36 * REVOLUTIONS, columns=COLUMNS)
     Sweeps.from_survey(survey, Scene.seed()).save(folder / "sweeps.npz")
@@ -59,7 +59,7 @@ def write_inputs(folder, points):
 
 
 def export(name, folder, path):
-    """Export a cloud as `lidarpool export` does."""
+    """Export a cloud in the same way as `lidarpool export`."""
     cloud = CloudFile(folder / "cloud.ply")
     sweeps = Sweeps.load(folder / "sweeps.npz")
     ExportSpec(name).write(path, cloud, sweeps)
@@ -130,13 +130,13 @@ SCRIPTS = {
 
 
 def write_by_library(name, folder, path):
-    """Write the same points with the format's library alone."""
+    """Write the same points using only the library of the format."""
     start, count, row = layout(folder / "cloud.ply")
     SCRIPTS[name](np.fromfile(folder / "cloud.ply", row, count, offset=start), path)
 
 
 def measure_call(write, *arguments):
-    """Return the processor time of a call, seconds, and the peak memory of this process, MB."""
+    """Return the CPU time of a call in seconds, and this process's peak memory in MB."""
     samples_kb = [0]
     finished = threading.Event()
 
@@ -152,9 +152,8 @@ def measure_call(write, *arguments):
 
 
 def main(arguments=None):
-    """Print the table."""
     parser = argument_parser(__doc__)
-    parser.add_argument("--points", type=float, default=1e7, help="points of the cloud")
+    parser.add_argument("--points", type=float, default=1e7, help="number of points")
     options = parser.parse_args(arguments)
     points = int(options.points)
     results = {}

@@ -1,4 +1,4 @@
-"""All operations on a CUDA device.
+"""Measure all operations on a CUDA device.
 
     python -m benchmarks.gpu [--quick] [--only SECTION ...] --json gpu.json
 
@@ -67,7 +67,7 @@ _MOVING = ("still", "a pose for each firing", "with motion")
 
 
 def _casts(kind: str) -> list[str]:
-    """Return the paths of the rates of casts, by city, of a kind of rays."""
+    """Return the result paths of casting rates in all cities, for one kind of rays."""
     paths = [f"kernels/{city}, {kind}/grays_s/cast" for city in _CITIES]
     return [*paths, f"large/city 1e7, {kind}/grays_s/cast"]
 
@@ -121,7 +121,7 @@ ROWS = (
 
 
 def figure_at(results: dict[str, Any], path: str) -> float | None:
-    """Return a figure of the results by its path, or None if it was not measured."""
+    """Return the value at a path in the results, or None if it was not measured."""
     if path == "different":
         checked = [results.get(name, {}) for name in ("bits", "columns")]
         rows = [row for section in checked for row in section.values() if isinstance(row, dict)]
@@ -147,7 +147,7 @@ def figure_at(results: dict[str, Any], path: str) -> float | None:
 
 
 def table(results: dict[str, Any]) -> list[str]:
-    """Return the lines of the table in docs/performance.md."""
+    """Return the Markdown table for docs/performance.md, line by line."""
     lines = ["| measurement | result |", "|---|---|"]
     for name, digits, paths in ROWS:
         values = [figure_at(results, path) for path in paths]
@@ -158,7 +158,7 @@ def table(results: dict[str, Any]) -> list[str]:
 
 
 def headline(results: dict[str, Any]) -> str:
-    """Return a line with the device, its clock under load, versions and date."""
+    """Format the device, its clock rates under load, the versions and the date as one line."""
     device = results.get("device", {}).get("device", {})
     clock = results.get("kernels", {}).get("clocks", {}).get("after", {})
     words = [device.get("name"), *(f"{name} {value}" for name, value in clock.items())]
@@ -167,7 +167,7 @@ def headline(results: dict[str, Any]) -> str:
 
 
 def problems(results: dict[str, Any]) -> list[str]:
-    """List failed sections and wrong results of the device."""
+    """List the sections that failed on the device or gave wrong results."""
     failures = [f"{name}: {row['error']}" for name, row in results.items() if "error" in row]
     failures += [
         f"{name}: {title} failed"
@@ -185,13 +185,13 @@ def problems(results: dict[str, Any]) -> list[str]:
 
 
 def left_out(results: dict[str, Any]) -> list[str]:
-    """List sections and rows that were not measured, with their reasons."""
+    """List the skipped sections and rows, with the reasons."""
     notes = []
     for name, rows in results.items():
         if "left out" in rows:
-            notes.append(f"left out: {name}, because {rows['left out']}")
+            notes.append(f"skipped: {name}, because {rows['left out']}")
         notes += [
-            f"left out: {name}, {title}, because {row['left out']}"
+            f"skipped: {name}, {title}, because {row['left out']}"
             for title, row in rows.items()
             if isinstance(row, dict) and "left out" in row
         ]
@@ -211,7 +211,10 @@ def page(results: dict[str, Any]) -> str:
 
 
 def measured(name: str, sizes: Sizes, folder: str) -> Iterator[dict[str, Any]]:
-    """Measure a section in this process, and yield all rows so far after each new row."""
+    """Run a section in this process.
+
+    Yield all rows measured so far after each new row.
+    """
     module, seconds = SECTIONS[name]
     rows: dict[str, Any] = {}
     clocks_before = clocks()
@@ -224,7 +227,7 @@ def measured(name: str, sizes: Sizes, folder: str) -> Iterator[dict[str, Any]]:
             print(f"{name}: {title}: {shown(row)}", flush=True)
             yield rows
             if time.monotonic() > end:
-                rows["left out"] = "its time was over: there may be more rows"
+                rows["left out"] = "the time limit was reached, so rows may be missing"
                 break
     except ModuleNotFoundError as error:
         rows["left out"] = f"{error.name} is not installed"
@@ -236,7 +239,7 @@ def measured(name: str, sizes: Sizes, folder: str) -> Iterator[dict[str, Any]]:
 
 
 def shown(row: Any) -> str:
-    """Format a row in a line, without times where rates are present."""
+    """Format a row as one line, omitting times if rates are present."""
     if not isinstance(row, dict):
         return f"{row:.4g}" if isinstance(row, float) else str(row)
     words = [
@@ -248,7 +251,10 @@ def shown(row: Any) -> str:
 
 
 def apart(name: str, options: list[str], seconds: float) -> dict[str, Any]:
-    """Measure a section in a new process, which is killed after `seconds`; return its rows."""
+    """Run a section in a new process and return its rows.
+
+    The process is killed after `seconds`.
+    """
     start = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "rows.json")
@@ -272,7 +278,10 @@ def apart(name: str, options: list[str], seconds: float) -> dict[str, Any]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run from the command line; return 1 for failures or wrong results, 2 without a device."""
+    """Run the benchmark.
+
+    Return 1 for failures or wrong results, and 2 if there is no device.
+    """
     parser = argument_parser(__doc__, quick=True)
     parser.add_argument(
         "--first-device",
@@ -299,7 +308,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run_sections(names: list[str], chosen: argparse.Namespace) -> dict[str, Any]:
-    """Run sections one after another; write the results after each, and return them."""
+    """Run sections one after another, and write all results after each of them."""
     options = ["--folder", chosen.folder, *(["--quick"] if chosen.quick else [])]
     seconds = chosen.seconds or (FIRST_S if chosen.first_device else MEASURED_S)
     end = time.monotonic() + seconds

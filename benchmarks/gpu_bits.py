@@ -1,4 +1,4 @@
-"""Sections of the device's benchmark that need raybeam alone: the bits that kernels return."""
+"""Sections of the GPU benchmark that check the exact results of kernels, using only raybeam."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ Placed = tuple[str, list[Instance], Float]  # name, instances of a scene, origin
 
 
 def placed(name: str, mesh: Faces, origin: Any = (0, 0, 0)) -> Placed:
-    """Return a scene of a mesh, and the origin of its rays."""
+    """Return the scene of a mesh, with the origin of its rays."""
     return name, [Instance(Mesh(*mesh))], np.asarray(origin, np.float64)
 
 
 def scenes(sizes: Sizes) -> Iterator[Placed]:
-    """Yield 20 scenes: small, large, nested, masked, far from the origin, and degenerate."""
+    """Yield 20 scenes, which include nested, masked, remote and degenerate meshes."""
     vertices, faces = six_objects()
     center = np.array([0, 0, 2.0])
     yield placed("six objects", (vertices, faces), center)
@@ -55,7 +55,7 @@ def scenes(sizes: Sizes) -> Iterator[Placed]:
 
 
 def scattered_instances(shear: float) -> Iterator[Instance]:
-    """Yield a ball forty times, turned, unevenly scaled and sheared."""
+    """Yield 40 instances of a ball that are rotated, sheared and scaled unevenly."""
     rng = np.random.default_rng(4)
     mesh = Mesh(*ball(2.0, 20, 30))
     for _ in range(40):
@@ -65,7 +65,7 @@ def scattered_instances(shear: float) -> Iterator[Instance]:
 
 
 def bits(session: Session) -> Rows:
-    """Count values of sample rays that differ from those of numpy or tiles; 0 expected."""
+    """Count values of sample rays that differ from those of NumPy or tiles (0 is expected)."""
     step = max(1, session.sizes.rays // session.sizes.sample)
     sample = revolution(session.sizes.rays)[::step]
     other = "numpy" if available_backends()["tiles"] else "tiles"
@@ -101,7 +101,7 @@ def _count_differences(casters: list[RayCaster], sample: Float, origin: Float) -
 
 
 def _moving_scan(pattern: Pattern, origin: Float, rotation: Float) -> Scan:
-    """Make a scan with a pose for each ray, 1 mm apart, and motion within poses."""
+    """Make a scan with a separate pose for each ray, 1 mm apart, and with motion within poses."""
     positions = origin + 1e-3 * np.arange(len(pattern))[:, None]
     rotations = np.broadcast_to(rotation, (len(positions), 3, 3))
     rates = np.full_like(positions, 0.3)
@@ -110,7 +110,10 @@ def _moving_scan(pattern: Pattern, origin: Float, rotation: Float) -> Scan:
 
 
 def _count_different_hits(device_scan: Any, host_scan: Any) -> int:
-    """Count hits that differ in distance or triangle; 1 if the rays that hit differ."""
+    """Count hits that differ in distance or triangle.
+
+    Return 1 if the rays that hit are not the same.
+    """
     if not np.array_equal(device_scan.ray, host_scan.ray):
         return 1
     differs = device_scan.distance != host_scan.distance
@@ -119,7 +122,7 @@ def _count_different_hits(device_scan: Any, host_scan: Any) -> int:
 
 
 def _count_different_rays(caster: RayCaster, scan: Scan, expected: tuple[Float, Float]) -> int:
-    """Count coordinates of the device's rays of hits that differ from expected rays."""
+    """Count ray coordinates computed on the device that differ from the expected ones."""
     parts: list[tuple[Float, Float]] = []
     caster.scan_on_device(scan, lambda hits: parts.append(tuple(a.get() for a in hits.rays())))
     return int(
@@ -131,7 +134,7 @@ def _count_different_rays(caster: RayCaster, scan: Scan, expected: tuple[Float, 
 
 
 def leaks(session: Session) -> Rows:
-    """Count rays from inside a closed mesh that escape at its edges and corners."""
+    """Count rays that start inside a closed mesh and escape at its edges or corners."""
     vertices, faces = six_objects()
     faces = faces[: len(faces) // 6]
     vertices = vertices[: faces.max() + 1] + 5e5

@@ -1,4 +1,4 @@
-"""Times and rates on a CUDA device, and what it and its surroundings are."""
+"""Time measurements on a CUDA device, and a description of the device and its host."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ _CLOCKS = ("clocks.sm", "clocks.mem", "temperature.gpu", "power.draw", "pcie.lin
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of all sections; the defaults are for a device, `QUICK` is for tests."""
+    """Sizes for all sections.
+
+    The defaults are for a device, and `QUICK` is for tests.
+    """
 
     cities: tuple[int, ...] = (100_000, 1_000_000)  # triangles
     smallest: int = 10_000
@@ -54,7 +57,7 @@ QUICK = Sizes(
 
 @dataclass(frozen=True)
 class Session:
-    """CuPy, sizes and output folder of all sections."""
+    """CuPy, the sizes and the output folder, as used by all sections."""
 
     cupy: Any
     sizes: Sizes
@@ -62,9 +65,9 @@ class Session:
 
 
 def milliseconds(session: Session, launch: Callable[[], object]) -> dict[str, float]:
-    """Return median, least and greatest time of a launch on the device, by events.
+    """Time a launch with CUDA events, and return the median, minimum and maximum.
 
-    A time is the mean of a batch of launches that takes at least 50 ms, or `seconds` of the sizes.
+    Each time is the mean over a batch of launches that takes at least 50 ms or `sizes.seconds`.
     """
     events = session.cupy.cuda.Event
 
@@ -85,7 +88,7 @@ def milliseconds(session: Session, launch: Callable[[], object]) -> dict[str, fl
 
 
 def wall_milliseconds(session: Session, call: Callable[[], object]) -> dict[str, float]:
-    """Return median, least and greatest wall time of a call, including the device's work."""
+    """Return the median, minimum and maximum wall time of a call and its work on the device."""
     device = session.cupy.cuda.Device()
     call()
 
@@ -100,7 +103,7 @@ def wall_milliseconds(session: Session, call: Callable[[], object]) -> dict[str,
 
 
 def _repeated(session: Session, once: Callable[[], float]) -> dict[str, float]:
-    """Return median, least and greatest of times that `once` returns, milliseconds."""
+    """Return the median, minimum and maximum of the times that `once` returns, in milliseconds."""
     end = time.monotonic() + session.sizes.seconds
     times = [once()]
     while len(times) < _LEAST or (len(times) < _MOST and time.monotonic() < end):
@@ -109,7 +112,7 @@ def _repeated(session: Session, once: Callable[[], float]) -> dict[str, float]:
 
 
 class Split:
-    """Sums of device times by name of the work, measured by events."""
+    """Total device time by name of the work, measured with CUDA events."""
 
     def __init__(self, cupy: Any) -> None:
         self._cupy = cupy
@@ -117,14 +120,14 @@ class Split:
 
     @contextmanager
     def timed(self, name: str, stream: Any = None) -> Iterator[None]:
-        """Add the device time of the body's work in a stream, by default the current stream."""
+        """Add the device time of the body's work, by default in the current stream."""
         stream = stream or self._cupy.cuda.get_current_stream()
         start = stream.record()
         yield
         self._pairs.append((name, start, stream.record()))
 
     def milliseconds(self) -> dict[str, float]:
-        """Synchronize the device, and return the sums by name, milliseconds."""
+        """Synchronize the device, and return the total time by name, in milliseconds."""
         self._cupy.cuda.Device().synchronize()
         sums: Counter[str] = Counter()
         for name, start, stop in self._pairs:
@@ -138,7 +141,7 @@ def pinned(cupy: Any, count: int) -> Any:
 
 
 def to_pinned(session: Session) -> float:
-    """Return the bus rate, GB/s: a plain copy from the device to page-locked memory."""
+    """Measure the bus rate in GB/s, by copying from the device to page-locked memory."""
     cupy = session.cupy
     count = session.sizes.copied
     array = cupy.zeros(count, np.uint8)
@@ -149,7 +152,7 @@ def to_pinned(session: Session) -> float:
 
 
 def device(session: Session) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the properties of the device, and its copy rates."""
+    """Yield the properties and the copy rates of the device."""
     cupy = session.cupy
     count = session.sizes.copied
     runtime = cupy.cuda.runtime
@@ -195,7 +198,10 @@ def device(session: Session) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def clocks() -> dict[str, str]:
-    """Return clocks, temperature and power as nvidia-smi reports them; {} without nvidia-smi."""
+    """Return the clocks, temperature and power that nvidia-smi reports.
+
+    The result is empty without nvidia-smi.
+    """
     program = shutil.which("nvidia-smi")
     if program is None:
         return {}

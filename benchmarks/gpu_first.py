@@ -1,4 +1,4 @@
-"""Sections for a device on which nothing has run yet: compilation, tests, and NVIDIA's tools."""
+"""Sections for a new device, which run compilation, tests and NVIDIA's tools."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ PROFILED = ("cast_table", "pack")
 
 
 def compiling(session: Session) -> Rows:
-    """Yield seconds, registers and local bytes of each kernel, by kind of scene."""
+    """Yield the compile time, registers and local bytes of each kernel for each kind of scene."""
     names = re.findall(r"^KERNEL (\w+)\(", kernel_source(), re.M)
     for words, nested, masked in (
         ("meshes", False, False),
@@ -75,7 +75,10 @@ def compiling(session: Session) -> Rows:
 
 
 def tests(session: Session) -> Rows:
-    """Run the tests that need a device, each file by a process of its own; yield their outcomes."""
+    """Run the tests that need a device, and yield their outcomes.
+
+    Each test file runs in its own process.
+    """
     if find_spec("pytest") is None:
         raise ModuleNotFoundError("pytest is not installed", name="pytest")
     files = _files_of_tests(session.sizes.tests)
@@ -92,7 +95,7 @@ def _pytest(*arguments: str) -> list[str]:
 
 
 def _files_of_tests(paths: tuple[str, ...]) -> list[str]:
-    """Return the files with tests for a device, as pytest collects them."""
+    """Return the test files from which pytest collects tests for a device."""
     listing, _ = _output_of(_pytest("--collect-only", "-q", *paths), _FILE_S)
     files = re.findall(r"^(tests/\S+?)::", listing, re.M)
     if not files:
@@ -101,7 +104,10 @@ def _files_of_tests(paths: tuple[str, ...]) -> list[str]:
 
 
 def _outcomes(path: str) -> dict[str, Any]:
-    """Run the tests of a file; return the number of each outcome, and the end of a failure."""
+    """Run the tests of a file.
+
+    Return the number of tests by outcome, and the end of the output if tests failed.
+    """
     text, code = _output_of(
         _pytest("-v", "--maxfail=9", "-o", "faulthandler_timeout=30", "--no-header", path), _FILE_S
     )
@@ -115,7 +121,10 @@ def _outcomes(path: str) -> dict[str, Any]:
 
 
 def _output_of(command: list[str], seconds: float) -> tuple[str, int]:
-    """Run a command in the checkout; return its output and exit code, 124 if it took too long."""
+    """Run a command in the checkout and return its output and exit code.
+
+    The exit code is 124 if the time limit was reached.
+    """
     with tempfile.TemporaryFile("w+") as output:  # what is written before a time-out is kept
         try:
             code = subprocess.run(
@@ -129,7 +138,7 @@ def _output_of(command: list[str], seconds: float) -> tuple[str, int]:
 
 
 def _program(name: str) -> str:
-    """Return the path of a program of CUDA; ModuleNotFoundError if it is not installed."""
+    """Return the path of a CUDA tool, or raise ModuleNotFoundError if it is not installed."""
     homes = [os.environ.get(variable) for variable in ("CUDA_PATH", "CUDA_HOME")]
     folders = [f"{home}/bin" for home in (*homes, "/usr/local/cuda") if home]
     folders.insert(0, os.environ.get("PATH", ""))
@@ -163,14 +172,14 @@ def sanitizer(_session: Session) -> Rows:
 
 
 def _hazards(text: str, count: int) -> dict[str, int]:
-    """Divide the `count` hazards that racecheck reports: in kernels of CuPy, and all others."""
+    """Divide the hazards reported by racecheck into those in CuPy's kernels and all others."""
     reports = re.findall(r"Race reported between .*?access at (\w+)\+0x", text)
     in_cupy = sum(name.startswith("cupy_") for name in reports)
     return {"errors": count - in_cupy, "hazards in kernels of CuPy": in_cupy}
 
 
 def counters(session: Session) -> Rows:
-    """Yield what ncu measures of two kernels, for one launch of each."""
+    """Yield what ncu measures for one launch of each of two kernels."""
     program = _program("ncu")
     triangles = session.sizes.cities[0]
     cast = (
@@ -193,7 +202,10 @@ def counters(session: Session) -> Rows:
 
 
 def _profiles(report: str) -> dict[str, dict[str, float]]:
-    """Return figures by kernel and by name with unit, from the table that ncu prints."""
+    """Parse the table printed by ncu.
+
+    Values are keyed by kernel, then by name and unit.
+    """
     table = [line for line in report.splitlines() if line.startswith('"')]
     profiles: dict[str, dict[str, float]] = {}
     for line in csv.DictReader(table):
@@ -208,7 +220,7 @@ def _profiles(report: str) -> dict[str, dict[str, float]]:
 
 
 def cast_once(triangles: int, rays: int) -> None:
-    """Cast four revolutions in a city, for a profiler."""
+    """Cast four revolutions in a city, for use with a profiler."""
     caster = RayCaster(*city(triangles), backend="cuda")
     directions = revolution(rays)
     window = (0, 4 * len(directions))

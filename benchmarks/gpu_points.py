@@ -1,4 +1,4 @@
-"""Sections of the device's benchmark that need lidarpool: points, from rays to files."""
+"""Sections of the GPU benchmark that measure points with lidarpool, from rays to files."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _ROOM = 4e9  # bytes
 
 
 def survey(sizes: Sizes, seconds: float = 10.0) -> Survey:
-    """Return a survey in which an OS1-128 drives along the street at 10 m/s."""
+    """Return a survey of an OS1-128 that moves along the street at 10 m/s."""
     positions = np.array([[-5.0, -1.8, 2.0], [5.0, -1.8, 2.0]]) * (seconds, 1, 1)
     sensor = Sensor.grid(sizes.rays // 128, 128, step_deg=360)
     drive = Track([0, seconds], positions)
@@ -48,7 +48,7 @@ def survey(sizes: Sizes, seconds: float = 10.0) -> Survey:
 
 
 def traffic(scene: Scene) -> Scene:
-    """Return the scene with ten cars on the street."""
+    """Add ten cars on the street to the scene."""
     trajectories = [Track([0, 10], [[k * 8 - 40, 3.6, 0], [k * 8 + 40, 3.6, 0]]) for k in range(10)]
     cars = (
         Actor(box(f"car {k}", (4.5, 1.8, 1.5)), trajectory)
@@ -58,7 +58,7 @@ def traffic(scene: Scene) -> Scene:
 
 
 def batches(rig: Rig, rays: int) -> Iterator[Callable[[], PartColumns]]:
-    """Yield functions that cast a batch and make its columns, endlessly."""
+    """Yield functions without end, each of which casts a batch and makes its columns."""
     spec = rig.survey.scan(0)
     size = max(1, rays // ((spec.firings[1] - spec.firings[0]) * spec.channels))
     count = rig.survey.scan_count
@@ -67,7 +67,7 @@ def batches(rig: Rig, rays: int) -> Iterator[Callable[[], PartColumns]]:
 
 
 def time_batches(rig: Rig, rays: int, seconds: float) -> dict[str, Any]:
-    """Make batches for `seconds`; return points per second and times per batch."""
+    """Make batches for `seconds`, and return points per second and times per batch."""
     casts = batches(rig, rays)
     part = next(casts)()
     times = []
@@ -89,7 +89,7 @@ def time_batches(rig: Rig, rays: int, seconds: float) -> dict[str, Any]:
 
 @contextmanager
 def split_times(cupy: Any, rig: Rig) -> Iterator[Split]:
-    """Measure the device times of kernels and of copies of columns while the body runs."""
+    """Measure the device times of kernels and column copies while the body runs."""
     split = Split(cupy)
     engine = rig.scene_casters[0].caster.engine
     run = engine._run  # type: ignore[attr-defined]
@@ -121,7 +121,7 @@ def split_times(cupy: Any, rig: Rig) -> Iterator[Split]:
 
 
 def columns(session: Session) -> Rows:
-    """Yield rates of points in host memory, such as with larger batches or with ten actors."""
+    """Yield the rates at which points arrive in host memory in several cases."""
     sizes = session.sizes
     bus = to_pinned(session)
     scene = city(sizes.cities[-1])
@@ -147,7 +147,7 @@ def columns(session: Session) -> Rows:
 
 
 def scanner(session: Session) -> Rows:
-    """Yield rates of sweeps and of images of ranges by a scanner in a loop, to the host."""
+    """Yield the rates of a scanner in a loop that copies sweeps or range images to the host."""
     sizes = session.sizes
     sensor = Sensor.grid(sizes.rays // 128, 128, step_deg=360)
     device_scanner = Scanner(city(sizes.cities[-1]), sensor, columns=["range"], backend="cuda")
@@ -171,7 +171,7 @@ def scanner(session: Session) -> Rows:
 
 
 def split_batch(session: Session, rig: Rig) -> dict[str, float]:
-    """Return the milliseconds of a batch by kernel, and in all."""
+    """Return the time per batch of each kernel and in total, in milliseconds."""
     with split_times(session.cupy, rig) as split:
         count = 10
         casts = batches(rig, session.sizes.batch)
@@ -184,7 +184,7 @@ def split_batch(session: Session, rig: Rig) -> dict[str, float]:
 
 
 def compare_columns(scene: Scene, drive: Survey) -> dict[str, int]:
-    """Count the values of a scan's columns that differ between the device and NumPy."""
+    """Count column values of a scan that differ between the device and NumPy."""
     scan = drive.scan_count // 2
     rigs = (Rig(scene, drive, backend) for backend in ("cuda", "numpy"))
     device_part, host_part = (columns_of(list(rig.cast(scan, scan + 1))) for rig in rigs)
@@ -195,7 +195,7 @@ def compare_columns(scene: Scene, drive: Survey) -> dict[str, int]:
 
 
 def durable(session: Session) -> Rows:
-    """Yield points per second in parts on disk and in memory, at the best number of threads."""
+    """Yield the rate of parts written to disk and to memory, with the best number of threads."""
     rig = Rig(city(session.sizes.cities[-1]), survey(session.sizes), "cuda")
     memory = "/dev/shm" if Path("/dev/shm").is_dir() else tempfile.gettempdir()
     for name, parent in {"memory": memory, "disk": session.folder}.items():
@@ -214,7 +214,7 @@ def durable(session: Session) -> Rows:
 
 
 def _written(session: Session, rig: Rig, storage: Storage, threads: int) -> dict[str, float]:
-    """Cast in this thread; make and write parts in worker threads, as collectors do."""
+    """Cast in this thread, and write parts in worker threads, as collectors do."""
     room = threading.Semaphore(2 * threads)
     sizes = []
 
@@ -244,7 +244,7 @@ def _written(session: Session, rig: Rig, storage: Storage, threads: int) -> dict
 
 
 def sharing(session: Session) -> Rows:
-    """Yield points per second into host memory by two threads, one process, two processes."""
+    """Yield the rate of points into host memory with two threads, one process and two processes."""
     rig = Rig(city(session.sizes.cities[-1]), survey(session.sizes), "cuda")
     with ThreadPoolExecutor(2) as pool:
         futures = [
@@ -283,7 +283,7 @@ def _share(sizes: Sizes, barrier: Any, rates_queue: Any) -> None:
 
 
 def run(session: Session) -> Rows:
-    """Run surveys on a local cluster, from rays to parts on disk, and yield their rates."""
+    """Yield the rates of surveys on a local cluster, from rays to parts on disk."""
     from lidarpool import simulate
 
     # It turns ten times a second, once at least.

@@ -1,4 +1,4 @@
-"""Sections of the device's benchmark that need raybeam alone: rates of the kernels."""
+"""Sections of the GPU benchmark that measure kernel rates, using only raybeam."""
 
 from __future__ import annotations
 
@@ -21,14 +21,13 @@ STAGES = ("rays", "cast", "pack", "to_device", "to_host")
 
 
 def name_of(triangles: int) -> str:
-    """Return the name of a city in the results."""
     return f"city {triangles:.0e}".replace("e+0", "e")
 
 
 def rates(
     session: Session, caster: RayCaster, scan: Scan, stages: Sequence[str] = STAGES
 ) -> dict[str, Any]:
-    """Time a scan: rays, the cast alone, packing of hits, and copies of hits to the host."""
+    """Measure how long a scan takes to make rays, cast, pack hits, and copy them to the host."""
     engine: Any = caster.engine
     parts = list(scan.chunks(engine.chunk))
     rays_of_parts = [engine._make_rays(scan, start, stop) for start, stop in parts]
@@ -64,14 +63,14 @@ def rates(
 
 
 def revolutions(session: Session, directions: Float) -> Scan:
-    """Make a scan of the same rays from successive poses, 10 cm apart."""
+    """Make a scan of the same rays from successive poses 10 cm apart."""
     poses = MIDDLE + 0.1 * np.arange(session.sizes.poses)[:, None] * [1, 0, 0]
     window = (0, len(directions) * len(poses))
     return check_scan(Pattern(directions), poses, window=window, rays_per_pose=len(directions))
 
 
 def build_caster(mesh: Faces) -> tuple[RayCaster, dict[str, Any]]:
-    """Build a CUDA caster; return the caster and figures of its build."""
+    """Build a CUDA caster, and return it with measurements of the build."""
     start = time.perf_counter()
     caster = RayCaster(*mesh, backend="cuda")
     took = time.perf_counter() - start  # type: ignore[attr-defined]
@@ -81,7 +80,7 @@ def build_caster(mesh: Faces) -> tuple[RayCaster, dict[str, Any]]:
 
 
 def scattered(session: Session, rays: int) -> Scan:
-    """Make a scan of random directions from random origins in the middle of the city."""
+    """Make a scan of random directions from random origins in the center of the city."""
     rng = np.random.default_rng(3)
     directions = rng.normal(size=(rays, 3))
     origins = rng.uniform([-40, -40, 0], [40, 40, 20], (rays, 3))
@@ -91,7 +90,7 @@ def scattered(session: Session, rays: int) -> Scan:
 
 
 def other_scans(session: Session, directions: Float) -> dict[str, Scan]:
-    """Return scans by the kind of their rays, for which the cast alone is timed."""
+    """Return the scans for which only casting is timed, keyed by the kind of rays."""
     shuffled = np.random.default_rng(0).permutation(directions)
     return {
         "shuffled": revolutions(session, shuffled),
@@ -101,7 +100,7 @@ def other_scans(session: Session, directions: Float) -> dict[str, Scan]:
 
 
 def kernels(session: Session) -> Rows:
-    """Yield rates of rays in cities, in order, shuffled and scattered."""
+    """Yield ray rates in cities, in sensor order, in random order and for random rays."""
     directions = revolution(session.sizes.rays)
     scans = other_scans(session, directions)
     for count in (session.sizes.smallest, *session.sizes.cities):
@@ -114,7 +113,7 @@ def kernels(session: Session) -> Rows:
 
 
 def moving(session: Session) -> Rows:
-    """Yield rates for one pose per revolution, for one pose per firing, and with motion."""
+    """Yield ray rates with one pose per revolution, one pose per firing, and motion."""
     caster = RayCaster(*city(session.sizes.cities[-1]), backend="cuda")
     beams = 128
     directions = beam_directions(beams, session.sizes.rays * session.sizes.poses)
@@ -145,7 +144,10 @@ def moving(session: Session) -> Rows:
 
 
 def forest(trees: int, leaves: int, masked: bool) -> list[Instance]:
-    """Make instances of a tree on a ground; half of each masked leaf is transparent."""
+    """Make instances of a tree on the ground.
+
+    With masks, half of each leaf is transparent.
+    """
     vertices, faces = tree(leaves)
     opacity = None
     if masked:
@@ -159,7 +161,7 @@ def forest(trees: int, leaves: int, masked: bool) -> list[Instance]:
 
 
 def instances(session: Session) -> Rows:
-    """Yield rates for a forest of instances and for a single tree, both opaque and masked."""
+    """Yield ray rates for a forest of instances and for a single tree, with and without masks."""
     scan = revolutions(session, revolution(session.sizes.rays))
     for masked in (False, True):
         start = time.perf_counter()
@@ -173,7 +175,7 @@ def instances(session: Session) -> Rows:
 
 
 def large(session: Session) -> Rows:
-    """Cast more rays than a 32-bit integer counts, then cast in a large city."""
+    """Cast more rays than a 32-bit integer can count, then cast in a large city."""
     directions = revolution(session.sizes.rays)
     caster = RayCaster(*city(session.sizes.cities[0]), backend="cuda")
     revolution_count = -(-session.sizes.rays_beyond_int // len(directions))

@@ -1,4 +1,4 @@
-"""Scenes and rays for the device's benchmark, made with NumPy alone."""
+"""Scenes and rays for the GPU benchmark, made with NumPy alone."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Float = NDArray[np.float64]
 
 
 def grid_faces(rows: int, columns: int, wrap: bool = False) -> NDArray[np.int64]:
-    """Return two triangles for each cell of a grid of vertices."""
+    """Return two triangles for each cell in a grid of vertices."""
     i = np.arange(rows - 1)[:, None] * columns
     j = np.arange(columns if wrap else columns - 1)[None, :]
     k = (j + 1) % columns
@@ -28,7 +28,7 @@ def joined(meshes: list[Mesh]) -> Mesh:
 
 
 def six_objects() -> Mesh:
-    """Make six surfaces of revolution, 80 by 80, as in the default survey."""
+    """Make six surfaces of revolution with 80 by 80 vertices, as in the default survey."""
     polar = np.linspace(0, np.pi, 80)[:, None]
     azimuth = np.arange(80) * 2 * np.pi / 80
     radius = 2 * np.sin(polar) * (0.75 + 0.25 * np.cos(3 * polar))
@@ -53,7 +53,10 @@ def ball(radius_m: float, rows: int = 40, columns: int = 60) -> Mesh:
 
 
 def soup(kind: str) -> Mesh:
-    """Make unconnected triangles of one kind: random, sliver, huge or tiny; 20 m around zero."""
+    """Make unconnected triangles within 20 m of the origin.
+
+    The kind is random, sliver, huge or tiny.
+    """
     rng = np.random.default_rng(0)
     count = 5000 if kind in ("sliver", "tiny") else 300
     first_corner = rng.uniform(-20, 20, (count, 1, 3))
@@ -68,7 +71,7 @@ def soup(kind: str) -> Mesh:
 
 
 def city(triangles: int, seed: int = 0) -> Mesh:
-    """Make streets of panelled box buildings on flat ground, about `triangles` triangles."""
+    """Make streets of box-shaped buildings on flat ground, with about `triangles` triangles."""
     rng = np.random.default_rng(seed)
     panels = 4
     pitch = 20.0
@@ -93,7 +96,10 @@ def city(triangles: int, seed: int = 0) -> Mesh:
 
 
 def panelled_box(panels: int) -> Mesh:
-    """Make a box from -1 to 1 without a floor; each face has `panels` x `panels` squares."""
+    """Make a box from -1 to 1 without a floor.
+
+    Each face has `panels` x `panels` squares.
+    """
     line = np.linspace(-1, 1, panels + 1)
     a, b = (x.ravel() for x in np.meshgrid(line, line, indexing="ij"))
     unit = np.ones_like(a)
@@ -111,7 +117,7 @@ def flat_ground(side: int, pitch: float) -> Mesh:
 
 
 def tree(leaves: int) -> Mesh:
-    """Make a crown of triangles around a point 6 m above the ground."""
+    """Make a tree crown of triangles around a point 6 m above the ground."""
     rng = np.random.default_rng(1)
     middle = rng.normal(size=(leaves, 1, 3)) * [1.5, 1.5, 2] + [0, 0, 6]
     corners = middle + 0.04 * rng.normal(size=(leaves, 3, 3))
@@ -119,7 +125,7 @@ def tree(leaves: int) -> Mesh:
 
 
 def tree_transforms(trees: int) -> Float:
-    """Make transforms (trees, 3, 4): a square grid, with random yaw and scale of each tree."""
+    """Make transforms (trees, 3, 4) on a square grid, with random yaw angles and scales."""
     rng = np.random.default_rng(2)
     pitch = 8.0
     side = int(np.ceil(np.sqrt(trees)))
@@ -138,7 +144,7 @@ def tree_transforms(trees: int) -> Float:
 
 
 def revolution(rays: int, layers: int = 128) -> Float:
-    """Return unit directions of a lidar's revolution; the field of view is 60 degrees."""
+    """Return the unit directions of a lidar revolution with a 60 degree field of view."""
     azimuth = 2 * np.pi * np.arange(max(1, rays // layers))[:, None] / max(1, rays // layers)
     elevation = np.radians(np.linspace(-30, 30, layers))
     level = np.cos(elevation)
@@ -147,7 +153,7 @@ def revolution(rays: int, layers: int = 128) -> Float:
 
 
 def beam_directions(beams: int, rays: int) -> Float:
-    """Return unit directions (n, 3), firing by firing, from 15 degrees below level to 45 above."""
+    """Return unit directions (n, 3) in firing order, for elevations from -15 to 45 degrees."""
     azimuth = np.linspace(0, 2 * np.pi, max(1, rays // beams), endpoint=False)[:, None]
     elevation = np.radians(np.linspace(-15, 45, beams))
     flat = np.cos(elevation)
@@ -159,7 +165,7 @@ def beam_directions(beams: int, rays: int) -> Float:
 def track(firings: int) -> tuple[Float, Float]:
     """Return positions (k, 3) and rotations (k, 3, 3) of a head that moves 1 m and turns 5 degrees.
 
-    It is tilted by 2 degrees, so that no rotation is about an axis.
+    The head is tilted by 2 degrees, so that it does not rotate about a coordinate axis.
     """
     part = np.linspace(-0.5, 0.5, firings)
     yaw = np.radians(5) * part

@@ -1,4 +1,4 @@
-"""Section of the device's benchmark: the same rays cast by NVIDIA Warp."""
+"""Section of the GPU benchmark that casts the same rays with NVIDIA Warp."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LEAF_SIZES = (1, 2, 4)
 
 
 def peers(session: Session, device: str = "cuda:0") -> Rows:
-    """Yield rates of Warp's ray query in the cities, by tree builder and leaf size."""
+    """Yield the rates of Warp's ray query in the cities, by tree builder and leaf size."""
     warp.config.quiet = True
     warp.init()
     once = revolution(session.sizes.rays)
@@ -65,7 +65,10 @@ def _cast(mesh: Any, directions: Float, device: str, seconds: float) -> dict[str
 
 
 def _timed(launch: Any, device: str) -> float:
-    """Time a launch, milliseconds: by events on a CUDA device, by the wall clock elsewhere."""
+    """Time a launch in milliseconds.
+
+    CUDA devices are timed with events, others with the wall clock.
+    """
     if not warp.get_device(device).is_cuda:
         began = time.perf_counter()
         launch()

@@ -1,4 +1,4 @@
-"""Options, timing and output that the benchmarks share."""
+"""Options, timing and output shared by the benchmarks."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PACKAGES = ("numpy", "numba", "dask", "open3d", "open3d-cpu", "trimesh", "mujoc
 def argument_parser(
     doc: str | None, *, repeat: int = 0, quick: bool = False, clock: str = ""
 ) -> argparse.ArgumentParser:
-    """Return a parser with the options that benchmarks share.
+    """Return a parser with the options that the benchmarks share.
 
     Parameters
     ----------
@@ -55,9 +55,9 @@ def argument_parser(
 
 
 def write_results(path: Path | None, results: Any) -> None:
-    """Write results with a description of the machine to a JSON file, or nothing without a path.
+    """Write results and a description of the machine to a JSON file.
 
-    The file is complete at all times.
+    Do nothing if there is no path. The file is replaced atomically.
     """
     if path is None:
         return
@@ -68,12 +68,12 @@ def write_results(path: Path | None, results: Any) -> None:
 
 
 def read_results(path: Path) -> Any:
-    """Return the results in a file of `write_results`."""
+    """Read the results from a file written by `write_results`."""
     return json.loads(path.read_text("utf-8"))["results"]
 
 
 def machine() -> dict[str, Any]:
-    """Return the date, the processor and the versions of a measurement."""
+    """Return the date, the processor and the software versions of a measurement."""
     versions = {"python": platform.python_version()}
     for name in _PACKAGES:
         try:
@@ -97,7 +97,7 @@ def _processor() -> str:
 
 
 def time_call(call: Callable[[], Result], clock: str = "cpu") -> tuple[float, Result]:
-    """Return the time of a call in seconds, and its result."""
+    """Return the time of a call in seconds, and the call's result."""
     start = CLOCKS[clock]()
     result = call()
     return CLOCKS[clock]() - start, result
@@ -106,11 +106,11 @@ def time_call(call: Callable[[], Result], clock: str = "cpu") -> tuple[float, Re
 def run_rounds(
     calls: Mapping[str, Callable[[int], Result]], repeat: int, warm_up: int = 1
 ) -> dict[str, list[Result]]:
-    """Call functions in rounds and return their results by name, without the first rounds.
+    """Call functions in rounds, and return their results by name, without the warm-up rounds.
 
-    All functions run once in each round, so that other programs on the machine slow them down
-    alike. Each random order is followed by its reverse, so that of two functions either is first
-    in every second round.
+    All functions run once in each round, so that other programs on the machine slow all of them
+    down equally. Each random order is followed by its reverse, so that each of two functions runs
+    first in half of the rounds.
 
     Parameters
     ----------
@@ -132,22 +132,22 @@ def run_rounds(
 
 
 def median_ratio(first: Sequence[float], second: Sequence[float]) -> float:
-    """Return the median over rounds of the ratio of two measurements."""
+    """Return the median over all rounds of the ratio between two measurements."""
     return float(np.median(np.maximum(first, 1e-9) / np.maximum(second, 1e-9)))
 
 
 def cpu_seconds(process: Any) -> float:
-    """Return the CPU time of a `psutil.Process`."""
+    """Return the total CPU time of a process in seconds."""
     times = process.cpu_times()
     return float(times.user + times.system)
 
 
 def has_modules(python: str, *modules: str) -> bool:
-    """Return True if a Python interpreter can import modules."""
+    """Return whether a Python interpreter can import the given modules."""
     command = [python, "-c", f"import {', '.join(modules)}"]
     return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
 def print_row(*cells: object) -> None:
-    """Print a row of a Markdown table."""
+    """Print a Markdown table row."""
     print("|", " | ".join(map(str, cells)), "|", flush=True)

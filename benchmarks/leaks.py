@@ -1,9 +1,9 @@
-"""Rays that escape from closed meshes, for each backend.
+"""Count the rays that escape from closed meshes with each backend.
 
     python -m benchmarks.leaks [--rays N] [--triangles N]
 
-All rays are aimed from inside at edges and corners, where rays escape if each triangle is rounded
-on its own. The exit code is 1 if a ray escapes from an exact backend.
+All rays start inside the mesh and are aimed at edges and corners. Rays escape there if triangles
+are rounded independently of each other. The exit code is 1 if a ray escapes from an exact backend.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .seams import count_escaped
 
 @dataclass(frozen=True, eq=False)
 class Closed:
-    """Closed mesh, a point inside the mesh, and a distance by which the point may be moved."""
+    """Closed mesh with a point inside it, and the distance by which this point may be moved."""
 
     name: str
     vertices: NDArray[np.float64]
@@ -36,7 +36,7 @@ class Closed:
 
 
 def closed_meshes(triangles: int) -> Iterator[Closed]:
-    """Yield a cube, a sphere, the default survey's six objects, and a box of terrain."""
+    """Yield a cube, a sphere, the six objects of the default survey, and a box of terrain."""
     x = np.stack(np.meshgrid([-1.0, 1], [-1.0, 1], [-1.0, 1], indexing="ij"), -1).reshape(-1, 3)
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     sides = np.array([f for a, b, c, d in quads for f in ((a, b, c), (a, c, d))])
@@ -55,7 +55,7 @@ def closed_meshes(triangles: int) -> Iterator[Closed]:
 
 
 def terrain_box(triangles: int) -> Closed:
-    """Make fractal ground below a lid of the same grid, joined by walls."""
+    """Make fractal ground, and a lid on the same grid, joined by walls."""
     ground = terrain(triangles // 2)
     points = np.array(ground.vertices)
     faces = np.array(ground.faces)
@@ -73,10 +73,14 @@ def terrain_box(triangles: int) -> Closed:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run from the command line; return 1 if a ray escapes from an exact backend."""
+    """Print the table, and return 1 if a ray escapes from an exact backend."""
     parser = argument_parser(__doc__)
-    parser.add_argument("--rays", type=int, default=10_000_000, help="rays of each backend")
-    parser.add_argument("--triangles", type=int, default=2_000_000, help="of the terrain box")
+    parser.add_argument(
+        "--rays", type=int, default=10_000_000, help="number of rays for each backend"
+    )
+    parser.add_argument(
+        "--triangles", type=int, default=2_000_000, help="triangles of the terrain box"
+    )
     options = parser.parse_args(arguments)
     backends = [name for name, reason in available_backends().items() if not reason]
     meshes = list(closed_meshes(options.triangles))
@@ -96,7 +100,7 @@ def main(arguments: list[str] | None = None) -> int:
             )
     for name in backends:
         rays, leaks = (sum(v[key] for v in results[name].values()) for key in ("rays", "escaped"))
-        print(f"{name}: {leaks:,.0f} of {rays:,.0f} escaped, {leaks / rays:.2g}")
+        print(f"{name}: {leaks:,.0f} of {rays:,.0f} rays escaped ({leaks / rays:.2g})")
     write_results(options.json, results)
     exact = [entry for name in backends if name != "tiles" for entry in results[name].values()]
     return int(any(entry["escaped"] for entry in exact))

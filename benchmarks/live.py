@@ -1,12 +1,12 @@
-"""Delay and loss of live packets.
+"""Measure the delay and loss of live packets.
 
     python -m benchmarks.live [--minutes 10]
 
 An OS1-64 among 20 moving cars and a VLP-16 among 100 moving cars send packets, one at a time, with
 7 sub-rays, rain and range noise in a city of 100,000 triangles. A receiver on the loopback
-interface runs in its own process. It counts the packets and measures how late they arrive after
-their timestamps. The sender measures its delay after the schedule, which starts when the first
-sweeps are cast.
+interface runs in its own process. It counts the packets and measures the delay between their
+timestamps and their arrival. The sender measures how late packets are sent, relative to a schedule
+that starts when the first sweeps have been cast.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ LIMITS_MS = (0.5, 1, 2, 5, 10, 20, 50, 100, 1000)
 
 
 def cars(count: int, seconds: float, seed: int = 7) -> list[Actor]:
-    """Make cars that drive on circles around the sensor, at 10 m/s."""
+    """Make cars that drive in circles around the sensor at 10 m/s."""
     random = np.random.default_rng(seed)
     times_s = np.arange(0, seconds + 3, 0.5)
     mesh = box("Car", (4.5, 1.8, 1.5))
@@ -57,7 +57,7 @@ def cars(count: int, seconds: float, seed: int = 7) -> list[Actor]:
 def measure(
     sensor: str, maker: str, actors: int, port: int, options: argparse.Namespace
 ) -> dict[str, Any]:
-    """Play a sensor; return the numbers of packets and their delays."""
+    """Play a sensor, and return the number of packets and their delays."""
     seconds = 60 * options.minutes
     lidar = load_sensor(sensor)
     packets = Packets(lidar)
@@ -110,11 +110,11 @@ def measure(
 
 
 def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
-    """Print the histograms of delays."""
+    """Measure the chosen sensors and print their delays."""
     parser = argument_parser(__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--only", choices=[*CASES], nargs="*", default=[*CASES])
-    parser.add_argument("--triangles", type=int, default=100_000, help="of the city")
+    parser.add_argument("--triangles", type=int, default=100_000, help="triangles of the city")
     parser.add_argument("--rate", type=float, default=1.0, help="speed; 0.1 is ten times as slow")
     options = parser.parse_args(arguments)
     results = {}
@@ -123,10 +123,11 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
         print(
             f"{name}: {row['sent']['sent']:,} packets sent in {row['seconds']:g} s, {row['lost']} "
             f"lost; {row['later_than_5_ms']:.3%} sent and {row['arrived_later_than_5_ms']:.3%} "
-            f"arrived later than 5 ms, the latest sent after {row['sent']['latest_ms']:.1f} ms"
+            f"arrived more than 5 ms late; maximum delay when sent "
+            f"{row['sent']['latest_ms']:.1f} ms"
         )
         print(f"  {row['cpu_ms_a_sweep']:.0f} ms of CPU time per sweep")
-        print("  sent", row["sent"]["lateness"])
+        print("  delay when sent", row["sent"]["lateness"])
         for note in row["notes"]:
             print(f"  note: {note}")
     write_results(options.json, results)

@@ -1,7 +1,7 @@
-"""The receiver of `benchmarks.live`: counts datagrams, and how late they are, until stdin ends.
+"""Process that counts datagrams and their delays for `benchmarks.live`.
 
-A datagram's lateness is its arrival less its stamp, beside the least of all. It is a process of its
-own, as a driver is, and prints a line of JSON.
+The process runs until stdin ends, then prints a line of JSON. A datagram's delay is its arrival
+time minus its timestamp, relative to the minimum of this difference over all datagrams.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ HOUR_NS = 3_600_000_000_000
 
 
 def velodyne_ns(payload: bytes) -> int:
-    """Return the stamp of a data packet of Velodyne, nanoseconds past the hour."""
+    """Return the timestamp of a Velodyne data packet in nanoseconds past the hour."""
     return 1000 * int(struct.unpack_from("<I", payload, 1200)[0])
 
 
 def ouster_ns(payload: bytes) -> int:
-    """Return the stamp of the first column of a lidar packet of Ouster, ns past an hour."""
+    """Return the timestamp of an Ouster packet's first column in nanoseconds past an hour."""
     return int(struct.unpack_from("<Q", payload, 32)[0]) % HOUR_NS
 
 
@@ -34,7 +34,7 @@ STAMPS = {"velodyne": velodyne_ns, "ouster": ouster_ns}
 
 
 def open_socket(port: int) -> socket.socket:
-    """Return a socket with a large buffer at a port of the loopback interface."""
+    """Return a socket with a large buffer, bound to a port of the loopback interface."""
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
     with suppress(OSError):
@@ -44,9 +44,9 @@ def open_socket(port: int) -> socket.socket:
 
 
 def main(maker: str, rate: str, *ports: str) -> None:
-    """Receive at ports, that of the returns first, until stdin ends and all is silent.
+    """Receive on the given ports until stdin ends and no more datagrams arrive.
 
-    Stamps advance `rate` times as fast as the clock.
+    The first port is that of the returns. Timestamps advance `rate` times as fast as the clock.
     """
     period_ns = HOUR_NS / float(rate)  # after which stamps repeat
     sockets = [open_socket(int(port)) for port in ports]

@@ -1,18 +1,18 @@
-"""Sweeps per second of `lidarpool.sweeps`, compared with the loader of each format.
+"""Compare the rate of `lidarpool.sweeps` with the usual loader of each format.
 
     python -m benchmarks.loaders [FORMAT ...]
 
-Both open the same data set again in each round, in one process, and read all sweeps in order. Files
-are cached in memory. `lidarpool.sweeps` provides points, all columns of the format and the pose of
-each sweep, and boxes if the other loader provides them. For each sweep, the other loaders provide
+In each round, both loaders open the same data set again in one process and read all sweeps in
+order. Files are cached in memory. For each sweep, `lidarpool.sweeps` provides points, all columns
+of the format, the pose, and boxes if the other loader provides them. The other loaders provide
 
-- webdataset: the whole sample, which is points, columns, pose and boxes as arrays, and parsed JSON;
+- webdataset: the whole sample with points, columns, pose and boxes as arrays, and parsed JSON;
 - pykitti: points with intensities and poses; NumPy reads labels as semantic-kitti-api does, and
   separates classes from objects;
 - nuscenes-devkit: points with intensities, without the channel, and the boxes of actors;
 - pyarrow: all columns with positions in world coordinates.
 
-Formats whose package is not installed are skipped.
+Formats are skipped if their package is not installed.
 """
 
 import tempfile
@@ -80,7 +80,7 @@ PEERS = {webdataset: "webdataset", kitti: "pykitti", nuscenes: "nuscenes", parqu
 
 
 def write_data_set(folder, name, cloud, sweeps):
-    """Write a data set of jobs with the same sweeps, like a campaign."""
+    """Write a data set of jobs that have the same sweeps, like a campaign."""
     from lidarpool.datasets.dataset import DataSet  # other versions may not have these modules
     from lidarpool.datasets.job_table import JobRow, write_table
     from lidarsim.io.storage import Storage
@@ -92,7 +92,7 @@ def write_data_set(folder, name, cloud, sweeps):
 
 
 def write(folder, name):
-    """Write a data set of sweeps past a car."""
+    """Write a data set of sweeps of a sensor that passes a car."""
     from lidarsim.sweeps.sweeps import Sweeps
 
     track = lp.Track([0, 60], [[0, 0, 1], [60, 5, 1]])
@@ -114,7 +114,7 @@ def write(folder, name):
 
 
 def main(arguments=None):
-    """Print a row for each format."""
+    """Measure all formats and print a row for each."""
     parser = argument_parser(__doc__, repeat=15)
     known = [peer.__name__ for peer in PEERS]
     parser.add_argument("formats", metavar="FORMAT", nargs="*", help=f"of {', '.join(known)}")
@@ -141,7 +141,7 @@ def main(arguments=None):
 
 
 def sweep_rate(read):
-    """Return the number of sweeps that are read per second of CPU time."""
+    """Return the number of sweeps read per second of CPU time."""
     seconds, count = time_call(lambda: sum(1 for _ in read()))
     return count / seconds
 

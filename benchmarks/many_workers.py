@@ -1,4 +1,4 @@
-"""Clusters whose scheduler and workers are each in a process: a part of other benchmarks."""
+"""Clusters with one process for the scheduler and one for all workers, used by benchmarks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from distributed import Scheduler, Worker
 
 
 async def run_scheduler(connection: Connection) -> None:
-    """Run a scheduler until the connection ends."""
+    """Run a scheduler until the connection closes."""
     options = {"host": "127.0.0.1", "port": 0, "dashboard_address": "127.0.0.1:0"}
     async with Scheduler(**options, dashboard=False) as scheduler:
         connection.send(scheduler.address)

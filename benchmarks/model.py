@@ -1,12 +1,12 @@
-"""Throughput of clusters that were not available for measurements, modeled from results of `scale`.
+"""Model the throughput of clusters that were not available for measurements.
 
     python -m benchmarks.model --driver MS MS --scheduler MS MS --collectors MS MS --casting MS MS
 
-A fixed number of tasks is in flight: the driver offers a task, the scheduler sends it, the next
-free GPU worker casts its batches, a collector stores them, and scheduler and driver receive the
-receipts. Each process does one thing at a time. Their CPU times, per task and per receipt in it,
-come from `benchmarks.scale`. `--read` compares the model with other results of that benchmark,
-whose processes share `--cores`, and `--picture` draws how busy the GPUs of one scheduler are.
+A fixed number of tasks is in flight. The driver offers a task, the scheduler sends it, the next
+free GPU worker casts its batches, a collector stores them, and the scheduler and the driver receive
+the receipts. Each process does one thing at a time. The CPU times per task and per receipt were
+measured by `benchmarks.scale`. `--read` compares the model with other results of that benchmark,
+whose processes share `--cores` cores. `--picture` plots how busy the GPUs of one scheduler are.
 """
 
 from __future__ import annotations
@@ -35,16 +35,17 @@ SECONDS = (0.05, 0.2, 1.0)  # of casting a batch
 
 @dataclass(frozen=True)
 class Costs:
-    """Processor time of each process, seconds: {name: (per task, per receipt of the task)}.
+    """CPU time of each process for one step of a task, in seconds.
 
-    Of the scheduler's, `member` comes with each GPU worker, for Dask looks at all of them.
+    The times have the form {name: (per task, per receipt of the task)}. The scheduler also spends
+    `member` per GPU worker on each task, because Dask examines all of these workers.
     """
 
     per_step: dict[str, tuple[float, float]]
     member: float
 
     def step(self, number: int, gpus: int, batches: int) -> float:
-        """Return the time of a step of a task with `batches` batches, seconds."""
+        """Return the duration of a step of a task with `batches` batches, in seconds."""
         name = STEPS[number]
         task, receipt = self.per_step[name]
         task += gpus * self.member if name == "scheduler" else 0
@@ -60,9 +61,10 @@ def collectors_of(gpus: int) -> int:
 def batches_a_second(
     gpus: int, seconds: float, costs: Costs, cores: int | None = None, shards: int = 1
 ) -> float:
-    """Return the rate of batches of `seconds` that `shards` clusters cast together, per second.
+    """Return the number of batches per second that `shards` clusters cast in total.
 
-    Their processes share `cores`; None: each has its own.
+    Each batch takes `seconds` to cast. All processes share `cores` cores. If it is None, each
+    process has its own core.
     """
     clusters = _Clusters(gpus, seconds, costs, cores, shards)
     tasks_under_way = shards * max_weight_in_flight(gpus, collectors_of(gpus))
@@ -82,7 +84,7 @@ def batches_a_second(
 
 
 class _Clusters:
-    """Processes of all shards, and the time at which each process is free."""
+    """Processes of all shards, with the time at which each process becomes free."""
 
     def __init__(
         self, gpus: int, seconds: float, costs: Costs, cores: int | None, shards: int
@@ -97,7 +99,7 @@ class _Clusters:
         self._vary = Random(1).uniform
 
     def run_step(self, ready_s: float, shard: int, step: int) -> float:
-        """Run a step of a task that is ready at a time; return the time of its end, seconds."""
+        """Run a task's step that becomes ready at the given time, and return its end in seconds."""
         process: Any = STEPS[step], shard
         time_s = ready_s
         if process[0] == "casting":
@@ -120,12 +122,12 @@ class _Clusters:
 
 
 def busy(gpus: int, seconds: float, costs: Costs) -> float:
-    """Return the share of the time that the GPU workers cast."""
+    """Return the fraction of time in which the GPU workers cast."""
     return min(1.0, batches_a_second(gpus, seconds, costs) * seconds / gpus)
 
 
 def limit(gpus: int, seconds: float, costs: Costs) -> str:
-    """Return the name of the busiest process, for which the rest of the cluster waits."""
+    """Return the name of the busiest process, which limits the throughput of the cluster."""
     batches = batches_per_task([(seconds, 1)], gpus)
     load: Counter[str] = Counter()
     for number, name in enumerate(STEPS):
@@ -136,7 +138,7 @@ def limit(gpus: int, seconds: float, costs: Costs) -> str:
 
 
 def schedulers(gpus: int, seconds: float, costs: Costs, min_busy: float = 0.9) -> int:
-    """Return the number of clusters that keep all GPUs busy for at least a share of the time."""
+    """Return the number of clusters required to keep all GPUs busy for a given fraction of time."""
     shards = 1
     while busy(-(-gpus // shards), seconds, costs) < min_busy:
         shards += max(1, shards // 8)
@@ -144,7 +146,7 @@ def schedulers(gpus: int, seconds: float, costs: Costs, min_busy: float = 0.9) -
 
 
 def draw(costs: Costs, read: dict[str, dict[str, float]], path: Path) -> None:
-    """Draw how busy the GPUs of a scheduler are by the model, with measured runs as dots."""
+    """Plot the modeled GPU utilization of one scheduler, with measured runs as dots."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 4), layout="constrained")
@@ -166,17 +168,23 @@ def draw(costs: Costs, read: dict[str, dict[str, float]], path: Path) -> None:
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    """Run from the command line; return rates, limits and shards by case."""
+    """Print and return the rates, limits and numbers of shards of all cases."""
     parser = argument_parser(__doc__)
     for name in dict.fromkeys(STEPS):
         words = "its CPU time per task, and per receipt in the task"
         parser.add_argument(
             f"--{name}", type=float, nargs=2, required=True, metavar="MS", help=words
         )
-    parser.add_argument("--member", type=float, default=3.5, help="µs of the scheduler per worker")
-    parser.add_argument("--read", type=Path, nargs="*", default=[], help="JSON files of `scale`")
+    parser.add_argument(
+        "--member", type=float, default=3.5, help="scheduler time per GPU worker in µs"
+    )
+    parser.add_argument(
+        "--read", type=Path, nargs="*", default=[], help="JSON files written by `scale`"
+    )
     parser.add_argument("--cores", type=int, help="cores of the machine that wrote these files")
-    parser.add_argument("--picture", type=Path, help="draw the busy share to this file")
+    parser.add_argument(
+        "--picture", type=Path, help="save a plot of the GPU utilization to this file"
+    )
     options = parser.parse_args(arguments)
     per_step = {name: tuple(ms / 1e3 for ms in getattr(options, name)) for name in STEPS}
     costs = Costs(per_step, options.member / 1e6)
@@ -186,7 +194,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
         gpus = int(row["gpus"])
         shards = int(row["shards"])
         rate = batches_a_second(gpus, row["seconds"], costs, options.cores, shards)
-        print(f"{name}: {row['a_second']:.0f} a second, by the model {rate:.0f}")
+        print(f"{name}: {row['a_second']:.0f} batches/s measured, {rate:.0f} modeled")
     results = {}
     for gpus, seconds in product((200, 1_000, 10_000), SECONDS):
         rate = batches_a_second(gpus, seconds, costs)

@@ -1,11 +1,11 @@
-"""Lidars in MuJoCo worlds, compared with MuJoCo's own ray casting.
+"""Compare lidars in MuJoCo worlds with MuJoCo's own ray casting.
 
     python -m benchmarks.mujoco
 
 A VLP-16 and an OS1-64 scan rooms with 20, 100 and 400 moving bodies. Then the lidars of 256
 quadrupeds on a terrain scan with 16 x 360 rays each, in a single call. All bodies move before each
-scan. Times are CPU time of one thread: the minimum over the rounds, because other programs may use
-the cores, and the median ratio of MuJoCo's time to the time.
+scan. Times are the CPU time of one thread. The table lists the minimum over the rounds, because
+other programs may use the cores, and the median ratio of MuJoCo's time to this time.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _ROUND_SHAPES = ("box", "cylinder", "capsule", "sphere")
 
 
 class World(NamedTuple):
-    """A model of MuJoCo with the sites of its lidars."""
+    """MuJoCo model with the sites of its lidars."""
 
     name: str
     model: Any
@@ -38,7 +38,7 @@ class World(NamedTuple):
 
 
 def room(bodies: int) -> str:
-    """Return the MJCF of a floor, a robot, and bodies of four shapes."""
+    """Return the MJCF of a floor, a robot, and bodies with four kinds of shapes."""
     rng = np.random.default_rng(0)
     positions = rng.uniform(-20, 20, (bodies, 2))
     angles = rng.uniform(0, 360, bodies)
@@ -56,7 +56,10 @@ def room(bodies: int) -> str:
 
 
 def herd(robots: int, cells: int) -> str:
-    """Return the MJCF of quadrupeds with a lidar each, on a terrain of 2 * cells² triangles."""
+    """Return the MJCF of quadrupeds on a terrain of 2 * cells² triangles.
+
+    Each quadruped has a lidar.
+    """
     side = int(np.ceil(np.sqrt(robots)))
     leg = (
         '<body pos="{x} {y} 0"><joint axis="0 1 0"/>'
@@ -78,7 +81,7 @@ def herd(robots: int, cells: int) -> str:
 
 
 def build(name: str, xml: str, sites: list[str]) -> World:
-    """Compile a model, and fill its height fields with waves."""
+    """Compile a model and fill its height fields with waves."""
     import mujoco
 
     model = mujoco.MjModel.from_xml_string(xml)
@@ -93,7 +96,7 @@ def build(name: str, xml: str, sites: list[str]) -> World:
 
 
 def cast_by_mujoco(world: World, directions: Floats) -> None:
-    """Cast rays (sites, n, 3), in the frame of the world, by MuJoCo."""
+    """Cast rays (sites, n, 3), given in world coordinates, with MuJoCo."""
     import mujoco
 
     model, data = world.model, world.data
@@ -109,7 +112,7 @@ def cast_by_mujoco(world: World, directions: Floats) -> None:
 
 
 def measure(world: World, sensor: Sensor, repeat: int) -> dict[str, Any]:
-    """Return the times of MuJoCo's rays, `ranges`, `sweep` and `step` in a world."""
+    """Measure MuJoCo's ray casting, `ranges`, `sweep` and `step` in a world."""
     rng = np.random.default_rng(1)
     data = world.data
     is_single = len(world.sites) == 1
@@ -160,7 +163,7 @@ def measure(world: World, sensor: Sensor, repeat: int) -> dict[str, Any]:
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print a row of the table."""
+    """Print a table row."""
     seconds = row["seconds"]
     mujoco_s = seconds["mj_multiRay"]
     cells = [f"{1e3 * min(mujoco_s):.1f}"]
@@ -171,15 +174,18 @@ def show(row: dict[str, Any]) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run from the command line; return 2 without MuJoCo."""
+    """Print the table, and return 2 if MuJoCo is not installed."""
     parser = argument_parser(__doc__, repeat=21, quick=True)
     options = parser.parse_args(arguments)
     if find_spec("mujoco") is None:
-        print("Nothing was measured: pip install mujoco", file=sys.stderr)
+        print(
+            "Nothing was measured, because MuJoCo is not installed (pip install mujoco).",
+            file=sys.stderr,
+        )
         return 2
     repeat = 1 if options.quick else options.repeat
     robots, cells = (4, 16) if options.quick else (256, 257)
-    print_row("bodies", "rays", "mj_multiRay, ms", "ranges (times as fast)", "sweep", "step")
+    print_row("world", "rays", "mj_multiRay (ms)", "ranges (speedup)", "sweep", "step")
     print("|---|--:|--:|--:|--:|--:|")
     rows = []
     for bodies in (5,) if options.quick else (20, 100, 400):

@@ -1,14 +1,14 @@
-"""Positions that KISS-ICP estimates from a bag, with and without deskewing.
+"""Measure how well KISS-ICP deskews the points in an exported bag.
 
     python -m benchmarks.odometry [--sweeps 64] [--model ouster/os1-64]
 
 A car drives along a street of the generated city and turns left. A bag contains each point in the
 sensor frame at its firing, as drivers publish it. KISS-ICP (Vizzo et al., 2023) estimates the
 motion and moves the points of a sweep to its end. The table lists the distances of these points
-from their true positions. With deskewing, they are small only if the points in the bag are not
-compensated.
+from their true positions. With deskewing, the distances are only small if the points in the bag are
+not motion-compensated.
 
-Requires KISS-ICP (`pip install kiss-icp`) and the extra `ros` of lidarpool.
+The benchmark requires KISS-ICP (`pip install kiss-icp`) and the `ros` extra of lidarpool.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ WARM_UP = 6  # sweeps in which KISS-ICP knows no motion yet
 
 
 class Distances(NamedTuple):
-    """Distances of deskewed points from their true positions, meters."""
+    """Distances between deskewed points and their true positions, in meters."""
 
     median: float
     percentile_95: float
 
 
 def left_turn(duration_s: float) -> Track:
-    """Make a drive at constant speed: straight ahead, a left turn by 90°, and straight ahead."""
+    """Make a drive at constant speed that goes straight, turns left by 90°, and goes straight."""
     times_s = np.arange(0, duration_s + 2 * STEP_S, STEP_S)
     turned = STRAIGHT_M + RADIUS_M * np.pi / 2
     corners = np.add.outer((STRAIGHT_M, turned), (-RAMP_M, RAMP_M)).ravel()
@@ -70,7 +70,7 @@ def left_turn(duration_s: float) -> Track:
 
 
 def survey_of(model: str, sweeps: int) -> Survey:
-    """Make the survey of a sensor on a car, with `sweeps` sweeps."""
+    """Make a survey of a car-mounted sensor with `sweeps` sweeps."""
     sensor = load_sensor(model)
     track = left_turn(sweeps * SWEEP_S + SWEEP_S)
     return Survey(
@@ -83,7 +83,7 @@ def survey_of(model: str, sweeps: int) -> Survey:
 
 
 def cloud_of(survey: Survey, scene: Scene) -> Cloud:
-    """Cast a survey in this process; return its cloud."""
+    """Cast a survey in this process and return its cloud."""
     rig = Rig(scene, survey, "auto")
     part = columns_of(list(rig.cast(0, survey.scan_count)))
     cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
@@ -92,7 +92,7 @@ def cloud_of(survey: Survey, scene: Scene) -> Cloud:
 
 
 def true_points(survey: Survey, cloud: Cloud) -> list[Any]:
-    """Return the points of each sweep in the sensor frame at the end of the sweep, (n, 3) each."""
+    """Return the points of each sweep in the sensor frame at the end of the sweep."""
     sweeps = cloud.sweeps()
     points = []
     for number, sweep in enumerate(sweeps.points(cloud)):
@@ -103,7 +103,7 @@ def true_points(survey: Survey, cloud: Cloud) -> list[Any]:
 
 
 def distances(bag: Path, expected: list[Any], *, deskew: bool) -> Distances:
-    """Play a bag through KISS-ICP; return the distances of its points from the expected points."""
+    """Process a bag with KISS-ICP, and return how far its points are from the expected points."""
     from kiss_icp.config.parser import load_config
     from kiss_icp.datasets.rosbag import RosbagDataset
     from kiss_icp.kiss_icp import KissICP
@@ -124,7 +124,7 @@ def distances(bag: Path, expected: list[Any], *, deskew: bool) -> Distances:
 
 
 def measured(model: str, sweeps: int, triangles: int) -> dict[bool, Distances]:
-    """Return odometry errors for the bag of a simulated drive, with and without deskewing."""
+    """Return the distances for the bag of a simulated drive, with and without deskewing."""
     survey = survey_of(model, sweeps)
     cloud = cloud_of(survey, city(triangles))
     expected = true_points(survey, cloud)
@@ -146,7 +146,7 @@ def main(arguments: list[str] | None = None) -> int:
         options.sweeps = 14
         options.model = "velodyne/vlp16"
     results = measured(options.model, options.sweeps, 20_000 if options.quick else 200_000)
-    print_row("deskewing", "median, m", "95 %, m")
+    print_row("deskewing", "median (m)", "95th percentile (m)")
     print("|---|--:|--:|")
     for deskew, errors in results.items():
         words = "on" if deskew else "off"

@@ -1,13 +1,13 @@
-"""Time to place a task and balance of the workers, as a cluster grows.
+"""Measure how fast and how evenly tasks are placed on clusters of different sizes.
 
     python -m benchmarks.placing [--workers N ...]
 
-A real scheduler has simulated workers, which never respond: tasks are placed and ended by the
-scheduler's own transitions. Half of the workers belong to an exclusive partition. For each
-cluster size, the benchmark lists
+A real scheduler has simulated workers that never respond. Tasks are placed and ended by the
+scheduler's own transitions. Half of the workers belong to an exclusive partition. For each cluster
+size, the benchmark lists
 
-- the microseconds to place a task of the partition, and any other task, with the rule of poolpart
-  and without it, both behind the same fence;
+- the time to place a task of the partition or any other task in microseconds, with and without
+  poolpart's rule, both behind the same fence;
 - the mean end of tasks with random durations, relative to the mean end with Dask's own choice, and
   the longest queue of a worker.
 """
@@ -39,7 +39,7 @@ _numbers = itertools.count()
 
 
 class _Silence:
-    """Stand-in for the connection to a worker; drops all messages."""
+    """Stand-in for the connection to a worker that drops all messages."""
 
     def send(self, *messages: Any) -> None:
         """Drop messages."""
@@ -55,7 +55,10 @@ class _Silence:
 
 
 def add_workers(scheduler: Any, number: int) -> None:
-    """Add simulated workers of one thread; every second worker declares the partition."""
+    """Add simulated workers with one thread each.
+
+    Every second worker declares the partition.
+    """
     for index in range(number):
         address = f"tcp://10.{index >> 16}.{index >> 8 & 255}.{index & 255}:1"
         worker = WorkerState(
@@ -90,7 +93,7 @@ def add_workers(scheduler: Any, number: int) -> None:
 
 
 class Tasks:
-    """Tasks of a partition, or without a partition, that are placed and ended by hand."""
+    """Tasks that are placed and ended by hand, with or without a partition."""
 
     def __init__(self, scheduler: Any, partition: bool) -> None:
         self.scheduler = scheduler
@@ -99,7 +102,7 @@ class Tasks:
         self.count = 0
 
     def assign(self, number: int) -> tuple[list[Any], float]:
-        """Place tasks; return their states and the elapsed seconds."""
+        """Place all tasks, and return their states and the elapsed time in seconds."""
         states = []
         for _ in range(number):
             self.count += 1
@@ -118,7 +121,7 @@ class Tasks:
         return states, seconds
 
     def end(self, states: list[Any]) -> None:
-        """End tasks, and remove them from the scheduler."""
+        """End the tasks and remove them from the scheduler."""
         for state in states:
             self.scheduler.transition(
                 state.key,
@@ -134,7 +137,7 @@ class Tasks:
 
 
 def cost_us(scheduler: Any, partition: bool, number: int) -> float:
-    """Return the microseconds to place a task, the minimum of three rounds."""
+    """Return the time to place a task in microseconds, as the minimum of three rounds."""
     tasks = Tasks(scheduler, partition)
     rounds = []
     for _ in range(3):
@@ -145,14 +148,17 @@ def cost_us(scheduler: Any, partition: bool, number: int) -> float:
 
 
 class Flow(NamedTuple):
-    """Flow of tasks of random durations through a cluster."""
+    """Results of simulating tasks of random durations on a cluster."""
 
     mean_end: float  # when a task ends on average, in mean durations
     longest_queue: int  # tasks that one worker had at a time
 
 
 def flow(scheduler: Any, partition: bool, tasks_per_worker: int) -> Flow:
-    """Simulate tasks: three per two workers are placed at once, then a new task per ended task."""
+    """Simulate tasks on a cluster.
+
+    Three tasks per two workers are placed at once, then a new task for each ended task.
+    """
     workers = len(scheduler.workers) // 2
     rng = random.Random(7)
     durations = [rng.expovariate(1.0) for _ in range(workers * tasks_per_worker)]
@@ -190,7 +196,7 @@ def flow(scheduler: Any, partition: bool, tasks_per_worker: int) -> Flow:
 
 
 async def measure(number: int, rounds: int, tasks_per_worker: int) -> dict[str, Any]:
-    """Measure a size of cluster, with poolpart's rule and without."""
+    """Measure one cluster size, with and without poolpart's rule."""
     figures: dict[str, Any] = {"workers": number}
     for label in ("dask", "poolpart"):
         async with Scheduler(port=0, host="127.0.0.1", dashboard=False) as scheduler:
@@ -212,11 +218,13 @@ async def measure(number: int, rounds: int, tasks_per_worker: int) -> dict[str, 
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Print a row for each cluster size."""
+    """Measure all cluster sizes and print the results."""
     parser = argument_parser(__doc__)
     parser.add_argument("--workers", type=int, nargs="+", default=[40, 4000])
-    parser.add_argument("--tasks", type=int, default=400, help="tasks that are placed at a time")
-    parser.add_argument("--per-worker", type=int, default=2, help="tasks of random durations")
+    parser.add_argument("--tasks", type=int, default=400, help="number of tasks to place at a time")
+    parser.add_argument(
+        "--per-worker", type=int, default=2, help="tasks of random duration per worker"
+    )
     options = parser.parse_args(arguments)
     logging.getLogger("distributed").setLevel(logging.ERROR)
     results = []
@@ -228,8 +236,8 @@ def main(arguments: list[str] | None = None) -> None:
             dask_cost, dask_end, dask_queue = (values[f"{name}_dask_{key}"] for key in KEYS)
             print(
                 f"{number:>6} workers, tasks of {name:<9}: {cost:7.0f} µs, Dask {dask_cost:7.0f};"
-                f" mean end {end / dask_end:.3f} of Dask's,"
-                f" longest queue {queue} and {dask_queue}"
+                f" mean end {end / dask_end:.3f} x Dask's;"
+                f" longest queue {queue}, Dask {dask_queue}"
             )
     write_results(options.json, results)
 

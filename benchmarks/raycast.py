@@ -1,10 +1,10 @@
-"""Rays per second of each backend, compared with Open3D and trimesh.
+"""Compare the rays per second of each backend with Open3D and trimesh.
 
     python -m benchmarks.raycast [--large] [--scene NAME] [--mesh FILE] [--threads N]
 
-All engines cast the same rays in one process, in turns. Rates are medians over the rounds, with
-the minimum and the maximum. Ratios are medians of the ratios within a round. On a machine that
-other programs use, `--clock cpu` measures CPU time.
+All engines cast the same rays in one process, in turn. Rates are medians over the rounds, with the
+minimum and the maximum. Ratios are medians of the ratios within each round. Use `--clock cpu` to
+measure CPU time on a machine that also runs other programs.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ _CHUNK = 1 << 17  # rays that Open3D casts at a time
 
 
 def prepare_raybeam(backend: str, job: Job, threads: int) -> Cast:
-    """Return a function that makes the rays of all poses, casts them and gathers hits."""
+    """Return a function that makes the rays of all poses, casts them, and gathers the hits."""
     caster = RayCaster(job.vertices, job.faces, backend, threads=threads)
     pattern = Pattern(job.directions)
     return lambda: sum(len(caster.scan(pattern, origin, job.rotation)) for origin in job.origins)
 
 
 def prepare_open3d(job: Job, threads: int) -> Cast:
-    """Return a function that casts precomputed rays, without gathering hits."""
+    """Return a function that casts precomputed rays without gathering the hits."""
     import open3d
 
     scene = open3d_scene(job.vertices, job.faces, threads)
@@ -59,7 +59,7 @@ def prepare_open3d(job: Job, threads: int) -> Cast:
 
 
 def prepare_open3d_numpy(job: Job, threads: int) -> Cast:
-    """Return a function that makes rays, casts them and gathers hits, as a script would."""
+    """Return a function that makes rays, casts them, and gathers the hits, like a user's script."""
     import open3d
 
     scene = open3d_scene(job.vertices, job.faces, threads)
@@ -77,7 +77,7 @@ def prepare_open3d_numpy(job: Job, threads: int) -> Cast:
 
 
 def prepare_trimesh(job: Job, threads: int) -> Cast:
-    """Return a function that finds triangles by trimesh's fastest query, without distances."""
+    """Return a function that finds hit triangles with trimesh's fastest query (no distances)."""
     import trimesh
     from trimesh.ray.ray_pyembree import RayMeshIntersector
 
@@ -92,7 +92,6 @@ def prepare_trimesh(job: Job, threads: int) -> Cast:
 
 
 def open3d_scene(vertices: Float, faces: NDArray[Any], threads: int) -> Any:
-    """Return an Open3D scene of a mesh."""
     import open3d
 
     scene = open3d.t.geometry.RaycastingScene(nthreads=threads)
@@ -102,14 +101,17 @@ def open3d_scene(vertices: Float, faces: NDArray[Any], threads: int) -> Any:
 
 
 def _rays(job: Job, origin: Float) -> NDArray[np.float32]:
-    """Return the rays (n, 6) of an origin."""
+    """Return all rays (n, 6) from one origin."""
     directions = job.directions @ job.rotation.T
     origins = np.tile(origin, (len(directions), 1))
     return np.hstack([origins, directions]).astype(np.float32)
 
 
 def available_engines() -> dict[str, Callable[[Job, int], Cast]]:
-    """Return functions that prepare an engine for a job, by name; print what is missing."""
+    """Return functions that prepare an engine for a job, keyed by engine name.
+
+    Print which engines are not installed.
+    """
     missing = dict(available_backends())
     engines: dict[str, Callable[[Job, int], Cast]] = {
         backend: partial(prepare_raybeam, backend) for backend in missing
@@ -124,7 +126,7 @@ def available_engines() -> dict[str, Callable[[Job, int], Cast]]:
         missing[name] = "" if find_spec(module) else f"pip install {module}"
     for name, reason in missing.items():
         if reason:
-            print(f"{name} is left out: {reason}")
+            print(f"{name} is skipped: {reason}")
     return {name: prepare for name, prepare in engines.items() if not missing[name]}
 
 
@@ -133,7 +135,7 @@ def measure(
     engines: dict[str, Callable[[Job, int], Cast]],
     options: argparse.Namespace,
 ) -> dict[str, Any]:
-    """Measure the rates of all engines on a job."""
+    """Measure the rates of all engines for one job."""
     builds = {}
     hits = {}
     calls = {}
@@ -161,13 +163,13 @@ def measure(
 
 
 def _rate(job: Job, cast: Cast, repeats: int, clock: str, _: int) -> float:
-    """Return the rate of several casts in Mray/s."""
+    """Return the rate of repeated casts in Mray/s."""
     seconds, _ = time_call(lambda: [cast() for _ in range(repeats)], clock)
     return job.rays * repeats / max(seconds, 1e-9) / 1e6
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print the rates of all engines on a job, and their ratios to the fastest peer."""
+    """Print the rates of all engines for one job, with their ratios to the fastest peer."""
     print(f"\n{row['scene']}, {row['triangles']:,} triangles, {row['rays']:,} {row['order']} rays")
     engines = row["engines"]
     medians = {name: float(np.median(entry["mrays_s"])) for name, entry in engines.items()}
@@ -186,7 +188,6 @@ def show(row: dict[str, Any]) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run from the command line."""
     parser = argument_parser(__doc__, repeat=7, quick=True, clock="wall")
     parser.add_argument(
         "--large", action="store_true", help="also cast in a city of 10 million triangles (13 GB)"
@@ -209,18 +210,18 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def add_scene_options(parser: argparse.ArgumentParser) -> None:
-    """Add options that choose scenes, for `chosen_jobs`."""
+    """Add the options from which `chosen_jobs` selects scenes."""
     parser.add_argument("--scene", action="append", help="only this scene; can be repeated")
     parser.add_argument(
         "--mesh", action="append", type=Path, default=[], help="an additional mesh file"
     )
-    parser.add_argument("--rays", type=int, default=1 << 17, help="rays of a scan")
+    parser.add_argument("--rays", type=int, default=1 << 17, help="number of rays per scan")
 
 
 def chosen_jobs(
     parser: argparse.ArgumentParser, options: argparse.Namespace, large: bool = False
 ) -> list[Callable[[], Job]]:
-    """Return functions that make the jobs of the chosen scenes."""
+    """Return functions that make the jobs of the selected scenes."""
     rays = 2_000 if options.quick else options.rays
     makers = jobs(rays, options.mesh, options.quick, large)
     if unknown := {*(options.scene or ())} - {*makers}:

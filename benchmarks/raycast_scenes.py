@@ -1,4 +1,4 @@
-"""Scenes, and a lidar's rays in them, for benchmarks/raycast.py and benchmarks/trees.py."""
+"""Scenes and lidar rays for benchmarks/raycast.py and benchmarks/trees.py."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A mesh, and the rays to cast at it.
+    """Mesh and the rays to cast at it.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Job:
 
 
 def _tilted_rotation(degrees: float) -> Float:
-    """Return the rotation of a tilted sensor: about z, then by two degrees about x."""
+    """Return the rotation of a sensor: by an angle about z, then by two degrees about x."""
     a = np.radians(degrees)
     b = np.radians(2.0)
     about_z = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
@@ -67,7 +67,7 @@ def _tilted_rotation(degrees: float) -> Float:
 
 
 def _job(name: str, scene: Scene, origins: Float, sensor: Sensor) -> Job:
-    """Make a job of a sensor's revolution."""
+    """Make a job of one sensor revolution."""
     return Job(
         name,
         np.array(scene.vertices),
@@ -79,17 +79,17 @@ def _job(name: str, scene: Scene, origins: Float, sensor: Sensor) -> Job:
 
 
 def _named(kind: str, triangles: int) -> str:
-    """Return the name of a scene, such as city 1e5."""
+    """Return the name of a scene, such as 'city 1e5'."""
     return f"{kind} {triangles:.0e}".replace("e+0", "e")
 
 
 def _lidar(rays: int) -> Sensor:
-    """Make a sensor of 128 rings and 45 degrees, with about `rays` rays per revolution."""
+    """Make a sensor with 128 rings over 45 degrees and about `rays` rays per revolution."""
     return Sensor.grid(rays_per_revolution=max(36, rays // 128), layers=128, vertical_fov_deg=45)
 
 
 def survey_job(rays: int) -> Job:
-    """Make a job of the default survey: its scene, its sensor, its three poses."""
+    """Make a job from the scene, sensor and three poses of the default survey."""
     survey = Survey(poses=[(0, 0, 1), (0, 0, 2), (0, 0, 3)])
     origins = np.array([pose.position for pose in survey.poses])
     firings_per_revolution = max(36, min(survey.sensor.period or 0, rays // 120))
@@ -100,12 +100,12 @@ def survey_job(rays: int) -> Job:
 
 
 def city_job(triangles: int, rays: int) -> Job:
-    """Make a city, with the sensor on the central crossing."""
+    """Make a city with the sensor at the central crossing."""
     return _job(_named("city", triangles), city(triangles), [0, 0, 2], _lidar(rays))
 
 
 def positions_job(triangles: int, rays: int, *, inside: bool) -> Job:
-    """Make a city, with the sensor in streets, or in buildings where all rays hit."""
+    """Make a city with the sensor in streets, or inside buildings, where all rays hit."""
     scene = city(triangles)
     sensor = _lidar(rays)
     lower_m, upper_m = scene.bounds
@@ -120,7 +120,7 @@ def positions_job(triangles: int, rays: int, *, inside: bool) -> Job:
 
 
 def terrain_job(triangles: int, rays: int) -> Job:
-    """Make a terrain, with the sensor 30 m above its middle."""
+    """Make a terrain with the sensor 30 m above its center."""
     scene = terrain(triangles)
     down = RayCaster(scene.vertices, scene.faces, "numpy").cast([0.1, 0.2, 1e4], [[0, 0, -1]])
     height = 1e4 - float(down.distance[0]) + 30
@@ -128,7 +128,10 @@ def terrain_job(triangles: int, rays: int) -> Job:
 
 
 def mesh_job(path: Path, rays: int) -> Job:
-    """Read a mesh file; the sensor is in its middle, 1.5 m above the lowest point."""
+    """Make a job from a mesh file.
+
+    The sensor is at the center, 1.5 m above the lowest point.
+    """
     scene = Scene.load(path)
     lower_m, upper_m = scene.bounds
     middle = (lower_m + upper_m) / 2
@@ -138,9 +141,9 @@ def mesh_job(path: Path, rays: int) -> Job:
 def jobs(
     rays: int, meshes: list[Path], quick: bool, large: bool = False
 ) -> dict[str, Callable[[], Job]]:
-    """Return functions that make jobs, by the name of their scene in `--scene`.
+    """Return functions that make jobs, keyed by their scene name in `--scene`.
 
-    With `large`, they include a city of ten million triangles, which needs 13 GB and minutes.
+    With `large`, they include a city of ten million triangles, which takes minutes and 13 GB.
     """
     cities = [2_000] if quick else [100_000, 1_000_000]
     if large:

@@ -1,4 +1,4 @@
-"""The ray query of NVIDIA Warp that benchmarks/gpu_warp.py measures; requires warp-lang."""
+"""Ray query with NVIDIA Warp for benchmarks/gpu_warp.py (requires warp-lang)."""
 
 import warp as wp
 
@@ -13,7 +13,7 @@ def first_hits(
     t: wp.array(dtype=float),  # type: ignore[valid-type]
     face: wp.array(dtype=int),  # type: ignore[valid-type]
 ):
-    """Write distance and triangle of the closest hit of each ray; triangle -1 for a miss."""
+    """Write the distance and triangle of each ray's closest hit. The triangle is -1 for a miss."""
     i = wp.tid()
     query = wp.mesh_query_ray(mesh, origin, directions[i], 1.0e6)
     if query.result:

@@ -1,12 +1,13 @@
-"""One sweep with actors, sub-rays, weather and noise, compared with the same sweep without them.
+"""Measure the time of one sweep with actors, sub-rays, weather and noise.
 
     python -m benchmarks.realism [--rows NAME ...] [--sensor MODEL]
 
-The sensor is an OS1-64 in a city of 100,000 triangles, on one thread. Rows have moving cars (boxes,
-and meshes of 1,000 triangles), 20 people of 2,320 triangles, rigid and walking, a moving sensor,
+Each time is compared with that of the `bare` sweep, which has none of these. The sensor is an
+OS1-64 in a city of 100,000 triangles, simulated on one thread. Rows add moving cars (boxes or
+meshes of 1,000 triangles), 20 rigid or walking people of 2,320 triangles, a moving sensor,
 sub-rays, noise, systematic errors, lost returns, saturation, rain, fog, snow, ghosts, wet ground or
-spray. `real` combines cars, sub-rays, noise and rain, and `all` everything. `whole survey` and
-`faults` are revolutions of a survey. Values are medians of CPU times.
+spray. `real` combines cars, sub-rays, noise and rain, and `all` combines everything. `whole survey`
+and `faults` are revolutions of a survey. Values are medians of CPU times.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ PEOPLE_M = (4.0, 30.0)
 
 
 def fine_box(triangles: int) -> SceneMesh:
-    """Make the box of a car with at least `triangles` triangles."""
+    """Make a car-sized box with at least `triangles` triangles."""
     mesh = box("Car", (4.5, 1.8, 1.5))
     vertices = mesh.vertices
     faces = mesh.faces
@@ -75,7 +76,7 @@ def fine_box(triangles: int) -> SceneMesh:
 
 
 def cars(count: int, mesh: SceneMesh, seed: int) -> list[Actor]:
-    """Make cars around the sensor, at 10 m/s, with random changes of heading."""
+    """Make cars around the sensor that drive at 10 m/s and change direction at random."""
     random = np.random.default_rng(seed)
     angle, heading = random.uniform(0, 2 * np.pi, (2, count))
     radius = random.uniform(*FIELD_M, count)
@@ -93,7 +94,7 @@ def cars(count: int, mesh: SceneMesh, seed: int) -> list[Actor]:
 
 
 def people(count: int, seed: int, *, walking: bool) -> list[Actor]:
-    """Make copies of a person around the sensor, at 1.4 m/s, in different phases."""
+    """Make people around the sensor that walk at 1.4 m/s in different phases."""
     mesh = join_meshes("Person", load_objects(PERSON, animation="Walk").static)
     assert mesh.animation is not None
     mesh = replace(mesh, animation=replace(mesh.animation, speed_m_s=1.4) if walking else None)
@@ -110,7 +111,10 @@ def people(count: int, seed: int, *, walking: bool) -> list[Actor]:
 
 
 def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> dict[str, Any]:
-    """Make a function of the round for each row; each function returns a sweep."""
+    """Make a function for each row.
+
+    Each function takes the number of the round and returns a sweep.
+    """
     lidar = load_sensor(sensor)
     weather = {"rain": {"rain_mm_h": 10.0}, "snow": {"snow_mm_h": 2.0}}
     weather["fog"] = {"visibility_km": 0.2, "fog_lidar_ratio_sr": 20.0}
@@ -170,7 +174,7 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
 
 
 def revolution_caster(scene: Scene, survey: Survey, backend: str) -> Any:
-    """Return a function that casts a revolution of a survey, of five, and makes its columns."""
+    """Return a function that casts one of five revolutions of a survey and makes its columns."""
     rig = Rig(scene, survey, backend, threads=1)
     scans = survey.scan_count // 5
 
@@ -182,7 +186,7 @@ def revolution_caster(scene: Scene, survey: Survey, backend: str) -> Any:
 
 
 def measure(rows: dict[str, Any], repeat: int) -> dict[str, dict[str, float]]:
-    """Time all rows."""
+    """Measure the times of all rows."""
 
     def sweep(row: str, number: int) -> tuple[float, int]:
         seconds, points = time_call(lambda: rows[row](number % 5))
@@ -201,7 +205,7 @@ def measure(rows: dict[str, Any], repeat: int) -> dict[str, dict[str, float]]:
 
 
 def main(arguments: list[str] | None = None) -> dict[str, dict[str, float]]:
-    """Print the time of each row."""
+    """Print and return the time of each row."""
     parser = argument_parser(__doc__, repeat=9)
     parser.add_argument("--triangles", type=int, default=100_000)
     parser.add_argument("--cars", type=int, nargs="+", default=COUNTS)
@@ -215,7 +219,7 @@ def main(arguments: list[str] | None = None) -> dict[str, dict[str, float]]:
     results = measure(rows, options.repeat)
     for row, values in results.items():
         print(
-            f"{row:20} {values['ms']:8.2f} ms {values['times']:6.2f} x bare "
+            f"{row:20} {values['ms']:8.2f} ms {values['times']:6.2f} x `bare` "
             f"{values['points']:10,} points"
         )
     write_results(options.json, results)

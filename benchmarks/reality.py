@@ -1,4 +1,4 @@
-"""Scenes reconstructed from public recordings, compared with held-out sweeps.
+"""Compare scenes reconstructed from public recordings with held-out sweeps.
 
     python -m benchmarks.reality FOLDER [NAME ...]
 
@@ -11,12 +11,12 @@ FOLDER contains the recordings, each in the folder of its repository:
 | `kitti360` | heisenberg141/Pointcloud-Segmentation | HDL-64E |
 | `hdl32` | cwchen1102/map_reconstruction | HDL-32E |
 
-Sweeps are held out by two rules: `easy` holds out every second sweep, `hard` blocks of 20. The
-static mask does not come from the twin: a point is static if other sweeps, a second away, have
-points in its neighborhood. `next` compares each held-out sweep with the following recorded one,
-pulse by pulse: a scale, since the sensor moved between the two.
+There are two rules for held-out sweeps: `easy` holds out every second sweep, and `hard` holds out
+blocks of 20 sweeps. The static mask is independent of the twin. A point is static if sweeps that
+are a second apart have points in its neighborhood. For scale, `next` compares each held-out sweep
+with the next recorded sweep pulse by pulse, although the sensor moves between the two.
 
-The recordings are not part of lidarpool, and none states a license: fetch them yourself.
+The recordings are not included in lidarpool, because they state no license. Download them yourself.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ _TRAM = Path("exampleData/MuehlburgerTor/velodyne_dist")
 
 
 class Source(NamedTuple):
-    """A recording in the folder of its repository."""
+    """Public recording, and how its files are opened."""
 
     repository: str
     open: Callable[[Path], Recording]
@@ -74,7 +74,10 @@ def _opened(folder: str) -> Callable[[Path], Recording]:
 
 
 def _tram(root: Path) -> Recording:
-    """Open range images: 16-bit PNG files with a row for each ring, and 0 for no return."""
+    """Open range images.
+
+    These are 16-bit PNG files with a row for each ring, in which 0 means no return.
+    """
     files = sorted((root / _TRAM / "data").glob("*.png"))
     entries = (root / _TRAM / "velodyne_config.txt").read_text().splitlines()[-1].split()
     steps_per_m, column_count, ring_count, start_deg, stop_deg = map(float, entries[:5])
@@ -119,7 +122,7 @@ SOURCES = {
 
 
 def part_of(recording: Recording, chosen: slice) -> Recording:
-    """Return some consecutive sweeps of a recording."""
+    """Return the given consecutive sweeps of a recording."""
     numbers = range(recording.count)[chosen]
     return replace(
         recording, count=len(numbers), read=lambda number: recording.read(numbers[number])
@@ -127,7 +130,7 @@ def part_of(recording: Recording, chosen: slice) -> Recording:
 
 
 def mapped_sweeps(count: int, rule: str) -> Ints:
-    """Return the numbers of the sweeps that make the map."""
+    """Return the numbers of the sweeps from which the map is built."""
     numbers = np.arange(count)
     if rule == "easy":
         return numbers[::2]
@@ -137,9 +140,11 @@ def mapped_sweeps(count: int, rule: str) -> Ints:
 
 
 def static_points(sweeps: AlignedSweeps, numbers: Ints) -> dict[int, Bools]:
-    """Return which points of sweeps are static: other sweeps, a second away, saw something there.
+    """Return a mask of the static points of each sweep.
 
-    Independent of the twin: points are counted in voxels, and no ray is cast.
+    A point is static if sweeps at least a second apart have points in its voxel.
+
+    The mask does not depend on the twin, because no rays are cast.
     """
     keys = []
     for number in range(sweeps.recorded.count):
@@ -165,16 +170,16 @@ def static_points(sweeps: AlignedSweeps, numbers: Ints) -> dict[int, Bools]:
 
 
 def _cells(world: Floats) -> Ints:
-    """Return the voxels (n, 3) of points (n, 3)."""
+    """Return the voxel indices (n, 3) of the given points (n, 3)."""
     return np.floor(world / _STATIC_VOXEL_M).astype(np.int64)
 
 
 def to_next(
     sweeps: RecordedSweeps, numbers: Ints, coverage: SensorCoverage
 ) -> dict[str, float | None]:
-    """Return how far the ranges of sweeps are from the ranges of the next recorded sweep.
+    """Compare the ranges of each sweep with those of the next recorded sweep.
 
-    With the F1 of "no return", of cells in which the sensor has returns.
+    The results include the F1 score of "no return" in the image cells that the sensor covers.
     """
     images = {
         n: _range_image(sweeps, n) for n in np.unique([numbers, numbers + 1]) if n < sweeps.count
@@ -205,7 +210,7 @@ def to_next(
 
 
 def _range_image(sweeps: RecordedSweeps, number: int) -> Floats:
-    """Return the ranges (r, c) of a sweep; NaN without a return."""
+    """Return a sweep's range image, with NaN where there is no return."""
     sweep = sweeps.read(number)
     image = np.full((sweeps.ring_count, _IMAGE_COLUMNS), np.nan)
     turns = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi) + 0.5
@@ -217,7 +222,7 @@ def _range_image(sweeps: RecordedSweeps, number: int) -> Floats:
 def interval(
     rays: HeldOutRays, figure: Callable[[HeldOutRays], float | None]
 ) -> list[float] | None:
-    """Return the interval that holds a figure with 95 %, by drawing sweeps again."""
+    """Return the 95 % confidence interval of a measure, estimated by bootstrapping over sweeps."""
     random = np.random.default_rng(0)
     numbers = np.unique(rays.sweep)
     by_sweep = [figure(rays.select(rays.sweep == number)) for number in numbers]
@@ -230,7 +235,7 @@ def interval(
 
 
 def measure(name: str, root: Path, rules: tuple[str, ...]) -> list[dict[str, Any]]:
-    """Build the twins of a recording by the rules, and return and print a row for each."""
+    """Build the twins of a recording for each rule, and print and return a row for each twin."""
     source = SOURCES[name]
     rows = []
     whole = source.open(root / source.repository)
@@ -263,7 +268,7 @@ def measure(name: str, root: Path, rules: tuple[str, ...]) -> list[dict[str, Any
 def _row(
     recorded: RecordedSweeps, poses: RecordedPoses, mapped: Ints, coverage: SensorCoverage
 ) -> dict[str, Any]:
-    """Return the figures of the held-out sweeps of a recording."""
+    """Return the results for the held-out sweeps of a recording."""
     first = first_alignment(recorded, poses)
     submaps = split_into_submaps(first.poses[:, :3, 3])
     counting = np.concatenate([submap.own_numbers for submap in submaps])
@@ -304,7 +309,7 @@ def _row(
 
 
 def _compared(task: BuildTask) -> HeldOutRays | None:
-    """Return the rays of the held-out sweeps of a submap."""
+    """Return the rays of a submap's held-out sweeps."""
     sweeps = task.read()
     standing = find_stationary_points(sweeps, task.submap.numbers.tolist())
     rays, _ = compare_held_out_sweeps(sweeps, task, standing)
@@ -312,7 +317,7 @@ def _compared(task: BuildTask) -> HeldOutRays | None:
 
 
 def _line(row: dict[str, Any]) -> str:
-    """Return the figures of a row as text."""
+    """Format a row as text."""
     twin = row["twin"]
     standing = twin["stationary"]
     no_return = twin["no_return"] or {"f1": float("nan")}
@@ -336,9 +341,9 @@ def _line(row: dict[str, Any]) -> str:
 
 
 def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
-    """Measure, print and return the rows of the recordings in a folder."""
+    """Measure the recordings in a folder, and print and return the rows."""
     parser = argument_parser(__doc__)
-    parser.add_argument("folder", type=Path, help="folder with the folders of the repositories")
+    parser.add_argument("folder", type=Path, help="folder that contains the repositories")
     parser.add_argument("names", nargs="*", help=f"of {', '.join(SOURCES)} (default: all)")
     parser.add_argument("--rules", default="easy,hard", help="easy, hard, or both")
     options = parser.parse_args(arguments)
@@ -346,7 +351,7 @@ def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
     for name in options.names or SOURCES:
         root = options.folder / SOURCES[name].repository
         if not root.is_dir():
-            print(f"{name}: {root} is not there, and is left out")
+            print(f"{name} is skipped, because {root} does not exist")
             continue
         rows += measure(name, options.folder, tuple(options.rules.split(",")))
     write_results(options.json, rows)

@@ -1,12 +1,12 @@
-"""Time to read recordings and views, compared with another checkout of lidarpool.
+"""Measure the time to read and view recordings, optionally compared with another checkout.
 
     python -m benchmarks.recordings [--against CHECKOUT] [--folder FOLDER]
 
-The inputs are written once: an airborne survey (.las), the drive of a rotating sensor (.mcap), a
-sequence in KITTI format, and a data set of a campaign. Each measurement runs in a new process,
-which first performs the action on a small input, so that imports and compilation are not measured.
-Short actions are then repeated, and the minimum counts. The processes of both checkouts run in
-turns. The ratio is less than 1 if this checkout is faster. Times are CPU time.
+The inputs are written once. They are an airborne survey (.las), the drive of a rotating sensor
+(.mcap), a sequence in KITTI format, and a data set of a campaign. Each measurement runs in a new
+process, which first performs the action on a small input, so that imports and compilation are not
+measured. Short actions are then repeated, and the minimum counts. Processes of the two checkouts
+alternate. The ratio is less than 1 if this checkout is faster. Times are CPU times.
 """
 
 import argparse
@@ -36,7 +36,7 @@ LEAST_S = 2  # actions are repeated for so long in each process
 
 
 def write_survey(path, count):
-    """Write points with colors and classes, among them noise, in lines across the flight."""
+    """Write points in lines across the flight path, with colors and classes that include noise."""
     rng = np.random.default_rng(1)
     header = laspy.LasHeader(version="1.4", point_format=7)
     header.scales, header.offsets = np.full(3, 0.001), np.array([4e5, 5.6e6, 0])
@@ -57,7 +57,7 @@ def write_survey(path, count):
 
 
 def make_drive(sweep_count):
-    """Return the points of a moving sensor beside a car, and their sweeps."""
+    """Return the points and sweeps of a sensor that moves past a car."""
     from lidarsim.sweeps.sweeps import Sweeps  # other versions may not have this module
 
     rng = np.random.default_rng(1)
@@ -87,7 +87,7 @@ def make_drive(sweep_count):
 
 
 def write_kitti(folder, sweep_count):
-    """Write a sequence of SemanticKITTI."""
+    """Write a sequence in SemanticKITTI format."""
     rng = np.random.default_rng(1)
     (folder / "velodyne").mkdir(parents=True)
     (folder / "labels").mkdir()
@@ -104,7 +104,7 @@ def write_kitti(folder, sweep_count):
 
 
 def write_inputs(folder, share=1.0):
-    """Write all inputs with a share of the points or sweeps, unless they exist."""
+    """Write all inputs with a fraction of the points or sweeps, unless they exist."""
     from lidarpool.clouds.writing import ExportSpec
 
     if folder.exists():
@@ -121,7 +121,7 @@ def write_inputs(folder, share=1.0):
 
 
 def read_items(path):
-    """Open a recording and read all items: positions in meters, float64, and all columns."""
+    """Open a recording and read its positions in meters and all columns."""
     from lidarpool.recordings.opening import open_recording
 
     recording = open_recording(path)
@@ -140,7 +140,6 @@ def read_items(path):
 
 
 def view(path):
-    """Open a recording in the viewer."""
     from lidarpool.pages.recorded import recorded_view
     from lidarpool.recordings.opening import open_sensors
 
@@ -148,7 +147,7 @@ def view(path):
 
 
 def read_scene(path):
-    """Read points as `lidarpool scene points` does, before surfels are made of them."""
+    """Read points as `lidarpool scene points` does before it makes surfels."""
     from lidarpool.scenario.point_files import read_points
 
     points = read_points(path, None, lambda _: None)
@@ -162,7 +161,7 @@ def read_epoch(path):
 
 
 def read_torch_epoch(path):
-    """Iterate once over all sweeps of a data set as tensors."""
+    """Iterate once over all sweeps of a data set, converted to tensors."""
     return sum(len(item["points"]) for item in lp.sweeps(path).torch())
 
 
@@ -179,7 +178,7 @@ ACTIONS = {  # {name: (function that returns the number of points it has read, i
 
 
 def measure(name, folder, size):
-    """Print the fewest seconds of an action in this process, and the number of points, as JSON."""
+    """Print an action's minimum time in this process and its number of points as JSON."""
     (action, file), seconds = ACTIONS[name], []
     action(folder / "small" / file)
     while sum(seconds) < LEAST_S:
@@ -189,7 +188,7 @@ def measure(name, folder, size):
 
 
 def measure_in_process(checkout, name, folder, size):
-    """Return the seconds of an action in a new process, and the number of points."""
+    """Run an action in a new process, and return its time in seconds and its number of points."""
     paths = os.pathsep.join(f"{checkout}/{part}" for part in ("kernels", "scheduler", "workflows"))
     command = [sys.executable, "-m", __spec__.name, "--measure", name, "--folder", str(folder)]
     command += ["--quick"] if size == "small" else []
@@ -201,7 +200,7 @@ def measure_in_process(checkout, name, folder, size):
 
 
 def compare(name, checkouts, pairs, folder, size):
-    """Return the seconds of an action by checkout, and the number of points; print a row."""
+    """Print a row for an action, and return its time in each checkout and the number of points."""
     calls = {
         str(checkout): lambda _, checkout=checkout: measure_in_process(checkout, name, folder, size)
         for checkout in checkouts
@@ -219,7 +218,6 @@ def compare(name, checkouts, pairs, folder, size):
 
 
 def main(arguments=None):
-    """Print the table."""
     parser = argument_parser(__doc__, repeat=5, quick=True)
     parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="another checkout")
     parser.add_argument("--folder", type=Path, default=ROOT / "build" / "recordings")

@@ -1,4 +1,4 @@
-"""CPU time of the driver, the scheduler and the collectors for each task, receipt and job.
+"""Measure the CPU time of driver, scheduler and collectors per task, receipt and job.
 
     python -m benchmarks.scale [--workers N ...]
     python -m benchmarks.scale --receipts SECONDS [--workers N ...] [--shards N]
@@ -14,11 +14,11 @@ divided into four partitions, and run tasks that do nothing:
 - The CPU time of the scheduler excludes heartbeats, which are measured separately.
 - Growth is the growth of driver and scheduler together, from the smallest to the largest cluster.
 
-With `--receipts`, surveys are cast by GPU workers whose batches, of one scan with four rays, take
-so many seconds: casting ends with a sleep, and the rest of the pipeline is real. The values are
-per receipt, with the share of a minute in which the workers are busy. `--shards N` runs N of these
-clusters at a time. `--jobs N` runs the tiny jobs of `benchmarks.campaign`. Both measure from a
-fifth of the work on, to exclude the start and the end of a run.
+With `--receipts SECONDS`, GPU workers cast surveys in batches of one scan with four rays. Each
+batch takes the given time, because casting ends with a sleep. The rest of the pipeline is real. The
+values are per receipt, with the fraction of a minute in which the workers are busy. `--shards N`
+runs N of these clusters at a time. `--jobs N` runs the tiny jobs of `benchmarks.campaign`. Both
+skip the first fifth of the work, to exclude the start of a run.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ async def _workers(
     seconds: float = 0.0,
     first: int = 0,
 ) -> None:
-    """Run workers as `run_workers` does; batches take `seconds` to cast."""
+    """Run workers like `run_workers`, with batches that take `seconds` to cast."""
     columns_of = lidarpool.run.pipeline.rigs.columns_of
 
     def slowly(points: Any) -> Any:
@@ -75,7 +75,7 @@ def name_of_worker(_: object = None) -> str:
 
 
 def divide(client: Client) -> tuple[list[Partition], float]:
-    """Divide all workers into four partitions; return the partitions and the elapsed seconds."""
+    """Divide all workers into four partitions, and return these and the elapsed seconds."""
     start = time.perf_counter()
     remaining = Pool.from_client(client)
     workers_per_partition = len(remaining) // len(NAMES)
@@ -116,7 +116,7 @@ WAYS = {
 
 
 def measure(workers: int, tasks: int) -> dict[str, Any]:
-    """Return the figures of a cluster of `workers` workers."""
+    """Return the results for a cluster of `workers` workers."""
     with (
         process(run_scheduler) as (scheduler, address),
         process(_workers, address, workers),
@@ -162,13 +162,13 @@ ROOM = Scene.from_meshes([box("Room", (8, 6, 3))])
 
 
 def small_survey(scans: int) -> Survey:
-    """Return a survey of scans of four rays."""
+    """Return a survey whose scans have four rays."""
     sensor = Sensor.grid(rays_per_revolution=4, layers=1, step_deg=360)
     return Survey(sensor, [(0.0, 0.0, 1.0)] * scans, steps=1)
 
 
 class CostSamples:
-    """Processor time per receipt or job of each kind of process, after a fifth of the work."""
+    """CPU time of each kind of process per receipt or job, without the first fifth of the work."""
 
     def __init__(self, total: int, processes: dict[str, list[psutil.Process]]) -> None:
         self._all = total
@@ -184,7 +184,7 @@ class CostSamples:
         }
 
     def __call__(self, progress: Progress) -> None:
-        """Sample the progress and the processor times."""
+        """Sample the progress and the CPU times."""
         finished = progress.jobs_done if progress.jobs else progress.collected
         if not self._samples or finished > self._samples[-1][0]:
             if finished <= self._all // 5:
@@ -192,7 +192,7 @@ class CostSamples:
             self._samples.append((finished, time.perf_counter(), self._cpu_s()))
 
     def figures(self) -> dict[str, float]:
-        """Return items per second, and milliseconds per item without heartbeats."""
+        """Return items per second, and milliseconds per item excluding heartbeats."""
         (first_count, start, cpu_before), *_, (last_count, stop, cpu_after) = self._samples
         took = {
             name: cpu_after[name] - cpu_before[name] - self._idle[name] * (stop - start)
@@ -213,7 +213,7 @@ class CostSamples:
 def casting_cluster(
     gpus: int, seconds: float
 ) -> Iterator[tuple[Client, dict[str, list[psutil.Process]]]]:
-    """Start slow casting workers and a worker of LIDAR; yield a client and processes by kind."""
+    """Start slow casting workers and a LIDAR worker; yield a client and the processes by kind."""
     with ExitStack() as stack:
 
         def start(main: Callable[..., Any], *arguments: Any) -> tuple[psutil.Process, str]:
@@ -230,7 +230,7 @@ def casting_cluster(
 
 
 def measure_receipts(gpus: int, seconds: float, scans: int) -> dict[str, float]:
-    """Run a survey with batches of one scan; return its figures and the share of casting."""
+    """Run a survey with one scan per batch, and return its results."""
     with casting_cluster(gpus, seconds) as (client, processes), single_scans():
         simulate(ROOM, small_survey(gpus), client=client, backend="numpy")
         counts = CostSamples(scans, processes)
@@ -254,7 +254,10 @@ def measure_receipts(gpus: int, seconds: float, scans: int) -> dict[str, float]:
 
 
 def measure_shards(shards: int, *arguments: Any) -> dict[str, float]:
-    """Run `measure_receipts` in several clusters at a time; return summed rates, other means."""
+    """Run `measure_receipts` in several clusters at once.
+
+    Rates are added up, and other values are averaged.
+    """
     spawn = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(shards, mp_context=spawn) as pool:
         rows = list(pool.map(measure_receipts, *([value] * shards for value in arguments)))
@@ -263,7 +266,7 @@ def measure_shards(shards: int, *arguments: Any) -> dict[str, float]:
 
 
 def measure_jobs(jobs: int) -> dict[str, float]:
-    """Run a campaign of tiny jobs; return its figures."""
+    """Run a campaign of tiny jobs and return its results."""
     with casting_cluster(4, 0.0) as (client, processes), tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "campaign.yaml"
         data = Path(folder) / "data"
@@ -277,7 +280,7 @@ def measure_jobs(jobs: int) -> dict[str, float]:
 
 
 def growth(smallest: dict[str, float], largest: dict[str, float]) -> float | None:
-    """Return the growth of driver and scheduler time together, or None from zero."""
+    """Return how much the sum of driver and scheduler time grows, or None if it starts at zero."""
     smallest_ms, largest_ms = (
         figures["driver_ms"] + figures["scheduler_ms"] for figures in (smallest, largest)
     )
@@ -287,10 +290,16 @@ def growth(smallest: dict[str, float], largest: dict[str, float]) -> float | Non
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser = argument_parser(__doc__)
     parser.add_argument("--workers", type=int, nargs="+", default=[10, 50, 200])
-    parser.add_argument("--tasks", type=int, default=20_000, help="tasks of each way to submit")
+    parser.add_argument(
+        "--tasks", type=int, default=20_000, help="number of tasks for each way to submit"
+    )
     parser.add_argument("--receipts", type=float, help="seconds to cast a batch of one scan")
-    parser.add_argument("--scans", type=int, default=3_000, help="with --receipts, of a survey")
-    parser.add_argument("--shards", type=int, default=1, help="with --receipts, clusters at a time")
+    parser.add_argument(
+        "--scans", type=int, default=3_000, help="scans per survey (with --receipts)"
+    )
+    parser.add_argument(
+        "--shards", type=int, default=1, help="number of simultaneous clusters (with --receipts)"
+    )
     parser.add_argument("--jobs", type=int, help="number of tiny jobs")
     options = parser.parse_args(arguments)
     rows: dict[str, Any] = {}
@@ -308,7 +317,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
 
 
 def measure_tasks(worker_counts: list[int], tasks: int) -> dict[str, Any]:
-    """Measure the cost of tasks that do nothing, in clusters of growing size."""
+    """Measure tasks that do nothing, on clusters of growing size."""
     clusters = {}
     for count in worker_counts:
         clusters[count] = values = measure(count, tasks)

@@ -1,4 +1,4 @@
-"""Sweeps of a `Scanner` in a loop, compared with ray casting alone, Open3D and MuJoCo.
+"""Compare the sweeps of a `Scanner` in a loop with ray casting alone, Open3D and MuJoCo.
 
     python -m benchmarks.scanner [--case NAME] [--peers PYTHON]
 
@@ -12,7 +12,7 @@ different poses, as in a loop:
 
 With `--peers`, MuJoCo's `mj_multiRay` and the CPU and Warp backends of MuJoCo-LiDAR (Warp on the
 CPU) run in a separate Python environment, which needs mujoco-lidar and warp-lang. They are called
-once for each pose, with directions that were rotated before.
+once for each pose, with directions that are already rotated.
 """
 
 from __future__ import annotations
@@ -52,14 +52,17 @@ HEIGHT_M = 1.8
 
 
 def sensor_of(case: str) -> Sensor:
-    """Make the sensor of a case; a robot's sensor has 64 rays around it."""
+    """Make the sensor of a case.
+
+    A robot's sensor has 64 rays in a circle.
+    """
     if case == "robots":
         return Sensor.grid(64, 1, step_deg=360, max_range_m=30)
     return load_sensor(case)
 
 
 def poses_of(count: int, number: int) -> Float:
-    """Return the poses of a round, (count, 4, 4): on the street, with random yaw."""
+    """Return poses (count, 4, 4) on the street with random yaw angles, for one round."""
     random = np.random.default_rng(number)
     angle = random.uniform(-np.pi, np.pi, count)
     poses = np.tile(np.eye(4), (count, 1, 1))
@@ -73,7 +76,7 @@ def poses_of(count: int, number: int) -> Float:
 
 
 class LidarpoolScans:
-    """Ray casting alone, and scanners, with the same rays."""
+    """Ray casting alone and scanners, all with the same rays."""
 
     def __init__(self, scene: Scene, sensor: Sensor, backend: str) -> None:
         self.sensor = sensor
@@ -92,7 +95,7 @@ class LidarpoolScans:
         self.noisy = Scanner(scene, sensor, noise=noise, backend=backend, threads=1)
 
     def cast(self, poses: Float) -> int:
-        """Cast the rays from poses (k, 4, 4); return the number of hits."""
+        """Cast the rays from poses (k, 4, 4), and return the number of hits."""
         hits = self.caster.scan(
             self.pattern,
             poses[:, :3, 3],
@@ -109,21 +112,21 @@ class LidarpoolScans:
         return self.scanner.ranges(poses)
 
     def noise(self, poses: Float) -> Any:
-        """Make range images with noise."""
+        """Return range images with noise."""
         return self.noisy.ranges(poses)
 
     def sweep(self, poses: Float) -> int:
-        """Make the cloud of a pose; return its number of points."""
+        """Make the cloud of a stationary sensor, and return the number of points."""
         return len(self.scanner.sweep(poses[0, :3, 3]))
 
     def moving(self, poses: Float) -> int:
-        """Make the cloud of a sensor at 20 m/s; return its number of points."""
+        """Make the cloud of a sensor that moves at 20 m/s, and return the number of points."""
         positions = poses[0, :3, 3] + np.array([[0, 0, 0], [4, 0, 0]])
         return len(self.scanner.sweep(Track([0, 0.2], positions)))
 
 
 class Peer:
-    """Process of a Python with a package, which casts a job of arrays on request."""
+    """Process of another Python interpreter that casts the rays of a file on request."""
 
     def __init__(self, name: str, python: str, job: Path, clock: str) -> None:
         script = Path(__file__).with_name("scanner_peers.py")
@@ -145,7 +148,7 @@ class Peer:
         raise RuntimeError(f"The peer ended with {self._process.wait()}")
 
     def cast(self) -> tuple[float, int]:
-        """Return the time of a revolution, seconds, and the number of hits."""
+        """Return the time of one cast in seconds, and the number of hits."""
         assert self._process.stdin is not None
         self._process.stdin.write("cast\n")
         self._process.stdin.flush()
@@ -190,7 +193,7 @@ class Open3D:
 
 
 def measure(case: str, scene: Scene, options: argparse.Namespace) -> dict[str, Any]:
-    """Time all methods of a case."""
+    """Measure all methods of a case."""
     count = options.robots if case == "robots" else 1
     scans = LidarpoolScans(scene, sensor_of(case), options.backend)
     methods: dict[str, Callable[[Float], Any]] = {
@@ -227,7 +230,7 @@ def measure(case: str, scene: Scene, options: argparse.Namespace) -> dict[str, A
 def _time_peer(
     name: str, scans: LidarpoolScans, scene: Scene, poses: Float, options: argparse.Namespace
 ) -> list[tuple[float, float]]:
-    """Return the time and the share of hits of each cast of a peer."""
+    """Return the time and the hit ratio of each cast by a peer."""
     rays = np.concatenate([scans.directions @ pose[:3, :3].T for pose in poses])
     with tempfile.TemporaryDirectory() as folder:
         job = Path(folder) / "job.npz"
@@ -246,35 +249,36 @@ def _time_peer(
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print the execution times of a case."""
+    """Print the times of a case."""
     print(
-        f"\n{row['case']} by {row['backend']}: {row['rays']:,} rays from {row['poses']:,} poses, "
+        f"\n{row['case']} with {row['backend']}: {row['rays']:,} rays from {row['poses']:,} poses, "
         f"{row['triangles']:,} triangles"
     )
     for method, seconds in row["seconds"].items():
         ratio = median_ratio(seconds, row["seconds"]["cast"])
         print(
             f"  {method:<17} {1e3 * np.median(seconds):9.2f} ms  {ratio:6.2f} x cast; "
-            f"hits {100 * row['hits'][method]:.1f} % of rays"
+            f"{100 * row['hits'][method]:.1f} % of rays hit"
         )
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run from the command line."""
     parser = argument_parser(__doc__, repeat=21, quick=True, clock="wall")
     backends = [name for name, reason in available_backends().items() if not reason]
     parser.add_argument("--case", action="append", choices=CASES, help="only this case")
     parser.add_argument("--backend", choices=backends, default=backends[0])
     parser.add_argument("--triangles", type=int, default=100_000)
     parser.add_argument("--robots", type=int, default=1000)
-    parser.add_argument("--peers", default="", metavar="PYTHON", help="Python that has the peers")
+    parser.add_argument(
+        "--peers", default="", metavar="PYTHON", help="Python interpreter with the peers"
+    )
     options = parser.parse_args(arguments)
     if options.quick:
         options.triangles = 10_000
         options.robots = 20
         options.repeat = 2
     if not options.peers:
-        print("mujoco-lidar is left out, because --peers is not given")
+        print("mujoco-lidar is skipped, because --peers is not given")
     elif not has_modules(options.peers, "mujoco_lidar", "warp"):
         parser.error(f"{options.peers} lacks peers: pip install mujoco-lidar mujoco warp-lang")
     scene = city(options.triangles)

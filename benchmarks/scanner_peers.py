@@ -1,4 +1,4 @@
-"""Casters of other packages for benchmarks/scanner.py; requires only NumPy and these packages.
+"""Ray casters of other packages, run by benchmarks/scanner.py in another Python environment.
 
 The process builds its tree, prints "ready", and then casts once for each line on standard input.
 """
@@ -18,7 +18,7 @@ Job = dict[str, Any]
 
 
 def _mujoco_model(job: Job) -> tuple[Any, Any]:
-    """Make a model of the scene, and its data."""
+    """Make a MuJoCo model of the scene, and its data."""
     import mujoco
 
     spec = mujoco.MjSpec()
@@ -37,7 +37,7 @@ def _mujoco_model(job: Job) -> tuple[Any, Any]:
 
 
 def mujoco_caster(job: Job) -> Callable[[], int]:
-    """Return a function that casts the rays of each firing with one call, from one origin."""
+    """Return a function that casts the rays of each origin with one call of MuJoCo."""
     import mujoco
 
     model, data = _mujoco_model(job)
@@ -70,7 +70,7 @@ def mujoco_caster(job: Job) -> Callable[[], int]:
 
 
 def mujoco_lidar_caster(job: Job, backend: str) -> Callable[[], int]:
-    """Return a function that casts each origin's rays with one call of MuJoCo-LiDAR."""
+    """Return a function that casts the rays of each origin with one call of MuJoCo-LiDAR."""
     if backend == "cpu":
         from mujoco_lidar.core_cpu.mjlidar_cpu import MjLidarCPU as Caster
     else:
@@ -109,7 +109,7 @@ CASTERS = {
 
 
 def main() -> None:
-    """Answer each line on standard input with the time of a cast."""
+    """Cast once for each line on standard input, and print the time."""
     name, path, clock = sys.argv[1:]
     clock_s = {"wall": time.perf_counter, "cpu": time.process_time}[clock]
     cast = CASTERS[name](dict(np.load(path)))

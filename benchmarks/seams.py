@@ -1,4 +1,4 @@
-"""Rays where watertightness is hardest: at the edges and corners of a closed mesh, from inside."""
+"""Rays from inside a closed mesh to its edges and corners, where rays are most likely to escape."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _PART = 1 << 18  # rays that are cast at a time
 def seam_rays(
     vertices: Float, faces: Index, origins: Float, count: int, rng: np.random.Generator
 ) -> Float:
-    """Return directions from origins to points of edges: corners, middles, and between."""
+    """Return directions from the origins to corners, edge midpoints, and other points on edges."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edge = vertices[edges[rng.integers(len(edges), size=count)]]
     part = rng.choice([0.0, 0.5, 1.0, np.nan], count)
@@ -31,10 +31,10 @@ def escaped(
     count: int,
     rng: np.random.Generator,
 ) -> int:
-    """Count escaping rays: `count` rays from a point and `count` rays from points around it.
+    """Count escaping rays among `count` rays from a point and `count` rays from points around it.
 
-    `inside` is a point (3,) inside the closed mesh, and `room` the distance by which it may be
-    moved along each axis.
+    `inside` is a point (3,) inside the closed mesh. `room` is the distance by which this point may
+    be moved along each axis.
     """
     leaks = 0
     for origins in (inside, inside + room * rng.uniform(-1, 1, (count, 3))):
@@ -46,7 +46,7 @@ def escaped(
 def count_escaped(
     caster: RayCaster, mesh: tuple[Float, Index], inside: Float, room: float, count: int
 ) -> dict[str, int]:
-    """Count escaping rays among about `count` rays, part by part."""
+    """Count escaping rays among about `count` rays, which are cast in parts to limit memory."""
     rng = np.random.default_rng(0)
     cast = leaks = 0
     while cast < count:

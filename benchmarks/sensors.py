@@ -1,4 +1,4 @@
-"""One revolution of sensor models in motion, compared with a grid of rays from a fixed pose.
+"""Compare moving sensor models with a grid of rays that is cast from a fixed pose.
 
     python -m benchmarks.sensors [--model NAME] [--backend NAME]
 
@@ -44,14 +44,14 @@ CASES = ("grid", "still", "moving", "turning", "noise", "ten actors", "19 sub-ra
 
 
 def track(shift: tuple[float, float] = (0.0, 0.0), speed: float = 1.0) -> Track:
-    """Make a level trajectory along the street, beside the carrier's; the survey is its middle."""
+    """Make a level trajectory along the street, next to that of the carrier."""
     start, end = np.array(LINE)
     positions = np.array([start, end]) * (speed, 1, 1) + (*shift, 0)
     return Track([-0.5, 0.5], positions, start_s=0, duration_s=0.2)
 
 
 def bend(rate_deg: float = 30.0) -> Track:
-    """Make the trajectory along the street of a carrier that turns to the left."""
+    """Make the trajectory of a carrier that drives along the street and turns left."""
     straight = track()
     half = np.radians(rate_deg) * np.array([-0.5, 0.5]) / 2
     quaternions = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)
@@ -59,14 +59,16 @@ def bend(rate_deg: float = 30.0) -> Track:
 
 
 def surveys(name: str, share: float) -> dict[str, Survey]:
-    """Return the surveys of a sensor model by case, without actors, which belong to the scene.
+    """Return the surveys of a sensor model, keyed by case.
+
+    Actors are part of the scene instead.
 
     Parameters
     ----------
     name
         Name of the sensor model.
     share
-        Share of a revolution that is cast.
+        Fraction of a revolution that is cast.
     """
     sensor = load_sensor(name, step_deg=360 * share)
     first, stop = sensor.firings(0)
@@ -92,7 +94,7 @@ def surveys(name: str, share: float) -> dict[str, Survey]:
 
 
 def traffic(scene: Scene) -> Scene:
-    """Put ten cars into a scene: five ahead of the carrier, and five oncoming cars."""
+    """Add ten cars to a scene: five ahead of the carrier, and five oncoming ones."""
     trajectories = [track((8.0 + 6 * k, 3.6 * (k % 2)), 1 - 1.5 * (k % 2)) for k in range(10)]
     cars = [
         Actor(box(f"car {k}", (4.5, 1.8, 1.5)), _on_ground(trajectory))
@@ -106,7 +108,7 @@ def _on_ground(trajectory: Track) -> Track:
 
 
 def make_columns(batches: list[BatchPoints]) -> int:
-    """Make all columns of a cloud; return the number of points."""
+    """Make all columns of a cloud, and return the number of points."""
     for returns in batches:
         for column in returns.survey.stored_columns:
             column.make(returns)
@@ -114,7 +116,7 @@ def make_columns(batches: list[BatchPoints]) -> int:
 
 
 def measure(name: str, backend: str, scene: Scene, options: argparse.Namespace) -> dict[str, Any]:
-    """Time all cases of a model on a backend."""
+    """Measure all cases of a sensor model on a backend."""
     crowded = traffic(scene)
     rigs = {
         case: Rig(crowded if case == "ten actors" else scene, survey, backend, threads=1)
@@ -135,16 +137,16 @@ def measure(name: str, backend: str, scene: Scene, options: argparse.Namespace) 
 
 
 def _time_rig(rig: Rig, clock: str, _: int) -> tuple[list[float], int]:
-    """Return the time of casting, of casting and making columns, and the number of points."""
+    """Return the times for casting without and with making columns, and the number of points."""
     cast_s, batches = time_call(lambda: list(rig.cast(0, rig.survey.scan_count)), clock)
     columns_s, count = time_call(lambda: make_columns(batches), clock)
     return [cast_s, cast_s + columns_s], count
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print the execution times of a sensor model on a backend."""
+    """Print the times of a sensor model on a backend."""
     print(
-        f"\n{row['model']} by {row['backend']}: {row['rays']:,} rays in {row['firings']:,} "
+        f"\n{row['model']} with {row['backend']}: {row['rays']:,} rays in {row['firings']:,} "
         f"firings, {row['triangles']:,} triangles"
     )
     seconds = {case: np.array(times).T for case, times in row["seconds"].items()}
@@ -154,12 +156,11 @@ def show(row: dict[str, Any]) -> None:
             f"{stage} {1e3 * np.median(own):9.2f} ms {median_ratio(own, other):6.3f} x {base}"
             for stage, own, other in zip(STAGES, times, seconds[base], strict=True)
         ]
-        points = f"points {100 * row['hits'][case]:.1f} % of rays"
+        points = f"{100 * row['hits'][case]:.1f} % of rays give points"
         print("; ".join([f"  {case:<12} {words[0]}", *words[1:], points]))
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run from the command line."""
     parser = argument_parser(__doc__, repeat=9, quick=True, clock="wall")
     backends = [name for name, reason in available_backends().items() if not reason]
     parser.add_argument("--model", action="append", help="only this model; can be repeated")

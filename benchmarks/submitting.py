@@ -1,11 +1,11 @@
-"""CPU time of `Partition.submit`, compared with `Client.submit`, also with a slow scheduler.
+"""Compare the CPU time of `Partition.submit` with that of `Client.submit`.
 
     python -m benchmarks.submitting [--tasks N] [--delay SECONDS] [--kind KIND]
 
 Two equal clusters of worker processes have their schedulers in separate processes. The same tasks
 are sent to one cluster by `client.submit(resources=)` and to the other by `Partition.submit`, in
 alternating blocks. CPU time is the sum for driver and scheduler. With `--delay 2`, the scheduler
-responds to requests 2 s late, like a busy scheduler; messages that nobody waits for are not
+responds to requests 2 s late, like a busy scheduler. Messages that require no response are not
 delayed.
 """
 
@@ -37,7 +37,7 @@ SLOTS = 2
 
 
 class Cost(NamedTuple):
-    """Processor time of driver and scheduler, and the time until all tasks were sent; seconds."""
+    """CPU time of the driver and the scheduler, and the time to send all tasks, in seconds."""
 
     driver: float
     scheduler: float
@@ -45,14 +45,14 @@ class Cost(NamedTuple):
 
 
 class Side:
-    """One of the two clusters, and how its tasks are submitted."""
+    """One of the two clusters, with its function to submit a task."""
 
     def __init__(self, pid: int, submit: Callable[[str], Future]) -> None:
         self._processes = psutil.Process(), psutil.Process(pid)
         self._submit = submit
 
     def run(self, tasks: int) -> Cost:
-        """Submit tasks, and wait for their ends."""
+        """Submit tasks and wait until they are done."""
         gc.collect()
         before = [cpu_seconds(process) for process in self._processes]
         started = time.perf_counter()
@@ -67,7 +67,7 @@ class Side:
 
 
 def serve(declared: bool) -> None:
-    """Start a cluster, print the address of its scheduler, and stay until the input ends."""
+    """Start a cluster, print its scheduler address, and wait until standard input ends."""
     options: dict[str, Any] = {"resources": {NAME: SLOTS}} if declared else {}
     with LocalCluster(
         n_workers=WORKERS, threads_per_worker=SLOTS, dashboard_address="127.0.0.1:0", **options
@@ -78,7 +78,7 @@ def serve(declared: bool) -> None:
 
 @contextmanager
 def cluster_of(kind: str) -> Iterator[tuple[Client, int]]:
-    """Yield a client of a cluster in a process of its own, and the process of its scheduler."""
+    """Start a cluster in another process, and yield a client and the scheduler's process ID."""
     command = [sys.executable, "-m", "benchmarks.submitting", "--serve", kind]
     server = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert server.stdin is not None and server.stdout is not None
@@ -93,7 +93,7 @@ def cluster_of(kind: str) -> Iterator[tuple[Client, int]]:
 
 
 def answer_late(delay_s: float, dask_scheduler: Any = None) -> None:
-    """Have the scheduler answer the requests of `run_on_scheduler` late."""
+    """Delay the scheduler's answers to requests of `run_on_scheduler`."""
     answer = dask_scheduler.handlers["run_function"]
 
     async def late(comm: Any, *args: Any, **kwargs: Any) -> Any:
@@ -105,7 +105,7 @@ def answer_late(delay_s: float, dask_scheduler: Any = None) -> None:
 
 
 def measure(kind: str, tasks: int, pairs: int, delay_s: float) -> dict[str, Floats]:
-    """Return the costs (fields, pairs) of each way to submit tasks."""
+    """Return the costs of both ways to submit tasks, as arrays (fields, pairs)."""
     with cluster_of("declared") as (plain, plain_pid), cluster_of(kind) as (client, pid):
         part = Partition(NAME, client)
         if kind == "divided":
@@ -131,10 +131,12 @@ def measure(kind: str, tasks: int, pairs: int, delay_s: float) -> dict[str, Floa
 
 
 def main(arguments: list[str] | None = None) -> dict[str, float]:
-    """Measure, print and return the medians of all pairs."""
+    """Measure all pairs, then print and return the medians."""
     parser = argument_parser(__doc__, repeat=9)
     parser.add_argument("--tasks", type=int, default=10_000)
-    parser.add_argument("--delay", type=float, default=0.0, help="of the scheduler, seconds")
+    parser.add_argument(
+        "--delay", type=float, default=0.0, help="response delay of the scheduler in seconds"
+    )
     parser.add_argument("--kind", choices=["declared", "divided"], default="divided")
     parser.add_argument("--serve", choices=["declared", "divided"], help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
@@ -148,12 +150,12 @@ def main(arguments: list[str] | None = None) -> dict[str, float]:
         for name, seconds in zip(Cost._fields, rows, strict=True)
     }
     for name, value in results.items():
-        print(f"{name}: {value:.0f} µs a task")
+        print(f"{name}: {value:.0f} µs per task")
     totals = {way: rows[:2].sum(axis=0) for way, rows in costs.items()}  # driver and scheduler
     ratios = totals["Partition.submit"] / totals["Client.submit"]
     results["ratio"] = float(np.median(ratios))
     words = " ".join(f"{ratio:.3f}" for ratio in sorted(ratios))
-    print(f"ratio: {results['ratio']:.3f}, of the pairs: {words}")
+    print(f"median ratio: {results['ratio']:.3f}; ratios of all pairs: {words}")
     write_results(options.json, results)
     return results
 

@@ -1,10 +1,10 @@
-"""A complete survey, compared with an expert's single-process script.
+"""Compare a complete survey with an expert's single-process script.
 
     python -m benchmarks.survey [--rays 1e8] [--pictures]
 
 The script runs in one process: Open3D casts rays on all cores, NumPy thins and rounds the points,
 and Open3D writes the PLY file. lidarpool runs as a command with `--cloud-only` on a cluster that it
-starts itself. Both are complete processes and run in turns. Their clouds are compared.
+starts itself. Both are complete processes, which run in turn. Their clouds are compared.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MESH = "city.glb"
 
 
 def poses(count: int) -> list[tuple[float, float, float]]:
-    """Return random positions in the city, at the height of a car roof."""
+    """Return random positions in the city at the height of a car roof."""
     from lidarscenes.procedural.city import city
 
     lower_m, upper_m = city(TRIANGLES).bounds
@@ -40,7 +40,7 @@ def poses(count: int) -> list[tuple[float, float, float]]:
 
 
 def ray_directions() -> np.ndarray:
-    """Return the unit directions of a revolution, (rays, 3)."""
+    """Return the unit directions (rays, 3) of a revolution."""
     azimuth = 2 * np.pi * np.arange(RAYS_PER_TURN) / RAYS_PER_TURN
     elevation = np.linspace(-np.radians(FOV_DEG) / 2, np.radians(FOV_DEG) / 2, LAYERS)
     a, e = np.meshgrid(azimuth, elevation, indexing="ij")
@@ -49,7 +49,7 @@ def ray_directions() -> np.ndarray:
 
 
 def script(rays: int, folder: Path) -> None:
-    """Run the survey in this process as a plain script would, and write its cloud."""
+    """Run the survey in this process, like a plain script, and write its cloud."""
     import open3d as o3d
 
     from lidarpool import Scene
@@ -84,12 +84,12 @@ def script(rays: int, folder: Path) -> None:
 
 
 def scan_count(rays: int) -> int:
-    """Return the number of scans, each a whole revolution."""
+    """Return the number of scans, each of which is a whole revolution."""
     return max(1, round(rays / (RAYS_PER_TURN * LAYERS)))
 
 
 def scenario(rays: int, folder: Path) -> Path:
-    """Write the mesh and scenario of the same survey, and return the path of the scenario."""
+    """Write the mesh and scenario of the same survey, and return the scenario's path."""
     from lidarscenes.procedural.city import city
     from lidarscenes.writers.scene_file import write_scene
 
@@ -112,7 +112,10 @@ def scenario(rays: int, folder: Path) -> Path:
 
 
 def time_side(side: str, rays: int, folder: Path) -> tuple[float, float]:
-    """Return and print the wall and CPU time of the process of a side and its children, seconds."""
+    """Run one side in its own process.
+
+    Print and return its wall time and CPU time in seconds, including child processes.
+    """
     out_folder = folder / side
     out_folder.mkdir(exist_ok=True)
     python = [sys.executable, "-m"]
@@ -132,10 +135,9 @@ def time_side(side: str, rays: int, folder: Path) -> tuple[float, float]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the benchmark, or only the script."""
     parser = argument_parser(__doc__, repeat=3)
     parser.add_argument("--rays", type=lambda text: int(float(text)), default=100_000_000)
-    parser.add_argument("--pictures", action="store_true", help="also run with pictures and report")
+    parser.add_argument("--pictures", action="store_true", help="also run with plots and report")
     parser.add_argument("--script", type=Path, metavar="FOLDER", help="only run the script")
     options = parser.parse_args(arguments)
     if options.script:
@@ -151,15 +153,17 @@ def main(arguments: list[str] | None = None) -> None:
     seconds = {side: np.transpose(times) for side, times in results.items()}  # wall, CPU
     for index, quantity in enumerate(("wall time", "CPU time")):
         ratio = median_ratio(seconds["lidarpool"][index], seconds["script"][index])
-        print(f"{quantity}: lidarpool {ratio:.2f} x the script's, median of {options.repeat}")
+        print(
+            f"{quantity}: lidarpool {ratio:.2f} x the script's (median of {options.repeat} rounds)"
+        )
     if options.pictures:
         added_s = np.median(seconds["pictures"][0] - seconds["lidarpool"][0])
-        print(f"pictures and report: {added_s:.1f} s more")
+        print(f"plots and report: {added_s:.1f} s of additional wall time")
     write_results(options.json, results)
 
 
 def compare(folder: Path) -> None:
-    """Print the share of points that agree in both clouds, and the distances between them."""
+    """Print the proportion of points on which both clouds agree, and the distances between them."""
     from lidarpool import read_cloud
 
     script_cloud, our_cloud = (
@@ -175,10 +179,10 @@ def compare(folder: Path) -> None:
         else np.zeros(1)
     )
     print(
-        f"{len(script_cloud):,} and {len(our_cloud):,} points, {share:.4%} of them in the "
-        "same place of the order with the same labels; "
-        f"half of these within {np.median(distances):.3f} m, "
-        f"99.9 % within {np.quantile(distances, 0.999):.3f} m"
+        f"{len(script_cloud):,} and {len(our_cloud):,} points; {share:.4%} of them have "
+        "the same labels in the same order; "
+        f"of these, half agree within {np.median(distances):.3f} m, "
+        f"and 99.9 % within {np.quantile(distances, 0.999):.3f} m"
     )
 
 

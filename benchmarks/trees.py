@@ -1,12 +1,12 @@
-"""Tests per ray in our bounding volume hierarchies, compared with better ones.
+"""Compare the tests per ray of our bounding volume hierarchy with better hierarchies.
 
     python -m benchmarks.trees [--scene NAME] [--mesh FILE]
 
-Three trees are traversed by the same code, intersect.cu compiled for the CPU: ours; a tree that is
-clustered up to its root (ploc.py without the sweep); and a tree from a full sweep with the surface
-area heuristic, which is at least as good as what Embree builds. Leaves and width are equal. The
-table lists nodes (of four boxes), triangle tests and decisions in double precision per ray.
-Requires g++.
+The same code, intersect.cu compiled for the CPU, traverses three trees: our tree, a tree that is
+clustered up to its root (ploc.py without the sweep), and a tree built by a full sweep with the
+surface area heuristic, which is at least as good as Embree's trees. All have the same leaf size and
+width. The table lists visited nodes (four boxes each), triangle tests, and decisions in double
+precision per ray. The benchmark requires g++.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _BLOCK = 128
 
 
 def compile_kernels(folder: Path) -> ctypes.CDLL:
-    """Compile intersect.cu for the CPU, with counters."""
+    """Compile intersect.cu for the CPU, with counters of nodes, triangles and decisions."""
     library = folder / "intersect.so"
     files = importlib.resources.files("raybeam")
     with importlib.resources.as_file(files / "intersect.cu") as kernels:
@@ -69,7 +69,7 @@ def compile_kernels(folder: Path) -> ctypes.CDLL:
 
 
 def count(library: ctypes.CDLL, layout: MeshTables, mesh: LocalMesh, job: Job) -> dict[str, float]:
-    """Cast the rays of a job, and return the counters per ray and the share of hits."""
+    """Cast the rays of a job, and return the counts per ray and the hit ratio."""
     directions = np.ascontiguousarray((job.directions @ job.rotation.T).T)
     n = directions.shape[1]
     distance = np.empty(n)
@@ -111,7 +111,10 @@ def _read_counters(library: ctypes.CDLL) -> np.ndarray[Any, Any]:
 
 
 def _run(library: ctypes.CDLL, name: str, threads: int, *arguments: Any) -> None:
-    """Launch a kernel; tests/raybeam/host/launch.h defines its interface."""
+    """Launch a kernel.
+
+    Its interface is defined in tests/raybeam/host/launch.h.
+    """
     assert getattr(library, f"parameters_{name}")() == len(arguments)
     values = [ctypes.c_void_p(a.ctypes.data) if isinstance(a, np.ndarray) else a for a in arguments]
     pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
@@ -119,7 +122,7 @@ def _run(library: ctypes.CDLL, name: str, threads: int, *arguments: Any) -> None
 
 
 def measure(library: ctypes.CDLL, job: Job) -> dict[str, Any]:
-    """Measure all trees on a job."""
+    """Build all trees for a job, and count their tests."""
     mesh = local_mesh(job.vertices, job.faces)
     row: dict[str, Any] = {"scene": job.name, "triangles": len(mesh.corners), "rays": job.rays}
     for name, cluster_limits in TREES.items():
@@ -138,7 +141,7 @@ def measure(library: ctypes.CDLL, job: Job) -> dict[str, Any]:
 
 
 def _lay_out_limited(mesh: LocalMesh, cluster_limits: tuple[int, int]) -> MeshTables:
-    """Lay out a mesh with limits on the clusters left to the sweep."""
+    """Build the tables of a mesh, limiting the clusters that are left to the sweep."""
     with (
         patch.object(ploc, "_MAX_CLUSTERS", cluster_limits[0]),
         patch.object(ploc, "_MIN_CLUSTERS", cluster_limits[1]),
@@ -147,7 +150,7 @@ def _lay_out_limited(mesh: LocalMesh, cluster_limits: tuple[int, int]) -> MeshTa
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print the counts for a scene as a table row."""
+    """Print the counts of a scene as a table row."""
     cells = [row["scene"], f"{row['triangles']:,}"]
     cells += [" / ".join(f"{row[name][kind]:.2f}" for name in TREES) for kind in KINDS]
     cells.append(f"{row['ours']['nodes'] / row['sweep']['nodes']:.2f}")
@@ -156,16 +159,18 @@ def show(row: dict[str, Any]) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run from the command line; return 2 without a compiler."""
+    """Print the table, and return 2 if g++ is not installed."""
     parser = argument_parser(__doc__, quick=True)
     add_scene_options(parser)
     options = parser.parse_args(arguments)
     if shutil.which("g++") is None:
-        print("Nothing was counted, because g++ is not installed.", file=sys.stderr)
+        print("Nothing was measured, because g++ is not installed.", file=sys.stderr)
         return 2
     rows = []
-    print(f"of each: {' / '.join(TREES)}")
-    print_row("scene", "triangles", "nodes", "triangle tests", "decisions", "ratio", "seconds")
+    print(f"Values are listed for {' / '.join(TREES)}.")
+    print_row(
+        "scene", "triangles", "nodes", "triangle tests", "decisions", "node ratio", "build time (s)"
+    )
     with tempfile.TemporaryDirectory() as folder:
         library = compile_kernels(Path(folder))
         for make in chosen_jobs(parser, options):

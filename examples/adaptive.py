@@ -1,4 +1,6 @@
-"""Start and stop workers as the work of their partitions changes: `python examples/adaptive.py`.
+"""Start and stop workers depending on the load of their partitions.
+
+    python examples/adaptive.py
 
 In this example, jobs are processes on this machine. With `dask_jobqueue.SLURMCluster` and similar
 classes, they are jobs in a queue.
@@ -12,7 +14,6 @@ from poolpart.deploy import start_partitions
 
 
 def worker_name(number: int) -> str:
-    """Return the name of the worker that runs the task."""
     return str(get_worker().name)
 
 

@@ -1,8 +1,8 @@
-"""Create the files of block.yaml: a city block (OpenUSD), hills (GeoTIFF) and a hundred cars.
+"""Create the files for block.yaml: a city block (OpenUSD), hills (GeoTIFF) and 100 cars.
 
     python block.py [FOLDER]
 
-It requires the extras [usd] and [geo].
+It requires the `usd` and `geo` extras.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ STREET_AT = 0.5  # time step of the traffic file, seconds
 
 
 def height(x: Array, y: Array) -> Array:
-    """Return the height of the hills."""
+    """Return the height of the terrain."""
     return np.asarray(512 + 1.6 * np.sin(x / 47) + 1.1 * np.cos(y / 39))
 
 
 def ring(distance_m: Array, aside: Array | float = 0.0) -> tuple[Array, Array, Array]:
-    """Return x, y and heading of points along the center line, counterclockwise."""
+    """Return the x, y and heading of points on the center line in counterclockwise order."""
     straight = 2 * (HALF - CORNER)
     arc = np.pi / 2 * CORNER
     side, along_side = np.divmod(distance_m % (4 * (straight + arc)), straight + arc)
@@ -61,7 +61,7 @@ LENGTH = 4 * (2 * (HALF - CORNER) + np.pi / 2 * CORNER)
 
 
 def raster(path: Path) -> None:
-    """Write the hills as a raster of 200 x 200 pixels, each of which is 2 m wide."""
+    """Write the hills as a raster of 200 x 200 pixels with a pixel size of 2 m."""
     coordinates = np.arange(-199.0, 200, 2)
     heights = height(coordinates[None, :], coordinates[::-1, None])
     transform = from_origin(EAST - 200, NORTH + 200, 2, 2)
@@ -73,7 +73,10 @@ def raster(path: Path) -> None:
 
 
 def traffic(path: Path) -> None:
-    """Write floating car data in SUMO's format: two opposite lanes without collisions."""
+    """Write vehicle positions in SUMO's format.
+
+    Two lanes run in opposite directions, and no vehicles collide.
+    """
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<fcd-export>"]
     cars = np.arange(CARS)
     ahead = cars % 2 == 0
@@ -97,7 +100,7 @@ def traffic(path: Path) -> None:
 
 
 def street_image() -> Image.Image:
-    """Paint 12 m of the street at 2 cm per pixel: asphalt, edge lines, and a dashed center line."""
+    """Draw 12 m of the street at 2 cm per pixel, with edge lines and a dashed center line."""
     image = np.random.default_rng(1).choice([78.0, 86.0, 94.0], (400, 600), p=[0.1, 0.8, 0.1])
     for edge in (14, 380):
         image[edge : edge + 6] = 235
@@ -106,7 +109,7 @@ def street_image() -> Image.Image:
 
 
 def crossing_image() -> Image.Image:
-    """Paint a crosswalk with bars of half a meter."""
+    """Draw a crosswalk with stripes that are 0.5 m wide."""
     image = np.full((400, 200), 84, np.uint8)
     for begin in range(20, 380, 50):
         image[begin : begin + 25, 15:185] = 238
@@ -114,7 +117,7 @@ def crossing_image() -> Image.Image:
 
 
 def facade_image() -> Image.Image:
-    """Paint a window and the wall around it, 3 x 3 m."""
+    """Draw a window and the surrounding wall, 3 x 3 m in total."""
     rng = np.random.default_rng(2)
     image = (
         np.array([176, 128, 100]) + rng.choice([-14, 0, 10], (150, 150, 1), p=[0.15, 0.7, 0.15])
@@ -126,7 +129,10 @@ def facade_image() -> Image.Image:
 
 
 class Block:
-    """OpenUSD stage with meshes, textures and point instancers, in meters and z-up."""
+    """OpenUSD stage with meshes, textures and point instancers.
+
+    The unit is meters, and z points up.
+    """
 
     def __init__(self, path: Path) -> None:
         self.stage = Usd.Stage.CreateInMemory()
@@ -136,7 +142,7 @@ class Block:
         self.stage.SetDefaultPrim(UsdGeom.Xform.Define(self.stage, "/Block").GetPrim())
 
     def mesh(self, name: str, points: Array, corners: Array, uv: Array | None = None) -> Usd.Prim:
-        """Add polygons (n, k) of points (p, 3), optionally with texture coordinates (p, 2)."""
+        """Add polygons (n, k) with points (p, 3), and optionally texture coordinates (p, 2)."""
         mesh = UsdGeom.Mesh.Define(self.stage, f"/Block/{name}")
         mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points.astype(np.float32)))
         mesh.CreateFaceVertexIndicesAttr(corners.ravel().tolist())
@@ -150,7 +156,7 @@ class Block:
         return mesh.GetPrim()
 
     def color(self, prim: Usd.Prim, colors: list[tuple[float, ...]]) -> None:
-        """Set the color of a mesh, or the color of each of its polygons (linear RGB)."""
+        """Set the linear RGB color of a mesh, either for the whole mesh or for each polygon."""
         primvar = UsdGeom.Gprim(prim).CreateDisplayColorPrimvar(
             UsdGeom.Tokens.uniform if len(colors) > 1 else UsdGeom.Tokens.constant
         )
@@ -206,7 +212,7 @@ class Block:
 
 
 def building(corner: Array, size: Array) -> tuple[Array, Array, Array]:
-    """Return points, corners and texture coordinates of a house with a window every 3 m."""
+    """Return the points, faces and texture coordinates of a house with a window every 3 m."""
     x, y, z = size
     outline = np.array([[0, 0], [x, 0], [x, y], [0, y], [0, 0]])
     points = []
@@ -228,7 +234,7 @@ def building(corner: Array, size: Array) -> tuple[Array, Array, Array]:
 
 
 def block(path: Path) -> None:
-    """Write the city block, with its origin at the center of the square enclosed by the street."""
+    """Write the city block, with the origin at the center of the square inside the street."""
     stage = Block(path)
     stage.texture(stage.strip("Street", 0, LENGTH, 1.0, LIFT), street_image(), "block-street.png")
     for number in range(4):
@@ -260,7 +266,7 @@ def block(path: Path) -> None:
 
 
 def trees(stage: Block, rng: np.random.Generator, occupied: list[tuple[float, ...]]) -> None:
-    """Add rows of trees along both sides of the street, and a park between the houses."""
+    """Add rows of trees on both sides of the street, and a park between the houses."""
     instancer = UsdGeom.PointInstancer.Define(stage.stage, "/Block/Trees")
     maple = maple_tree(stage)
     x, y = np.array(tree_positions(rng, occupied)).T
@@ -275,7 +281,7 @@ def trees(stage: Block, rng: np.random.Generator, occupied: list[tuple[float, ..
 
 
 def maple_tree(stage: Block) -> Usd.Prim:
-    """Add the mesh of a maple, with brown wood and green leaves."""
+    """Add the mesh of a maple with brown wood and green leaves."""
     shape = tree(next(species for species in SPECIES if species.name == "Maple"), seed=1)
     maple = stage.mesh("Trees/Maple", shape.vertices, shape.faces)
     wood = len(shape.faces) - 13 * 10 * 40

@@ -23,7 +23,7 @@ KEPT = 5  # every fifth hit is drawn as a point
 
 
 class LiveFigure:
-    """Figure of the scene with colored triangles, points and the sensor position.
+    """Figure that shows the scene with colored triangles, the points and the sensor position.
 
     The gray scene is drawn only once. Each frame draws only the triangles that have been hit, which
     takes about ten milliseconds.
@@ -57,10 +57,6 @@ class LiveFigure:
         self.background = self.figure.canvas.copy_from_bbox(self.figure.bbox)
 
     def on_frame(self, frame) -> None:
-        """Draw a frame.
-
-        `simulate` calls this method in scan order, at the given pace.
-        """
         self.num_hits += frame.hit_counts()
         self.points = np.concatenate([self.points, frame.points().positions[::KEPT]])
         hit = np.flatnonzero(self.num_hits)
@@ -76,7 +72,6 @@ class LiveFigure:
         canvas.flush_events()
 
     def save(self, path: str) -> None:
-        """Save the figure as an image."""
         self.hit.set_animated(False)
         self.cloud.set_animated(False)
         self.figure.savefig(path, dpi=150)

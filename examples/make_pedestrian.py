@@ -1,4 +1,6 @@
-"""Create pedestrian.glb, an adult of 1.75 m who walks at 1.4 m/s: `python make_pedestrian.py`.
+"""Create pedestrian.glb, a 1.75 m tall adult who walks at 1.4 m/s.
+
+Run it with `python make_pedestrian.py`.
 
 The body consists of tubes with elliptical cross-sections along the limbs, which a skin with 15
 joints deforms. The animation "Walk" is one cycle of two steps. Feet roll from heel to ball without
@@ -42,7 +44,10 @@ NAMES = [name for name, *_ in JOINTS]
 
 
 class Figure:
-    """Vertices and triangles of the body, with up to two weighted joints for each vertex."""
+    """Vertices and triangles of the body.
+
+    Each vertex is attached to one or two weighted joints.
+    """
 
     def __init__(self) -> None:
         self.points = []
@@ -51,7 +56,9 @@ class Figure:
         self.weights = []
 
     def tube(self, rings, held, across=16, along=2) -> None:
-        """Add a closed tube through rings, each given by the center x, y, z and two semi-axes.
+        """Add a closed tube through rings.
+
+        Each ring is given by its center x, y, z and two semi-axes.
 
         The ellipses are perpendicular to the axis `along`. `held` maps the coordinate along this
         axis to two joints and the weight of the second joint.
@@ -89,7 +96,7 @@ class Figure:
 
 
 def blend(*stops):
-    """Return a function that maps a coordinate to two joints and a weight.
+    """Return a function that maps a coordinate to two joints and the weight of the second one.
 
     Each stop consists of a joint's name, its end and its reach. Stops are in descending order.
     """
@@ -105,7 +112,7 @@ def blend(*stops):
 
 
 def figure() -> Figure:
-    """Return the body in its rest pose, standing."""
+    """Return the standing body in its rest pose."""
     person = Figure()
     torso = [
         (0.84, 0.07, 0.10),
@@ -181,14 +188,13 @@ def rotations(angle, axis=1):
 
 
 def times(p, q):
-    """Return the products of quaternions."""
     (a, b, c, d), (e, f, g, h) = np.moveaxis(p, -1, 0), np.moveaxis(q, -1, 0)
     return np.stack([d * e + a * h + b * g - c * f, d * f - a * g + b * h + c * e,
                      d * g + a * f - b * e + c * h, d * h - a * e - b * f - c * g], -1)  # fmt: skip
 
 
 def ankle(phase):
-    """Return an ankle's position and the pitch of its foot at a given phase of the cycle.
+    """Return the position of an ankle and the pitch of its foot at a given phase of the gait cycle.
 
     The position consists of the forward distance from the hips and the height above the ground. The
     pitch is positive if the toes point up. The phase is 0 when the heel strikes the ground.
@@ -259,7 +265,7 @@ def walk(phase):
 
 
 class Buffer:
-    """Binary chunk of a glTF file, with the buffer views and accessors of its arrays."""
+    """Binary chunk of a glTF file, with the buffer views and accessors of the arrays in it."""
 
     def __init__(self) -> None:
         self.views = []
@@ -280,7 +286,7 @@ class Buffer:
 
 
 def skeleton() -> list[dict]:
-    """Return the nodes of the root, the body and the joints."""
+    """Return the glTF nodes of the root, the body and the joints."""
     positions = {name: np.array(position, float) for name, _, position in JOINTS}
     nodes = [{"name": "Pedestrian", "children": [1, 2], "rotation": [-(0.5**0.5), 0, 0, 0.5**0.5]},
              {"name": "Body", "mesh": 0, "skin": 0}]  # fmt: skip
@@ -293,7 +299,7 @@ def skeleton() -> list[dict]:
 
 
 def walk_animation(buffer: Buffer) -> dict:
-    """Store the key frames of a cycle and return the animation."""
+    """Store the key frames of a gait cycle and return the animation."""
     phase = np.linspace(0, 1, KEYS + 1)
     times = np.array(CYCLE_S * phase, "f")
     keys = buffer.store(times, "SCALAR", min=[0.0], max=[float(times[-1])])

@@ -22,14 +22,17 @@ TRIALS = 100
 
 
 def generate(scans):
-    """Generate the parameters of each scan, here the azimuth of the sensor head (stage 1)."""
+    """Generate the parameters of each scan (stage 1).
+
+    Here, this is the azimuth of the sensor head.
+    """
     for scan in range(SCANS):
         scans.put((scan, 360 / SCANS * scan))
     scans.close()
 
 
 def intersect(item, hits, frames):
-    """Intersect the rays of a scan with the walls, in a task on the GPU partition (stage 2)."""
+    """Intersect the rays of a scan with the walls, as a task on the GPU partition (stage 2)."""
     scan, azimuth_deg = item
     azimuth = math.radians(azimuth_deg)
     elevations = np.radians(np.linspace(-45, 45, RAYS))
@@ -47,7 +50,10 @@ def intersect(item, hits, frames):
 
 
 def sort_frames(frames, shown):
-    """Sort the frames into scan order, because several workers may intersect scans (stage 3)."""
+    """Sort the frames into scan order (stage 3).
+
+    They arrive out of order if several workers intersect scans.
+    """
     waiting = {}
     following = 0
     for scan, frame in frames:
@@ -59,12 +65,12 @@ def sort_frames(frames, shown):
 
 
 def collect(hits):
-    """Return the points of all scans that arrive in this task, one of two collectors (stage 4)."""
+    """Return all points received by this task, which is one of two collectors (stage 4)."""
     return dict(hits)
 
 
 def plan(trial):
-    """Return the length of a path around a pillar through a random point."""
+    """Return the length of a path that avoids a pillar by passing through a random point."""
     beside = np.random.default_rng(trial).uniform(-3, 3)
     if abs(beside) < 1:  # within the pillar
         return math.inf

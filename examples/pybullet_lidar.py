@@ -15,7 +15,7 @@ SIZE_M = 0.6
 
 
 def matrix(position, quaternion):
-    """Return a PyBullet pose as a transformation matrix from the body frame to the world frame.
+    """Convert a PyBullet pose to a transformation matrix from the body frame to the world frame.
 
     The shape is (4, 4).
     """

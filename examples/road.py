@@ -21,7 +21,7 @@ TURN = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])  # from z-
 
 
 def markings() -> Image.Image:
-    """Paint the road from above: edge lines, a dashed center line, and a crosswalk."""
+    """Draw the road from above, with edge lines, a dashed center line and a crosswalk."""
     image = np.full((round(WIDTH_M / PIXEL_M), round(LENGTH_M / PIXEL_M), 3), ASPHALT, np.uint8)
     for edge in (8, -12):
         image[edge : edge + 4] = WHITE
@@ -34,14 +34,14 @@ def markings() -> Image.Image:
 
 
 def slab(lower: tuple[float, ...], upper: tuple[float, ...], color: list[float]) -> trimesh.Trimesh:
-    """Return a box with a uniform color (linear RGB)."""
+    """Return a box with a uniform linear RGB color."""
     box = trimesh.creation.box(bounds=[lower, upper])
     box.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=[*color, 1.0]))
     return box
 
 
 def road() -> trimesh.Scene:
-    """Return the road with a sidewalk on each side and a parked van."""
+    """Return a road with a sidewalk on each side and a parked van."""
     x = LENGTH_M / 2
     y = WIDTH_M / 2
     corners = [[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]]

@@ -1,4 +1,4 @@
-"""Define a Gymnasium environment in which a robot uses only its lidar to drive to a goal."""
+"""Define a Gymnasium environment in which a robot drives to a goal using only its lidar."""
 
 import math
 
@@ -21,7 +21,7 @@ GOAL = (-30.0, -20.0)
 
 
 class RobotEnv(gymnasium.Env):
-    """Environment in which a robot drives to a goal and avoids columns.
+    """Environment in which a robot drives to a goal without hitting columns.
 
     An observation contains 64 ranges, and the distance and direction of the goal. An action
     consists of the speed (0 to 2 m/s) and the yaw rate. The reward is the distance covered toward

@@ -28,7 +28,7 @@ RNG = np.random.default_rng(1)
 
 
 def street(number, rng):
-    """Return a job of three sweeps in a separate city."""
+    """Return a job that simulates three sweeps in a randomly generated city."""
     values = {"cars": int(rng.integers(40, 110)), "trees": int(rng.integers(10, 100))}
     scene = city(40_000, seed=number, **values)
     values["visibility_km"] = round(float(np.exp(rng.uniform(np.log(0.1), np.log(10)))), 3)
@@ -67,7 +67,7 @@ def features(sweep):
 
 
 def column_features(points, side):
-    """Return features that compare each point's height with the lowest and highest nearby."""
+    """Return the height of each point relative to the lowest and highest points nearby."""
     z = points[:, 2]
     cell = np.floor(points[:, :2] / side).astype(int)
     cell -= cell.min(axis=0) - 1  # leaves a border of empty cells
@@ -84,7 +84,7 @@ def column_features(points, side):
 
 
 def surface_features(points, side):
-    """Return normals and roughness as features, computed from the points in each cube."""
+    """Compute normals and roughness from the points in each cube, and return them as features."""
     _, cube = np.unique(np.floor(points / side), axis=0, return_inverse=True)
     count = np.bincount(cube)
     mean = np.stack([np.bincount(cube, axis) / count for axis in points.T], axis=1)
@@ -100,7 +100,7 @@ def surface_features(points, side):
 def sweeps_of(folder, split):
     """Return the sweeps of a split.
 
-    They are streamed, or read from a data set that is created if necessary.
+    The sweeps are streamed, or read from a data set that is created if necessary.
     """
     campaign = lp.Campaign(street, 30, seed=1, splits={"train": 0.7, "test": 0.3})
     if folder == "stream":
@@ -122,7 +122,7 @@ def read(folder, split, share):
 
 
 class Network:
-    """Neural network with ReLU layers that predicts the class with the highest output."""
+    """Neural network with ReLU layers that classifies each point."""
 
     def __init__(self, features):
         self.mean = features.mean(axis=0)
@@ -133,7 +133,7 @@ class Network:
         self.slopes = [(np.zeros_like(w), np.zeros_like(w)) for w in self.weights]
 
     def layers(self, features):
-        """Yield the inputs of each layer, with a 1 for its bias, and then the network outputs."""
+        """Yield the inputs of each layer, with a 1 for the bias, and then the final outputs."""
         inputs = (features - self.mean) / self.scale
         for weights in self.weights:
             yield (inputs := np.column_stack([inputs, np.ones(len(inputs))]))
@@ -145,7 +145,7 @@ class Network:
         return [*self.layers(features)][-1].argmax(axis=1)
 
     def learn(self, features, classes, weight, step, steps):
-        """Reduce the weighted cross-entropy by one step of Adam (Kingma and Ba, 2015)."""
+        """Reduce the weighted cross-entropy with one step of Adam (Kingma and Ba, 2015)."""
         *inputs, outputs = self.layers(features)
         error = np.exp(
             outputs - np.logaddexp.reduce(outputs, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Define a Gymnasium vector environment: MuJoCo robots use lidars to avoid columns."""
+"""Define a Gymnasium vector environment in which MuJoCo robots use lidars to avoid columns."""
 
 import numpy as np
 
@@ -37,7 +37,7 @@ def world(robots: int) -> str:
 
 
 class LidarVectorEnv(gymnasium.vector.VectorEnv):
-    """Environment of robots that drive in a hall and avoid columns.
+    """Environment in which robots drive in a hall without hitting columns.
 
     An observation contains the velocities and the ranges (channels, firings). An action consists
     of the speed and the yaw rate. The reward is the distance driven, in meters. An episode ends
@@ -81,7 +81,7 @@ class LidarVectorEnv(gymnasium.vector.VectorEnv):
         return self._observed(), reward, ended, np.zeros_like(ended), infos
 
     def _place(self, chosen):
-        """Place the selected robots at random positions between columns."""
+        """Place the selected robots at random positions between the columns."""
         cells = self.np_random.integers(0, 6, (self.num_envs, 2)) * 4 + 2
         yaws = self.np_random.uniform(-np.pi, np.pi, (self.num_envs, 1))
         self.data.qpos.reshape(-1, 3)[chosen] = np.hstack([cells, yaws])[chosen]

@@ -1,4 +1,4 @@
-"""Additional pages of the site: README, the reference, and the sources that pages link to.
+"""Add pages to the site: README files, the reference, and sources that pages link to.
 
 MkDocs calls the functions whose names begin with `on_`.
 """
@@ -45,7 +45,7 @@ _FETCHED = re.compile(
 
 
 def on_config(config: Any) -> Any:
-    """Replace the folders in the navigation, such as `how-to/mesh-formats/`, with their pages."""
+    """Replace folders in the navigation, such as `how-to/mesh-formats/`, with their pages."""
     config["nav"] = _with_pages(config["nav"], Path(config["docs_dir"]))
     return config
 
@@ -69,7 +69,7 @@ def _with_pages(nav: list[Any], docs: Path) -> list[Any]:
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add README and similar files, the reference, and the sources that pages link to."""
+    """Add the README and similar files, the reference, and all sources that pages link to."""
     pages = {
         page: _relinked((ROOT / file).read_text("utf-8"), file, page, files, config)
         for file, page in _ELSEWHERE.items()
@@ -89,7 +89,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Redirect links that lead out of docs/ to the corresponding pages of the site."""
+    """Redirect links from docs/ to other folders to the corresponding pages of the site."""
     if page.file.abs_src_path is None:  # generated: done already
         return markdown
     path = page.file.src_uri
@@ -97,7 +97,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
 
 
 def on_post_build(config: Any) -> None:
-    """Reject a site whose pages would load resources from elsewhere."""
+    """Reject a site whose pages would load resources from other servers."""
     found = [
         f"{path.relative_to(config['site_dir'])}: {match}"
         for path in sorted(Path(config["site_dir"]).rglob("*.html"))
@@ -108,7 +108,7 @@ def on_post_build(config: Any) -> None:
 
 
 def _relinked(text: str, file: str, page: str, files: Files, config: Any) -> str:
-    """Adjust the links in a repository file for the page of the site that shows it."""
+    """Adjust the links in a repository file for its page on the site."""
 
     def relink(match: re.Match[str]) -> str:
         target = match[2]
@@ -123,9 +123,9 @@ def _relinked(text: str, file: str, page: str, files: Files, config: Any) -> str
 
 
 def _page_of(path: str, files: Files, config: Any) -> str:
-    """Return the location of a repository file on the site.
+    """Return the path on the site that shows a repository file.
 
-    Sources get pages, and input files are copied.
+    Source files have pages on the site, and input files are copied to it.
     """
     if shown := (_ELSEWHERE | _SHOWN).get(path):
         return shown

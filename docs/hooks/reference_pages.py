@@ -1,4 +1,4 @@
-"""Pages of the reference, generated from the packages."""
+"""Generate the pages of the reference from the packages."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def members_page(package: str) -> str:
 
 
 def _declared(member: Any) -> Iterator[str]:
-    """Yield a table of a dataclass's fields that have a description, unless none have one."""
+    """Yield a table of a dataclass's fields with descriptions, or nothing if there are none."""
     hints = get_type_hints(member, include_extras=True) if is_dataclass(member) else {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnsupportedFieldAttributeWarning)  # an alias in scenarios
@@ -131,7 +131,7 @@ def scenario_page() -> str:
     head = (
         "# Scenario files\n\n"
         f"{schema['description']} All of it but the scene may be left out. "
-        "Fields that are not in these tables are refused. `lidarpool init --all` writes a file "
+        "Fields that are not in these tables are rejected. `lidarpool init --all` writes a file "
         "with all of them, and `lidarpool schema` prints this as JSON Schema.\n"
     )
     return _schema_page(head, schema, _SECTIONS)
@@ -164,7 +164,7 @@ def _schema_page(head: str, schema: dict[str, Any], sections: dict[str, str]) ->
 
 
 def columns_page() -> str:
-    """Generate tables of a cloud's columns from the package's column table."""
+    """Generate tables of all columns of a cloud from the column definitions in the package."""
     return "\n".join(
         [
             "# Columns of a cloud\n",
@@ -238,7 +238,7 @@ def _kinds(content: dict[str, Any]) -> str:
 
 
 def _section(name: str) -> str:
-    """Link to the table of a section on this page, given its name in the schema."""
+    """Return a link to the table of a section on this page, given its name in the schema."""
     both = _SECTIONS | _OF_CAMPAIGNS
     heading = next(heading for heading, section in both.items() if section == name)
     return f"[{heading}](#{heading.replace(': ', '-')})"

@@ -1,4 +1,4 @@
-"""Plots and films of the documentation.
+"""Programs that draw the plots and animations in the documentation.
 
 Each module runs with `python -m docs.pictures.NAME`.
 """

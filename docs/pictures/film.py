@@ -1,10 +1,10 @@
-"""A film of sweeps with many effects, in the sensor's own time.
+"""Make an animation of sweeps with many effects that plays in real time.
 
     python -m docs.pictures.film OUT.webp
 
-Sweeps of an OS1-64 among moving cars, with sub-rays, noise and rain (`real` of
-`benchmarks.realism`), are cast on one core while another core draws them. The program prints the
-duration of the scan and the time that the film took.
+One core casts sweeps of an OS1-64 among moving cars with sub-rays, noise and rain (`real` in
+`benchmarks.realism`), while another core draws them. The program prints the duration of the scan
+and the time it took to make the animation.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ RAISED = 12.0  # meters above the ground with the last color
 
 
 def cast(sweeps: int, triangles: int, connection: Connection) -> None:
-    """Cast a sweep to compile, then send the points of `sweeps` sweeps."""
+    """Cast one sweep to compile the code, then cast and send the points of `sweeps` sweeps."""
     sweep = cases(city(triangles), "tiles", (100,), "ouster/os1-64")["real"]
     connection.send(len(sweep(0)))
     connection.recv()
@@ -43,7 +43,7 @@ def cast(sweeps: int, triangles: int, connection: Connection) -> None:
 
 
 def frame(camera: Camera, points: Any) -> Image.Image:
-    """Draw the points of a sweep, by height."""
+    """Draw the points of a sweep, colored by height."""
     pixels, distance = camera.project(points)
     inside = np.flatnonzero(((pixels >= 0) & (pixels < camera.size)).all(axis=1))
     rows = inside[np.argsort(-distance[inside])]
@@ -64,7 +64,7 @@ def aim(eye: Any, target: Any, focal: float, size: tuple[int, int]) -> Camera:
 
 
 def save(frames: list[Image.Image], path: Path, period_s: float, **options: Any) -> None:
-    """Write a film, with options of Pillow for WebP."""
+    """Save frames as an animated WebP file, with additional options for Pillow."""
     duration = round(1e3 * period_s)
     later = frames[1:]
     frames[0].save(
@@ -73,7 +73,7 @@ def save(frames: list[Image.Image], path: Path, period_s: float, **options: Any)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Make the film, and return the exit status."""
+    """Make the animation and return the exit status."""
     parser = file_parser(__doc__, ".webp")
     parser.add_argument("--sweeps", type=int, default=100)
     parser.add_argument("--triangles", type=int, default=100_000)

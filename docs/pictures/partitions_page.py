@@ -1,8 +1,8 @@
-"""The page of partitions, as a browser shows it while two partitions work.
+"""Take a screenshot of the partitions page while two partitions work.
 
-`python -m docs.pictures.partitions_page docs/images/partitions-page.png` divides a cluster of this
-machine, sends items from a task of IO through a pipe to tasks of GPU, and has Chromium draw the
-page. Workers of this machine stand for machines with GPUs.
+`python -m docs.pictures.partitions_page docs/images/partitions-page.png` divides a local
+cluster, sends items from a task of the IO partition through a pipe to tasks of the GPU partition,
+and takes a screenshot of the page with Chromium. Local workers stand in for machines with GPUs.
 """
 
 from __future__ import annotations
@@ -36,26 +36,26 @@ DONE = 6  # tasks of GPU before the picture is taken
 
 
 def load(pipe: Pipe, count: int) -> None:
-    """Put numbers into a pipe, which waits while the pipe is full."""
+    """Put numbers into a pipe, waiting whenever it is full."""
     for number in range(count):
         pipe.put(number)
 
 
 def shrink(number: int) -> int:
-    """Stand for a task on a GPU."""
+    """Simulate a task on a GPU."""
     time.sleep(ITEM_S)
     return number
 
 
 def index(number: int) -> int:
-    """Stand for a task of the remaining workers."""
+    """Simulate a task on the remaining workers."""
     time.sleep(4 * ITEM_S)
     return number
 
 
 @contextmanager
 def page_at_work(client: Client) -> Iterator[str]:
-    """Divide a cluster, give the partitions work, and yield the address of the page."""
+    """Divide a cluster, submit tasks to the partitions, and yield the URL of the page."""
     pool = Pool.from_client(client)
     rules = {"GPU": n_workers(2), "IO": n_workers(1), "OTHER": rest()}
     gpu, io, other = pool.divide(rules).values()
@@ -74,13 +74,16 @@ def page_at_work(client: Client) -> Iterator[str]:
 
 
 def _until_it_fails(gpu: Partition, pipe: Pipe) -> None:
-    """Run a task for each item of a pipe."""
+    """Run a task for each item in a pipe until the pipe fails."""
     with suppress(PipeFailed):
         gpu.for_each(pipe, shrink)
 
 
 def draw(url: str, picture: Path) -> None:
-    """Have a browser draw a page into a PNG; RuntimeError without a browser, or if it fails."""
+    """Take a screenshot of a page with a browser and save it as PNG.
+
+    Raise RuntimeError if no browser is installed or if the browser fails.
+    """
     program = next(filter(None, map(shutil.which, BROWSERS)), None)
     if program is None:
         raise RuntimeError(f"The picture needs a browser, one of {', '.join(BROWSERS)}.")
@@ -100,7 +103,7 @@ def draw(url: str, picture: Path) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Draw the picture, and return the exit status."""
+    """Take the screenshot and return the exit status."""
     options = file_parser(__doc__, ".png").parse_args(arguments)
     with (
         LocalCluster(**CLUSTER) as cluster,

@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/how-to/sensor-pictures.md: `python -m docs.pictures.sensors`."""
+"""Draw the plots of docs/how-to/sensor-pictures.md: `python -m docs.pictures.sensors`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ QUALITY = 50  # of WebP
 
 
 def draw(model: str, path: Path) -> None:
-    """Draw the pattern of a model, small."""
+    """Draw the pattern of a sensor model in a small size."""
     image = Image.open(io.BytesIO(pattern_page(load_sensor(model)).png())).convert("RGB")
     height = round(image.height * WIDTH / image.width)
     small = image.resize((WIDTH, height), Image.Resampling.LANCZOS)
@@ -26,7 +26,6 @@ def draw(model: str, path: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Draw the pictures."""
     options = folder_parser(__doc__, IMAGES / "sensors").parse_args(arguments)
     options.folder.mkdir(parents=True, exist_ok=True)
     for model in options.only or model_names():

@@ -1,9 +1,9 @@
-"""A film of a reconstruction: a recorded drive, and the same drive with another sensor in its twin.
+"""Make an animation of a recorded drive next to the same drive in its reconstruction.
 
-`python -m docs.pictures.twin OUT.webp` drives an OS1-64 through the generated city among moving
-cars, and reconstructs the place from its sweeps. The left side shows the recorded sweeps, and the
-right side sweeps of a Pandar128 in the twin, where nothing moves. The metrics of the twin are
-printed.
+`python -m docs.pictures.twin OUT.webp` simulates an OS1-64 that drives through the generated city
+among moving cars, and reconstructs the scene from its sweeps. The left side shows the recorded
+sweeps. The right side shows sweeps of a Pandar128 in the twin, in which nothing moves. The program
+prints the metrics of the twin.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ CAPTIONS = ("recorded: OS1-64", "in the twin: Pandar128")
 
 
 def drive(sweeps: int) -> Cloud:
-    """Simulate a drive through the city, amid cars, and return the recorded cloud."""
+    """Simulate a drive through the city among cars, and return the recorded cloud."""
     end_s = (sweeps + 1) * SWEEP_S
     actors = [
         Actor(box(f"car {number}", (4.4, 1.8, 1.5)), Track([0, end_s], [(*start, 0), (*stop, 0)]))
@@ -54,7 +54,7 @@ def drive(sweeps: int) -> Cloud:
 
 
 def frames(cloud: Cloud, place: Twin, sweeps: int) -> list[Image.Image]:
-    """Draw the sweeps of the recording beside sweeps of another sensor in the twin."""
+    """Draw the recorded sweeps next to the sweeps of another sensor in the twin."""
     view = aim(EYE, TARGET, 470.0, SIZE)
     scanner = Scanner(place.scene, load_sensor("hesai/pandar128"))
     images = []
@@ -73,7 +73,7 @@ def frames(cloud: Cloud, place: Twin, sweeps: int) -> list[Image.Image]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Make the film, and return the exit status."""
+    """Make the animation and return the exit status."""
     parser = file_parser(__doc__, ".webp")
     parser.add_argument("--sweeps", type=int, default=40)
     options = parser.parse_args(arguments)

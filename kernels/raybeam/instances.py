@@ -164,7 +164,10 @@ class LocalScene:
 
     @property
     def counters(self) -> Ints:
-        """First row of each instance in a table of hit counts, and the row step. Shape (n, 2)."""
+        """Location of each instance's rows in a table of hit counts.
+
+        The array has shape (n, 2). Its columns are the first row and the row step.
+        """
         first = self.first_face[:-1][self.mesh]
         return np.stack([first, np.ones_like(first)], axis=1)
 

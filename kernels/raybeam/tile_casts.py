@@ -28,10 +28,11 @@ _T_MIN = field_index("t_min")
 
 @noinline
 def _number_rays(tile, rays, lanes, first, count):  # type: ignore[no-untyped-def]
-    """Write the ray indices of a tile, and return whether the call includes any of its rays.
+    """Write the ray indices of a tile.
 
-    The indices are `first` plus the numbers at the address `lanes`. An index below 0, or not below
-    `count`, belongs to a ray that is cast with the tile but ignored.
+    Return whether any of these rays belong to the call. The indices are `first` plus the numbers at
+    the address `lanes`. An index below 0, or not below `count`, belongs to a ray that is cast with
+    the tile but ignored.
     """
     numbers = int64s(tile)
     lane_numbers = int64s(lanes)

@@ -1,1 +1,1 @@
-"""Faults on purpose: a nemesis, what it is done to, and a checker that judges the outcome."""
+"""Fault injection: a nemesis injects faults into clusters, and a checker judges the results."""

@@ -1,6 +1,7 @@
-"""Do harm to surveys until so many faults were carried out: `python -m tests.chaos`.
+"""Disturb surveys until a given number of faults has been injected: `python -m tests.chaos`.
 
-The last line says whether anything was lost; a seed plays the same faults again.
+The last line of the output states whether anything was lost. Runs with the same seed inject the
+same faults.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ VAIN_RUNS_MOST = 2  # one after the other in which nothing that was left to do c
 
 
 class Campaign:
-    """Runs of one seed, one after the other."""
+    """Sequence of disturbed runs whose faults are planned from one seed."""
 
     def __init__(self, faults: int, seed: int, what: Survey) -> None:
         self.what = what
@@ -41,18 +42,18 @@ class Campaign:
 
     @property
     def done(self) -> Counter[tuple[str, str]]:
-        """Faults carried out so far, by kind and point."""
+        """Number of injected faults by kind and point."""
         return sum((outcome.done for outcome in self.outcomes), Counter())
 
     @property
     def over(self) -> bool:
-        """Whether all faults were carried out, or there is no hope of that."""
+        """Whether all faults have been injected, or the last runs injected none."""
         recent = self.outcomes[-VAIN_RUNS_MOST:]
         in_vain = len(recent) == VAIN_RUNS_MOST and not any(outcome.done for outcome in recent)
         return not self.waiting or in_vain
 
     def play(self, arena: Arena, known: Reference) -> Outcome:
-        """Make one run, with the next faults."""
+        """Perform one run with the next faults."""
         faults = self.waiting[:FAULTS_PER_RUN]
         self.waiting = self.waiting[FAULTS_PER_RUN:]
         options = {
@@ -66,7 +67,7 @@ class Campaign:
         return outcome
 
     def table(self) -> str:
-        """Faults carried out, by kind and point."""
+        """Table of injected faults by kind and point."""
         done = self.done
         order = (*WORKER_POINTS, *DRIVER_POINTS, *RARE_POINTS, RANDOM)
         points = sorted({point for _, point in done}, key=order.index)
@@ -78,7 +79,7 @@ class Campaign:
         return "\n".join(lines)
 
     def summary(self) -> str:
-        """The last line."""
+        """Last line of the output."""
         verdicts = [outcome.verdict for outcome in self.outcomes]
         lost = sum(len(verdict.lost) for verdict in verdicts)
         duplicated = sum(len(verdict.duplicated) for verdict in verdicts)
@@ -102,7 +103,7 @@ def _tell(number: int, outcome: Outcome, faults: int) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the campaign; returns 0 if every run was sound."""
+    """Play the campaign and return 0 if every run was sound."""
     parser = argparse.ArgumentParser(prog="tests.chaos", description=__doc__)
     parser.add_argument("--faults", type=int, default=200)
     parser.add_argument("--seed", type=int, default=None, help="random by default")

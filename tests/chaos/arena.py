@@ -1,4 +1,4 @@
-"""The cluster that faults are done to."""
+"""Cluster into which faults are injected."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ CLOSING_S = 10.0
 
 
 class Arena:
-    """A local cluster with two casting workers, two for the LIDAR stages, one more, and a board.
+    """Local cluster with two casting workers, two LIDAR workers, another worker, and a board.
 
-    `pauses` are seconds a scan to hold at some points of the workers. A worker is given up by the
-    scheduler when it has had no heartbeat for `time_to_live_s`.
+    `pauses` maps points of the workers to the seconds per scan for which workers are held there.
+    The scheduler gives up on a worker that has sent no heartbeat for `time_to_live_s`.
     """
 
     def __init__(
@@ -67,17 +67,17 @@ class Arena:
         self._stack.close()
 
     def names(self, partition: str) -> list[str]:
-        """Names of a partition's workers, there or not."""
+        """Return the names of a partition's workers, including those that are down."""
         return sorted(name for name in self.cluster.worker_spec if name.startswith(partition))
 
     def pid(self, name: str) -> int | None:
-        """Process of a worker, None while it has none."""
+        """Return the process ID of a worker, or None if it has no process."""
         nanny = self.cluster.workers.get(name)
         pid = getattr(nanny, "pid", None)
         return pid if pid and _is_there(pid) else None
 
     def address(self, name: str) -> str | None:
-        """Address of a worker, None while the scheduler or its nanny does not have it."""
+        """Return a worker's address, or None if the scheduler or the nanny does not know it."""
         # The scheduler hears of it first. A nanny whose first worker dies before it has heard
         # of that one gives up.
         nanny = self.cluster.workers.get(name)
@@ -87,14 +87,14 @@ class Arena:
         return address if address in self.cluster.scheduler.workers else None
 
     def withdraw(self, partition: str) -> None:
-        """Have all workers of a partition leave until another one was given up."""
+        """Remove all workers of a partition until `give_up` is called."""
         self.wait_until_whole()
         for name in self.names(partition):
             self._withdrawn[name] = self.cluster.worker_spec.pop(name)
         self.cluster.sync(self.cluster._correct_state)
 
     def give_up(self, pid: int) -> None:
-        """Have the scheduler do with the worker of a process as when it is not heard of."""
+        """Make the scheduler treat a process's worker as one without heartbeats."""
         scheduler = self.cluster.scheduler
         workers = list(scheduler.workers.items())
         self.cluster.sync(
@@ -108,7 +108,7 @@ class Arena:
         self.cluster.sync(self.cluster._correct_state)
 
     def revive(self, name: str) -> None:
-        """Start a worker anew whose nanny has left with it."""
+        """Restart a worker whose nanny has exited."""
         nanny = self.cluster.workers.get(name)
         deadline = time.monotonic() + CLOSING_S
         while nanny is not None and nanny.status.name not in ("closed", "failed"):
@@ -120,12 +120,12 @@ class Arena:
 
     @property
     def deserted(self) -> list[str]:
-        """Names of workers whose nanny has left without them."""
+        """Names of workers whose nannies have exited."""
         nannies = list(self.cluster.workers.items())
         return [name for name, nanny in nannies if nanny.status.name in ("closed", "failed")]
 
     def wait_until_whole(self, timeout_s: float = 300.0) -> None:
-        """Wait until every worker is there."""
+        """Wait until all workers are running."""
         deadline = time.monotonic() + timeout_s
         while absent := [name for name in self.cluster.worker_spec if not self.address(name)]:
             for name in self.deserted:  # also one that was killed while it came back

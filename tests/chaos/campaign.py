@@ -1,8 +1,9 @@
-"""Do harm to campaigns until so many faults were done: `python -m tests.chaos.campaign`.
+"""Disturb campaigns until a given number of faults has been injected.
 
-Workers of an outside cluster are killed, and so is the driver, which resumes. Before it does, and
-when a data set is finished, files of jobs are deleted or cut in half. The last line says whether a
-job was lost or doubled, and whether all files of jobs have the bytes of an undisturbed run.
+`python -m tests.chaos.campaign` kills workers of an external cluster, and the driver, which is then
+resumed. Files of jobs are deleted or cut in half before the driver resumes and after a data set is
+finished. The last line of the output states whether a job was lost or duplicated, and whether all
+files of jobs are identical to those of an undisturbed run.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ ENDS_WITHIN_S = 300.0
 
 @dataclass
 class Tally:
-    """What became of the data sets."""
+    """Faults injected so far, and defects found in the data sets."""
 
     done: Counter[str] = field(default_factory=Counter)  # {what was killed or harmed: how often}
     datasets: int = 0
@@ -69,12 +70,12 @@ class Tally:
 
     @property
     def sound(self) -> bool:
-        """Whether nobody could tell the data sets from undisturbed ones."""
+        """Whether all data sets are equal to the undisturbed one."""
         return not (self.lost or self.doubled or self.differing or self.errors)
 
 
 class Arena:
-    """A cluster of two workers of each kind, in processes of their own, and a driver."""
+    """Cluster with two workers of each kind in separate processes, and a driver."""
 
     def __init__(self, folder: Path, seed: int) -> None:
         self.folder = folder
@@ -90,7 +91,6 @@ class Arena:
         return self.cluster.add((kind, WORKERS[kind]))
 
     def start(self, out: str) -> subprocess.Popen[str]:
-        """Start a driver."""
         return subprocess.Popen(
             [
                 *(sys.executable, "-m", "lidarpool", "run", "c.yaml", "--resume", "-q"),
@@ -104,7 +104,10 @@ class Arena:
         )
 
     def _harm(self, dataset: Path) -> list[str]:
-        """Delete, cut or flip a bit of a file of the data set; returns what was done."""
+        """Delete a file of the data set, cut it in half, or flip a bit in it.
+
+        Return what was done.
+        """
         kinds = ("jobs/*/[cs]*", ".jobs/*.json", "run/run.db", *SHARED)
         found = sorted(path for kind in kinds for path in dataset.glob(kind))
         if not found:
@@ -128,7 +131,7 @@ class Arena:
         return [harm]
 
     def disturb(self, out: str, tally: Tally, faults: int) -> None:
-        """Make a data set, with so many faults at most."""
+        """Create a data set while injecting at most `faults` faults."""
         driver = self.start(out)
         harms = HARMS if faults else 0  # of the finished data set
         while driver.poll() is None and faults:
@@ -166,7 +169,7 @@ class Arena:
             driver = self.start(out)
 
     def _lead_away(self, out: str, tally: Tally) -> None:
-        """Put a link to a stranger's folder there: a driver refuses it, and touches nothing."""
+        """Check that a driver rejects a link to a foreign folder and does not change the folder."""
         link = self.folder / out / self._chance.choice(LINKS)
         stranger = self.folder / "stranger"
         aside = self.folder / "aside"
@@ -188,13 +191,13 @@ class Arena:
 
 
 def files_of(dataset: Path) -> dict[str, bytes]:
-    """Files of the jobs of a data set."""
+    """Return the content of all files that belong to a data set's jobs, keyed by path."""
     found = [path for folder in ("jobs", ".jobs") for path in (dataset / folder).rglob("*")]
     return {str(p.relative_to(dataset)): p.read_bytes() for p in found if p.is_file()}
 
 
 def judge(dataset: Path, reference: dict[str, bytes], tally: Tally) -> None:
-    """Compare a data set with an undisturbed one."""
+    """Compare a data set with the undisturbed one."""
     rows: Counter[str] = Counter()
     with suppress(FileNotFoundError), (dataset / "jobs.csv").open(newline="") as file:
         rows.update(row["number"] for row in csv.DictReader(file))
@@ -211,7 +214,7 @@ def judge(dataset: Path, reference: dict[str, bytes], tally: Tally) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Disturb campaigns; returns 0 if every data set was sound."""
+    """Disturb campaigns and return 0 if all data sets are sound."""
     parser = argparse.ArgumentParser(prog="tests.chaos.campaign", description=__doc__)
     parser.add_argument("--faults", type=int, default=60)
     parser.add_argument("--seed", type=int, default=None, help="random by default")

@@ -1,8 +1,8 @@
-"""Verdicts on a run, from what was written down and what was delivered.
+"""Verdict on a run, based on its log and its results.
 
-Nothing here knows how the run works but for the points that say that a scan was asked for,
-delivered or let go of, and the delivered cloud is compared with what another, undisturbed run
-had in it. So a fault of the code under test cannot hide in the checker.
+The checker only knows the points at which a scan is requested, delivered or released, and compares
+the delivered cloud with that of an undisturbed run. It shares no other code or knowledge with the
+code under test, whose faults it could otherwise hide.
 """
 
 from __future__ import annotations
@@ -22,7 +22,10 @@ TRIED = ("generate.put", "intersect.start", "driver.handon", "driver.replay")
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of the scans of a run; each list names scans, some possibly in two ways."""
+    """What happened to the scans of a run.
+
+    Each list names scans. A scan can be listed for several reasons.
+    """
 
     expected: int  # number of scans that should have arrived
     # Asked for, and not delivered, or without rows in the cloud that belong there.
@@ -36,7 +39,7 @@ class Verdict:
 
     @property
     def sound(self) -> bool:
-        """Whether every scan arrived once, in order."""
+        """Whether every scan arrived exactly once and in order."""
         return not (self.lost or self.duplicated or self.unexpected)
 
     def __str__(self) -> str:
@@ -62,11 +65,11 @@ def judge(
     rows: Sequence[int],
     expected_rows: Sequence[int],
 ) -> Verdict:
-    """Judge one run.
+    """Find lost, duplicated and unexpected scans of a run.
 
-    `events` are what was logged of it, by process, in the order it happened there; `scans` is the
-    number of scans asked for, numbered from 0; `rows` has the scan of each row of the delivered
-    cloud, and `expected_rows` that of each row of the cloud as it should be.
+    `events` is the log of the run, grouped by process and in order of time. `scans` is the number
+    of requested scans, which are numbered from 0. `rows` contains the scan of each row in the
+    delivered cloud, and `expected_rows` the scan of each row in the correct cloud.
     """
     log = list(events)
     every = set(range(scans))
@@ -97,7 +100,7 @@ def judge(
 
 
 def _out_of_order(order: Sequence[int]) -> list[int]:
-    """Scans that came after a later one."""
+    """Return the scans that arrived after a later scan."""
     found = []
     highest = -1
     for scan in order:
@@ -108,7 +111,7 @@ def _out_of_order(order: Sequence[int]) -> list[int]:
 
 
 def _released_early(log: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Scans that were let go of when they had not arrived in every way."""
+    """Return the scans that were released before they had been delivered in every way."""
     here: dict[str, set[int]] = {point: set() for point in DELIVERED.values()}
     found = []
     for event in log:

@@ -1,4 +1,4 @@
-"""The cluster and the survey that tests of faults share."""
+"""The cluster and the survey shared by all tests with faults."""
 
 from __future__ import annotations
 

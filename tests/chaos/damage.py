@@ -1,10 +1,10 @@
-"""Damage files of results and runs, and read them: `python -m tests.chaos.damage`.
+"""Damage files of results and runs, and then read them: `python -m tests.chaos.damage`.
 
-Each file of a result, a data set, its shards and a stored run gets flipped bits, is cut, or grows
-beyond all measure, one damage at a time; and so does each file of `inputs`: recordings (.mcap,
-.pcap), traces of OSI, surveys of HELIOS++ and compiled loops. All readers of the file must then
-give what they gave before, or end with an error of a line or two; for files with checksums what
-they give must be the same. A seed repeats it.
+A bit of a file is flipped, the file is truncated, or a huge value is inserted, one damage at a
+time. The files are those of a result, a data set, its shards, a stored run, and `inputs`:
+recordings (.mcap, .pcap), OSI traces, HELIOS++ surveys and compiled loops. All readers of the file
+must then return the same as before, or fail with an error message of one or two lines. Runs with
+the same seed cause the same damages.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ SLOWEST_S = 60.0  # for a reader
 
 @dataclass
 class Outcome:
-    """What became of damaged files."""
+    """Results of reading damaged files."""
 
     ends: Counter[str] = field(default_factory=Counter)  # {"right", "refused", …: how often}
     faults: list[str] = field(default_factory=list)  # what should not have happened
@@ -85,7 +85,6 @@ class Outcome:
 
 
 def digest_of(*arrays: object) -> str:
-    """Return the hash of arrays."""
     digest = hashlib.sha256()
     for values in arrays:
         digest.update(np.ascontiguousarray(values).tobytes())
@@ -96,19 +95,22 @@ def digest_of(*arrays: object) -> str:
 
 
 def read_sweeps(place: Path) -> str:
-    """Read all sweeps of a data set."""
+    """Read all sweeps of a data set, and return a description and a checksum."""
     saved = lidarpool.sweeps(place)
     words = [f"{one.job} {one.split} {dict(one.values)}" for one in saved]
     return f"{words} {digest_of(*(one.points for one in saved))}"
 
 
 def read_verified(place: Path) -> str:
-    """Compare all files of a data set with what is kept of them."""
+    """Verify all files of a data set against their stored checksums."""
     return verify_dataset(Storage.at(place))
 
 
 def merged(shards: Path) -> str:
-    """Merge the shards of a campaign or survey; returns all but times and notes."""
+    """Merge the shards of a campaign or survey.
+
+    Return everything except times and notes.
+    """
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder, "out")
         lidarpool.merge([shards / "part-1", shards / "part-2"], out)
@@ -118,20 +120,18 @@ def merged(shards: Path) -> str:
 
 
 class Resumed:
-    """Resumes a data set, or a run, with a cluster of threads."""
+    """Readers that resume a data set or a run on a cluster of threads."""
 
     def __init__(self, client: Client, source: Path) -> None:
         self._client = client
         self._source = source
 
     def campaign(self, place: Path) -> str:
-        """Resume a campaign."""
         campaign = Campaign.load(self._source / "c.yaml")
         campaign.run(place, client=self._client, verify=True)
         return read_sweeps(place) + read_verified(place)
 
     def survey(self, place: Path) -> str:
-        """Resume a survey."""
         job = prepare(Scenario.load(self._source / "base.yaml")).job
         result = lidarpool.simulate(
             job.scene, job.survey, client=self._client, backend="numpy", folder=place / "run",
@@ -141,7 +141,7 @@ class Resumed:
 
 
 def shown(place: Path) -> str:
-    """Answer what the page of a result asks."""
+    """Answer all requests of a result's page."""
     from lidarview.viewer.result_views import open_result
 
     view = open_result(place)
@@ -158,7 +158,10 @@ def shown(place: Path) -> str:
 
 
 def commanded(*arguments: str) -> Reader:
-    """Return a reader that runs a command on a result and a folder for what it writes."""
+    """Return a reader that runs a command on a result.
+
+    In the arguments, `{out}` stands for an output folder.
+    """
 
     def read(place: Path) -> str:
         with tempfile.TemporaryDirectory() as out:
@@ -181,7 +184,7 @@ RESULT_READERS = {
 
 
 def damaged(data: bytes, chance: random.Random) -> bytes:
-    """Flip a bit of a file's content, cut it, or make a part of it large."""
+    """Flip a bit in a file's content, truncate it, or insert a large value."""
     at = chance.randrange(len(data))
     kind = chance.random()
     if kind < CUTS:
@@ -193,7 +196,10 @@ def damaged(data: bytes, chance: random.Random) -> bytes:
 
 
 def files_of(folder: Path) -> list[Path]:
-    """Files in a folder as paths relative to it, one of those whose names differ in numbers."""
+    """Return relative paths of files in a folder.
+
+    Of files whose names differ only in numbers, one is returned.
+    """
     kinds: dict[str, Path] = {}
     for path in sorted(folder.rglob("*")):
         if path.is_file() and path.stat().st_size:
@@ -203,7 +209,7 @@ def files_of(folder: Path) -> list[Path]:
 
 
 def attempt(reader: Reader, place: Path) -> tuple[str, str]:
-    """Read a damaged place; returns how it ended, and what was read or said."""
+    """Read a damaged folder, and return how this ended and what was read or printed."""
     started = time.monotonic()
     try:
         with redirect_stdout(StringIO()), redirect_stderr(StringIO()), warnings.catch_warnings():
@@ -219,7 +225,7 @@ def attempt(reader: Reader, place: Path) -> tuple[str, str]:
 
 @contextmanager
 def copied(whole: Path) -> Iterator[Path]:
-    """Copy a folder beside `whole`, to be damaged."""
+    """Yield a copy of the folder `whole` that can be damaged."""
     copy = whole.with_name("damaged")
     shutil.copytree(whole, copy)
     try:
@@ -232,7 +238,7 @@ def attack(
     whole: Path, reader: Reader, file: Path, count: int, chance: random.Random, outcome: Outcome,
     name: str,
 ) -> None:  # fmt: skip
-    """Damage a file some times, and read what it is of each time."""
+    """Damage a file `count` times, and read the folder after each damage."""
     data = (whole / file).read_bytes()
     with copied(whole) as copy:
         _, expected = attempt(reader, copy)
@@ -251,7 +257,7 @@ def attack(
 
 
 def targets(folder: Path, client: Client) -> list[Target]:
-    """Make a result, a data set, shards of both, a stored run, and inputs."""
+    """Create a result, a data set, shards of both, a stored run, and input files."""
     (folder / "base.yaml").write_text(BASE)
     (folder / "c.yaml").write_text(CAMPAIGN)
     wholes = {name: folder / name / "whole" for name in ("result", "set", "shards", "runs", "run")}
@@ -277,7 +283,6 @@ def targets(folder: Path, client: Client) -> list[Target]:
     resumed = Resumed(client, folder)
 
     def is_kept(file: Path) -> bool:
-        """Whether the readers of a data set rely on a file."""
         return file.suffix in (".json", ".csv", ".npz", ".ply") and file.name != "report.json"
 
     return [
@@ -293,7 +298,7 @@ def targets(folder: Path, client: Client) -> list[Target]:
 
 
 def fuzz(count: int, seed: int, seconds: float = float("inf"), tell: bool = False) -> Outcome:
-    """Damage files until each had `count` damages, in an order by chance, or the time is over."""
+    """Damage each file `count` times in random order, or until the time is up."""
     chance = random.Random(seed)
     outcome = Outcome()
     with (
@@ -329,7 +334,7 @@ def fuzz(count: int, seed: int, seconds: float = float("inf"), tell: bool = Fals
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Damage files; returns 0 if all readers ended right or with a line."""
+    """Damage files and return 0 if every reader succeeded or failed with a short error."""
     parser = argparse.ArgumentParser(prog="tests.chaos.damage", description=__doc__)
     parser.add_argument("--count", type=int, default=200, help="damages of each file and reader")
     parser.add_argument("--seed", type=int, default=None, help="random by default")

@@ -1,9 +1,9 @@
-"""What a run passes, written down as it happens, and faults carried out at those points.
+"""Log of the points that a run passes, and faults that are injected at these points.
 
-The log must survive the process that writes it: each event is one line, appended in one
-system call, to a file of the process. Faults are armed as files in a folder: a process that
-comes to the point takes the file away, so that exactly one carries the fault out, and one
-that was restarted meanwhile knows as much as the others.
+The log must survive the process that writes it. Each event is therefore one line that is appended
+to a file of the process in one system call. Armed faults are files in a folder. A process that
+reaches the point of a fault moves its file away, so that exactly one process injects the fault, and
+a process that was restarted knows as much as the others.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _FIRED = "fired"
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing to go wrong."""
+    """Fault to inject into a run."""
 
     number: int  # tells faults apart
     kind: str  # of KINDS
@@ -77,9 +77,9 @@ class Fault:
 
 @dataclass(frozen=True)
 class Fired:
-    """A fault that a process has taken, by its number.
+    """Fault that a process has claimed.
 
-    `path` can be removed to tell the process, which may be waiting, to go on.
+    If the process waits, it continues when `path` is removed.
     """
 
     number: int
@@ -90,7 +90,7 @@ class Fired:
 
 
 class Board:
-    """The folder that all processes share: events that happened, faults that wait."""
+    """Folder shared by all processes, with the logged events and the faults to inject."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -98,20 +98,20 @@ class Board:
             (folder / name).mkdir(parents=True, exist_ok=True)
 
     def arm(self, fault: Fault) -> None:
-        """Have the next process that comes to the point carry it out.
+        """Arm a fault, so that the next process that reaches its point injects it.
 
-        All that it has to know is the name of a file: nothing has to be read.
+        The name of the file contains everything that the process needs to know.
         """
         name = f"{fault.number:05d}~{fault.kind}~{fault.point}~{fault.scan}~{fault.worker}"
         (self.folder / _ARMED / name).touch()
 
     def disarm(self) -> None:
-        """Take back the faults that nobody has come to."""
+        """Withdraw the faults that no process has claimed."""
         for path in (self.folder / _ARMED).iterdir():
             path.unlink(missing_ok=True)  # it may be taken at this moment
 
     def claim(self, point: str, scan: int, worker: str) -> Fired | None:
-        """Take a fault for this point, if there is one that nobody else takes."""
+        """Claim an armed fault for this point, or return None if there is none."""
         for name in sorted(path.name for path in (self.folder / _ARMED).iterdir()):
             number, kind, where, first, whose = name.split("~")
             if where == point and scan >= int(first) and whose in ("", worker):
@@ -122,13 +122,13 @@ class Board:
         return None
 
     def fired(self) -> Iterator[Fired]:
-        """Faults that were taken and whose files are still there."""
+        """Yield the claimed faults whose files still exist."""
         for path in sorted((self.folder / _FIRED).iterdir()):
             number, kind, pid, worker = path.name.split("~")
             yield Fired(int(number), kind, int(pid), worker, path)
 
     def log(self, event: Event) -> None:
-        """Append an event to this process's file."""
+        """Append an event to the log file of this process."""
         path = self.folder / _EVENTS / f"{event['pid']}.jsonl"
         line = json.dumps(event, default=str) + "\n"
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
@@ -138,7 +138,7 @@ class Board:
             os.close(descriptor)
 
     def events(self, run: str) -> list[Event]:
-        """Events of a run so far: by process, in the order they happened there."""
+        """Return a run's events so far, grouped by process and in order of time."""
         lines = (
             line
             for path in sorted((self.folder / _EVENTS).iterdir())
@@ -149,21 +149,19 @@ class Board:
 
     @property
     def has_events(self) -> bool:
-        """Whether anything was logged."""
+        """Whether any event was logged."""
         return any((self.folder / _EVENTS).iterdir())
 
     def forget_events(self) -> None:
-        """Start over with an empty log."""
         for path in (self.folder / _EVENTS).iterdir():
             path.unlink()
 
 
 class Sink:
-    """What `trace_to` is given: it logs a point, slows it down, strikes there.
+    """Callback for `trace_to` that logs points, slows the run down, and injects faults.
 
-    `strike` carries a fault out that was taken here. `pauses` are seconds for which the thread is
-    held at a point for each scan that it is about: they pace a run that would be over before
-    anything could happen to it.
+    `strike` injects a fault that was claimed here. `pauses` maps points to the seconds per scan for
+    which the thread is held there, because a run would otherwise end before faults can occur.
     """
 
     def __init__(
@@ -199,7 +197,7 @@ class Sink:
 def die_at_pipe() -> None:
     """Start a thread that kills this process as soon as another thread waits at a pipe.
 
-    The scheduler then has a request of a client that is dead.
+    The scheduler is then left with a request from a dead client.
     """
 
     def waits_at_pipe() -> bool:
@@ -222,7 +220,7 @@ def die_at_pipe() -> None:
 
 
 def strike_self(fired: Fired) -> None:
-    """End or stop this process, or hold this thread until somebody has done what is to be done."""
+    """Kill or stop this process, or hold this thread until the nemesis has injected the fault."""
     if fired.kind == CLIENT:
         die_at_pipe()  # the thread of the point has to go on to the pipe
         return
@@ -237,7 +235,7 @@ def strike_self(fired: Fired) -> None:
 
 
 class ChaosPlugin(WorkerPlugin):
-    """Has every worker, also one that joins later, log its points and carry faults out."""
+    """Plugin that makes all current and future workers log their points and inject faults."""
 
     name = "chaos"
 
@@ -246,9 +244,10 @@ class ChaosPlugin(WorkerPlugin):
         self.pauses = dict(pauses or {})
 
     def setup(self, worker: Any) -> None:
-        """Listen to this worker's points, for as long as its process lasts.
+        """Trace the points of this worker until its process ends.
 
-        Not only until it is torn down: its long tasks go on for a moment after that.
+        Tracing continues after the worker is closed, because its long tasks run for a moment
+        longer.
         """
         logging.disable(logging.CRITICAL)  # that workers die here is no news
         board = Board(Path(self.folder))

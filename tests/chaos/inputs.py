@@ -1,4 +1,4 @@
-"""Files that runs read, to be damaged: recordings, traces of OSI, HELIOS++, and compiled loops."""
+"""Input files to damage: recordings, OSI traces, HELIOS++ surveys and compiled loops."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ LOOP = "def twice(x):\n    return 2.0 * x\n"
 
 
 def write_inputs(folder: Path, client: Client) -> list[Target]:
-    """Write inputs into folders."""
+    """Write all inputs and return the folders to damage."""
     result = drive(client)
     recordings = folder / "recordings" / "whole"
     recordings.mkdir(parents=True)
@@ -83,7 +83,7 @@ def write_inputs(folder: Path, client: Client) -> list[Target]:
 
 
 def helios_target(folder: Path) -> Target:
-    """Write a survey of HELIOS++ into a folder."""
+    """Write a HELIOS++ survey to a folder."""
     helios = folder / "helios" / "whole"
     for name, text in HELIOS.items():
         path = helios / name
@@ -93,7 +93,7 @@ def helios_target(folder: Path) -> Target:
 
 
 def loops_target(folder: Path) -> Target:
-    """Compile a loop, whose code numba keeps in a folder."""
+    """Compile a loop that numba caches in a folder."""
     loops = folder / "loops" / "whole"
     loops.mkdir(parents=True)
     (loops / "twice.py").write_text(LOOP)
@@ -102,7 +102,7 @@ def loops_target(folder: Path) -> Target:
 
 
 def drive(client: Client) -> Result:
-    """Run a revolution of a VLP-16, past which a car drives."""
+    """Simulate a revolution of a VLP-16 while a car passes."""
     scene = Scene.from_meshes([block("room", (10, 8, 6))])
     car = Actor(block("car", (1, 1, 1)), Track([0, 9], [[2, 0, 0], [3, 0, 0]]))
     columns = ["ray", "range", "reflectivity", "time", "intensity"]
@@ -111,7 +111,7 @@ def drive(client: Client) -> Result:
 
 
 def read_recordings(place: Path) -> str:
-    """Read sweeps of each recording, and the datagrams of packets."""
+    """Read sweeps of all recordings, and all datagrams of packet files."""
     for path in sorted(place.rglob("*.*cap")):
         if path.suffix == ".pcap":
             list(PcapRecording(path).batches(100_000_000))
@@ -123,14 +123,14 @@ def read_recordings(place: Path) -> str:
 
 
 def read_traces(place: Path) -> str:
-    """Build scenarios with the traffic of each trace."""
+    """Prepare all scenarios, which contain the traffic of the traces."""
     for path in sorted(place.glob("*.yaml")):
         prepare(Scenario.load(path))
     return ""
 
 
 def import_helios(place: Path) -> str:
-    """Import a survey of HELIOS++, as the command does."""
+    """Import a HELIOS++ survey like the command."""
     outcome = CliRunner().invoke(import_, [str(place / "fly.xml"), "-o", str(place / "out")])
     if isinstance(outcome.exception, Exception):
         raise outcome.exception
@@ -140,13 +140,13 @@ def import_helios(place: Path) -> str:
 
 
 def run_loop(place: Path) -> str:
-    """Run a loop that numba compiled, or compiles again."""
+    """Run a loop, which numba loads from its cache or compiles again."""
     loop = compiled("f8(f8)")(module_of(place / "twice.py").twice)
     return str(loop(21.0))
 
 
 def module_of(path: Path) -> ModuleType:
-    """Import a file, each time anew."""
+    """Import a file again, without a cached module."""
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None
     assert spec.loader is not None

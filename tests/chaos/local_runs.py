@@ -1,14 +1,14 @@
-"""Kill commands that need no outside cluster until so many faults were done.
+"""Kill commands that start their own cluster, until a given number of faults has been injected.
 
-`python -m tests.chaos.local_runs` plays three cases, each beside an undisturbed run:
+`python -m tests.chaos.local_runs` compares three cases with undisturbed runs:
 
 - a survey;
 - a campaign of 200 jobs;
-- the shards of a survey and their merge, beside the run that was not divided.
+- the shards of a survey and their merge, compared with the run that was not divided.
 
 A fault kills the driver (with its scheduler), a worker, or all processes of a command at once. A
-command whose driver was killed is given again with `--resume`, as a user would. The last line says
-whether all files have the bytes of the undisturbed run.
+command whose driver was killed is repeated with `--resume`, as a user would do. The last line of
+the output states whether all files are identical to those of the undisturbed run.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ OF_ONE_RUN = {"report.json", "report.html", "report.csv"}
 
 @dataclass
 class Tally:
-    """What was done, and what became of the results."""
+    """Faults injected so far, and defects found in the results."""
 
     done: Counter[str] = field(default_factory=Counter)  # {what was killed: how often}
     results: int = 0
@@ -86,12 +86,15 @@ class Tally:
 
     @property
     def sound(self) -> bool:
-        """Whether nobody could tell the results from undisturbed ones."""
+        """Whether all results are equal to the undisturbed ones."""
         return not (self.differing or self.errors)
 
 
 def commands_of(case: str, out: str) -> list[list[str]]:
-    """Return the commands of a case, the last of which writes to `out`."""
+    """Return the commands of a case.
+
+    The last one writes to `out`.
+    """
     options = ["--resume", "-q", "--backend", "numpy"]
     if case == "survey":
         return [["run", "survey.yaml", "--out", out, *options]]
@@ -109,7 +112,7 @@ REFERENCES = {"survey": "survey", "campaign": "campaign", "shards": "survey"}
 
 
 class Arena:
-    """A folder of scenarios, in which commands run and are killed."""
+    """Folder with scenarios in which commands are run and killed."""
 
     def __init__(self, folder: Path, seed: int) -> None:
         self.folder = folder
@@ -118,13 +121,13 @@ class Arena:
             (folder / f"{name}.yaml").write_text(text)
 
     def play(self, case: str, out: str, tally: Tally, faults: int) -> None:
-        """Play a case, with so many faults at most."""
+        """Run the commands of a case while injecting at most `faults` faults."""
         for command in commands_of(case, out):
             allowed = min(FAULTS_PER_COMMAND, faults)
             faults -= self._disturb(command, tally, allowed)
 
     def _disturb(self, command: Sequence[str], tally: Tally, faults: int) -> int:
-        """Give a command until it has ended well; return the number of faults."""
+        """Repeat a command until it succeeds, and return the number of injected faults."""
         done = 0
         driver = self._start(command)
         while done < faults and self._has_come_to_a_moment(driver, has_workers=command[0] == "run"):
@@ -145,7 +148,10 @@ class Arena:
         return done
 
     def _has_come_to_a_moment(self, driver: subprocess.Popen[str], has_workers: bool) -> bool:
-        """Wait for the moment of a fault; False if the command has ended before."""
+        """Wait until it is time for a fault.
+
+        Return False if the command has ended before.
+        """
         starting = self._chance.random() < STARTING or not has_workers
         while not starting and driver.poll() is None and not workers_of(driver.pid):
             time.sleep(LOOK_EVERY_S)
@@ -166,7 +172,7 @@ class Arena:
         )
 
     def _kill(self, driver: subprocess.Popen[str]) -> str:
-        """Kill the driver, a worker if there is one, or all; return which."""
+        """Kill the driver, a worker or all processes, and return which of these."""
         [kind] = self._chance.choices(KINDS, SHARES)
         workers = workers_of(driver.pid)
         number = self._chance.random()
@@ -187,9 +193,9 @@ class Arena:
 
 
 def workers_of(pid: int) -> list[psutil.Process]:
-    """Return the processes of workers of a driver that have been up for a while.
+    """Return the worker processes of a driver that have been running for a while.
 
-    The driver starts them by a fork server, and kills nobody else's.
+    The driver starts its workers with a fork server.
     """
     with suppress(psutil.NoSuchProcess):
         servers = psutil.Process(pid).children()
@@ -203,7 +209,7 @@ def workers_of(pid: int) -> list[psutil.Process]:
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
-    """Return the bytes of each file of a result by path, without those that have times."""
+    """Return the content of a result's files, keyed by path, without files that contain times."""
     return {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in folder.rglob("*")
@@ -212,7 +218,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 
 def judge(folder: Path, reference: dict[str, bytes], tally: Tally) -> None:
-    """Compare the files of a result with those of the undisturbed run."""
+    """Compare the files of a result with those of an undisturbed run."""
     files = files_of(folder)
     tally.results += 1
     tally.differing += [
@@ -223,7 +229,7 @@ def judge(folder: Path, reference: dict[str, bytes], tally: Tally) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Disturb commands; returns 0 if every result was sound."""
+    """Disturb commands and return 0 if all results are sound."""
     parser = argparse.ArgumentParser(prog="tests.chaos.local_runs", description=__doc__)
     parser.add_argument("--faults", type=int, default=30)
     parser.add_argument("--seed", type=int, default=None, help="random by default")

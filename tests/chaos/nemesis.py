@@ -1,4 +1,4 @@
-"""Who does harm: a plan of faults that follows from a seed, and the one who carries it out."""
+"""Plan of faults that is generated from a seed, and the nemesis that injects them."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ WAKE_MOST_S = 30.0  # for those who are to stop to have stopped, when all is ove
 def make_plan(
     seed: int, count: int, worker_points: Sequence[str], driver_points: Sequence[str], scans: int
 ) -> list[Fault]:
-    """Choose faults: the same for the same arguments.
+    """Choose faults, which depend only on the arguments.
 
-    First every point, every kind among them, then every kind at every point of the workers, and
-    for the rest faults at random times. Workers strike themselves at their points; at the
-    driver's, it strikes some worker.
+    The first faults cover every point and every kind. Then each kind occurs at each point of the
+    workers, and all remaining faults occur at random times. Workers inject faults into themselves
+    at their points. At its points, the driver injects faults into a worker.
     """
     chance = random.Random(seed)
     turned = [KINDS[turn:] + KINDS[:turn] for turn in range(len(KINDS))]
@@ -80,7 +80,10 @@ def make_plan(
 
 
 def _is_possible(kind: str, point: str) -> bool:
-    """Return False for a part where a stage starts, and a pipe where rays are cast."""
+    """Return whether this kind of fault can occur at a point.
+
+    No parts exist yet when a stage starts, and casting tasks have no pipes.
+    """
     if kind == DAMAGE:
         return not point.endswith(".start")
     return kind != CLIENT or not point.startswith("intersect.")
@@ -105,13 +108,13 @@ def _fault(
 
 
 class Nemesis:
-    """Carries out faults during a run whose driver is in this process; a context manager around it.
+    """Context manager that injects faults into a run whose driver is in this process.
 
-    The run keeps its parts in the folder `parts`. Links lead from there to that of a `stranger`,
-    who has a run, too.
+    The run keeps its parts in the folder `parts`. Links lead from there to the run in the folder
+    `stranger`.
 
-    Faults at points are armed at once; those at random times follow one another, from when
-    anybody passes a point.
+    Faults at points are armed at the start. Faults at random times are injected one after another,
+    starting when any process passes a point.
     """
 
     def __init__(self, arena: Arena, faults: Sequence[Fault], parts: Path, stranger: Path) -> None:
@@ -175,7 +178,7 @@ class Nemesis:
             self._over.wait(LOOK_EVERY_S)
 
     def _answer(self, fired: Fired) -> None:
-        """Do what a process that has come to a point cannot do by itself."""
+        """Complete a fault that the process at its point cannot complete by itself."""
         fault = self.faults[fired.number]
         if fault.partition:  # the driver does that in its own thread
             return
@@ -196,7 +199,7 @@ class Nemesis:
             self._help(fault, fired.worker)
 
     def _wake(self, now: float) -> None:
-        """Let those go on that have been stopped for long enough."""
+        """Continue the processes that have been stopped for long enough."""
         with self._lock:
             over = [pid for pid, until in self._stopped.items() if until <= now]
             # A process that is slow to stop itself would not hear it, and stay stopped.
@@ -209,9 +212,11 @@ class Nemesis:
     # -- in either thread --------------------------------------------------------------
 
     def strike(self, fault: Fault) -> bool:
-        """Carry out a fault on a worker of its partition; False if there is none now.
+        """Inject a fault into a worker of its partition.
 
-        Only on one that has joined: a nanny whose worker dies before gives up, and leaves.
+        Return False if no worker is running.
+
+        Only workers that have joined are chosen, because a nanny exits if its worker dies before.
         """
         names = [name for name in self.arena.names(fault.partition) if self.arena.address(name)]
         if not names:
@@ -241,7 +246,7 @@ class Nemesis:
         return {DAMAGE: self._damage, LINK: self._link}
 
     def _link(self, fault: Fault) -> bool:
-        """Put a link to a file of the stranger among those of the run, as if it were its own."""
+        """Add a link to a foreign file, under a name that the run might use for its own files."""
         for mark in self.parts.glob("*-mark"):
             link = mark.with_name(mark.name.replace("mark", f"probe-{fault.number:08x}"))
             link.symlink_to(self.stranger / "run.owner")
@@ -249,7 +254,10 @@ class Nemesis:
         return False
 
     def _damage(self, fault: Fault) -> bool:
-        """Flip a bit of some part; False if there is none now."""
+        """Flip a bit in one of the parts.
+
+        Return False if there are no parts.
+        """
         parts = sorted(self.parts.glob("*.npz"))
         with suppress(FileNotFoundError):  # just removed, as one that came twice
             if parts:
@@ -261,7 +269,10 @@ class Nemesis:
         return False
 
     def _help(self, fault: Fault, name: str) -> bool:
-        """Have a worker leave, restart or pause, in a thread; False if it is not there."""
+        """Retire, restart or pause a worker in a new thread.
+
+        Return False if the worker is down.
+        """
         address = self.arena.address(name)
         if address is None:
             return False
@@ -275,7 +286,10 @@ class Nemesis:
         helper.start()
 
     def _kill_at_pipe(self, fault: Fault, name: str) -> bool:
-        """Have a worker die as soon as it waits at a pipe; False if the worker has left."""
+        """Make a worker kill itself as soon as it waits at a pipe.
+
+        Return False if the worker is down.
+        """
         pid = self.arena.pid(name)
         address = self.arena.address(name)
         if pid is None or address is None:
@@ -290,7 +304,10 @@ class Nemesis:
         return True
 
     def _note_death(self, fault: Fault, pid: int) -> None:
-        """Note a fault once its process has died; not if the process has waited at no pipe."""
+        """Record a fault once its process has died.
+
+        Nothing is recorded if the process has not waited at a pipe.
+        """
         deadline = time.monotonic() + PIPE_WAIT_S
         while time.monotonic() < deadline:
             if not psutil.pid_exists(pid):
@@ -328,7 +345,7 @@ class Nemesis:
 
 
 class _DriverSink(Sink):
-    """The driver logs as the workers do; what it is to strike is a worker."""
+    """Sink of the driver, which injects its faults into a worker."""
 
     def __init__(self, nemesis: Nemesis) -> None:
         super().__init__(nemesis.arena.board, "driver", self._strike)
@@ -344,7 +361,7 @@ class _DriverSink(Sink):
 
 
 def _is_going(pid: int) -> bool:
-    """Whether a process is there and not stopped."""
+    """Return whether a process exists and is not stopped."""
     try:
         status = psutil.Process(pid).status()
     except psutil.NoSuchProcess:

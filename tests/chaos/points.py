@@ -1,9 +1,9 @@
-"""Points that a survey passes, told through `poolpart.trace`: for checkers and fault injection.
+"""Points that a survey reports through `poolpart.trace`, for checkers and fault injection.
 
-Every point carries ``run`` (the survey's id), ``stage`` and ``attempt`` where a stage tells of
-it (how many tasks of long stages had been started before), and ``scans``, a list of the scans
-that it is about, possibly empty. The driver's points carry ``stage`` too where they are about
-one.
+Every point has the fields ``run`` (the survey's id) and ``scans`` (a list of the scans concerned,
+which can be empty). Points of stages also have ``stage`` and ``attempt``, which is the number of
+tasks of long stages that were started before. The driver's points have ``stage`` if they concern a
+stage.
 
 ================== ======================================================================
 point              when

@@ -1,7 +1,7 @@
-"""A long survey with a worker killed every few seconds: `python -m tests.chaos.soak`.
+"""Run a long survey while workers are killed every few seconds: `python -m tests.chaos.soak`.
 
-Driver and scheduler are in this process, whose memory is seen. Afterwards nothing may be left
-on the scheduler that was not there before.
+Driver and scheduler are in this process, whose memory is measured. At the end, the scheduler's
+state must be the same as before.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ LETHAL = (KILL, KILL, TERM, SEGV)
 
 @dataclass(frozen=True)
 class Soaked:
-    """What a soak has shown."""
+    """Results of a soak test."""
 
     outcome: Outcome
     memory: list[tuple[float, float]]  # seconds, MiB resident
@@ -44,19 +44,19 @@ class Soaked:
 
     @property
     def sound(self) -> bool:
-        """Whether nothing is lost and nothing is left."""
+        """Whether nothing was lost and nothing is left on the scheduler."""
         return self.outcome.sound and not self.left_on_scheduler
 
     @property
     def growth(self) -> float:
-        """MiB by which memory grew from the second quarter of the time to the last."""
+        """Growth of memory from the second to the last quarter of the time, in MiB."""
         values = [mebibytes for _, mebibytes in self.memory]
         quarter = max(1, len(values) // 4)
         return float(np.median(values[-quarter:]) - np.median(values[quarter : 2 * quarter]))
 
 
 def soak(arena: Arena, what: Survey, expected: Reference, seed: int) -> Soaked:
-    """Survey while workers are killed all the time."""
+    """Run a survey while workers are killed repeatedly."""
     memory: list[tuple[float, float]] = []
     over = threading.Event()
     started = time.monotonic()
@@ -79,10 +79,10 @@ def soak(arena: Arena, what: Survey, expected: Reference, seed: int) -> Soaked:
 
 
 def _faults(chance: random.Random, scans: int) -> list[Fault]:
-    """Far more at random times than come to pass, and some that are sure to interrupt scans.
+    """Return more faults at random times than can occur, and some that are sure to interrupt scans.
 
-    Where workers start more slowly than they are killed the last of them come to an end, so
-    that the survey does.
+    The number of faults at random times is limited, so that the survey ends even if workers start
+    more slowly than they are killed.
     """
     timed = [
         Fault(
@@ -103,7 +103,7 @@ def _faults(chance: random.Random, scans: int) -> list[Fault]:
 
 
 def draw(soaked: Soaked, path: Path) -> None:
-    """Draw the memory as a curve."""
+    """Plot memory over time."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 4), layout="constrained")
@@ -118,7 +118,7 @@ def draw(soaked: Soaked, path: Path) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Soak, and say what was found; returns 0 if all was well."""
+    """Run the soak test, print its results, and return 0 if it is sound."""
     parser = argparse.ArgumentParser(prog="tests.chaos.soak", description=__doc__)
     parser.add_argument("--scans", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=1)

@@ -1,4 +1,4 @@
-"""The survey that is disturbed, and what became of it."""
+"""Survey that is disturbed, and the outcome of disturbed runs."""
 
 from __future__ import annotations
 
@@ -50,7 +50,10 @@ PLANNING = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=12, particles=60
 
 
 def room() -> Scene:
-    """A room of 10 by 8 by 6 meters around the sensor, and what moves in it: every ray hits."""
+    """Return a room of 10 by 8 by 6 meters with two moving blocks.
+
+    All rays hit.
+    """
     ways = [[(-3, -3, -2), (-3, 3, 2)], [(4, 3, 0), (4, -3, 1)]]
     moving = [
         Actor(block(f"block {k}", (1, 1, 1)), Track([0, 9], way, beyond="hold"))
@@ -60,14 +63,17 @@ def room() -> Scene:
 
 
 def survey(poses: int = POSES, layers: int = 8) -> Survey:
-    """Describe `poses` times 360 scans, each of two azimuths."""
+    """Return a survey of `poses` poses with 360 scans each.
+
+    Each scan covers two azimuths.
+    """
     sensor = Sensor.grid(rays_per_revolution=720, layers=layers, vertical_fov_deg=60, step_deg=1)
     places = [(0.5 * (pose % 7), 0.25 * (pose % 5), 0.0) for pose in range(poses)]
     return Survey(sensor, places, STEPS, keep_every=3)
 
 
 def digest(result: Result) -> str:
-    """SHA-256 of everything that a run delivers and that must not depend on luck."""
+    """Return the SHA-256 checksum of everything in a result that must be reproducible."""
     cloud = result.cloud
     plan = () if result.plan is None else (result.plan.path,)
     arrays = (cloud.positions, cloud.scan, cloud.channel, cloud.object, result.hit_counts, *plan)
@@ -80,9 +86,10 @@ def digest(result: Result) -> str:
 
 
 def growing(*arguments: Any, **options: Any) -> tuple[Result, bytes | None]:
-    """Run `simulate`, and grow a cloud.ply meanwhile.
+    """Run `simulate` with a cloud.ply that grows during the run.
 
-    Returns the bytes of the file, too; None if it failed, as it may where a part is damaged.
+    Return the result, and the content of this file or None if it could not be finished. That is
+    allowed if a part is damaged.
     """
     written: list[bytes] = []
 
@@ -114,7 +121,7 @@ def growing(*arguments: Any, **options: Any) -> tuple[Result, bytes | None]:
 
 @dataclass(frozen=True)
 class Reference:
-    """What an undisturbed run gives."""
+    """Result of an undisturbed run."""
 
     digest: str
     rows: tuple[int, ...]  # scan of each row of the cloud
@@ -122,20 +129,23 @@ class Reference:
 
     @classmethod
     def of(cls, result: Result) -> Reference:
-        """Keep what is compared."""
+        """Keep the values that are compared."""
         with tempfile.TemporaryDirectory() as folder:
             save_cloud(result.points, path := Path(folder, "cloud.ply"))
             ply = path.read_bytes()
         return cls(digest(result), tuple(result.cloud.scan.tolist()), ply)
 
     def is_same(self, result: Result, ply: bytes | None) -> bool:
-        """Whether all that a run delivers is the same; a file that has not grown is no loss."""
+        """Return whether a run has the same result.
+
+        A cloud.ply that has not grown to its end is not a defect.
+        """
         return digest(result) == self.digest and ply in (None, self.ply)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one run."""
+    """Outcome of a disturbed run."""
 
     verdict: Verdict
     identical: bool
@@ -149,18 +159,18 @@ class Outcome:
 
     @property
     def sound(self) -> bool:
-        """Whether nobody could tell this run from an undisturbed one."""
+        """Whether this run is equal to an undisturbed one."""
         return self.verdict.sound and self.identical and not self.misplaced and not self.error
 
 
 def reference(arena: Arena, what: Survey, planning: Planning | None = PLANNING) -> Reference:
-    """Run it with nobody disturbing it."""
+    """Run a survey without faults."""
     result = simulate(room(), what, planning, client=arena.client, backend="numpy")
     return Reference.of(result)
 
 
 def _run_of_another(folder: Path) -> dict[str, bytes]:
-    """Make what a run removes of its own; returns the files."""
+    """Create files with the names of those that a run deletes, and return their content."""
     mark = "0123456789abcdef"
     (folder / "parts").mkdir()
     for name in ("run.owner", f"parts/{mark}-mark", f"parts/{mark}-000000-00000000-00000004.npz"):
@@ -180,9 +190,9 @@ def disturbed(
     planning: Planning | None = PLANNING,
     **options: float,
 ) -> Outcome:
-    """Run it while the nemesis does its worst, and judge what comes of it.
+    """Run a survey while faults are injected, and judge the result.
 
-    Where parts were damaged, or there are links, it is resumed in the end.
+    If parts were damaged or links were added, the run is resumed at the end.
     """
     arena.wait_until_whole()
     arena.board.forget_events()

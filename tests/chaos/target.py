@@ -1,4 +1,4 @@
-"""Folders whose files are damaged."""
+"""Folders with files to damage."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Reader = Callable[[Path], str]  # reads what is in a folder; returns a digest of
 
 @dataclass
 class Target:
-    """A folder, who reads it, and which of its files are damaged."""
+    """Folder with its readers and a function that selects the files to damage."""
 
     whole: Path
     readers: dict[str, Reader]

@@ -1,4 +1,4 @@
-"""The short versions of `python -m tests.chaos` and of its soak."""
+"""Short versions of `python -m tests.chaos` and its soak test."""
 
 import signal
 import subprocess
@@ -41,7 +41,7 @@ def test_whoever_dies_each_scan_arrives_once(arena, what, known):
 
 @pytest.mark.slow
 def test_more_deaths_than_dask_allows_a_task(arena, what, known):
-    """Dask gives a task up for good when its fourth worker dies."""
+    """Dask abandons a task when the fourth worker that ran it has died."""
     faults = [Fault(number, "kill", "sort.get", 50 * number) for number in range(5)]
     outcome = disturbed(arena, what, known, faults, **PATIENT)
     assert outcome.sound, outcome.error or outcome.verdict

@@ -1,4 +1,4 @@
-"""The checker by itself, on logs that are written here."""
+"""Test the checker alone, using made-up logs."""
 
 import pytest
 from tests.chaos.checker import judge
@@ -9,7 +9,7 @@ def event(point, *scans, **fields):
 
 
 def whole(scans=3):
-    """Return the log of a run of which nothing is to be said."""
+    """Return the log of a run without defects."""
     numbers = range(scans)
     return [
         *(event("generate.put", scan) for scan in numbers),

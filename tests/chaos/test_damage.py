@@ -1,4 +1,4 @@
-"""Damaged files of results and runs end in a line, or are read right; the rest in `damage`."""
+"""Test that damaged files of results and runs are read correctly or cause a short error."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ DAMAGES = 3  # of each file, for each reader
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory) -> Path:
-    """Return a data set of six jobs, of which one has failed."""
+    """Create a data set of six jobs, one of which has failed."""
     place = tmp_path_factory.mktemp("set") / "whole"
     scene = the_scene()
     write_set(place, "folder", scene, the_sweeps(scene))
@@ -40,7 +40,6 @@ def dataset(tmp_path_factory) -> Path:
 
 
 def read_all(place: Path) -> str:
-    """Read all sweeps, and compare all files."""
     return read_verified(place) + read_sweeps(place)
 
 
@@ -65,7 +64,10 @@ def test_files_of_a_data_set_are_read_right_or_refused(dataset, name):
 
 
 def test_a_damaged_database_is_refused_or_the_same(tmp_path):
-    """Each flipped bit: SQLite itself does not notice those in values."""
+    """Flip each bit of the database.
+
+    SQLite itself does not detect flipped bits in values.
+    """
     path = tmp_path / "run.db"
     copy = tmp_path / "copy.db"
 

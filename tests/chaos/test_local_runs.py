@@ -1,4 +1,4 @@
-"""The short versions of `python -m tests.chaos.local_runs`."""
+"""Short versions of `python -m tests.chaos.local_runs`."""
 
 import pytest
 from tests.chaos.local_runs import REFERENCES, Tally, commands_of, files_of, judge, main

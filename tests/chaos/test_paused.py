@@ -1,6 +1,6 @@
-"""A worker that is stopped until it was given up, and then wakes up.
+"""Test a worker that is stopped, given up by the cluster, and then continued.
 
-What it did before, it goes on with, beside those who have taken its work over.
+The worker then continues its tasks, although other workers have taken them over.
 """
 
 import os
@@ -25,9 +25,9 @@ STOP_S = 2.0  # for others to take over
 
 @pytest.fixture
 def lonely(arena):
-    """Start a worker, as the only one of its partition; returns its name.
+    """Return a function that starts the only worker of a partition and returns the worker's name.
 
-    It has no nanny, which would kill it when the scheduler gives it up.
+    The worker has no nanny, which would kill it when the scheduler gives up on it.
     """
     started: list[subprocess.Popen[bytes]] = []
 
@@ -78,7 +78,7 @@ def test_given_up_by_the_scheduler_what_it_does_counts_once(
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", ["collect-0", GPU])
 def test_given_up_by_the_driver_it_does_no_harm(arena, what, known, monkeypatch, stage):
-    """The scheduler would take it for dead after five minutes, and wait that long."""
+    """The driver gives up on the worker long before the scheduler's timeout of five minutes."""
     monkeypatch.setattr("lidarpool.run.pipeline.policies.scans_per_batch", lambda *_: 10)
     seen = []
     stopped = []
@@ -118,7 +118,7 @@ def test_given_up_by_the_driver_it_does_no_harm(arena, what, known, monkeypatch,
 
 
 def _worker_of(arena, stage) -> int | None:
-    """Process of the worker that runs a stage, or of a casting worker."""
+    """Return the process ID of the worker that runs a stage, or of a casting worker."""
     scheduler = arena.cluster.scheduler
     if stage == GPU:
         return next((w.pid for w in list(scheduler.workers.values()) if GPU in w.resources), None)

@@ -1,4 +1,4 @@
-"""What a run may leave behind on the scheduler."""
+"""State of the scheduler, to check what a run leaves behind."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SETTLE_S = 300.0  # for what was closed to be gone: connections end a moment lat
 
 
 def scheduler_state(client: Client) -> dict[str, Any]:
-    """All that a scheduler knows, as sets and counts that can be compared."""
+    """Return the state of the scheduler as sets and counts that can be compared."""
     state: dict[str, Any] = client.run_on_scheduler(_look)
     return state
 
@@ -58,12 +58,15 @@ def _look(dask_scheduler: Any) -> dict[str, Any]:
 
 
 def _clients_of_workers(dask_scheduler: Any) -> int:
-    """Each worker whose tasks have used a client has one, until it leaves."""
+    """Count the clients of workers.
+
+    A worker whose tasks have used a client keeps it until the worker leaves.
+    """
     return sum(str(name).startswith("Client-worker") for name in dask_scheduler.clients)
 
 
 def differences(before: dict[str, Any], after: dict[str, Any]) -> list[str]:
-    """Say what is not as it was."""
+    """Describe all differences between two states."""
     return [
         f"{name}: {before.get(name)} before, {after.get(name)} after"
         for name in sorted(before.keys() | after.keys())
@@ -72,7 +75,10 @@ def differences(before: dict[str, Any], after: dict[str, Any]) -> list[str]:
 
 
 def settled_differences(client: Client, before: dict[str, Any]) -> list[str]:
-    """Say what a scheduler knows that it did not, once it has heard of all that was closed."""
+    """Describe how the scheduler's state differs from `before`.
+
+    Wait until connections that were closed are gone.
+    """
     deadline = time.monotonic() + SETTLE_S
     while (left := differences(before, scheduler_state(client))) and time.monotonic() < deadline:
         time.sleep(0.2)

@@ -68,7 +68,7 @@ def test_a_section_that_fails_leaves_the_others(played_cuda, tmp_path, capsys, m
     assert found["leaks"]["edges and corners"]["escaped"] == 0
     said = capsys.readouterr().out
     assert "wrong: moving: MemoryError: no room" in said
-    assert "left out: peers, because benchmarks.gpu_of_nobody is not installed" in said
+    assert "skipped: peers, because benchmarks.gpu_of_nobody is not installed" in said
 
 
 def test_the_page_has_the_rows_of_the_table():

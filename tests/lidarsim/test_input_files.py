@@ -1,4 +1,4 @@
-"""Input files: devices, pipes, sockets, pointers and false counts are refused at once."""
+"""Input files: devices, pipes, sockets, pointers and false counts are rejected at once."""
 
 import json
 import os

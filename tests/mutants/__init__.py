@@ -1,4 +1,4 @@
-"""Plant faults in the sources, one at a time, and list those that no test notices.
+"""Plant faults in the sources, one at a time, and list those that no test detects.
 
 Run with `python -m tests.mutants --help`, or by `make mutants`.
 """

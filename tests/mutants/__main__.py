@@ -1,4 +1,4 @@
-"""Plant faults, run the tests that execute them, and list the faults that no test notices."""
+"""Plant faults, run the tests that execute them, and list the faults that no test detects."""
 
 import argparse
 import json
@@ -46,7 +46,7 @@ _EXTRA_S = 120.0  # a fault that makes tests this much slower counts as noticed
 
 @dataclass
 class Outcome:
-    """What became of a fault.
+    """Result of testing one fault.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Outcome:
 
 
 def main() -> None:
-    """Run as the command line says, and exit with 1 if a fault passed."""
+    """Run the program, and exit with 1 if a fault was not detected."""
     options = _parser().parse_args()
     FOLDER.mkdir(parents=True, exist_ok=True)
     record = FOLDER / "lines.json"
@@ -136,7 +136,7 @@ def _parser() -> argparse.ArgumentParser:
 
 @dataclass
 class Place:
-    """Where a fault is tried: a process that has imported everything, and a copy of the project."""
+    """Process with all packages imported, and copy of the project, for testing one fault."""
 
     forks: Forks
     copy: Path
@@ -144,7 +144,7 @@ class Place:
 
 @contextmanager
 def _places(count: int) -> Iterator["Queue[Place]"]:
-    """Yield places for faults that are tried at the same time."""
+    """Yield a queue of places, one for each fault that is tested concurrently."""
     places: Queue[Place] = Queue()
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         for number in range(count):
@@ -158,14 +158,14 @@ def _places(count: int) -> Iterator["Queue[Place]"]:
 
 
 def _try(places: "Queue[Place]", lines: Lines, fault: Fault, budget_s: float) -> Outcome:
-    """Plant a fault, run the tests that execute it in groups, and say what became of it."""
+    """Plant a fault, and run groups of tests that execute it until one detects the fault."""
     start = time.monotonic()
     tests = lines.tests_of(ROOT, fault)
     place = places.get()
     try:
         noticed, tried = _noticed(place, lines, fault, list(_groups(lines, tests, budget_s)))
         while noticed.startswith("by ") and not _passes(place, lines, noticed[3:]):
-            print(f"left out, since it fails without a fault: {noticed[3:]}", flush=True)
+            print(f"skipped, because it fails without a fault: {noticed[3:]}", flush=True)
             tests = [test for test in tests if not noticed[3:].startswith(test)]
             noticed, tried = _noticed(place, lines, fault, list(_groups(lines, tests, budget_s)))
     finally:
@@ -174,7 +174,7 @@ def _try(places: "Queue[Place]", lines: Lines, fault: Fault, budget_s: float) ->
 
 
 def _noticed(place: Place, lines: Lines, fault: Fault, groups: list[list[str]]) -> tuple[str, int]:
-    """Return by which test a fault was noticed (see `Outcome`), and the number of tests tried."""
+    """Return `Outcome.noticed`, and the number of tests that were run."""
     tried = 0
     for group in [] if fault.compiled else groups:
         tried += len(group)
@@ -194,12 +194,15 @@ def _passes(place: Place, lines: Lines, test: str) -> bool:
 
 
 def _limit_s(lines: Lines, tests: list[str]) -> float:
-    """Return after how many seconds tests count as hanging."""
+    """Return the time limit in seconds after which tests count as hanging."""
     return 3 * sum(map(lines.cost, tests)) + _EXTRA_S
 
 
 def _groups(lines: Lines, tests: list[str], budget_s: float) -> Iterator[list[str]]:
-    """Yield tests to run together: quick ones first, then the others up to a budget."""
+    """Yield groups of tests to run together.
+
+    The first group contains quick tests. The other tests follow up to the budget.
+    """
     group: list[str] = []
     spent = total = 0.0
     limit = _FIRST_S
@@ -218,7 +221,7 @@ def _groups(lines: Lines, tests: list[str], budget_s: float) -> Iterator[list[st
 
 
 def _failure(copy: Path, fault: Fault, lines: Lines, tests: list[str]) -> str:
-    """Plant a fault in a copy, and return `Outcome.noticed`."""
+    """Plant a fault in a copy of the project, run tests, and return `Outcome.noticed`."""
     path = copy / fault.path
     path.write_text(fault.plant((ROOT / fault.path).read_text()))
     environment = os.environ | {
@@ -253,7 +256,7 @@ def _failure(copy: Path, fault: Fault, lines: Lines, tests: list[str]) -> str:
 
 
 def _restore_loops(copy: Path) -> None:
-    """Bring back the compiled loops that the fault's tests have replaced."""
+    """Restore the compiled loops in a copy that tests with a fault have replaced."""
     for root in ROOTS:
         for cached in (copy / root).rglob("__pycache__/*.nb[ic]"):
             kept = ROOT / cached.relative_to(copy)
@@ -264,7 +267,7 @@ def _restore_loops(copy: Path) -> None:
 
 
 def _print_summary(outcomes: list[Outcome]) -> None:
-    """Print the share of noticed faults by folder."""
+    """Print the number of detected faults by folder."""
     total: Counter[str] = Counter()
     noticed: Counter[str] = Counter()
     for outcome in outcomes:

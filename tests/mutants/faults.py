@@ -1,4 +1,4 @@
-"""Faults that can be planted in a source file: another operator, comparison, constant or condition.
+"""Faults for source files: replaced operators, comparisons, constants and conditions.
 
 A fault replaces one expression on one line. Messages, assertions, log calls and representations are
 left alone, since tests do not assert their wording.
@@ -60,7 +60,7 @@ _NAMES = {"min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum"
 
 @dataclass(frozen=True)
 class Fault:
-    """A replacement of one expression.
+    """Replacement of one expression.
 
     Attributes
     ----------
@@ -91,11 +91,11 @@ class Fault:
 
     @classmethod
     def read(cls, row: dict[str, Any]) -> "Fault":
-        """Return a fault from the JSON object of its attributes."""
+        """Create a fault from a JSON object with its attributes."""
         return cls(**{**row, "columns": tuple(row["columns"])})
 
     def plant(self, source: str) -> str:
-        """Return the source with the fault.
+        """Plant the fault in a source text.
 
         Raises ValueError if the expression is not where it was.
         """
@@ -126,7 +126,7 @@ def faults_in(root: Path, path: str) -> list[Fault]:
 
 
 def modules(root: Path, packages: list[str]) -> list[str]:
-    """Return the source files below packages, without those whose layout is not asserted."""
+    """Return the source files in packages, except `SKIPPED_MODULES`."""
     paths = {
         path.relative_to(root)
         for package in packages
@@ -142,7 +142,7 @@ def modules(root: Path, packages: list[str]) -> list[str]:
 
 
 def choose(root: Path, packages: list[str], count: int, seed: int) -> list[Fault]:
-    """Draw faults at random, without repetition, from all that can be planted below packages."""
+    """Draw distinct faults at random from all that can be planted in packages."""
     every = [fault for path in modules(root, packages) for fault in faults_in(root, path)]
     random.Random(seed).shuffle(every)
     usable = (fault for fault in every if _can_be_parsed(fault, (root / fault.path).read_text()))
@@ -150,7 +150,7 @@ def choose(root: Path, packages: list[str], count: int, seed: int) -> list[Fault
 
 
 def function_spans(source: str) -> dict[str, tuple[int, int]]:
-    """Return first and last line of the body of each function, by qualified name."""
+    """Return the first and last line of each function's body, keyed by qualified name."""
     spans = {}
     waiting: list[tuple[str, ast.AST]] = [("", ast.parse(source))]
     while waiting:
@@ -167,7 +167,7 @@ def function_spans(source: str) -> dict[str, tuple[int, int]]:
 
 
 def _matches(path: Path, pattern: str) -> bool:
-    """Return whether a path matches a pattern in which ``**`` stands for any folders."""
+    """Return whether a path matches a pattern, in which ``**`` stands for any folders."""
     if "**" not in pattern:
         return path.match(pattern)
     start, _, end = pattern.partition("/**/")
@@ -177,7 +177,10 @@ def _matches(path: Path, pattern: str) -> bool:
 def _expressions(
     body: list[ast.stmt], prefix: str, *, compiled: bool
 ) -> Iterator[tuple[str, bool, ast.AST]]:
-    """Yield the nodes in functions, with the function's qualified name."""
+    """Yield all nodes in functions.
+
+    Each node comes with the qualified name of its function, and whether the function is compiled.
+    """
     for statement in body:
         if isinstance(statement, ast.ClassDef):
             yield from _expressions(statement.body, f"{prefix}{statement.name}.", compiled=False)
@@ -195,9 +198,9 @@ def _expressions(
 
 
 def _walk(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield a node and its descendants, without messages and without the inside of functions.
+    """Yield a node and its descendants, except messages and the content of functions.
 
-    ``strict=True`` of zip, a check of the program itself, is left out.
+    The argument ``strict=True`` of zip is skipped, because it only checks the program itself.
     """
     if isinstance(node, ast.Raise | ast.Assert | ast.JoinedStr | ast.AnnAssign):
         return
@@ -213,7 +216,7 @@ def _walk(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _name(node: ast.expr) -> str:
-    """Return the last name of a decorator or a called function, such as "warn"."""
+    """Return the unqualified name of a decorator or a called function, such as "warn"."""
     if isinstance(node, ast.Call):
         return _name(node.func)
     if isinstance(node, ast.Attribute):
@@ -222,7 +225,7 @@ def _name(node: ast.expr) -> str:
 
 
 def _replacements(node: ast.AST) -> Iterator[tuple[ast.expr, str]]:
-    """Yield expressions at a node, each with the text of a faulty one."""
+    """Yield replaceable expressions of a node, each with the text of a faulty replacement."""
     match node:
         case ast.Compare(left, [operator], [right]) if type(operator) in _COMPARISONS:
             faulty = ast.Compare(left, [_COMPARISONS[type(operator)]()], [right])
@@ -244,7 +247,7 @@ def _replacements(node: ast.AST) -> Iterator[tuple[ast.expr, str]]:
 
 
 def _other_functions(called: ast.expr) -> Iterator[tuple[ast.expr, str]]:
-    """Yield a called function with the name of another one, such as `max` for `min`."""
+    """Yield a called function with the name of its replacement, such as `max` for `min`."""
     name = _name(called)
     if name in _NAMES and isinstance(called, ast.Name):
         yield called, _NAMES[name]
@@ -253,7 +256,7 @@ def _other_functions(called: ast.expr) -> Iterator[tuple[ast.expr, str]]:
 
 
 def _other_values(value: object) -> Iterator[str]:
-    """Yield the text of a constant other than a number or truth value."""
+    """Yield the text of a different constant for a number or truth value."""
     if isinstance(value, bool):
         yield repr(not value)
     elif isinstance(value, int | float) and value not in (0, 1):
@@ -261,14 +264,17 @@ def _other_values(value: object) -> Iterator[str]:
 
 
 def _is_text(node: ast.expr) -> bool:
-    """Return whether an operand is a string, or a sum of strings."""
+    """Return whether an operand is a string or a sum of strings."""
     if isinstance(node, ast.BinOp):
         return _is_text(node.left) or _is_text(node.right)
     return isinstance(node, ast.JoinedStr) or isinstance(getattr(node, "value", None), str)
 
 
 def _can_be_parsed(fault: Fault, source: str) -> bool:
-    """Return whether the source is still Python: patterns of `match` allow no parentheses."""
+    """Return whether the source with a fault is valid Python.
+
+    For example, `match` patterns cannot contain the parentheses that are inserted.
+    """
     try:
         ast.parse(fault.plant(source))
     except SyntaxError:

@@ -1,4 +1,4 @@
-"""Try faults in forks of a process that has imported the packages: seconds less for each fault.
+"""Test faults in forks of a process that has imported the packages, which saves seconds each time.
 
 A fault replaces the code of functions in memory. Compiled loops, and processes that tests start,
 do not see it; for these the fault is planted in a copy of the project (`__main__`).
@@ -28,7 +28,7 @@ PYTEST = ["-q", "-x", "-p", "no:cacheprovider", "-m", "not slow"]
 
 
 class Forks:
-    """The process that has imported everything, and tries a fault at a time."""
+    """Process that has imported all packages and tests one fault at a time."""
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
@@ -63,23 +63,22 @@ class Forks:
         return answer
 
     def close(self) -> None:
-        """End the process."""
         self._process.communicate()
 
 
 class _First:
-    """The first failure of a run of pytest."""
+    """Pytest plugin that records the first failure."""
 
     def __init__(self) -> None:
         self.name = ""
 
     def pytest_runtest_logreport(self, report: Any) -> None:
-        """Keep the name of the first test that fails."""
+        """Record the name of the first test that fails."""
         if report.failed:
             self.name = self.name or f"by {report.nodeid}"
 
     def pytest_collectreport(self, report: Any) -> None:
-        """Keep the name of the first file that cannot be collected."""
+        """Record the name of the first file that cannot be collected."""
         if report.failed:
             self.name = self.name or f"by {report.nodeid}"
 
@@ -99,7 +98,7 @@ def _serve() -> None:
 
 
 def _import_everything() -> None:
-    """Import the packages and what most tests need."""
+    """Import pytest and all packages."""
     importlib.import_module("pytest")
     for root in ROOTS:
         for package in pkgutil.iter_modules([str(ROOT / root)]):
@@ -110,7 +109,7 @@ def _import_everything() -> None:
 
 
 def _import_if_possible(name: str) -> None:
-    """Import a module, unless it needs what is not installed or runs only in a child process."""
+    """Import a module, or print why it cannot be imported."""
     try:
         importlib.import_module(name)
     except BaseException as error:
@@ -118,7 +117,7 @@ def _import_if_possible(name: str) -> None:
 
 
 def _functions_by_file() -> dict[str, list[types.FunctionType]]:
-    """Return all functions that exist, by the file that defines them."""
+    """Return all functions in memory, keyed by the file that defines them."""
     gc.unfreeze()  # imports may have frozen what exists, and frozen objects are not listed
     found: dict[str, list[types.FunctionType]] = {}
     for thing in gc.get_objects():
@@ -130,7 +129,7 @@ def _functions_by_file() -> dict[str, list[types.FunctionType]]:
 def _try(
     fault: Fault | None, request: dict[str, Any], functions: list[types.FunctionType]
 ) -> str | int | None:
-    """Fork, plant a fault, run tests, and return the answer of `_failed`, or "hangs"."""
+    """Run `_failed` in a fork and return its result, or "hangs"."""
     reader, writer = os.pipe()
     child = os.fork()
     if child:
@@ -159,10 +158,10 @@ def _try(
 def _failed(
     fault: Fault | None, tests: list[str], functions: list[types.FunctionType]
 ) -> str | int | None:
-    """Plant a fault in this process, and return which test failed first.
+    """Plant a fault in this process, run tests, and return the first test that failed.
 
-    Returns "" if all passed, None if the fault could not be planted, and the exit status of pytest
-    if it could not run the tests.
+    Return "" if all tests passed, None if the fault could not be planted, and the exit status of
+    pytest if it could not run the tests.
     """
     import pytest
 
@@ -174,7 +173,10 @@ def _failed(
 
 
 def _plant(fault: Fault, functions: list[types.FunctionType]) -> bool:
-    """Replace the code of the functions that contain a fault, and return whether there are any."""
+    """Replace the code of the functions that contain a fault.
+
+    Return whether there were any.
+    """
     path = ROOT / fault.path
     source = fault.plant(path.read_text())
     planted = _codes(compile(source, str(path), "exec", dont_inherit=True))
@@ -189,7 +191,7 @@ def _plant(fault: Fault, functions: list[types.FunctionType]) -> bool:
 
 
 def _codes(code: types.CodeType) -> dict[tuple[str, int], types.CodeType]:
-    """Return the code of all functions in a module, by name and first line."""
+    """Return the code of all functions in a module, keyed by qualified name and first line."""
     found = {}
     waiting = [code]
     while waiting:

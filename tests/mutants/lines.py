@@ -1,4 +1,4 @@
-"""Which tests execute a line, as `recorder` has found, and which of them to run for a fault."""
+"""Record of the tests that execute each line, and the choice of tests for a fault."""
 
 import ast
 import json
@@ -22,7 +22,7 @@ _TEST_S = 0.05  # added to the time of a test: sets that are alike in time shoul
 
 @dataclass
 class Lines:
-    """What the tests executed, and how long they took.
+    """Record of the lines that each test executes, and of the duration of each test.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Lines:
     counts: Counter[str] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
-        """Count the lines of each test."""
+        """Count the lines that each test executes."""
         for by_line in self.lines.values():
             for tests in by_line.values():
                 self.counts.update(self.tests[number] for number in tests)
@@ -59,7 +59,7 @@ class Lines:
     ) -> "Lines":
         """Run tests with `recorder`, write ``lines.json``, and return its content.
 
-        With test files, what was recorded of other files is kept.
+        If `files` are given, the records of all other test files are kept.
         """
         for path in folder.glob("gw*.json"):
             path.unlink()
@@ -75,7 +75,7 @@ class Lines:
 
     @classmethod
     def read(cls, path: Path) -> "Lines":
-        """Read what `record` has written."""
+        """Read a file written by `record`."""
         content = json.loads(path.read_text())
         lines = {
             file: {int(line): set(tests) for line, tests in by_line.items()}
@@ -84,11 +84,12 @@ class Lines:
         return cls(lines=lines, **content)
 
     def tests_of(self, root: Path, fault: Fault) -> list[str]:
-        """Return the tests that may notice a fault; first those that are quick and execute little.
+        """Return the tests that may detect a fault. Quick tests with few lines come first.
 
-        These are the tests that execute its line. For a compiled loop, or a line that only other
-        processes execute, these are the tests that execute a function that names something of the
-        fault's module, directly or through other compiled loops, or that runs it as a script.
+        These are the tests that execute the fault's line. No such tests are recorded for compiled
+        loops and for lines that only other processes execute. For these, the result contains the
+        tests that execute a function in which a name from the fault's module occurs, directly or
+        through other compiled loops, or which runs the module as a script.
         """
         numbers = self._executing(root, fault)
         if not numbers:
@@ -98,7 +99,7 @@ class Lines:
         return sorted(tests, key=lambda test: self.cost(test) * self.counts[test])
 
     def cost(self, test: str) -> float:
-        """Return the time of a test, in seconds, with a share of the time of its process."""
+        """Return the estimated duration of a test in seconds."""
         return self.seconds.get(test, 1.0) + _TEST_S
 
     def _executing(self, root: Path, fault: Fault) -> set[int]:
@@ -110,7 +111,7 @@ class Lines:
         return self._in_span(fault.path, span)
 
     def _using(self, root: Path, module: str) -> set[int]:
-        """Return the tests that execute functions which name something of a module."""
+        """Return the tests that execute functions in which a name from the module occurs."""
         numbers: set[int] = set()
         for path, module_names in _importers(root, module).items():
             lines = (root / path).read_text().splitlines()
@@ -130,7 +131,10 @@ class Lines:
         return set[int]().union(*found)
 
     def _add(self, root: Path, record: dict) -> None:
-        """Add what one process has recorded, as lines of the files as they were at first."""
+        """Add the record of one process.
+
+        Lines are converted to those of the files when they were first recorded.
+        """
         numbers = {name: number for number, name in enumerate(self.tests)}
         own = [numbers.setdefault(name, len(numbers)) for name in record["tests"]]
         self.tests = [*numbers]
@@ -159,7 +163,10 @@ class Lines:
 
 
 def _moved(line: int, spans: Spans, first_spans: Spans) -> int:
-    """Return the first line that the function of a line had, or 0 if there was no such function."""
+    """Return the recorded first line of the function that contains a line.
+
+    Return 0 if there was no such function.
+    """
     names = [name for name, (first, last) in spans.items() if first <= line <= last]
     return next((first_spans[name][0] for name in names if name in first_spans), 0)
 
@@ -170,15 +177,15 @@ def _content(path: Path) -> str:
 
 
 def _is_there(root: Path, test: str) -> bool:
-    """Return whether a test has neither been removed nor renamed since it was recorded."""
+    """Return whether a recorded test still exists with the same name."""
     path, _, name = test.partition("::")
     return f"def {name.rpartition('::')[2]}(" in _content(root / path)
 
 
 def _importers(root: Path, path: str) -> dict[str, set[str]]:
-    """Return the files that import a file, directly or through modules of compiled loops.
+    """Return the files that import a file, directly or through modules with compiled loops.
 
-    Each comes with the public names of the modules by which it does.
+    Each file is mapped to the public names of the modules through which it imports the file.
     """
     imports = _imports(root)
     found: dict[str, set[str]] = defaultdict(set)
@@ -198,7 +205,7 @@ def _importers(root: Path, path: str) -> dict[str, set[str]]:
 
 
 def _public_names(source: str) -> list[str]:
-    """Return the names of the functions and classes of a module."""
+    """Return the names of all functions and classes in a module."""
     kinds = ast.FunctionDef | ast.ClassDef
     return [node.name for node in ast.parse(source).body if isinstance(node, kinds)]
 
@@ -211,7 +218,7 @@ _known_imports: dict[Path, dict[str, set[str]]] = {}
 
 
 def _imports(root: Path) -> dict[str, set[str]]:
-    """Return the files that each file imports, of those below the source roots."""
+    """Return the imported source files of each source file."""
     if root not in _known_imports:
         files = {
             path.relative_to(root).as_posix(): path

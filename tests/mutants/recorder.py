@@ -1,8 +1,8 @@
-"""A pytest plugin that records which lines each test executes, and how long each test takes.
+"""Pytest plugin that records the lines that each test executes and the duration of each test.
 
-Load it with ``-p tests.mutants.recorder``. The results go to the folder that the environment
-variable `LIDARPOOL_MUTANTS` names, one file for each process of pytest-xdist. Lines that only
-processes of a cluster execute, and compiled loops, are not seen.
+Load it with ``-p tests.mutants.recorder``. Each process of pytest-xdist writes its results
+to a file in the folder given by the environment variable `LIDARPOOL_MUTANTS`. Compiled loops, and
+lines that are only executed by processes of a cluster, are not recorded.
 """
 
 import json
@@ -22,18 +22,18 @@ _seconds: Counter[str] = Counter()
 
 
 def pytest_configure() -> None:
-    """Start before the packages are imported."""
+    """Start recording before the packages are imported."""
     _coverage.start()
 
 
 def test_name(nodeid: str) -> str:
-    """Return the name of a test without its parameters, as pytest accepts it."""
+    """Return the name of a test without parameters, in a form that pytest accepts."""
     return nodeid.partition("[")[0]
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Attribute what runs from now on to a test."""
+    """Attribute all lines executed during a test to this test."""
     _coverage.switch_context(test_name(item.nodeid))
     try:
         return (yield)
@@ -42,12 +42,12 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    """Add the time of a set-up, call or tear-down."""
+    """Add the duration of a setup, call or teardown."""
     _seconds[test_name(report.nodeid)] += report.duration
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
-    """Write what this process has recorded."""
+    """Write the record of this process."""
     _coverage.stop()
     worker = getattr(config, "workerinput", {}).get("workerid", "main")
     data = _coverage.get_data()

@@ -1,4 +1,4 @@
-"""Faults are found where values are decided, and planted one at a time."""
+"""Test that faults are found where values are computed, and are planted one at a time."""
 
 import ast
 

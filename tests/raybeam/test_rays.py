@@ -1,4 +1,4 @@
-"""Rays that are none are refused with a message that names the first; the rest are unit vectors."""
+"""Invalid rays are rejected with a message that names the first; the rest are unit vectors."""
 
 import numpy as np
 import pytest

@@ -75,7 +75,7 @@ def test_beside_dask(tmp_path, capsys):
     short = {"quiet_map", "quiet_map_slow", "busy_map", "busy_map_slow"}
     assert rows.keys() == small | wide | short
     assert all(row["wall_us"] > 0 and row["wall_ratio"] > 0 for row in rows.values())
-    assert capsys.readouterr().out.count("beside Dask") == 10
+    assert capsys.readouterr().out.count("µs, Dask") == 20
 
 
 def test_bytes_of_batches(capsys):
@@ -155,4 +155,6 @@ def test_decoders(capsys, monkeypatch):
     monkeypatch.setattr(decoders, "python_of", lambda program, pythons: None)
     assert decoders.main(["--quick", "--only", "pykitti"]) == 1
     told = capsys.readouterr().err
-    assert "pykitti was left out: pip install pykitti opencv-python-headless" in told
+    assert (
+        "pykitti was skipped. Install it with `pip install pykitti opencv-python-headless`" in told
+    )

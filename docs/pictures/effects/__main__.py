@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/effects.md: `python -m docs.pictures.effects [--only rain]`."""
+"""Draw the plots of docs/effects.md: `python -m docs.pictures.effects [--only rain]`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from docs.pictures.options import IMAGES, folder_parser
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Draw the pictures."""
     options = folder_parser(__doc__, IMAGES).parse_args(arguments)
     for name, effect in load_effects(options.only).items():
         path = options.folder / f"effect-{name.replace('_', '-')}.png"

@@ -1,4 +1,4 @@
-"""The effects by name."""
+"""Lookup of effects by name."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from lidarpool import Survey
 
 
 class Effect(Protocol):
-    """A module or an object of an effect.
+    """Interface of an effect's module or object.
 
-    It may also have `with_actors(scene)`, which returns the scene with moving objects, for runs
-    with and without the effect.
+    An effect may also have `with_actors(scene)`, which returns the scene with moving objects. These
+    are used for runs with and without the effect.
     """
 
     def with_effect(self, survey: Survey) -> Survey:
@@ -29,7 +29,7 @@ class Effect(Protocol):
 
 
 def load_effects(only: Sequence[str] = ()) -> dict[str, Effect]:
-    """Return the named effects, by default all effects."""
+    """Return the effects with the given names, or all effects if no names are given."""
     modules = [module.name for module in pkgutil.iter_modules(effects.__path__)]
     names = sorted({*WEATHER, *(name for name in modules if not name.startswith("_"))})
     return {

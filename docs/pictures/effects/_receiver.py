@@ -1,4 +1,4 @@
-"""Walls and rigs for plots of receiver effects."""
+"""Walls, sensors and simulations for plots of receiver effects."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WIDE_RAD = 0.01  # beam of the sensors that hear each other
 def wall(
     name: str, x: float, y: tuple[float, float] = (-50, 50), z: tuple[float, float] = (-50, 50)
 ) -> SceneMesh:
-    """Return a rectangle across the x axis."""
+    """Return a rectangle that is perpendicular to the x axis."""
     corners = [[x, y[0], z[0]], [x, y[1], z[0]], [x, y[1], z[1]], [x, y[0], z[1]]]
     return SceneMesh(name, np.array(corners, float), np.array([[0, 1, 2], [0, 2, 3]]))
 
@@ -35,7 +35,7 @@ def room(x: float, y: float, z: float = 6.0) -> list[SceneMesh]:
 
 
 def fixed_beams(rays: int, max_range_m: float = 1e4) -> Sensor:
-    """Return a sensor that fires `rays` beams along x at once."""
+    """Return a sensor that fires `rays` beams along x simultaneously."""
     return Sensor(Beams(np.zeros(rays)), Spin(1, 360), 0.0, max_range_m)
 
 

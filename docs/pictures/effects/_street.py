@@ -1,4 +1,4 @@
-"""The survey on which plots of effects are based."""
+"""The survey on which the plots of effects are based."""
 
 from __future__ import annotations
 

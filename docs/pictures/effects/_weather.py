@@ -1,4 +1,4 @@
-"""Weather that returns light: a street from above, and comparisons with closed forms."""
+"""Weather that returns light: maps of a street, and comparisons with closed-form solutions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ TURNS = 20
 
 
 def page(title: str, weather: dict[str, Any], reach_m: float) -> tuple[Figure, Any]:
-    """Draw the street from weather. The detection range of its sensor is third plot."""
+    """Plot the street from above in clear air and in the given weather.
+
+    Return the figure and its empty third axes.
+    """
     figure = Figure((13.5, 4.7), dpi=100, layout="constrained")
     clear, wet, right = figure.subplots(1, 3, width_ratios=[1, 1, 1.25])
     scene = city(20_000)
@@ -51,13 +54,13 @@ def page(title: str, weather: dict[str, Any], reach_m: float) -> tuple[Figure, A
 
 
 def sky() -> Scene:
-    """Nothing but a small triangle far away."""
+    """Return a scene that is empty except for a small, remote triangle."""
     corner = np.array([[0, 0, -900], [1, 0, -900], [0, 1, -900.0]])
     return Scene.from_meshes([SceneMesh("Nothing", corner, np.array([[0, 1, 2]]))])
 
 
 def counts(axes: Any, weather: dict[str, Any], farthest_m: float) -> None:
-    """Plot numbers of returns against range, of pulses into the open sky, and the closed form."""
+    """Plot the number of returns from the open sky over range, with the closed-form solution."""
     separate = Returns("all", pulse_ns=0)
     survey = replace(survey_without(), noise=NOISE, steps=TURNS * 36, returns=separate, **weather)
     points = cloud(sky(), survey)
@@ -87,7 +90,7 @@ def counts(axes: Any, weather: dict[str, Any], farthest_m: float) -> None:
 
 
 def energies(axes: Any, weather: dict[str, Any]) -> None:
-    """Plot energies against range, and the closed forms of surfaces and of the air."""
+    """Plot energies over range, with the closed-form solutions for surfaces and air."""
     survey = replace(survey_without(), noise=NOISE, **weather)
     points = cloud(city(20_000), survey)
     air = points["cause"] == 1
@@ -122,7 +125,7 @@ def energies(axes: Any, weather: dict[str, Any]) -> None:
 
 @dataclass(frozen=True)
 class Weather:
-    """Weather with its picture."""
+    """Weather condition that can be simulated and plotted."""
 
     options: dict[str, float]  # of a survey
     title: str
@@ -130,11 +133,14 @@ class Weather:
     farthest_m: float = 0.0  # in the diagram of counts; 0 for a diagram of energies
 
     def with_effect(self, survey: Survey) -> Survey:
-        """Return the survey in this weather, with a sensor that detects 10 % at 90 m."""
+        """Return the survey in this weather.
+
+        The sensor detects surfaces with 10 % reflectance at up to 90 m.
+        """
         return replace(survey, noise=NOISE, **self.options)
 
     def picture(self) -> Figure:
-        """Plot a street, and the number or the energies of returns against range."""
+        """Plot a street from above, and the number or the energies of returns over range."""
         figure, right = page(self.title, self.options, self.reach_m)
         if self.farthest_m:
             counts(right, self.options, self.farthest_m)

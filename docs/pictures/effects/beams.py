@@ -1,4 +1,4 @@
-"""Gaussian and oval beams: footprints, light on an edge, and width against range."""
+"""Gaussian and elliptical beams: footprints, light at an edge, and beam width over range."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ EVEN, ROUND, WIDE = OBJECT_COLORS[:3]
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with 19 sub-rays in a Gaussian, oval beam that is wide at its start."""
+    """Return the survey with 19 sub-rays per beam.
+
+    The beam is Gaussian and elliptical, and starts with a large diameter.
+    """
     beam = Returns(
         subrays=19, divergence_mrad=OVAL, beam_profile="gaussian", exit_diameter_m=EXIT_M
     )
@@ -34,7 +37,7 @@ def with_effect(survey: Survey) -> Survey:
 
 
 def footprint(returns: Returns, distance: float) -> NDArray[np.float64]:
-    """Return where the sub-rays of a beam hit a wall: (k, 2), meters across and up."""
+    """Return where the sub-rays of a beam hit a wall, in horizontal and vertical meters (k, 2)."""
     scene = Scene.from_meshes([wall("Wall", distance)])
     rig = Rig(scene, Survey(SENSOR, poses=[(0, 0, 0)], steps=1, returns=returns), "numpy")
     beams = rig.pulse_casters[0].emitter.subrays_of(rig.pattern(0, 0, 1))
@@ -45,7 +48,10 @@ def footprint(returns: Returns, distance: float) -> NDArray[np.float64]:
 
 
 def share(returns: Returns, edge_m: float) -> float:
-    """Return the share of a pulse's light on a wall at 50 m with an edge, before a wall at 60 m."""
+    """Return the fraction of a pulse's light that hits a wall at 50 m.
+
+    The light beyond the wall's edge hits another wall at 60 m.
+    """
     meshes = [wall("Near", 50, (-50, edge_m)), wall("Far", 60)]
     survey = Survey(
         SENSOR, poses=[(0, 0, 0)], steps=1, returns=returns, columns=["reflectance", "range"]
@@ -57,7 +63,7 @@ def share(returns: Returns, edge_m: float) -> float:
 
 
 def picture() -> Figure:
-    """Plot beam footprints, the share of light at an edge, and the beam width against range."""
+    """Plot beam footprints, the fraction of light at an edge, and the beam width over range."""
     figure = Figure((13.5, 4.5), dpi=100, layout="constrained")
     prints, edges, widths = figure.subplots(1, 3, width_ratios=[0.8, 1, 1])
     kinds = (

@@ -1,4 +1,4 @@
-"""Blooming of retro-reflectors."""
+"""Blooming around retroreflectors."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ STEP_DEG = 0.1
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with stray light, in a street with five retro-reflecting lamp posts."""
+    """Return the survey with stray light in a street with five retroreflective lamp posts."""
     posts = [f"lamp-{number}" for number in range(1, 6)]
     materials = [Material(posts, reflectance=1.0, retro=True), Material("*", reflectance=0.3)]
     return replace(survey, noise=NOISE, materials=materials)
 
 
 def picture() -> Figure:
-    """Plot a sign with and without stray light, and the share of rays that receive stray light."""
+    """Plot a sign with and without stray light, and the fraction of rays that receive it."""
     across = np.arange(-4, 4.01, STEP_DEG)
     up = np.arange(-3, 3.01, STEP_DEG)
     grid = np.meshgrid(np.radians(up), np.radians(across), indexing="ij")

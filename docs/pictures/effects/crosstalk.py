@@ -34,7 +34,7 @@ def with_effect(survey: Survey) -> Survey:
 def cast_pair(
     meshes: list[SceneMesh], distance_m: float, field_mrad: float, mode: Mode = "strongest"
 ) -> dict[str, NDArray[Any]]:
-    """Cast a sensor that receives pulses of a second sensor; return its columns."""
+    """Simulate a sensor that receives pulses of a second sensor, and return its columns."""
     receiver = spinning_beam(FIRINGS)
     emitter = spinning_beam(FIRINGS - 300, OTHER_HZ, clockwise=True)
     receiver = replace(receiver, optics=replace(receiver.optics, divergence_mrad=field_mrad))
@@ -56,7 +56,7 @@ def cast_pair(
 
 
 def picture() -> Figure:
-    """Plot the pulses that a sensor receives from another, with their expected number."""
+    """Plot the pulses that a sensor receives from another sensor, and their expected number."""
     figure = Figure((9, 3.9), layout="constrained", dpi=110)
     above, counts = figure.subplots(1, 2, width_ratios=[1.25, 1])
     columns = cast_pair(room(25, 15), 8.0, 1000 * WIDE_RAD)

@@ -1,4 +1,4 @@
-"""Data sheets: what sensors detect, and how precisely, as their makers state it."""
+"""Simulated detection rates and precision compared with data sheets."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ RAYS = 2000
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with the data sheet's noise and 7 sub-rays."""
+    """Return the survey with 7 sub-rays and the noise stated in the data sheet."""
     sheet = read_model("ouster/os1-64").datasheet()
     return replace(survey, noise=sheet.noise, returns=sheet.returns)
 

@@ -1,4 +1,4 @@
-"""Radial velocities measured by a car's lidar at a crossing, with its own motion."""
+"""Radial velocities measured at a crossing by the lidar of a moving car."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def with_effect(survey: Survey) -> Survey:
 
 
 def picture() -> Figure:
-    """Plot the points from above, and their radial velocities against azimuth."""
+    """Plot the points from above, and their radial velocities over azimuth."""
     trajectories = [
         Track([-1, 2], [start - t * np.array(v) for t in (1, -2)])
         for (start, speed, yaw) in OTHERS

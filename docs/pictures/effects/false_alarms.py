@@ -1,4 +1,4 @@
-"""False alarms."""
+"""False alarms in a yard, and in front of and behind a wall."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Faults of a sensor: range images of a street, and a wall that a vehicle approaches."""
+"""Sensor faults: range images of a street, and a wall that a vehicle approaches."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ SECONDS = 4.0
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with all that changes points of single sweeps."""
+    """Return the survey with all faults that change points of single sweeps."""
     return replace(survey, faults=[DIRT, DEAD, LOST, Fault("time_jump", by_s=-0.5)])
 
 
 def image(survey: Survey) -> np.ndarray:
-    """Return intensities of a revolution, channels by firings; NaN without a return."""
+    """Return the intensities of a revolution (channels, firings), with NaN for missing returns."""
     first = survey.scan(0).firings[0]
     stop = survey.scan(survey.scan_count - 1).firings[1]
     intensities = np.full((survey.sensor.channels, stop - first), np.nan)
@@ -36,7 +36,7 @@ def image(survey: Survey) -> np.ndarray:
 
 
 def approach(*faults: Fault) -> tuple[np.ndarray, np.ndarray]:
-    """Return stamps, seconds, and ranges of a forward beam on a vehicle that approaches a wall."""
+    """Return timestamps in seconds, and ranges measured by a vehicle that approaches a wall."""
     sensor = Sensor.grid(10, 1, 1, step_deg=360, horizontal_fov_deg=1)
     track = Track([0, SECONDS], [(0, 0, 0), (SPEED_M_S * SECONDS, 0, 0)])
     survey = Survey(sensor, trajectory=track, columns=["time"], faults=faults)
@@ -48,7 +48,7 @@ def approach(*faults: Fault) -> tuple[np.ndarray, np.ndarray]:
 
 
 def picture() -> Figure:
-    """Plot the effect of faults on range images, and on ranges over time."""
+    """Plot how faults affect range images and ranges over time."""
     figure = Figure((11, 5.2), layout="constrained", dpi=100)
     images, charts = figure.subfigures(1, 2, width_ratios=[1.7, 1])
     bare = survey_without()

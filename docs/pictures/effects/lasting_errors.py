@@ -1,4 +1,4 @@
-"""Systematic errors: caused by channels, warm-up, and the encoder."""
+"""Systematic errors caused by channels, warm-up and the encoder."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ NOISE = Noise(
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with lasting errors, and without noise."""
+    """Return the survey with systematic errors and no noise."""
     return replace(survey, noise=replace(NOISE, range_m=0.0))
 
 
 def errors(sensor: Sensor, noise: Noise, **options: object) -> dict[str, np.ndarray]:
-    """Return range errors at a wall 10 m ahead, with their channel and the time (in seconds)."""
+    """Return the range errors at a wall 10 m ahead, with their channels and times in seconds."""
     batches_by_noise = []
     for noise_of_run in (Noise(), noise):
         survey = Survey(
@@ -41,7 +41,7 @@ def errors(sensor: Sensor, noise: Noise, **options: object) -> dict[str, np.ndar
 
 
 def picture() -> Figure:
-    """Plot errors by channel, time and azimuth, together with their closed forms."""
+    """Plot errors over channel, time and azimuth, with the closed-form solutions."""
     figure = Figure((11, 3.6), layout="constrained", dpi=100)
     by_channel, by_time, by_azimuth = figure.subplots(1, 3)
     revolution = errors(
@@ -78,7 +78,7 @@ def picture() -> Figure:
 
 
 def ripple(cycles: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return azimuths and their errors, degrees, computed from ranges of a slanted wall."""
+    """Return azimuths and azimuth errors in degrees, computed from ranges to a slanted wall."""
     noise = Noise(ripple_deg=NOISE.ripple_deg, ripple_cycles=cycles)
     corner = np.array([[-30, -8, -9], [30, -8, -9], [30, -8, 9], [-30, -8, 9.0]])
     azimuths = []

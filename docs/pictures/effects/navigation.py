@@ -1,4 +1,4 @@
-"""Allan deviations of a stationary vehicle's IMU, compared with their closed forms."""
+"""Allan deviations of a stationary vehicle's IMU, compared with closed-form solutions."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ GNSS = Gnss(
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with instruments.
+    """Return the survey with errors of the navigation instruments.
 
-    Stage 2 takes as long as without instruments.
+    The instruments do not affect the duration of stage 2.
     """
     return replace(survey, navigation=Navigation(imu=IMU, gnss=GNSS))
 
 
 def allan(values: np.ndarray, size: int) -> tuple[float, int]:
-    """Compute the overlapping Allan deviation of samples and the number of disjoint clusters.
+    """Return the overlapping Allan deviation of the samples, and the number of disjoint clusters.
 
     The samples have shape (n, axes).
     """
@@ -60,9 +60,9 @@ def parts(tau: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def outage(axes: Any, still: SimpleNamespace) -> None:
-    """Plot position errors of an IMU during a 15 s outage, with their closed form.
+    """Plot an IMU's position errors during a 15 s outage, with the closed-form solution.
 
-    Each seed is a line.
+    Each seed is plotted as one line.
     """
     imu = Imu(accelerometer_bias=0.01, accelerometer_noise_density=0.02)
     gnss = Gnss(rate_hz=10, outages=[(10, 25)])

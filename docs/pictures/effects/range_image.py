@@ -1,4 +1,4 @@
-"""Range images: rays that hit nothing, and rays whose return is lost."""
+"""Range images with rays that hit nothing and rays whose returns are lost."""
 
 from __future__ import annotations
 

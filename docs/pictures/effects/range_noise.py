@@ -1,4 +1,4 @@
-"""Range noise and range walk as functions of the energy of returns."""
+"""Range noise and range walk as functions of the return energy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def with_effect(survey: Survey) -> Survey:
 
 
 def picture() -> Figure:
-    """Plot range noise and range walk at simulated walls against energy, with the model curves."""
+    """Plot range noise and range walk at simulated walls over energy, with the model curves."""
     kinds = {
         "10 % reflectance": (Material("*", 0.1), GRAY, np.geomspace(4, 105, 9)),
         "80 %": (Material("*", 0.8), BLUE, np.geomspace(10, 250, 9)),

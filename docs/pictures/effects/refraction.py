@@ -1,4 +1,4 @@
-"""Light that is refracted: a pool, where it seems to be, and what comes back of its floor."""
+"""Refraction of light in a pool: where the floor appears, and how much light it returns."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Real = NDArray[np.float64]
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with cars of glass."""
+    """Return the survey with cars made of glass."""
     glass = Material("car-*", transparent="pass", refractive_index=1.5)
     return replace(survey, materials=[glass, Material("*")])
 
@@ -47,7 +47,7 @@ def pool() -> list[SceneMesh]:
 
 
 def cast(meshes: list[SceneMesh], water: Material) -> tuple[Real, Real, Real, Real]:
-    """Return x and z of points, and angles and energies of their beams."""
+    """Return x and z of all points, with the angles and energies of their beams."""
     survey = Survey(
         SCANNER,
         poses=[(0, 0, HEIGHT)],
@@ -63,7 +63,7 @@ def cast(meshes: list[SceneMesh], water: Material) -> tuple[Real, Real, Real, Re
 
 
 def picture() -> Figure:
-    """Plot a cross section of the pool, and the received energies of its floor."""
+    """Plot a cross section of the pool, and the energy received from its floor."""
     straight = Material("Water", transparent="pass")
     wet = Material("Water", transparent="pass", refractive_index=INDEX, attenuation_per_m=LOSS)
     figure = Figure((13.5, 4.7), dpi=100, layout="constrained")

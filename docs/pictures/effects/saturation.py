@@ -1,4 +1,4 @@
-"""Saturation: pulses that fill the receiver."""
+"""Saturation of the receiver by strong pulses."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ COLUMNS = ("range", "intensity", "amplitude", "pulse_width", "object")
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with saturation."""
+    """Return the survey with a receiver that saturates."""
     return replace(survey, noise=NOISE)
 
 
 def _waveform(wall_m: float, noise: Noise) -> tuple[NDArray, NDArray]:
-    """Return range and signal of the samples of a white wall's waveform."""
+    """Return the ranges and signals of the samples in a white wall's waveform."""
     survey = Survey(
         fixed_beams(1),
         poses=[(0, 0, 0)],
@@ -49,7 +49,7 @@ def _waveform(wall_m: float, noise: Noise) -> tuple[NDArray, NDArray]:
 
 
 def _separable_distance(name: str, plate_m: float) -> tuple[float, float]:
-    """Return a plate's relative signal, and the smallest resolved distance to a wall."""
+    """Return a plate's relative signal, and the minimum resolved distance of a wall behind it."""
     beam = Returns("all", subrays=61, divergence_mrad=1)
     options = {"materials": MATERIALS[name], "returns": beam, "columns": COLUMNS}
     lower_m = 0.1
@@ -63,7 +63,7 @@ def _separable_distance(name: str, plate_m: float) -> tuple[float, float]:
 
 
 def picture() -> Figure:
-    """Plot clipped pulses, pulse widths and range errors, and the smallest resolved walls."""
+    """Plot clipped pulses, pulse widths and range errors, and the minimum distances of walls."""
     figure = Figure((11, 3.7), layout="constrained", dpi=110)
     pulse, widths, apart = figure.subplots(1, 3)
     pulse.axhline(1, color="k", lw=0.8, ls=":")

@@ -51,7 +51,7 @@ def lorry(name: str, start: tuple[float, float], height: float = 0.0) -> Actor:
 
 
 def picture() -> Figure:
-    """Plot a truck with spray from above and from the side, and the decrease of spray behind it."""
+    """Plot a truck and its spray from above and from the side, and how the spray decreases."""
     figure = Figure((12, 4.4), layout="constrained", dpi=100)
     views = figure.subplot_mosaic([["above", "right"], ["aside", "right"]], width_ratios=[1.5, 1])
     road = SceneMesh("Road", 80.0 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]),

@@ -1,4 +1,4 @@
-"""Leaves in tree crowns: points of a tree, gap fractions by leaf angle, and return depths."""
+"""Leaves in tree crowns: points, gap fractions by leaf angle, and depths of returns."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Real = NDArray[np.float64]
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with leaves in the crowns of all trees."""
+    """Return the survey with tree crowns that contain leaves."""
     leaves = Material("tree-*", 0.5, leaf_area_density=0.8)
     return replace(survey, materials=[leaves, Material("*")])
 
@@ -43,7 +43,7 @@ def cast(
 
 
 def tree() -> list[SceneMesh]:
-    """Create a tree crown, its trunk, and the ground."""
+    """Create a tree crown, its trunk and the ground."""
     crown = trimesh.creation.icosphere(4, 1.0)
     shaped = np.asarray(crown.vertices) * (2.4, 2.4, 3.0) + (0, 0, 5.5)
     trunk = trimesh.creation.cylinder(0.2, 7.0, sections=16)
@@ -55,9 +55,9 @@ def tree() -> list[SceneMesh]:
 
 
 def section(axes: Any, leaves: Material, title: str) -> None:
-    """Draw a slice of a tree from the side.
+    """Draw a vertical slice of a tree.
 
-    The sensor is 9 m to the left.
+    The sensor is 9 m to the left of the tree.
     """
     head = Beams(np.radians(np.linspace(-14, 50, 160)))
     scan = cast(tree(), Sensor(head, Spin(2400, 360)), (-9, 0, 2), [leaves, Material("*", 0.3)])
@@ -92,7 +92,7 @@ def canopy(kind: str, zenith_deg: float) -> Real:
 
 
 def picture() -> Figure:
-    """Plot cross sections of a tree, gap fractions, and the depths of returns."""
+    """Plot cross sections of a tree, gap fractions and the depths of returns."""
     figure = Figure((13.5, 5.2), dpi=100, layout="constrained")
     grid = figure.add_gridspec(2, 3, width_ratios=[1.05, 1, 1])
     above = figure.add_subplot(grid[0, 0])

@@ -1,4 +1,4 @@
-"""Walking people: one from the side at four moments, and the velocities of arms and legs."""
+"""Walking pedestrian: points at four times, and velocities of arms and legs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Waveforms at an edge and in a tree, and the returns that three receivers find in them."""
+"""Waveforms at a roof edge and in a tree, with the returns found by three receivers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _LANES = {
 
 
 def with_effect(survey: Survey) -> Survey:
-    """Return the survey with 19 sub-rays per beam and a Gaussian decomposition."""
+    """Return the survey with 19 sub-rays per beam and returns from a Gaussian decomposition."""
     returns = Returns("all", subrays=19, waveform="gaussian")
     return replace(survey, returns=returns)
 
@@ -36,7 +36,7 @@ def with_effect(survey: Survey) -> Survey:
 def _pulse_points(
     scene: Scene, position: tuple[float, float], samples: int = 0, **returns: Any
 ) -> Cloud:
-    """Return the points of a pulse that is fired straight down."""
+    """Return the points of a pulse fired straight down."""
     sensor = Sensor(Beams(np.zeros(1)), Spin(1, 360), optics=Optics(divergence_mrad=2.5))
     options = {"subrays": 217, "pulse_ns": _PULSE_NS, "mode": "all", **returns}
     survey = Survey(
@@ -62,7 +62,7 @@ def _flat(name: str, height: float, x: tuple[float, float]) -> SceneMesh:
 def _panel(
     axes: Any, scene: Scene, position: tuple[float, float], span: tuple[float, float]
 ) -> None:
-    """Draw a pulse's waveform over height, its components, and the returns of the receivers."""
+    """Draw a pulse's waveform over height, its components, and the returns of all receivers."""
     hits = _pulse_points(scene, position, pulse_ns=0.001)
     clouds = {name: _pulse_points(scene, position, 160, waveform=name) for name in _LANES}
     waves = clouds["gaussian"].waveforms

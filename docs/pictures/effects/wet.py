@@ -19,7 +19,7 @@ def with_effect(survey: Survey) -> Survey:
 
 
 def picture() -> Figure:
-    """Plot a dry and a wet road from the side, and reflectance against the angle of incidence."""
+    """Plot a dry and a wet road from the side, and reflectance over the angle of incidence."""
     figure = Figure((12, 4.4), layout="constrained", dpi=100)
     views = figure.subplot_mosaic([["dry", "right"], ["wet", "right"]], width_ratios=[1.5, 1])
     corners = np.array([[-90, -90, -2], [90, -90, -2], [90, 90, -2], [-90, 90, -2.0]])

@@ -54,7 +54,7 @@ class PCD(MultiFileFormat):
         return {f"{number:06}.pcd": pcd_bytes(fields, position, (w, x, y, z), comment)}, None
 
     def _fields(self, number: int, points: Cloud, *, as_fired: bool) -> list[tuple[str, AnyArray]]:
-        """Return the names and values of the fields in the file of a sweep.
+        """Return the fields of a sweep's PCD file as pairs of a name and an array.
 
         If `as_fired` is True, each point is in the sensor frame at the time of its firing.
         Otherwise, the points are motion-compensated.

@@ -190,7 +190,7 @@ class SavedSweeps:
 
 
 class _OpenJob:
-    """Poses, boxes and reader of a job that is open."""
+    """Open job with its poses, its boxes and the reader of its files."""
 
     def __init__(self, dataset: DataSet, job: JobRow, classes: Mapping[int, str]) -> None:
         self.storage = storage = dataset.storage

@@ -79,7 +79,7 @@ MountEntry = Annotated[MountSection, by_position(MountSection)]
 
 
 class MountedSensorSection(SensorSection):
-    """A sensor on a platform, with its mount, start and time steps.
+    """A sensor that is mounted on a platform.
 
     In YAML, the model alone is sufficient.
     """
@@ -106,10 +106,10 @@ class MountedSensorSection(SensorSection):
         returns: ReturnsSection,
         name: str = "",
     ) -> Mounted:
-        """Return the sensor on its platform, with its start and time steps.
+        """Return the mounted sensor.
 
-        The parameters are those of `SensorSection.mounted_sensor`. Raise LidarError if a file
-        cannot be used.
+        It has the start time and the number of time steps of this section. The parameters are those
+        of `SensorSection.mounted_sensor`. Raise LidarError if a file cannot be used.
         """
         mounted = super().mounted_sensor(path, mount, noise, returns, name)
         sensor = mounted.sensor

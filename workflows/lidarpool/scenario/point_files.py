@@ -113,7 +113,7 @@ def read_points(
 
 
 def vectors(points: Sweep, names: Sequence[str]) -> AnyArray | None:
-    """Stack columns to an array of vectors, or return None if the first column is missing.
+    """Stack columns into an array of vectors, or return None if the first column is missing.
 
     The result has shape (n, k), where k is the number of columns.
     """

@@ -1,7 +1,7 @@
 """Parse SDFormat and MJCF files as leniently as Gazebo and MuJoCo do.
 
 Public files have comments that contain "--" and prefixes without a namespace, which expat, and
-therefore ElementTree, rejects. Entities are refused, except predefined entities and character
+therefore ElementTree, rejects. Entities are rejected, except predefined entities and character
 references.
 """
 

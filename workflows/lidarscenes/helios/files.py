@@ -38,7 +38,7 @@ class Assets:
     """The files to which a survey may refer.
 
     Files are searched for in `folders`, in the folder of the survey, and in its parent folders. All
-    other files are refused.
+    other files are rejected.
     """
 
     def __init__(self, survey: Path, folders: Sequence[Path]) -> None:

@@ -89,7 +89,7 @@ def load_robot(
     path = Path(path)
     check_fits("opacity", opacity, OpacityMode)
     root, size = _read_root(path)
-    with prefix_errors(path), np.errstate(all="ignore"):  # infinite values are refused later
+    with prefix_errors(path), np.errstate(all="ignore"):  # infinite values are rejected later
         name = printable(root.get("name", "")) or path.stem
         links = {_name(element): element for element in _named(root, "link")}
         joints = _joints(root, links, lambda line: report(f"{path}: {line}"))

@@ -87,7 +87,7 @@ def load_trajectory(
         Path of the file or folder. The supported formats are TUM (rows of time, x, y, z, qx, qy,
         qz, qw), KITTI poses (rows of a 3 x 4 matrix), tables with a header (separated by commas,
         semicolons, tabs or spaces, such as EuRoC's data.csv), KITTI oxts folders, and ROS 2 bags
-        (.mcap, .db3 or the bag folder), which require the extra ``ros``. A table must contain
+        (.mcap, .db3 or the bag folder), which require the ``ros`` extra. A table must contain
         time_s (or time_ns), x, y and z. Rotations are optional: either qx, qy, qz and qw, or
         yaw_deg (or heading_deg, clockwise from y) with pitch_deg and roll_deg. Without rotations,
         the platform faces its direction of travel.

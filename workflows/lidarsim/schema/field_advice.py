@@ -283,9 +283,10 @@ def list_advice(annotation: Any, value: Any) -> str:
 
 
 def name_advice(path: FieldPath, file: Any) -> str:
-    """Return an example of a mapping with names for its entries, or an empty string.
+    """Return advice if the names of a mapping's entries were omitted.
 
-    For instance, `sensors: {model: …, mount: …}` lacks the name of the sensor.
+    The advice contains an example. For instance, `sensors: {model: …, mount: …}` lacks the name of
+    the sensor. If no name was omitted, return an empty string.
     """
     for owner in _inner_sections(owner_of_file(file)):
         is_table = owner.names == path[:-1] and owner.forms[0].startswith("{")

@@ -394,7 +394,7 @@ def announce_page(
 
 
 def notebook_html(page: PageServer, words: str) -> str:
-    """Return HTML for a notebook cell that contains a link to the page and the page in a frame."""
+    """Return the HTML of a notebook cell that links to the page and shows it in a frame."""
     url = page.url
     words = escape(words)
     if hub := os.environ.get(_HUB):  # 127.0.0.1 would be the machine of the user's browser

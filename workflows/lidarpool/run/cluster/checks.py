@@ -210,7 +210,7 @@ def common_software(
     """Return the software versions with which scans are cast.
 
     A resumed run uses the `earlier` software. Otherwise, the most common software of the workers is
-    used. Workers with different software are refused when they are checked later. Raise LidarError
+    used. Workers with different software are rejected when they are checked later. Raise LidarError
     if no worker has the earlier software.
     """
     answers = _query_workers(

@@ -192,10 +192,11 @@ class StaticBodies:
             self._trees = self._build(None if _half_side(region) > MAX_REACH_M else region)
 
     def move_instances(self, instances: Instances, instance_indices: Indices) -> None:
-        """Move the instances in the given rows to their transforms in `instances`.
+        """Apply the new transforms of the given instances.
 
-        No cast may be in progress. Trees are rebuilt if an instance enters or leaves the region
-        that sensors can reach, as a body that falls forever does, or if it was clipped.
+        The transforms are those in `instances`. No cast may be in progress. Trees are rebuilt if an
+        instance enters or leaves the region that sensors can reach, as a body that falls forever
+        does, or if it was clipped.
         """
         self._instances = instances
         if self._instance_is_seen is not None:

@@ -79,7 +79,10 @@ class WaterFilm(NamedTuple):
 
 
 class OnwardOptics(NamedTuple):
-    """Optical properties of n surface kinds that determine how light continues beyond a hit."""
+    """Optical properties of surfaces that determine how light continues beyond a hit.
+
+    All arrays have shape (n,), where n is the number of surface kinds.
+    """
 
     specular: Floats  # fraction of light that is reflected specularly at normal incidence
     passes: Bools  # whether light passes through, as through glass

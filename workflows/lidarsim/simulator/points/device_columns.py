@@ -463,9 +463,9 @@ class _TransferBuffers:
 
 @lru_cache(maxsize=16)
 def _kernel(cupy: Any, device: int) -> Any:
-    """Compile columns.cu for the current device, which has the number `device`.
+    """Compile columns.cu for the current device.
 
-    The compiled kernel is cached for each device.
+    `device` is the number of this device. The compiled kernel is cached for each device.
     """
     code = importlib.resources.files(__package__).joinpath("columns.cu").read_text("utf-8")
     module = cupy.RawModule(code=f'#line 1 "columns.cu"\n{code}', options=OPTIONS)

@@ -111,9 +111,9 @@ def thin_out(ray, scan_starts, keep_every, hit_counts, row_indices, number, retu
 
 @inlined
 def _half_way(hit, neighbor, inverse_distance, neighbors):
-    """Return the range of the plane through a hit, halfway between two rays.
+    """Return the range in meters to the plane of a hit, measured halfway to a neighboring ray.
 
-    These are the rays of the hit and of a neighboring hit. The range is in meters. `hit` and
+    The plane is the tangent plane of the surface at the hit. `hit` and
     `neighbor` are rows in `SubrayNeighbors`, and `inverse_distance` is that of `hit`, in 1/m.
     """
     normals = neighbors.normals
