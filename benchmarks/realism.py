@@ -219,7 +219,7 @@ def main(arguments: list[str] | None = None) -> dict[str, dict[str, float]]:
     results = measure(rows, options.repeat)
     for row, values in results.items():
         print(
-            f"{row:20} {values['ms']:8.2f} ms {values['times']:6.2f} x `bare` "
+            f"{row:20} {values['ms']:8.2f} ms {values['times']:6.2f} x bare "
             f"{values['points']:10,} points"
         )
     write_results(options.json, results)
