@@ -8,7 +8,6 @@ from distributed import Client, Worker
 from tests.clusters import thread_cluster
 
 from lidarpool import LidarError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
-from lidarpool.run.cluster.watch import WATCH_EVERY_S
 from lidarpool.run.pipeline.pipeline import Pipeline
 from lidarpool.run.pipeline.task_records import placement_violations
 from lidarpool.run.planning_trials import TrialRunner
