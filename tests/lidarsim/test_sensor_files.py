@@ -346,7 +346,7 @@ def test_omnilidar_has_attributes_of_the_schema_and_reads_back(model, frames, tm
     assert back.rays.range_m == pytest.approx(file.rays.range_m)
     wavelength = values[f"{CORE}waveLengthNm"]
     others = [] if wavelength == 905 else [f"waveLengthNm = {wavelength:g}"]  # 905 is the default
-    assert back.left_out == ["channels (a ray list has one channel)", *others]
+    assert back.unsupported == ["channels (a ray list has one channel)", *others]
 
 
 ROTARY = """#usda 1.0

@@ -76,7 +76,7 @@ def test_clear_air_leaves_all_of_the_light(tmp_path, lidarpool):
 def test_what_is_counted_and_needed_is_what_a_run_gives(cluster, tmp_path):
     job = prepare(Scenario.from_data(SHORT), plans=False).job
     with Client(cluster, set_as_default=False) as client:
-        made = forecast(job, RunOptions(backend="numpy", out=tmp_path), client)
+        made = forecast(job, tmp_path, RunOptions(backend="numpy"), client)
         result = simulate(
             job.scene, job.survey, client=client, backend="numpy", folder=tmp_path / "run"
         )

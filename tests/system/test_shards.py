@@ -556,7 +556,7 @@ from lidarpool import merge
 from lidarsim.io.storage import Storage
 from lidarpool.datasets.job_table import read_table
 import lidarpool.report.campaign_output as output
-owners = {"take": Storage, "write_table": output, "finish": output.DataSet}
+owners = {"copy_from": Storage, "write_table": output, "finish": output.DataSet}
 def die_at(name, number):
     left, function = [number], getattr(owners[name], name)
     def call(*arguments, **options):
@@ -584,7 +584,7 @@ def killed(out: Path, parts: list[Path], *moments: tuple[str, int]) -> None:
 @pytest.mark.extended
 def test_a_killed_merge_goes_on(parts, campaigns, tmp_path):
     out = tmp_path / "ds"
-    killed(out, parts, ("take", 5), ("take", 5), ("write_table", 1), ("finish", 1))
+    killed(out, parts, ("copy_from", 5), ("copy_from", 5), ("write_table", 1), ("finish", 1))
     assert not (out / "dataset.json").exists()
     times = {path: path.stat().st_ctime_ns for path in (out / "jobs").rglob("*.ply")}
     assert len(times) == 7
@@ -646,7 +646,7 @@ def _some_of_a_survey(survey: Path, shards: list[Path]) -> None:
         merge(shards[1:], shards[0])
     report = merge(shards[:2], survey / "some", partial=True)
     assert "these shards are missing: 1/3" in report["notes"] and report["planning"] is None
-    killed(survey / "some", shards, ("take", 3))
+    killed(survey / "some", shards, ("copy_from", 3))
     merge(shards, survey / "some")
     assert content(survey / "some") == content(survey / "all")
 
