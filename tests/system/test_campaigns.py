@@ -932,7 +932,7 @@ def test_jobs_are_written_here_when_no_worker_has_a_slot_left(files, whole, monk
 
 @pytest.mark.slow
 def test_workers_that_do_not_see_the_data_set(files, whole, monkeypatch, client):
-    monkeypatch.setattr(Storage, "sees", lambda *_: not in_worker())
+    monkeypatch.setattr(Storage, "has_content", lambda *_: not in_worker())
     run = Campaign.load(files / "c.yaml").run(files / "ds", client=client)
     assert run.done == 6 and bytes_of(files / "ds") == whole
     for words in ("no worker of partition LIDAR can access", "the driver wrote the data set"):

@@ -189,9 +189,9 @@ def test_a_data_set_is_written_and_read_in_the_bucket(environment, tmp_path, for
         np.testing.assert_array_equal(one.points, two.points)
         assert (one.job, one.number, one.boxes.names) == (two.job, two.number, two.boxes.names)
     rows = [JobRow(number, f"{number:02}") for number in (0, 1)]
-    assert [wrong for _, (_, wrong) in data.look(rows, contents=True)] == ["", ""]
+    assert [wrong for _, (_, wrong) in data.check_jobs(rows, contents=True)] == ["", ""]
     system.rm(f"{folder}/{job_file(format, '00', SWEEPS_FILE)}")
-    assert [bool(wrong) for _, (_, wrong) in data.look(rows)] == [True, False]
+    assert [bool(wrong) for _, (_, wrong) in data.check_jobs(rows)] == [True, False]
     system.rm(f"{folder}/dataset.json")
     with pytest.raises(package.LidarError, match="contains an unfinished data set"):
         package.sweeps(url)
