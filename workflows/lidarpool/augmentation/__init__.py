@@ -1,0 +1,1 @@
+"""Simulate weather, faults, noise and inserted objects on recorded sweeps."""
