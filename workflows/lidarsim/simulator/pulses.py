@@ -37,13 +37,14 @@ from raybeam import Pattern
 
 from ..numerics.arrays import Ints, to_writable
 from ..scene.scene import Scene
+from ..sensor.noise import Noise
 from ..survey.survey import Survey
 from .casting.motion import CastPoses, Firings
 from .casting.scene_caster import SceneCaster
 from .casting.surfaces import SceneSurfaces, sensor_light_of
 from .returns import NO_SURFACE, Keys, PulseReturns, concatenate_returns, require_column
 from .steps.doppler import radial_velocities
-from .steps.step import Emitter, PulseBatch, PulseStep, Role
+from .steps.step import Emitter, PulseBatch, PulseStep, RecordedPulses, Role
 from .steps.step_list import setup_of, steps_of
 
 CHUNK_RAYS = 1 << 17  # number of sub-rays that are cast at a time
@@ -68,8 +69,9 @@ class PulseCaster:
         scene: Scene,
         survey: Survey,
         surfaces: SceneSurfaces,
+        recorded_noise: Noise | None = None,
     ) -> None:
-        self.setup = setup = setup_of(scene, survey, sensor_number)
+        self.setup = setup = setup_of(scene, survey, sensor_number, recorded_noise)
         self._caster = caster
         self._surfaces = surfaces
         # Stored because copies of this caster have the same materials and the same sensor.
@@ -95,6 +97,7 @@ class PulseCaster:
         firings: Firings,
         *,
         tally: bool = True,
+        recorded: RecordedPulses | None = None,
     ) -> ScannedReturns:
         """Cast consecutive scans, count their returns, and keep every n-th return.
 
@@ -116,6 +119,8 @@ class PulseCaster:
             Firings of the beams.
         tally
             Whether to count the hits on surfaces by `StoredTriangles.counter`.
+        recorded
+            Recorded pulses of the beams, which are required if `Setup.is_recorded` is true.
         """
         first_row = window[0]
         beam_count = window[1] - window[0]
@@ -131,6 +136,7 @@ class PulseCaster:
                 poses=poses,
                 firings=firings,
                 emitter=self.emitter,
+                recorded=recorded,
             )
 
         all_beams = batch(0, beam_count)

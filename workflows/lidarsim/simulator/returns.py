@@ -68,6 +68,9 @@ class PulseReturns(NamedTuple):
     # Recorded waveform (`columns.waveforms.record`), to which `BatchPoints` adds `location_ps` and
     # `toward`.
     waveform: Records | None = None
+    # Row of the recorded return in `RecordedPulses`, or -1 for other returns; None unless pulses are
+    # recorded.
+    source: Ints32 | None = None
     number: Bytes | None = None  # number among the reported returns of the pulse, starting at 1
     return_counts: Bytes | None = None  # number of reported returns of the pulse
     reported: Floats | None = None  # distance with noise, meters
@@ -107,7 +110,12 @@ def require_column(column: T | None) -> T:
 
 
 # Fill values for tables that lack a column that other tables have.
-_LACKING: dict[str, Any] = {"cause": np.uint8(SURFACE), "velocity": np.nan, "width": 0.0}
+_LACKING: dict[str, Any] = {
+    "cause": np.uint8(SURFACE),
+    "velocity": np.nan,
+    "width": 0.0,
+    "source": np.int32(-1),
+}
 
 
 def concatenate_returns(tables: list[PulseReturns]) -> PulseReturns:
@@ -139,7 +147,7 @@ def returns_without_surface(
 ) -> PulseReturns:
     """Return a table of n returns that have the same cause and do not come from a surface.
 
-    The columns `color` and `amplitude` are present if `template` has them.
+    The columns `color`, `amplitude` and `source` are present if `template` has them.
     """
     count = len(ray)
     return PulseReturns(
@@ -150,6 +158,7 @@ def returns_without_surface(
         None if template.color is None else np.full(count, pack_colors(GRAY[0])[0]),
         np.full(count, cause, np.uint8),
         amplitude=None if template.amplitude is None else energy,
+        source=None if template.source is None else np.full(count, -1, np.int32),
     )
 
 

@@ -33,6 +33,7 @@ from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import CastPoses, FiringClock, order_along_rings
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import SceneSurfaces, sensor_light_of
+from ..casting.visibility import unseen_objects
 from ..returns import RETURN_COLUMNS, SURFACE, PulseReturns, concatenate_returns, select_rows
 from .doppler import range_rates_of_origins, velocities_of_ends
 from .light_in_media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, MediaRays, random_depths
@@ -182,6 +183,12 @@ class OnwardLight(NamedTuple):
     pattern: Pattern  # rays to cast, which are the origins and directions of `light`
 
 
+def has_bodies(setup: Setup) -> bool:
+    """Return whether the sensor sees any object of the scene."""
+    unseen = unseen_objects(setup.scene, setup.survey)[setup.number]
+    return unseen is None or not unseen.all()
+
+
 class CastStep(PulseStep):
     """Simulation step that casts sub-rays and records their hits on surfaces and leaves.
 
@@ -234,8 +241,8 @@ class CastStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return whether a ray may have several returns or none."""
-        return setup.return_count_varies
+        """Return whether rays are cast, and may have several returns or none."""
+        return setup.return_count_varies and (not setup.is_recorded or has_bodies(setup))
 
     @staticmethod
     def added_returns(setup: Setup) -> float:

@@ -27,7 +27,7 @@ class DirtStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the hits with their energies reduced by dirt, and store them in the batch."""
-        sensor = self.setup.sensor
+        sensor = batch.firings.sensor
         beams = np.arange(batch.start, batch.stop)
         transmission = np.ones(len(beams))
         x, y, z = sensor.directions(batch.firings.numbers[batch.row_range]).reshape(-1, 3).T

@@ -30,20 +30,27 @@ class RangeNoiseStep(PulseStep):
     @staticmethod
     def applies(setup: Setup) -> bool:
         """Return whether the noise changes ranges."""
-        return setup.noise.has_range_errors
+        earlier = setup.recorded_noise
+        return setup.noise.has_range_errors or (earlier is not None and earlier.has_range_errors)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Add reported ranges to the returns of a batch."""
+        reported = self._reported(self.setup.noise, returns, batch)
+        if self.setup.recorded_noise is not None:  # the other noise is already in the recording
+            on_recorded = self._reported(self.setup.recorded_noise, returns, batch)
+            reported = np.where(require_column(returns.source) >= 0, on_recorded, reported)
+        return returns._replace(reported=reported)
+
+    def _reported(self, noise: Noise, returns: PulseReturns, batch: PulseBatch) -> Floats:
+        """Return the ranges in meters that are reported with the given noise."""
         # The leading edge of a clipped pulse is the same as that of the whole pulse.
         height = returns.height if self.setup.in_waveforms else returns.energy
         scan, ray = batch.keys.scan_and_number(returns.ray)
-        noise = self.setup.noise
         distance = returns.distance
         if noise.channel_bias_m or noise.warm_up_m:
             channel = returns.ray % self.setup.sensor.channels
             distance = distance + lasting_errors(noise, channel, batch.firings.times(returns.ray))
-        reported = noisy_ranges(noise, distance, height, scan, ray, require_column(returns.number))
-        return returns._replace(reported=reported)
+        return noisy_ranges(noise, distance, height, scan, ray, require_column(returns.number))
 
 
 def noisy_ranges(

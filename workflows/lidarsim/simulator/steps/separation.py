@@ -154,9 +154,11 @@ def _columns(hits: PulseReturns, air_hits: PulseReturns, output: ReturnArrays) -
     """Return the columns of returns, taken from the strongest hit of each."""
     row = output.row
     if len(hits.ray):
-        columns = hits.triangle, hits.color, hits.cause
-        triangle, color, cause = select_rows(columns, np.maximum(row, 0))
-        returns = PulseReturns(output.beam, output.distance, triangle, output.energy, color, cause)
+        columns = hits.triangle, hits.color, hits.cause, hits.source
+        triangle, color, cause, source = select_rows(columns, np.maximum(row, 0))
+        returns = PulseReturns(
+            output.beam, output.distance, triangle, output.energy, color, cause, source=source
+        )
     else:
         returns = returns_without_surface(
             hits, output.beam, output.distance, output.energy, SURFACE
@@ -169,6 +171,8 @@ def _columns(hits: PulseReturns, air_hits: PulseReturns, output: ReturnArrays) -
     returns.triangle[from_air] = NO_SURFACE
     if returns.color is not None:
         returns.color[from_air] = pack_colors(GRAY[0])[0]
+    if returns.source is not None:
+        returns.source[from_air] = -1
     return returns._replace(cause=cause)
 
 
@@ -221,8 +225,11 @@ class SeparationStep(PulseStep):
         """Combine the hits of a batch into returns."""
         setup = self.setup
         # If the receiver adds or merges returns, `SelectionStep` selects the reported returns.
-        mode: Mode = "all" if setup.has_received_returns else setup.reporting.mode
-        reporting = Reporting(mode, setup.noise, batch.keys, batch.start)
+        selects_later = setup.has_received_returns or setup.is_recorded
+        mode: Mode = "all" if selects_later else setup.reporting.mode
+        # Recorded returns were detected before, so `DetectionStep` decides whether they still are.
+        noise = None if setup.is_recorded else setup.noise
+        reporting = Reporting(mode, noise, batch.keys, batch.start)
         return separate_hits(
             returns,
             setup.half_pulse_m,
@@ -242,7 +249,7 @@ class SelectionStep(PulseStep):
     @staticmethod
     def applies(setup: Setup) -> bool:
         """Return whether the receiver adds or merges returns before the selection."""
-        return setup.has_received_returns
+        return setup.has_received_returns or setup.is_recorded
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Keep the reported returns of a batch."""

@@ -19,7 +19,7 @@ import numpy as np
 from raybeam import Pattern, SubRays
 
 from ...columns.table import VELOCITY
-from ...numerics.arrays import Floats, Indices, Ints
+from ...numerics.arrays import Bools, Floats, Indices, Ints
 from ...numerics.random_numbers import Purpose
 from ...numerics.vectors import rotate
 from ...scene.scene import Scene
@@ -57,6 +57,9 @@ class Setup:
     number: int  # number of the sensor in the survey
     # Roles of all steps that apply, except `Role.FRAME`; None until the steps have been chosen.
     roles: Role | None
+    # Noise that is added to recorded returns, which already contain the noise of the sensor. None
+    # if pulses are cast.
+    recorded_noise: Noise | None = None
 
     @property
     def sensor(self) -> Sensor:
@@ -67,6 +70,11 @@ class Setup:
     def noise(self) -> Noise:
         """Noise settings of the sensor."""
         return self.survey.noise_each[self.number]
+
+    @property
+    def is_recorded(self) -> bool:
+        """Whether the returns of recorded pulses take the place of cast rays."""
+        return self.recorded_noise is not None
 
     @property
     def reporting(self) -> Returns:
@@ -118,7 +126,7 @@ class Setup:
     @property
     def return_count_varies(self) -> bool:
         """Whether a ray that hits a surface may have several returns or none."""
-        if self.has_role(Role.CHANGES | Role.RECEIVES):
+        if self.is_recorded or self.has_role(Role.CHANGES | Role.RECEIVES):
             return True
         dark = any(material.reflectance == 0 for material in self.survey.materials)
         return (
@@ -164,6 +172,30 @@ class Memory(NamedTuple):
     casting: float = 0.0  # while the beams of a `PulseBatch` are cast
     # after all beams are cast, while returns are counted and thinned out
     counting: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedPulses:
+    """Pulses of a recorded sweep and their returns.
+
+    Attributes
+    ----------
+    ray
+        (n,): rays of the returns in ascending order, counted from the first ray of the sweep.
+    distance
+        (n,): ranges of the returns in meters, in ascending order for each ray.
+    energy
+        (n,): energies of the returns on the scale of `SceneSurfaces.energy`. They are at least the
+        detection threshold of the sensor, because the returns were detected.
+    fired
+        (rays,): whether each ray of the sweep was fired. Rays that were not fired fill gaps in the
+        grid of firings and channels.
+    """
+
+    ray: Ints
+    distance: Floats
+    energy: Floats
+    fired: Bools
 
 
 class Emitter:
@@ -227,6 +259,7 @@ class PulseBatch:
     poses: CastPoses  # poses of all beams of the scans
     firings: Firings  # firings of all beams of the scans
     emitter: Emitter
+    recorded: RecordedPulses | None = None  # recorded pulses of all beams; None if rays are cast
     # (stop - start, 2): angles in radians added to the directions of beams (`deflect`)
     offsets: Floats | None = None
     # Hits of sub-rays on surfaces and, with waveforms, in the air, sorted by sub-ray. Sub-rays are

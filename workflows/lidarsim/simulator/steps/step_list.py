@@ -6,6 +6,7 @@ from functools import reduce
 from operator import or_
 
 from ...scene.scene import Scene
+from ...sensor.noise import Noise
 from ...survey.survey import Survey
 from .angle_noise import AngleNoiseStep, RippleStep
 from .cast import CastStep
@@ -15,6 +16,7 @@ from .false_alarms import FalseAlarmStep
 from .losses import DirtStep, LossStep
 from .particles import WeatherStep
 from .range_noise import RangeNoiseStep
+from .recorded import RecordedStep
 from .saturation import SaturationStep
 from .separation import SelectionStep, SeparationStep
 from .spray import SprayStep
@@ -28,6 +30,7 @@ STEPS: list[type[PulseStep]] = [
     AngleNoiseStep,
     RippleStep,
     CastStep,  # follows light at mirrors, glass, water and leaves
+    RecordedStep,  # recorded returns in place of the cast
     WeatherStep,  # rain, snow, fog and dust; casting/surfaces.py attenuates the light
     SprayStep,
     DirtStep,  # dirt on the window
@@ -45,12 +48,17 @@ STEPS: list[type[PulseStep]] = [
 ]
 
 
-def setup_of(scene: Scene, survey: Survey, number: int) -> Setup:
-    """Return the setup of a sensor, including the roles of the steps that apply to it."""
-    setup = Setup(scene, survey, number, None)
+def setup_of(
+    scene: Scene, survey: Survey, number: int, recorded_noise: Noise | None = None
+) -> Setup:
+    """Return the setup of a sensor, including the roles of the steps that apply to it.
+
+    `recorded_noise` is set if the pulses are recorded (`Setup.recorded_noise`).
+    """
+    setup = Setup(scene, survey, number, None, recorded_noise)
     effects = [step for step in STEPS if Role.FRAME not in step.role and step.applies(setup)]
     roles = reduce(or_, (step.role for step in effects), Role(0))
-    return Setup(scene, survey, number, roles)
+    return Setup(scene, survey, number, roles, recorded_noise)
 
 
 def steps_of(setup: Setup) -> list[type[PulseStep]]:

@@ -1,0 +1,232 @@
+"""Apply simulation steps to the pulses of recorded sweeps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from raybeam import Pattern
+
+from ..motion.trajectory import CENTER
+from ..numerics.arrays import Bools, Floats, Ints
+from ..scene.actors import Actor
+from ..scene.scene import Scene
+from ..scene.scene_mesh import SceneMesh
+from ..sensor import Noise, Returns, Sensor, Spin
+from ..sensor.beams import Beams
+from ..survey.survey import Mounted, ScanSpec, Survey
+from .casting.actor_trajectories import ActorTrajectories
+from .casting.motion import CastPoses, FiringClock, Firings
+from .casting.scene_caster import casters_of_sensors
+from .casting.surfaces import SceneSurfaces
+from .pulses import PulseCaster
+from .returns import PulseReturns
+from .steps.step import RecordedPulses
+
+RECORDING = "recording"  # name of the invisible object that stands for recorded surfaces
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RecordedSensor(Sensor):
+    """A sensor whose pulses were recorded. Each sweep has its own directions and times."""
+
+    # (f, c, 3): unit directions of the pulses of a sweep, in the sensor frame
+    pulse_directions: Floats = field(default_factory=lambda: np.zeros((0, 1, 3)))
+    # (f,): firing times in nanoseconds since the start of the recording
+    firing_ns: Floats = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def create(cls, channels: int, firings: int, sensor: Sensor, max_range_m: float) -> Any:
+        """Create a sensor with the optics and range limits of a sensor model.
+
+        Parameters
+        ----------
+        channels
+            Number of channels.
+        firings
+            Maximum number of firings of a sweep.
+        sensor
+            Sensor model.
+        max_range_m
+            Maximum range of the recorded returns in meters.
+        """
+        return cls(
+            Beams(np.zeros(channels)),
+            Spin(max(firings, 1), 360),
+            min_range_m=sensor.min_range_m,
+            max_range_m=max(max_range_m, sensor.max_range_m),
+            name=sensor.model,
+            optics=sensor.optics,
+            noise=sensor.noise,
+            returns=sensor.returns,
+        )
+
+    def directions(self, firings: Ints) -> Floats:
+        """Return the recorded directions of firings in the sensor frame, of shape (k, c, 3)."""
+        return self.pulse_directions[firings]
+
+    def begins_ns(self, firings: Ints) -> Floats:
+        """Return the firing times in nanoseconds since the start of the recording."""
+        if not len(self.firing_ns):  # before a sweep is known
+            return super().begins_ns(firings)
+        return self.firing_ns[firings]
+
+
+@dataclass(frozen=True, eq=False)
+class SweepPulses:
+    """Pulses of a recorded sweep in a grid of f firings and c channels.
+
+    Attributes
+    ----------
+    directions
+        (f, c, 3): unit directions of the pulses in the sensor frame.
+    firing_ns
+        (f,): firing times in nanoseconds since the start of the recording.
+    recorded
+        Returns of the pulses. The ray of a pulse is ``firing * c + channel``.
+    origins
+        (f, c, 3): sensor positions at the firings in the sensor frame of the sweep, in meters, or
+        None if all pulses start at the origin. They differ in motion-compensated sweeps.
+    """
+
+    directions: Floats
+    firing_ns: Floats
+    recorded: RecordedPulses
+    origins: Floats | None = None
+
+
+def scene_of_bodies(
+    objects: tuple[SceneMesh, ...] = (), actors: tuple[Actor, ...] = ()
+) -> Scene:
+    """Create a scene of objects that are inserted into recorded sweeps.
+
+    Coordinates are those of the recording's world frame. The scene also contains an invisible
+    object that represents the recorded surfaces.
+    """
+    corners = np.array([[0.0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 0]])
+    recording = SceneMesh(RECORDING, corners, np.array([[0, 1, 2]]))
+    scene = Scene.from_meshes([recording, *objects])
+    return scene.with_actors(actors) if actors else scene
+
+
+class PulseAugmenter:
+    """Applies simulation steps to the pulses of recorded sweeps.
+
+    Parameters
+    ----------
+    sensor
+        Sensor of the recording (`RecordedSensor.create`).
+    scene
+        Inserted objects (`scene_of_bodies`).
+    noise
+        Noise of added returns, with the detection threshold of the sensor.
+    recorded_noise
+        Noise that is added to recorded returns.
+    returns
+        Sub-rays of beams at inserted objects, and the returns that are reported for each pulse.
+    sweep_count
+        Number of sweeps of the recording.
+    **options
+        Fields of `Survey`, such as `rain_mm_h`, `faults` and `materials`.
+    """
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        scene: Scene,
+        noise: Noise,
+        recorded_noise: Noise,
+        returns: Returns,
+        sweep_count: int,
+        **options: Any,
+    ) -> None:
+        self.scene = scene
+        mounted = Mounted(sensor, unseen=(RECORDING,))
+        self.survey = Survey(
+            sensors=[mounted],
+            poses=[CENTER],
+            steps=max(sweep_count, 1),
+            noise=noise,
+            returns=returns,
+            **options,
+        )
+        self.surfaces = SceneSurfaces(
+            scene, tuple(self.survey.materials), [sensor.optics.wavelength_nm]
+        )
+        (caster,) = casters_of_sensors(scene, self.survey, self.surfaces)
+        self._caster = caster
+        self._pulses = PulseCaster(0, caster, scene, self.survey, self.surfaces, recorded_noise)
+        self._actor_trajectories = ActorTrajectories.from_actors(scene.actors)
+
+    @property
+    def threshold(self) -> float:
+        """Energy at which half of the returns are detected, or 0 without a detection range."""
+        return self.survey.noise_each[0].threshold
+
+    def apply(
+        self, number: int, pulses: SweepPulses, pose: tuple[Floats, Floats] | None = None
+    ) -> PulseReturns:
+        """Return the reported returns of a sweep.
+
+        Parameters
+        ----------
+        number
+            Number of the sweep, on which all random numbers depend.
+        pulses
+            Pulses of the sweep.
+        pose
+            Position (3,) and rotation (3, 3) of the sensor in the world frame of the recording, or
+            None for the identity.
+
+        Returns
+        -------
+        PulseReturns
+            Returns of the pulses that were fired. `source` is the row of a recorded return in
+            `pulses.recorded`, and `reported` is the range with noise in meters.
+        """
+        firings, channels = pulses.directions.shape[:2]
+        rays = firings * channels
+        sensor = replace(
+            self.survey.mounted_sensors[0].sensor,
+            pulse_directions=pulses.directions,
+            firing_ns=pulses.firing_ns,
+        )
+        spec = ScanSpec(number, 0, (0, firings), channels=channels)
+        position, rotation = (np.zeros(3), None) if pose is None else pose
+        poses = CastPoses(position - self.scene.origin, rotation)
+        if self.scene.actors:
+            clock = FiringClock(
+                pulses.firing_ns, sensor.beams.time_ns, self._actor_trajectories
+            )
+            poses = replace(poses, clock=clock)
+        origins = None if pulses.origins is None else pulses.origins.reshape(-1, 3)
+        pattern = Pattern(pulses.directions.reshape(-1, 3), origins, step=channels)
+        self._caster.ensure_trees(np.atleast_2d(poses.positions))
+        scanned = self._pulses.scan(
+            number,
+            pattern,
+            poses,
+            (0, rays),
+            np.zeros(1, np.int64),
+            Firings.from_scans(sensor, [spec]),
+            tally=False,
+            recorded=pulses.recorded,
+        )
+        returns = scanned.returns
+        return returns.take(pulses.recorded.fired[returns.ray])
+
+    def objects(self, returns: PulseReturns) -> Ints:
+        """Return the number of the inserted object of each return, or -1 if there is none.
+
+        Numbers are indices into `scene.object_names` without the recording itself, so the first
+        inserted object has the number 0.
+        """
+        numbers = np.full(len(returns.ray), -1)
+        source = returns.source
+        is_cast = (returns.triangle >= 0) & ((source < 0) if source is not None else True)
+        rows = np.flatnonzero(is_cast)
+        _, objects, _ = self.surfaces.triangles.locate(returns.triangle[rows])
+        numbers[rows] = objects - 1
+        return numbers
