@@ -2,11 +2,36 @@
 
 from __future__ import annotations
 
-from lidarsim.sensor import Sensor
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidarsim.columns.column_names import TIMES
+from lidarsim.columns.sweep import Sweep
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints
+from lidarsim.numerics.even_samples import even_indices
+from lidarsim.sensor import Noise, Returns, Sensor
+from lidarsim.simulator.recorded_sweeps import PulseAugmenter, RecordedSensor, SweepPulses
+from lidarsim.simulator.returns import PulseReturns
+from lidarsim.simulator.steps.step import RecordedPulses
 
 from ..clouds.recording import Recording
 from .augmented_sweep import AugmentedSweep
 from .effects import Effects
+from .inserted_objects import InsertedObjects, SweepMotion
+from .intensity_scale import DetectionThreshold, IntensityScale, detection_threshold
+from .scan_pattern import PulseGrid, ScanPattern
+
+_DIVERGENCE_MRAD = 3.0  # beam divergence of a sensor whose divergence is unknown
+_REFERENCE_SWEEPS = 5  # number of sweeps from which the sensitivity is estimated
+_SUBRAYS = 7  # sub-rays per beam if objects are inserted
+_RECEIVER = ("detection_range_m", "overlap_m", "saturation", "seed")  # properties of the receiver
+_UNSUPPORTED_FAULTS = ("frozen", "time_jump")
+_RANGES = ("range", "distance", "depth")  # columns that contain ranges
+_ROUNDING = 1e-9  # relative differences below this are rounding errors of the simulation
 
 
 class Augmenter:
@@ -19,17 +44,411 @@ class Augmenter:
     effects
         Effects to simulate.
     model
-        Model of the recording's sensor, or None if it is unknown.
+        Model of the recording's sensor, or None if it is unknown. It defines the intensity scale,
+        the optics and the sensitivity.
+    reflectance
+        Reflectance of all recorded surfaces if the recording has no intensities.
+
+    Raises
+    ------
+    LidarError
+        If the recording has no sweeps, its intensities are unknown, or the effects cannot be
+        simulated on it.
     """
 
-    def __init__(self, recording: Recording, effects: Effects, model: Sensor | None = None) -> None:
+    def __init__(
+        self,
+        recording: Recording,
+        effects: Effects,
+        model: Sensor | None = None,
+        reflectance: float | None = None,
+    ) -> None:
+        if recording.is_cloud or not len(recording):
+            raise LidarError(
+                f"{recording.name} contains no sweeps. Use a recording that consists of sweeps."
+            )
+        for number, fault in enumerate(effects.faults):
+            if fault.kind in _UNSUPPORTED_FAULTS:
+                raise LidarError(
+                    f"faults[{number}]: a fault of kind {fault.kind!r} cannot be simulated on a "
+                    "recording. Remove it, or edit the timestamps of the recording."
+                )
         self.recording = recording
         self.effects = effects
-        self.notes: tuple[str, ...] = ()
+        self.pattern = ScanPattern.from_recording(recording)
+        self.scale = IntensityScale.for_recording(recording, model, reflectance)
+        self.model = model
+        self._notes: list[str] = [self.pattern.note, self.scale.note]
+        self.objects = InsertedObjects.from_effects(recording, effects)
+        self._notes += self.objects.notes
+        self._simulation = self._build(model)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes for the user about properties of the recording that had to be assumed."""
+        return tuple(dict.fromkeys(note for note in self._notes if note))
 
     def __len__(self) -> int:
         return len(self.recording)
 
+    def _build(self, model: Sensor | None) -> PulseAugmenter:
+        """Create the simulation of the effects."""
+        effects = self.effects
+        pattern = self.pattern
+        sensor = model
+        if sensor is None:
+            sensor = Sensor.grid(
+                layers=1, vertical_fov_deg=0, max_range_m=1.1 * pattern.max_range_m
+            )
+        if sensor.optics.divergence_mrad is None:
+            sensor = replace(
+                sensor, optics=replace(sensor.optics, divergence_mrad=_DIVERGENCE_MRAD)
+            )
+            if effects.weather.particles:
+                self._notes.append(
+                    f"The beam divergence of the sensor is unknown. A divergence of "
+                    f"{_DIVERGENCE_MRAD:g} mrad was assumed. Pass `--model` to use that of a sensor."
+                )
+        recorded = RecordedSensor.create(
+            pattern.channel_count, pattern.firings, sensor, pattern.max_range_m
+        )
+        noise, recorded_noise = self._noises(sensor)
+        mode = effects.mode or ("two_strongest" if pattern.has_several else "strongest")
+        pulse = sensor.returns if sensor.returns is not None else Returns()
+        returns = replace(
+            pulse,
+            mode=mode,
+            subrays=_SUBRAYS if self.objects.scene.actors or self.objects.has_objects else 1,
+            waveform="none",
+        )
+        options = {
+            field.name: getattr(effects.weather, field.name) for field in fields(effects.weather)
+        }
+        return PulseAugmenter(
+            recorded,
+            self.objects.scene,
+            noise,
+            recorded_noise,
+            returns,
+            len(self.recording),
+            faults=effects.faults,
+            materials=self.objects.surface_materials,
+            **options,
+        )
+
+    def _noises(self, sensor: Sensor) -> tuple[Noise, Noise]:
+        """Return the noise of added returns, and the noise that is added to recorded returns."""
+        changes = {**self.effects.noise}
+        receiver = {name: changes[name] for name in _RECEIVER if name in changes}
+        base = sensor.noise or Noise()
+        if "detection_range_m" not in receiver and base.detection_range_m is None:
+            threshold = self._detection_threshold()
+            receiver["detection_range_m"] = threshold.range_m
+            self._notes.append(threshold.note)
+        base = replace(base, **receiver, seed=self.effects.seed)
+        recorded = Noise(
+            detection_range_m=base.detection_range_m,
+            overlap_m=base.overlap_m,
+            seed=base.seed,
+        )
+        # Errors of directions, and false and stray returns, are part of the recording.
+        added = replace(
+            base,
+            angle_deg=0.0,
+            ripple_deg=0.0,
+            false_alarm_hz=0.0,
+            stray_light=0.0,
+            crosstalk=False,
+        )
+        if "saturation" not in receiver:
+            added = replace(added, saturation=None)
+        if not isinstance(added.channel_bias_m, float) and len(
+            np.atleast_1d(added.channel_bias_m)
+        ) not in (1, self.pattern.channel_count):
+            added = replace(added, channel_bias_m=0.0)
+        others = {name: value for name, value in changes.items() if name not in _RECEIVER}
+        return replace(added, **others), replace(recorded, **others)
+
+    def _detection_threshold(self) -> DetectionThreshold:
+        """Estimate the detection threshold from a few sweeps."""
+        sweeps = [
+            self.recording[number].returns()
+            for number in even_indices(len(self.recording), _REFERENCE_SWEEPS).tolist()
+        ]
+        ranges = np.concatenate([np.linalg.norm(sweep.points, axis=1) for sweep in sweeps])
+        intensity = None
+        if self.scale.column:
+            intensity = np.concatenate([sweep.columns[self.scale.column] for sweep in sweeps])
+        return detection_threshold(self.scale, intensity, ranges, self.model)
+
     def sweep(self, number: int) -> AugmentedSweep:
-        """Augment a sweep."""
-        raise NotImplementedError
+        """Augment a sweep.
+
+        Parameters
+        ----------
+        number
+            Number of the sweep. All random numbers depend on it.
+
+        Returns
+        -------
+        AugmentedSweep
+
+        Raises
+        ------
+        LidarError
+            If the recording cannot be read.
+        """
+        return self.augment(self.recording[number], number)
+
+    def augment(self, sweep: Sweep, number: int) -> AugmentedSweep:
+        """Augment a sweep that has been read.
+
+        `number` selects the random numbers, the time of the sweep and the poses of actors.
+        """
+        grid = self.pattern.grid(sweep)
+        motion = self.objects.motion(sweep, number, grid.times_s - self._first_s)
+        rays = _Rays.from_grid(grid, motion)
+        intensity = self._intensity(sweep)
+        recorded = None if intensity is None else intensity[grid.row]
+        # What was detected had at least the energy of the threshold.
+        energy = np.maximum(self.scale.energies(recorded, rays.range_m), self._simulation.threshold)
+        firing_ns = self._start_ns(number) + 1e9 * (grid.times_s - self._first_s)
+        pulses = SweepPulses(
+            rays.directions,
+            firing_ns,
+            RecordedPulses(grid.cell, rays.range_m, energy, grid.fired.reshape(-1)),
+            rays.origins,
+        )
+        returns = self._simulation.apply(number, pulses, motion.poses)
+        points = _AugmentedPoints.from_returns(sweep, grid, rays, returns)
+        columns = self._columns(sweep, points, grid, rays, pulses.recorded, returns)
+        augmented = Sweep(
+            points.positions,
+            columns,
+            pose=sweep._pose,
+            time_ns=sweep.time_ns,
+            compensated=sweep.compensated,
+            sensor=sweep.sensor,
+            number=sweep.number,
+            object_names=(*sweep.object_names, *self.objects.names) if sweep.object_names else (),
+        )
+        boxes, visibility = self.objects.boxes(self._simulation, pulses, motion, returns, number)
+        return AugmentedSweep(augmented, points.template, points.is_recorded, boxes, visibility)
+
+    def _intensity(self, sweep: Sweep) -> AnyArray | None:
+        return np.asarray(sweep.columns[self.scale.column]) if self.scale.column else None
+
+    def _intensities(
+        self,
+        sweep: Sweep,
+        points: _AugmentedPoints,
+        rays: _Rays,
+        recorded: RecordedPulses,
+        returns: PulseReturns,
+    ) -> AnyArray:
+        """Return the intensities of the augmented points on the scale of the recording."""
+        assert returns.energy is not None
+        energy = returns.energy[points.order]
+        old = self._intensity(sweep)
+        assert old is not None
+        values = old[points.template]
+        added = np.flatnonzero(~points.is_recorded)
+        values[added] = self.scale.intensities(energy[added], points.range_m[added])
+        kept = np.flatnonzero(points.is_recorded)
+        source = points.source[kept]
+        unchanged = np.abs(energy[kept] - recorded.energy[source]) < _ROUNDING * energy[kept]
+        energy[kept] = np.where(unchanged, recorded.energy[source], energy[kept])
+        old_m = rays.range_m[source]
+        new_m = np.where(points.is_moved[kept], points.range_m[kept], old_m)
+        values[kept] = self.scale.scale_intensities(
+            values[kept],
+            recorded.energy[source],
+            energy[kept],
+            old_m,
+            new_m,
+        )
+        return values
+
+    def _start_ns(self, number: int) -> float:
+        """Return the timestamp of a sweep in nanoseconds since the first sweep."""
+        stamps_ns = self.recording.stamps_ns
+        if stamps_ns is not None and len(stamps_ns) > number:
+            return float(stamps_ns[number] - stamps_ns[0])
+        return 1e9 * self.pattern.period_s * number
+
+    @cached_property
+    def _first_s(self) -> float:
+        """Time of the first point of a sweep relative to its timestamp, which may be later."""
+        times = self.recording.point_times
+        return 0.0 if times is None else min(times.first_s, 0.0)
+
+    def _columns(
+        self,
+        sweep: Sweep,
+        points: _AugmentedPoints,
+        grid: PulseGrid,
+        rays: _Rays,
+        recorded: RecordedPulses,
+        returns: PulseReturns,
+    ) -> dict[str, AnyArray]:
+        """Return the columns of the augmented points."""
+        columns = {name: np.asarray(v)[points.template] for name, v in sweep.columns.items()}
+        if self.scale.column:
+            columns[self.scale.column] = self._intensities(sweep, points, rays, recorded, returns)
+        added = np.flatnonzero(~points.is_recorded)
+        ranges = np.linalg.norm(np.asarray(sweep.points, np.float64), axis=1)
+        for name in columns.keys() & {*_RANGES}:
+            stored = np.asarray(sweep.columns[name], np.float64)
+            valid = np.isfinite(ranges) & (ranges > 0) & (stored > 0)
+            if not valid.any():
+                continue
+            unit = float(np.median(stored[valid] / ranges[valid]))
+            changed = np.flatnonzero(points.is_moved)
+            values = unit * points.range_m[changed]
+            columns[name][changed] = _as_type(values, columns[name].dtype)
+        times = self.recording.point_times
+        if times is not None and len(added):
+            late_s = grid.times_s[points.firing] - grid.times_s[points.template_firing]
+            for name in TIMES:
+                if name in columns:
+                    values = columns[name][added] + late_s[added] / times.unit_s
+                    columns[name][added] = _as_type(values, columns[name].dtype)
+                    break
+        order = points.order
+        if "return_number" in columns and returns.number is not None:
+            columns["return_number"] = returns.number[order].astype(columns["return_number"].dtype)
+        if "returns" in columns and returns.return_counts is not None:
+            columns["returns"] = returns.return_counts[order].astype(columns["returns"].dtype)
+        cause = np.zeros(len(order), np.uint8) if returns.cause is None else returns.cause[order]
+        columns["cause"] = cause
+        numbers = self._simulation.objects(returns)[order]
+        self.objects.label(columns, added, numbers, len(sweep.object_names))
+        return columns
+
+
+class _Rays(NamedTuple):
+    """Pulses as rays from the sensor at the time of each firing.
+
+    Attributes
+    ----------
+    directions
+        (f, c, 3): unit directions.
+    origins
+        (f, c, 3): origins in meters, or None if all pulses start at the origin of the frame.
+    range_m
+        (n,): ranges of the returns.
+    """
+
+    directions: Floats
+    origins: Floats | None
+    range_m: Floats
+
+    @classmethod
+    def from_grid(cls, grid: PulseGrid, motion: SweepMotion) -> _Rays:
+        """Compute the rays of a sweep, which start along the path of the sensor if it is known."""
+        if motion.origins is None or motion.rotations is None:
+            return cls(grid.directions, None, grid.range_m)
+        channels = grid.directions.shape[1]
+        directions = np.einsum("fij,fcj->fci", motion.rotations, grid.directions)
+        flat = directions.reshape(-1, 3)
+        ends = grid.directions.reshape(-1, 3)[grid.cell] * grid.range_m[:, None]
+        path = ends - motion.origins[grid.cell // channels]
+        range_m = np.linalg.norm(path, axis=1)
+        flat[grid.cell] = path / range_m[:, None]
+        origins = np.repeat(motion.origins[:, None], channels, axis=1)
+        return cls(directions, origins, range_m)
+
+
+@dataclass(frozen=True, eq=False)
+class _AugmentedPoints:
+    """Points of an augmented sweep, sorted by template.
+
+    All arrays have n rows, except `order`, which sorts the returns.
+    """
+
+    order: Ints
+    positions: Floats  # (n, 3): meters
+    range_m: Floats
+    template: Ints
+    is_recorded: Bools
+    is_moved: Bools  # whether a point is new or has another range
+    source: Ints  # row among the recorded returns, or -1
+    firing: Ints
+    template_firing: Ints
+
+    @classmethod
+    def from_returns(
+        cls, sweep: Sweep, grid: PulseGrid, rays: _Rays, returns: PulseReturns
+    ) -> _AugmentedPoints:
+        """Compute the points of reported returns."""
+        channels = grid.directions.shape[1]
+        ray = returns.ray.astype(np.int64)
+        assert returns.reported is not None
+        range_m = returns.reported
+        source = (
+            np.full(len(ray), -1) if returns.source is None else returns.source.astype(np.int64)
+        )
+        is_recorded = source >= 0
+        nearest = source.copy()
+        added = np.flatnonzero(~is_recorded)
+        nearest[added] = _nearest_returns(grid.cell, ray[added], channels)
+        template = grid.row[nearest]
+        order = np.lexsort((~is_recorded, template))
+        ray, source, nearest, template = (v[order] for v in (ray, source, nearest, template))
+        range_m = range_m[order]
+        is_recorded = source >= 0
+        is_moved = ~is_recorded
+        rows = np.flatnonzero(is_recorded)
+        old_m = rays.range_m[source[rows]]
+        is_moved[rows] = np.abs(range_m[rows] - old_m) > _ROUNDING * old_m
+        positions = np.asarray(sweep.points, np.float64)[template]
+        moved = np.flatnonzero(is_moved)
+        cells = ray[moved]
+        ends = rays.directions.reshape(-1, 3)[cells] * range_m[moved, None]
+        if rays.origins is not None:
+            ends += rays.origins.reshape(-1, 3)[cells]
+        positions[moved] = ends
+        return cls(
+            order,
+            positions,
+            range_m,
+            template,
+            is_recorded,
+            is_moved,
+            source,
+            ray // channels,
+            grid.cell[nearest] // channels if len(nearest) else nearest,
+        )
+
+
+def _nearest_returns(cells: Ints, rays: Ints, channels: int) -> Ints:
+    """Return the recorded return that is nearest to each ray, in the same channel if possible.
+
+    `cells` (n,) are the cells of the recorded returns.
+    """
+    if not len(rays):
+        return np.zeros(0, np.int64)
+    firings = int(max(cells.max(initial=0), rays.max())) // channels + 1
+    keys = (cells % channels) * firings + cells // channels
+    by_channel = np.argsort(keys, kind="stable")
+    keys = keys[by_channel]
+    wanted = (rays % channels) * firings + rays // channels
+    after = np.searchsorted(keys, wanted).clip(0, len(keys) - 1)
+    before = (after - 1).clip(0)
+    # A return of another channel is farther away than any return of the same channel.
+    far = 2 * firings
+
+    def distance(row: Ints) -> Ints:
+        gap = np.abs(keys[row] - wanted)
+        return np.asarray(gap + far * (keys[row] // firings != wanted // firings))
+
+    closer = np.where(distance(before) <= distance(after), before, after)
+    return by_channel[closer]
+
+
+def _as_type(values: Floats, dtype: np.dtype[Any]) -> AnyArray:
+    """Convert values to the type of a column, rounding to integers if necessary."""
+    if dtype.kind in "iu":
+        limits = np.iinfo(dtype)
+        return np.rint(values).clip(limits.min, limits.max).astype(dtype)
+    return values.astype(dtype)

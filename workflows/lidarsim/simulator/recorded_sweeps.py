@@ -10,7 +10,7 @@ import numpy as np
 from raybeam import Pattern
 
 from ..motion.trajectory import CENTER
-from ..numerics.arrays import Bools, Floats, Ints
+from ..numerics.arrays import Floats, Ints
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..scene.scene_mesh import SceneMesh
@@ -97,9 +97,7 @@ class SweepPulses:
     origins: Floats | None = None
 
 
-def scene_of_bodies(
-    objects: tuple[SceneMesh, ...] = (), actors: tuple[Actor, ...] = ()
-) -> Scene:
+def scene_of_bodies(objects: tuple[SceneMesh, ...] = (), actors: tuple[Actor, ...] = ()) -> Scene:
     """Create a scene of objects that are inserted into recorded sweeps.
 
     Coordinates are those of the recording's world frame. The scene also contains an invisible
@@ -134,7 +132,7 @@ class PulseAugmenter:
 
     def __init__(
         self,
-        sensor: Sensor,
+        sensor: RecordedSensor,
         scene: Scene,
         noise: Noise,
         recorded_noise: Noise,
@@ -143,6 +141,7 @@ class PulseAugmenter:
         **options: Any,
     ) -> None:
         self.scene = scene
+        self.sensor = sensor
         mounted = Mounted(sensor, unseen=(RECORDING,))
         self.survey = Survey(
             sensors=[mounted],
@@ -177,8 +176,8 @@ class PulseAugmenter:
         pulses
             Pulses of the sweep.
         pose
-            Position (3,) and rotation (3, 3) of the sensor in the world frame of the recording, or
-            None for the identity.
+            Position (3,) and rotation (3, 3) of the frame of the rays in the world frame, or
+            positions (f, 3) and rotations (f, 3, 3) of all firings. None for the identity.
 
         Returns
         -------
@@ -189,20 +188,13 @@ class PulseAugmenter:
         firings, channels = pulses.directions.shape[:2]
         rays = firings * channels
         sensor = replace(
-            self.survey.mounted_sensors[0].sensor,
+            self.sensor,
             pulse_directions=pulses.directions,
             firing_ns=pulses.firing_ns,
         )
         spec = ScanSpec(number, 0, (0, firings), channels=channels)
-        position, rotation = (np.zeros(3), None) if pose is None else pose
-        poses = CastPoses(position - self.scene.origin, rotation)
-        if self.scene.actors:
-            clock = FiringClock(
-                pulses.firing_ns, sensor.beams.time_ns, self._actor_trajectories
-            )
-            poses = replace(poses, clock=clock)
-        origins = None if pulses.origins is None else pulses.origins.reshape(-1, 3)
-        pattern = Pattern(pulses.directions.reshape(-1, 3), origins, step=channels)
+        pattern = _pattern(pulses)
+        poses = self._poses(pulses, pose)
         self._caster.ensure_trees(np.atleast_2d(poses.positions))
         scanned = self._pulses.scan(
             number,
@@ -217,6 +209,41 @@ class PulseAugmenter:
         returns = scanned.returns
         return returns.take(pulses.recorded.fired[returns.ray])
 
+    def pulses_on_objects(
+        self, pulses: SweepPulses, pose: tuple[Floats, Floats] | None, count: int
+    ) -> Ints:
+        """Return the number of pulses that would hit each inserted object in clear air.
+
+        The parameters are those of `apply`. The result has shape (count,).
+        """
+        poses = self._poses(pulses, pose)
+        rays = pulses.directions.shape[0] * pulses.directions.shape[1]
+        sensor = self.sensor
+        hits = self._caster.scan(
+            _pattern(pulses),
+            poses,
+            window=(0, rays),
+            t_min=sensor.min_range_m,
+            t_max=sensor.max_range_m,
+        )
+        fired = pulses.recorded.fired[hits.ray]
+        _, objects, _ = self.surfaces.triangles.locate(hits.triangle[fired])
+        return np.bincount(objects - 1, minlength=count)
+
+    def _poses(self, pulses: SweepPulses, pose: tuple[Floats, Floats] | None) -> CastPoses:
+        """Return the poses of the rays of a sweep in the scene frame, with the clock of actors."""
+        position, rotation = (np.zeros(3), None) if pose is None else pose
+        poses = CastPoses(
+            position - self.scene.origin,
+            rotation,
+            rays_per_pose=None if position.ndim == 1 else pulses.directions.shape[1],
+        )
+        if not self.scene.actors:
+            return poses
+        sensor = self.sensor
+        clock = FiringClock(pulses.firing_ns, sensor.beams.time_ns, self._actor_trajectories)
+        return replace(poses, clock=clock)
+
     def objects(self, returns: PulseReturns) -> Ints:
         """Return the number of the inserted object of each return, or -1 if there is none.
 
@@ -230,3 +257,10 @@ class PulseAugmenter:
         _, objects, _ = self.surfaces.triangles.locate(returns.triangle[rows])
         numbers[rows] = objects - 1
         return numbers
+
+
+def _pattern(pulses: SweepPulses) -> Pattern:
+    """Return the rays of a sweep."""
+    origins = None if pulses.origins is None else pulses.origins.reshape(-1, 3)
+    channels = pulses.directions.shape[1]
+    return Pattern(pulses.directions.reshape(-1, 3), origins, step=channels)

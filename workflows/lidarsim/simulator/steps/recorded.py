@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...numerics.arrays import Floats, Ints
+from ...numerics.arrays import Floats, Integers
 from ...numerics.elementary import exp
 from ...scene.colors import GRAY, pack_colors
 from ..casting.scene_caster import SceneCaster
@@ -101,7 +101,7 @@ class RecordedStep(PulseStep):
         triangle = np.full(len(ray), RECORDED_TRIANGLE, np.int32)
         return PulseReturns(ray, distance, triangle, energy, source=source)
 
-    def _planes(self, batch: PulseBatch, ray: Ints) -> tuple[Floats, Floats] | None:
+    def _planes(self, batch: PulseBatch, ray: Integers) -> tuple[Floats, Floats] | None:
         """Return planes through recorded returns that face the sensor.
 
         The result is None if beams have a single sub-ray.

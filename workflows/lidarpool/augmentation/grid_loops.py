@@ -1,0 +1,169 @@
+"""Compiled loops that arrange the returns of a sweep in a grid of firings and channels."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lidarsim.numerics.arrays import Bools, Floats, Ints
+from raybeam.compiled import compiled
+
+SECTORS = 360  # azimuth sectors, in which all rings may be empty
+_SAME_PULSE_RAD = 1e-4  # maximum angle between the returns of a pulse
+_TURN = 2 * np.pi
+
+
+class ChannelTables(NamedTuple):
+    """Properties of the c channels of a sensor."""
+
+    sin_elevation: Floats
+    cos_elevation: Floats
+    offset_rad: Floats  # azimuth relative to the firing
+    stride: Ints  # number of firings from one pulse to the next
+    residue: Ints  # first firing with a pulse
+    in_view: Bools  # (c, SECTORS)
+
+
+class Rotation(NamedTuple):
+    """Rotation of the sensor during a sweep."""
+
+    sign: float  # 1 for a counterclockwise rotation, otherwise -1
+    step_rad: float  # azimuth between firings
+    phase_rad: float  # rotation from azimuth 0 at firing 0
+    firings: int
+
+
+class SweepReturns(NamedTuple):
+    """Returns of a sweep. All arrays have n rows."""
+
+    points: Floats  # (n, 3): meters
+    azimuth: Floats
+    range_m: Floats
+    channel: Ints  # -1 if it is unknown
+
+
+class GridReturns(NamedTuple):
+    """Output arrays for returns that are sorted by cell and range."""
+
+    firing: Ints  # (n,): in the order of the sweep
+    cell: Ints  # (n,)
+    order: Ints  # (n,): rows of the returns in the sweep
+
+
+@compiled()
+def locate_returns(returns, tables, rotation, has_several, output):
+    """Assign returns to firings, and sort them by cell and range.
+
+    A channel fires every `stride` firings. Each return gets a pulse of its own, unless
+    `has_several` is true and another return has the same azimuth. A return whose firing is occupied
+    gets the next free firing of its channel, or an additional firing at the end. Returns the number
+    of additional firings.
+    """
+    channels = len(tables.stride)
+    firings = rotation.firings
+    count = len(returns.channel)
+    occupied = np.full(firings * channels, -1, np.int64)
+    extra_of = np.zeros(channels, np.int64)
+    extra = 0
+    for k in range(count):
+        ring = returns.channel[k]
+        chosen = -1
+        if ring >= 0:
+            step = tables.stride[ring]
+            turn = rotation.sign * (returns.azimuth[k] - tables.offset_rad[ring])
+            position = (turn - rotation.phase_rad) / rotation.step_rad
+            exact = (position - tables.residue[ring]) / step
+            nearest = int(np.rint(exact))
+            side = 1 if exact >= nearest else -1
+            for attempt in range(3):
+                shift = 0 if attempt == 0 else (side if attempt == 1 else -side)
+                firing = (tables.residue[ring] + (nearest + shift) * step) % firings
+                other = occupied[firing * channels + ring]
+                if other < 0 or (
+                    has_several
+                    and attempt == 0
+                    and abs(returns.azimuth[other] - returns.azimuth[k]) < _SAME_PULSE_RAD
+                    and returns.range_m[other] != returns.range_m[k]
+                ):
+                    chosen = firing
+                    break
+        if chosen < 0:
+            row = max(ring, 0)
+            chosen = firings + extra_of[row]
+            extra_of[row] += 1
+            extra = max(extra, extra_of[row])
+        else:
+            occupied[chosen * channels + ring] = k
+        output.firing[k] = chosen
+    starts = np.zeros((firings + extra) * channels + 1, np.int64)
+    for k in range(count):
+        starts[output.firing[k] * channels + max(returns.channel[k], 0) + 1] += 1
+    for cell in range(1, len(starts)):
+        starts[cell] += starts[cell - 1]
+    filled = np.zeros(len(starts), np.int64)
+    for k in range(count):
+        cell = output.firing[k] * channels + max(returns.channel[k], 0)
+        index = starts[cell] + filled[cell]
+        while index > starts[cell] and returns.range_m[output.order[index - 1]] > returns.range_m[k]:
+            output.order[index] = output.order[index - 1]
+            index -= 1
+        output.order[index] = k
+        output.cell[starts[cell] + filled[cell]] = cell
+        filled[cell] += 1
+    return extra
+
+
+@compiled()
+def fill_pulses(returns, tables, rotation, min_rings, grid, firing_sines, directions, fired):
+    """Write the directions of pulses, and whether they were fired.
+
+    A pulse was fired if it has a return, or if its channel can receive returns from its sector of
+    azimuth, and at least `min_rings` channels have returns in this sector of the sweep.
+    `firing_sines` (2, f) are the sines and cosines of the azimuths of firings. `directions` (f, c,
+    3) and `fired` (f, c) are written.
+    """
+    channels = len(tables.stride)
+    returned = np.zeros((channels, SECTORS), np.bool_)
+    for k in range(len(returns.channel)):
+        if returns.channel[k] >= 0:
+            sector = int(np.floor(returns.azimuth[k] * (SECTORS / _TURN))) % SECTORS
+            returned[returns.channel[k], sector] = True
+    received = np.zeros(SECTORS, np.bool_)
+    for sector in range(SECTORS):
+        rings = 0
+        for ring in range(channels):
+            rings += returned[ring, sector]
+        received[sector] = rings >= min_rings
+    offset_sines = np.empty((2, channels))
+    for ring in range(channels):
+        offset_sines[0, ring] = np.sin(tables.offset_rad[ring])
+        offset_sines[1, ring] = np.cos(tables.offset_rad[ring])
+    for firing in range(len(fired)):
+        sine = firing_sines[0, firing]
+        cosine = firing_sines[1, firing]
+        azimuth = rotation.sign * (firing * rotation.step_rad + rotation.phase_rad)
+        for ring in range(channels):
+            level = tables.cos_elevation[ring]
+            sine_of = offset_sines[0, ring]
+            cosine_of = offset_sines[1, ring]
+            directions[firing, ring, 0] = level * (cosine * cosine_of - sine * sine_of)
+            directions[firing, ring, 1] = level * (sine * cosine_of + cosine * sine_of)
+            directions[firing, ring, 2] = tables.sin_elevation[ring]
+            pulse_azimuth = azimuth + tables.offset_rad[ring]
+            sector = int(np.floor(pulse_azimuth * (SECTORS / _TURN))) % SECTORS
+            fired[firing, ring] = (
+                firing < rotation.firings
+                and received[sector]
+                and (tables.in_view[ring, sector] or returned[ring, sector])
+                and (firing - tables.residue[ring]) % tables.stride[ring] == 0
+            )
+    for k in range(len(grid.cell)):
+        firing = grid.cell[k] // channels
+        ring = grid.cell[k] - firing * channels
+        row = grid.order[k]
+        for axis in range(3):
+            directions[firing, ring, axis] = returns.points[row, axis] / returns.range_m[row]
+        fired[firing, ring] = True

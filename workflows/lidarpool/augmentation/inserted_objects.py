@@ -1,0 +1,376 @@
+"""Objects that are inserted into recorded sweeps, and the motion of the sensor among them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidarsim.columns.sweep import Sweep
+from lidarsim.errors import LidarError
+from lidarsim.media.materials import Material
+from lidarsim.motion.rotations import quaternions_of
+from lidarsim.motion.trajectory import Track, full_poses
+from lidarsim.numerics.arrays import AnyArray, Floats, Ints
+from lidarsim.scene.actors import Actor
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.simulator.recorded_sweeps import PulseAugmenter, SweepPulses, scene_of_bodies
+from lidarsim.simulator.returns import PulseReturns
+from lidarsim.words import did_you_mean
+
+from ..clouds.boxes import SweepBoxes
+from ..clouds.recording import Recording
+from .effects import Effects, Insertion
+from .ground_plane import GroundPlane
+
+_MAX_LOCAL_M = 1e4  # distance from the origin beyond which the world frame is shifted
+_FIRST_OBJECT = 60_000  # number of the first inserted object if the objects have no names
+
+
+class SweepMotion(NamedTuple):
+    """Motion of the sensor during a sweep.
+
+    Attributes
+    ----------
+    poses
+        Positions (3,) or (f, 3) and rotations (3, 3) or (f, 3, 3) of the frame of the rays in the
+        world frame, or None if they are not needed.
+    origins
+        (f, 3): sensor positions at the firings in the frame of the sweep in meters, or None if the
+        points are not compensated for motion.
+    rotations
+        (f, 3, 3): rotations from the sensor frame at the firings to the frame of the sweep, or
+        None.
+    stamp_pose
+        (4, 4): transformation from the frame of the sweep to the world frame.
+    """
+
+    poses: tuple[Floats, Floats] | None = None
+    origins: Floats | None = None
+    rotations: Floats | None = None
+    stamp_pose: Floats = np.eye(4)
+
+
+@dataclass(frozen=True, eq=False)
+class InsertedObjects:
+    """Objects that are inserted into the sweeps of a recording.
+
+    Attributes
+    ----------
+    recording
+        The recording.
+    scene
+        Scene of the objects in the world frame of the recording, minus `shift`.
+    names, types
+        (k,): names of the objects, and names of their classes.
+    classes
+        (k,): semantic class numbers of the objects.
+    materials
+        Materials of the objects.
+    poses
+        (s, 4, 4): poses of the recording in the world frame, minus `shift`, or None if they are
+        unknown.
+    notes
+        Notes for the user.
+    """
+
+    recording: Recording
+    scene: Scene
+    names: tuple[str, ...] = ()
+    types: tuple[str, ...] = ()
+    classes: tuple[int, ...] = ()
+    materials: tuple[Material, ...] = ()
+    poses: Floats | None = None
+    # (k, 2, 3): bounds of the objects in their own frames, meters
+    bounds: Floats = field(default_factory=lambda: np.zeros((0, 2, 3)))
+    # {number of a stationary object: pose in the world frame (4, 4)}
+    placed: Mapping[int, Floats] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def from_effects(cls, recording: Recording, effects: Effects) -> InsertedObjects:
+        """Place the objects of effects in a recording.
+
+        Raises
+        ------
+        LidarError
+            If two objects have the same name, or the recorded ground below an object is unknown.
+        """
+        if not effects.actors and not effects.insertions:
+            return cls(recording, scene_of_bodies(), materials=effects.materials)
+        notes = []
+        poses = recording.poses(range(len(recording)))
+        if poses is None:
+            notes.append(
+                f"The poses of {recording.name} are unknown, so inserted objects move with the "
+                "sensor."
+            )
+        shift = np.zeros(3)
+        if poses is not None and np.abs(poses[0, :3, 3]).max() > _MAX_LOCAL_M:
+            shift = np.floor(poses[0, :3, 3])
+            poses[:, :3, 3] -= shift
+        first_pose = np.eye(4) if poses is None else poses[0]
+        ground = GroundPlane.from_sweep(recording[0]) if effects.insertions else None
+        meshes: list[SceneMesh] = []
+        placed: dict[int, Floats] = {}
+        for number, insertion in enumerate(effects.insertions):
+            assert ground is not None
+            pose = first_pose @ _sensor_pose(insertion, ground, recording.name)
+            placed[number] = pose
+            vertices = insertion.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
+            meshes.append(replace(insertion.mesh, vertices=vertices, animation=None))
+        actors = tuple(_shifted(actor, shift) for actor in effects.actors)
+        names = [mesh.name for mesh in meshes] + [actor.name for actor in actors]
+        for name in names:
+            if names.count(name) > 1:
+                raise LidarError(f"Two inserted objects are named {name!r}. Rename one of them.")
+        types = [
+            insertion.class_name or _type(insertion.mesh.name) for insertion in effects.insertions
+        ]
+        types += [_type(actor.name) for actor in actors]
+        bounds = [_bounds(insertion.mesh) for insertion in effects.insertions]
+        bounds += [_bounds(actor.mesh) for actor in actors]
+        return cls(
+            recording,
+            scene_of_bodies(tuple(meshes), actors),
+            tuple(names),
+            tuple(types),
+            _classes(effects, types, names),
+            effects.materials,
+            poses,
+            np.array(bounds),
+            placed,
+            tuple(notes),
+        )
+
+    @property
+    def has_objects(self) -> bool:
+        """Whether any object is inserted."""
+        return bool(self.names)
+
+    @property
+    def surface_materials(self) -> tuple[Material, ...]:
+        """Materials of all objects, including those without a material of the user."""
+        return (*self.materials, Material("*")) if self.materials else ()
+
+    def motion(self, sweep: Sweep, number: int, times_s: Floats) -> SweepMotion:
+        """Return the motion of the sensor during a sweep.
+
+        `times_s` (f,) are the firing times in seconds after the first point of the sweep.
+        """
+        if not self.has_objects or self.poses is None:
+            return SweepMotion()
+        pose = self.poses[number]
+        single = (pose[:3, 3], np.ascontiguousarray(pose[:3, :3]))
+        path = self._path(number)
+        if path is None or sweep.compensated is None:
+            return SweepMotion(single, stamp_pose=pose)
+        positions, rotations = full_poses(path, 0, 1e9 * (times_s - path.times_s[0]))
+        if not sweep.compensated:
+            return SweepMotion((positions, rotations), stamp_pose=pose)
+        back = np.linalg.inv(pose)
+        origins = positions @ back[:3, :3].T + back[:3, 3]
+        return SweepMotion(single, origins, back[:3, :3] @ rotations, pose)
+
+    def _path(self, number: int) -> Track | None:
+        """Return the trajectory of the sensor around a sweep, or None if it is unknown.
+
+        Time 0 of the trajectory is the timestamp of the previous sweep.
+        """
+        stamps_ns = self.recording.stamps_ns
+        if stamps_ns is None or self.poses is None or len(self.poses) < 2:
+            return None
+        count = len(self.poses)
+        pose = self.poses[number]
+        step_s = 1e-9 * float(np.median(np.diff(stamps_ns)))
+        after, after_s = None, step_s
+        before, before_s = None, step_s
+        if number + 1 < count:
+            after = self.poses[number + 1]
+            after_s = 1e-9 * float(stamps_ns[number + 1] - stamps_ns[number])
+        if number:
+            before = self.poses[number - 1]
+            before_s = 1e-9 * float(stamps_ns[number] - stamps_ns[number - 1])
+        if after is None and before is not None:
+            after, after_s = pose @ np.linalg.inv(before) @ pose, before_s
+        if before is None and after is not None:
+            before, before_s = pose @ np.linalg.inv(after) @ pose, after_s
+        if before is None or after is None or before_s <= 0 or after_s <= 0:
+            return None
+        samples = np.stack([before, pose, after])
+        return Track(
+            np.array([-before_s, 0.0, after_s]),
+            samples[:, :3, 3],
+            quaternions_of(samples[:, :3, :3]),
+            beyond="hold",
+        )
+
+    def label(
+        self, columns: dict[str, AnyArray], added: Ints, numbers: Ints, named_objects: int
+    ) -> None:
+        """Set the classes and objects of added points.
+
+        Points in the air have class 0 and no object.
+
+        Parameters
+        ----------
+        columns
+            Columns of all points, which are changed.
+        added
+            Rows of the added points.
+        numbers
+            (n,): inserted object of each point, or -1.
+        named_objects
+            Number of objects that are named in the recording.
+        """
+        inserted = numbers[added]
+        if "class" in columns:
+            classes = np.array([*self.classes, 0])
+            columns["class"][added] = classes[inserted]
+        if "object" in columns:
+            first = named_objects or _FIRST_OBJECT
+            columns["object"][added] = np.where(inserted >= 0, first + inserted, -1)
+
+    def boxes(
+        self,
+        simulation: PulseAugmenter,
+        pulses: SweepPulses,
+        motion: SweepMotion,
+        returns: PulseReturns,
+        number: int,
+    ) -> tuple[SweepBoxes, Floats]:
+        """Return the bounding boxes of objects in the frame of a sweep, and their visibility.
+
+        Objects that are beyond the range of the sensor have no box.
+        """
+        count = len(self.names)
+        if not count:
+            return _boxes((), (), np.zeros((0, 4, 4)), self.bounds, np.zeros(0, int), 0), np.zeros(
+                0
+            )
+        objects = simulation.objects(returns)
+        rays = np.unique(np.stack([objects, returns.ray]), axis=1)[0]
+        visible = np.bincount(rays[rays >= 0], minlength=count)
+        points = np.bincount(objects[objects >= 0], minlength=count)
+        alone = simulation.pulses_on_objects(pulses, motion.poses, count)
+        back = np.linalg.inv(motion.stamp_pose)
+        start_ns = float(pulses.firing_ns[0]) if len(pulses.firing_ns) else 0.0
+        matrices_4 = np.array([back @ self._pose(k, start_ns) for k in range(count)])
+        in_reach = alone > 0
+        visibility = visible / np.maximum(alone, 1)
+        chosen = np.flatnonzero(in_reach)
+        boxes = _boxes(
+            tuple(self.names[k] for k in chosen),
+            tuple(self.types[k] for k in chosen),
+            matrices_4[chosen],
+            self.bounds[chosen],
+            points[chosen],
+            _FIRST_OBJECT,
+            chosen,
+        )
+        return boxes, np.minimum(visibility[chosen], 1.0)
+
+    def _pose(self, number: int, time_ns: float) -> Floats:
+        """Return the pose of an object in the world frame, of shape (4, 4)."""
+        if number in self.placed:
+            return self.placed[number]
+        actor = self.scene.actors[number - len(self.placed)]
+        positions, rotations = full_poses(actor.trajectory, 0, np.array([time_ns]))
+        pose = np.eye(4)
+        pose[:3, :3] = rotations[0]
+        pose[:3, 3] = positions[0] + self.scene.origin
+        return pose
+
+
+def _boxes(
+    names: tuple[str, ...],
+    types: tuple[str, ...],
+    poses: Floats,
+    bounds: Floats,
+    points: Ints,
+    first: int,
+    numbers: Any = (),
+) -> SweepBoxes:
+    centers = bounds.mean(axis=1)
+    centers = np.einsum("kij,kj->ki", poses[:, :3, :3], centers) + poses[:, :3, 3]
+    quaternions = quaternions_of(poses[:, :3, :3]) if len(poses) else np.zeros((0, 4))
+    return SweepBoxes(
+        names,
+        types,
+        (first + np.asarray(numbers, np.int64)).astype(np.int32),
+        centers,
+        quaternions,
+        bounds[:, 1] - bounds[:, 0],
+        points,
+    )
+
+
+def _sensor_pose(insertion: Insertion, ground: GroundPlane, name: str) -> Floats:
+    """Return the pose of an insertion in the sensor frame of the first sweep, of shape (4, 4)."""
+    heading = np.radians(insertion.heading_deg)
+    pose = np.eye(4)
+    forward = np.array([np.cos(heading), np.sin(heading), 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+    if insertion.z_m is None:
+        z_m, up = ground.at(insertion.x_m, insertion.y_m, insertion.mesh.name, name)
+        z_m -= float(insertion.mesh.vertices[:, 2].min())
+    else:
+        z_m = insertion.z_m
+    left = np.cross(up, forward)
+    left /= np.linalg.norm(left)
+    pose[:3, :3] = np.stack([np.cross(left, up), left, up], axis=1)
+    pose[:3, 3] = insertion.x_m, insertion.y_m, z_m
+    return pose
+
+
+def _shifted(actor: Actor, shift: Floats) -> Actor:
+    if not shift.any():
+        return actor
+    track = actor.trajectory
+    if not isinstance(track, Track):
+        raise LidarError(
+            f"The recording is {np.abs(shift).max():.0f} m from the origin of its world frame, "
+            f"and the actor {actor.name!r} has no track. Set its `trajectory.points`."
+        )
+    return actor.with_trajectory(replace(track, positions=track.positions - shift))
+
+
+def _type(name: str) -> str:
+    """Return the name of an object without a number at its end."""
+    return name.rstrip("0123456789").strip(" _-") or name
+
+
+def _bounds(mesh: SceneMesh) -> Floats:
+    return np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)])
+
+
+def _classes(effects: Effects, types: list[str], names: list[str]) -> tuple[int, ...]:
+    """Return the class number of each object."""
+    numbers = {name: number for number, name in effects.classes.items()}
+    insertion_count = len(effects.insertions)
+    result = []
+    for index, (kind, name) in enumerate(zip(types, names, strict=True)):
+        material = next(
+            (m for m in effects.materials if m.semantic_class is not None and _selects(m, name)),
+            None,
+        )
+        if index < insertion_count and effects.insertions[index].class_name:
+            if numbers and kind not in numbers and not kind.isdigit():
+                hint = did_you_mean(kind, numbers) or f" Known classes: {', '.join(numbers)}."
+                raise LidarError(f"Unknown class {kind!r} of the inserted object {name!r}.{hint}")
+            result.append(numbers.get(kind, int(kind) if kind.isdigit() else 0))
+        elif material is not None:
+            result.append(int(material.semantic_class))
+        else:
+            result.append(0)
+    return tuple(result)
+
+
+def _selects(material: Material, name: str) -> bool:
+    """Return whether a material selects an object by its name."""
+    patterns = (material.objects,) if isinstance(material.objects, str) else material.objects
+    return patterns is None or any(fnmatchcase(name, pattern) for pattern in patterns)

@@ -1,0 +1,404 @@
+"""Pulses of recorded sweeps, including those without a return.
+
+A recording usually contains only returns. In fog, however, a pulse into the sky returns light, too.
+The grid of channels and firings of a spinning sensor is therefore recovered from the azimuths at
+which each ring returns, and cells of the grid without a return are pulses without a return.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from lidarsim.columns.sweep import Sweep
+from lidarsim.numerics.arrays import Bools, Floats, Ints, to_writable
+from lidarsim.numerics.elementary import arctan2, sin_cos
+from lidarsim.numerics.even_samples import even_indices
+
+from ..clouds.recording import Recording
+from ..clouds.rings import Rings
+
+if TYPE_CHECKING:
+    from .grid_loops import ChannelTables, Rotation, SweepReturns
+
+_REFERENCE_SWEEPS = 5  # number of sweeps from which the pattern is determined
+_MIN_STEP_RAD = np.radians(0.02)  # closer returns of a ring belong to the same pulse
+_SAME_PULSE_RAD = 1e-4  # maximum angle between the returns of a pulse
+_MIN_SEVERAL = 0.005  # minimum fraction of returns that are further returns of a pulse
+_MIN_STEPS = 8  # minimum number of steps of a ring from which its step is determined
+_MAX_STEPS = 3  # maximum number of steps in a gap from which the step is determined
+_MAX_OFF_STEP = 0.3  # maximum deviation of such a gap from whole steps
+_MAX_STRIDE = 4  # maximum ratio of the step of a ring to the smallest step
+_MAX_STEP_CHANGE = 0.1  # maximum relative deviation of the step of a sweep
+_PHASE_SAMPLE = 8  # one in this many returns determines the phase of a sweep
+_MIN_RESULTANT = 0.5  # minimum resultant length of azimuths minus the rotation
+_MIN_RINGS = 0.05  # minimum fraction of rings that return in a sector that was recorded
+_LOW_RAD = np.radians(-3)  # rings below this elevation return from the ground
+_SWEEP_S = 0.1  # assumed duration of a sweep without timestamps
+_DIGITS = 9  # decimals of fitted angles, so that rounding errors do not affect results
+_TURN = 2 * np.pi
+
+
+class PulseGrid(NamedTuple):
+    """Pulses of a sweep in a grid of f firings and c channels, and the returns of the pulses.
+
+    Attributes
+    ----------
+    directions
+        (f, c, 3): unit directions in the frame of the sweep.
+    times_s
+        (f,): firing times in seconds relative to the timestamp of the sweep.
+    fired
+        (f, c): whether there is a pulse in the cell.
+    cell
+        (n,): cells of the returns in ascending order, as ``firing * c + channel``.
+    range_m
+        (n,): ranges of the returns in meters.
+    row
+        (n,): rows of the returns in the sweep.
+    """
+
+    directions: Floats
+    times_s: Floats
+    fired: Bools
+    cell: Ints
+    range_m: Floats
+    row: Ints
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelPattern:
+    """Azimuths and elevations at which the channels of a spinning sensor fire.
+
+    Attributes
+    ----------
+    rings
+        Rings of the recording.
+    offset_rad
+        (c,): azimuth of each channel relative to the mean of all channels in the same firing. The
+        first channel is the lowest.
+    stride
+        (c,): number of firings from one pulse of a channel to the next.
+    step_rad
+        Azimuth between firings in radians.
+    clockwise
+        Whether the sensor rotates clockwise.
+    in_view
+        (c, SECTORS): sectors of azimuth from which each channel can receive returns. Others are
+        outside the field of view or blocked by the vehicle.
+    has_several
+        Whether a pulse can have several returns.
+    """
+
+    rings: Rings
+    offset_rad: Floats
+    stride: Ints
+    step_rad: float
+    clockwise: bool
+    in_view: Bools
+    has_several: bool
+
+    @classmethod
+    def from_sweeps(
+        cls, rings: Rings, sweeps: Sequence[Sweep], period_s: float
+    ) -> ChannelPattern | None:
+        """Determine the pattern of several sweeps, or return None if there is none."""
+        from .grid_loops import SECTORS
+
+        count = len(rings)
+        if not count:
+            return None
+        channels = [_channels(rings, sweep) for sweep in sweeps]
+        azimuths = [_azimuths(sweep.points) for sweep in sweeps]
+        found = map(_RingSteps.from_returns, azimuths, channels, [count] * len(sweeps))
+        steps = [step for step in found if step is not None]
+        if not steps:
+            return None
+        step_rad = round(float(np.median([step.smallest_rad for step in steps])), _DIGITS)
+        ring_rad = np.stack([step.ring_rad for step in steps])
+        ring_rad = np.nanmedian(np.where(np.isnan(ring_rad), step_rad, ring_rad), axis=0)
+        stride = np.rint(ring_rad / step_rad).clip(1, _MAX_STRIDE).astype(np.int64)
+        offset_rad, clockwise = _offsets(sweeps, azimuths, channels, count, period_s)
+        in_view = np.zeros((count, SECTORS), np.bool_)
+        for azimuth, channel in zip(azimuths, channels, strict=True):
+            sector = np.floor(azimuth / _TURN * SECTORS).astype(np.int64) % SECTORS
+            in_view[channel[channel >= 0], sector[channel >= 0]] = True
+        # A ring above the horizon may observe nothing but the sky.
+        in_view[rings.elevation_rad[::-1] >= _LOW_RAD] = in_view.any(axis=0)
+        several = sum(step.several for step in steps)
+        return cls(
+            rings,
+            offset_rad,
+            stride,
+            step_rad,
+            clockwise,
+            in_view,
+            several > _MIN_SEVERAL * sum(map(len, sweeps)),
+        )
+
+    def grid(
+        self, sweep: Sweep, points: Floats, rows: Ints, times_s: Floats | None, period_s: float
+    ) -> PulseGrid:
+        """Return the pulses of a sweep.
+
+        Parameters
+        ----------
+        sweep
+            Returns of the sweep.
+        points
+            (n, 3): positions of the returns in meters.
+        rows
+            (n,): rows of the returns in the recorded sweep.
+        times_s
+            (n,): times of the returns relative to the timestamp of the sweep, or None.
+        period_s
+            Duration of a sweep.
+        """
+        from . import grid_loops  # imported here because numba takes half a second to import
+
+        returns = grid_loops.SweepReturns(
+            points, _azimuths(points), _ranges(points), _channels(self.rings, sweep)
+        )
+        rotation = self._rotation(returns)
+        tables = self._tables(returns, rotation)
+        count = len(points)
+        located = grid_loops.GridReturns(*np.empty((3, count), np.int64))
+        extra = grid_loops.locate_returns(returns, tables, rotation, self.has_several, located)
+        firings = rotation.firings + extra
+        turns = np.arange(firings) * rotation.step_rad + rotation.phase_rad
+        sines = np.stack(sin_cos(rotation.sign * turns))
+        directions = np.empty((firings, len(self.rings), 3))
+        fired = np.empty((firings, len(self.rings)), np.bool_)
+        min_rings = max(_MIN_RINGS * len(self.rings), 1)
+        grid_loops.fill_pulses(
+            returns, tables, rotation, min_rings, located, sines, directions, fired
+        )
+        if times_s is None:
+            times = period_s * (np.arange(firings) % rotation.firings) / rotation.firings
+        else:
+            times = _firing_times(located.firing, times_s, firings)
+        order = located.order
+        return PulseGrid(
+            directions, times, fired, located.cell, returns.range_m[order], rows[order]
+        )
+
+    def _rotation(self, returns: SweepReturns) -> Rotation:
+        """Determine the rotation of a sweep, whose rate may differ from the median rate."""
+        from .grid_loops import Rotation
+
+        sign = -1.0 if self.clockwise else 1.0
+        step_rad = _sweep_step(returns.azimuth, returns.channel, self.step_rad)
+        rows = np.flatnonzero(returns.channel[::_PHASE_SAMPLE] >= 0) * _PHASE_SAMPLE
+        turn = sign * (returns.azimuth[rows] - self.offset_rad[returns.channel[rows]])
+        sine, cosine = (values.sum() for values in sin_cos(turn * (_TURN / step_rad)))
+        phase_rad = round(float(np.arctan2(sine, cosine)) * step_rad / _TURN, _DIGITS)
+        return Rotation(sign, step_rad, phase_rad, max(round(_TURN / step_rad), 1))
+
+    def _tables(self, returns: SweepReturns, rotation: Rotation) -> ChannelTables:
+        """Return tables of the channels for compiled loops."""
+        from .grid_loops import ChannelTables
+
+        residue = np.zeros(len(self.stride), np.int64)
+        for ring in np.flatnonzero(self.stride > 1).tolist():
+            azimuth = returns.azimuth[returns.channel == ring] - self.offset_rad[ring]
+            turn = rotation.sign * azimuth - rotation.phase_rad
+            firing = np.rint(turn / rotation.step_rad).astype(np.int64) % rotation.firings
+            if len(firing):
+                residue[ring] = np.bincount(firing % self.stride[ring]).argmax()
+        sine, cosine = sin_cos(self.rings.elevation_rad[::-1])
+        return ChannelTables(sine, cosine, self.offset_rad, self.stride, residue, self.in_view)
+
+
+@dataclass(frozen=True, eq=False)
+class ScanPattern:
+    """Scan pattern of a recording.
+
+    Attributes
+    ----------
+    channels
+        Pattern of a spinning sensor, or None if the rings are unknown. Each return then has its own
+        pulse, and pulses without a return are unknown.
+    max_range_m
+        Maximum range of the returns in meters.
+    period_s
+        Duration of a sweep in seconds.
+    note
+        Sentence for the user if pulses without a return are unknown, otherwise empty.
+    """
+
+    channels: ChannelPattern | None
+    max_range_m: float
+    period_s: float
+    note: str = ""
+
+    @classmethod
+    def from_recording(cls, recording: Recording) -> ScanPattern:
+        """Determine the scan pattern from a few sweeps.
+
+        Raises
+        ------
+        LidarError
+            If the recording cannot be read.
+        """
+        numbers = even_indices(len(recording), _REFERENCE_SWEEPS).tolist()
+        sweeps = [sweep for n in numbers if len(sweep := recording[n].returns())]
+        max_range_m = max((float(_ranges(sweep.points).max()) for sweep in sweeps), default=1.0)
+        period_s = _period_s(recording)
+        pattern = ChannelPattern.from_sweeps(recording.rings, sweeps, period_s) if sweeps else None
+        note = ""
+        if pattern is None:
+            note = (
+                f"The rings of {recording.name} are unknown, so pulses without a return are "
+                "unknown, too. Rain, snow, fog and dust only return light in front of recorded "
+                "points."
+            )
+        return cls(pattern, max_range_m, period_s, note)
+
+    @property
+    def channel_count(self) -> int:
+        """Number of channels, which is 1 if the rings are unknown."""
+        return 1 if self.channels is None else len(self.channels.rings)
+
+    @property
+    def firings(self) -> int:
+        """Number of firings in a revolution, or 1 if the rings are unknown."""
+        return 1 if self.channels is None else round(_TURN / self.channels.step_rad)
+
+    @property
+    def has_several(self) -> bool:
+        """Whether a pulse can have several returns."""
+        return self.channels is not None and self.channels.has_several
+
+    def grid(self, sweep: Sweep) -> PulseGrid:
+        """Return the pulses of a sweep of the recording."""
+        mask = sweep.has_return
+        rows = np.flatnonzero(mask)
+        returns = sweep if len(rows) == len(mask) else sweep.select(rows)
+        points = to_writable(returns.points, np.float64)
+        times_s = returns.times_s
+        if self.channels is not None and len(rows):
+            return self.channels.grid(returns, points, rows, times_s, self.period_s)
+        count = len(rows)
+        if times_s is None:
+            times_s = self.period_s * np.arange(count) / max(count, 1)
+        range_m = _ranges(points)
+        channels = self.channel_count
+        directions = np.repeat((points / range_m[:, None])[:, None, :], channels, axis=1)
+        fired = np.zeros((count, channels), np.bool_)
+        fired[:, 0] = True
+        cell = np.arange(count) * channels
+        return PulseGrid(directions, times_s, fired, cell, range_m, rows)
+
+
+class _RingSteps(NamedTuple):
+    """Azimuth steps of the rings in a sweep."""
+
+    smallest_rad: float  # typical step of the rings with the smallest steps
+    ring_rad: Floats  # (c,): step of each ring; NaN if it is unknown
+    several: int  # number of returns that share their pulse with another return
+
+    @classmethod
+    def from_returns(cls, azimuth: Floats, channel: Ints, count: int) -> _RingSteps | None:
+        """Determine the steps of rings, or return None if no ring has enough returns."""
+        order = np.lexsort((azimuth, channel))
+        gaps = np.diff(azimuth[order])
+        ring = channel[order]
+        same = (np.diff(ring) == 0) & (ring[:-1] >= 0)
+        is_step = same & (gaps > _MIN_STEP_RAD)
+        bounds = np.searchsorted(ring[:-1][is_step], np.arange(count + 1))
+        parts = [gaps[is_step][start:stop] for start, stop in zip(bounds, bounds[1:], strict=False)]
+        ring_rad = np.array(
+            [
+                _refined_step(part, float(np.median(part))) if len(part) >= _MIN_STEPS else np.nan
+                for part in parts
+            ]
+        )
+        if np.isnan(ring_rad).all():
+            return None
+        several = int((same & (gaps < _SAME_PULSE_RAD)).sum())
+        return cls(float(np.nanquantile(ring_rad, 0.2)), ring_rad, several)
+
+
+def _refined_step(gaps: Floats, step_rad: float) -> float:
+    """Refine a step with the gaps that span a few steps."""
+    steps = np.rint(gaps / step_rad)
+    usable = (steps >= 1) & (steps <= _MAX_STEPS)
+    usable &= np.abs(gaps / step_rad - steps) < _MAX_OFF_STEP
+    return float(gaps[usable].sum() / steps[usable].sum()) if usable.any() else step_rad
+
+
+def _sweep_step(azimuth: Floats, channel: Ints, step_rad: float) -> float:
+    """Return the step of one sweep, from the ring with the most returns."""
+    counts = np.bincount(channel[channel >= 0], minlength=1)
+    gaps = np.diff(np.sort(azimuth[channel == counts.argmax()]))
+    gaps = gaps[gaps > _MIN_STEP_RAD]
+    refined = _refined_step(gaps, step_rad) if len(gaps) else step_rad
+    return round(
+        refined if abs(refined / step_rad - 1) < _MAX_STEP_CHANGE else step_rad, _DIGITS
+    )
+
+
+def _channels(rings: Rings, sweep: Sweep) -> Ints:
+    """Return the channel of each return, counted from the lowest ring, or -1."""
+    row = rings.ring_indices(sweep)
+    return np.where(row >= 0, len(rings) - 1 - row, -1)
+
+
+def _offsets(
+    sweeps: Sequence[Sweep],
+    azimuths: Sequence[Floats],
+    channels: Sequence[Ints],
+    count: int,
+    period_s: float,
+) -> tuple[Floats, bool]:
+    """Return the azimuth offsets of channels in radians, and whether the sensor turns clockwise.
+
+    They are determined from point times. Without times, offsets are 0.
+    """
+    sums = np.zeros((2, count), complex)  # for counterclockwise and clockwise rotation
+    for sweep, azimuth, channel in zip(sweeps, azimuths, channels, strict=True):
+        if sweep.times_s is None:
+            return np.zeros(count), False
+        known = channel >= 0
+        turn = _TURN * sweep.times_s[known] / period_s
+        for index, sign in enumerate((1, -1)):
+            phases = np.exp(1j * (azimuth[known] - sign * turn))
+            start = phases.sum()
+            phases *= np.conj(start) / max(abs(start), 1e-300)
+            sums[index] += np.bincount(channel[known], phases.real, count)
+            sums[index] += 1j * np.bincount(channel[known], phases.imag, count)
+    lengths = np.abs(sums).sum(axis=1)
+    if lengths.max() < _MIN_RESULTANT * sum(map(len, sweeps)):
+        return np.zeros(count), False
+    clockwise = bool(lengths[1] > lengths[0])
+    return np.round(np.angle(sums[int(clockwise)]), _DIGITS), clockwise
+
+
+def _period_s(recording: Recording) -> float:
+    """Return the duration of a revolution in seconds."""
+    stamps_ns = recording.stamps_ns
+    if stamps_ns is not None and len(stamps_ns) > 1:
+        period_s = 1e-9 * float(np.median(np.diff(stamps_ns)))
+        if 0.01 <= period_s <= 2:
+            return period_s
+    return _SWEEP_S
+
+
+def _firing_times(firing: Ints, times_s: Floats, firings: int) -> Floats:
+    """Return the mean time of the returns of each firing, interpolated for firings without one."""
+    counts = np.bincount(firing, minlength=firings)
+    sums = np.bincount(firing, times_s, minlength=firings)
+    known = np.flatnonzero(counts)
+    return np.interp(np.arange(firings), known, sums[known] / counts[known])
+
+
+def _azimuths(points: Floats) -> Floats:
+    return arctan2(points[:, 1], points[:, 0])
+
+
+def _ranges(points: Floats) -> Floats:
+    x, y, z = np.asarray(points, np.float64).T
+    return np.asarray(np.sqrt(x * x + y * y + z * z))
