@@ -26,12 +26,19 @@ class ByteScale(NamedTuple):
 
         Reflectances above the end of the scale have the code 255. Both arrays have shape (n,).
         """
+        return np.rint(self.unrounded_codes(reflectance)).astype(np.uint8)
+
+    def unrounded_codes(self, reflectance: Floats) -> Floats:
+        """Return the codes of reflectances before they are rounded, from 0 to 255.
+
+        Both arrays have shape (n,).
+        """
         fraction = reflectance / self.reflectance
         code = self.code * np.minimum(fraction, 1) + log(np.maximum(fraction, 1)) / self._step
-        return np.rint(np.minimum(code, 255)).astype(np.uint8)
+        return np.minimum(code, 255)
 
-    def decode(self, codes: Bytes) -> Floats:
-        """Decode bytes to reflectances. This inverts `encode` except for rounding.
+    def decode(self, codes: Bytes | Floats) -> Floats:
+        """Decode codes to reflectances. This inverts `unrounded_codes`.
 
         Both arrays have shape (n,).
         """

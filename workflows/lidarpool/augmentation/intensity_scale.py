@@ -1,0 +1,621 @@
+"""Convert recorded intensities to received energies, and energies to recorded intensities.
+
+The energy of a return is on the scale of the simulator: a white surface at normal incidence and a
+distance of 10 m returns an energy of 1. Sensors record intensities on different scales. Many
+compensate them for the range, so that a white surface has the same intensity at all distances.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from lidarsim.columns.column_names import STRENGTHS
+from lidarsim.errors import LidarError
+from lidarsim.numerics.arrays import AnyArray, AnyFloats, Floats
+from lidarsim.schema.checks import check_number
+from lidarsim.sensor.noise import TARGET_REFLECTANCE
+from lidarsim.sensor.reflectivity import COUNTS, SCALES, ByteScale
+from lidarsim.sensor.sensor import Sensor
+from lidarsim.words import format_rounded
+
+from ..clouds.recording import Recording
+from .intensity_fit import (
+    NearFactors,
+    Quantization,
+    RecordedReturns,
+    is_compensated,
+    is_valid,
+    range_factors,
+    range_of_energy,
+    typical_level,
+    weakest_energy,
+    white_level,
+)
+
+# Typical values of the reflectance multiplied by the cosine of the angle of incidence. An assumed
+# scale must result in a median between these limits.
+_PLAUSIBLE = (0.03, 0.6)
+_ZERO_STEPS = 0.25  # value that represents a recorded 0, in steps
+_TYPICAL_REFLECTANCE = 0.2  # reflectance times cosine of the incidence, if it cannot be estimated
+_RESOLVED_STEPS = 3  # smallest value, in steps, that is used to estimate the detection threshold
+# Ranges and codes for which reflectivities are compared with energies, and the maximum deviation of
+# the ratio. Simulations produce constant ratios, except for rounding.
+_COMPARED_RANGES_M = (3.0, 60.0)
+_COMPARED_CODES = (20, 100)
+_MAX_RATIO_SPREAD = 1.1
+_MAX_RATIO_ERROR = 0.01
+_NO_DROP = NearFactors()
+_SENSOR_ADVICE = "Pass `--model` to use the scale of a sensor."
+
+
+@dataclass(frozen=True)
+class IntensityScale:
+    """Relationship between recorded intensities and received energies.
+
+    Both conversions are inverse to each other, except for the quantization and the limits of the
+    recorded values.
+
+    Attributes
+    ----------
+    column
+        Standard name of the column that contains the intensities. It is empty if there is no such
+        column and all returns are assumed to have the same reflectance.
+    dtype
+        Type of the recorded values.
+    quantization
+        Steps and largest value of the recorded values.
+    white
+        Recorded value of a white surface at normal incidence. If intensities are energies, this
+        value applies to a range of 10 m.
+    compensated
+        Whether intensities are compensated for the range. Otherwise, they are energies.
+    codes
+        Scale of the manufacturer if values are 8-bit codes or proportional to them. It is
+        logarithmic for retroreflectors. None if energies are proportional to the values.
+    codes_per_unit
+        Number of codes per recorded unit, which is 255 if values range from 0 to 1.
+    near
+        Share of the energy that is recorded at close range.
+    typical
+        Median of the reflectance multiplied by the cosine of the angle of incidence.
+    zero_value
+        Value that represents a recorded 0, which is a weak return that was rounded down.
+    is_known
+        Whether the scale is known, rather than assumed or fitted.
+    note
+        Sentences about assumed or fitted values, for the user. Empty if the scale is known.
+
+    Notes
+    -----
+    Intensities that are negative, infinite or NaN are invalid. A return with an invalid intensity
+    was detected, but its energy is unknown. It is assumed to come from a typical surface at normal
+    incidence, and `scale_intensities` does not change its recorded value.
+
+    If energies are clipped at the largest value, a saturated return has at least the energy of a
+    typical surface at its range.
+    """
+
+    column: str
+    dtype: np.dtype[Any]
+    quantization: Quantization
+    white: float
+    compensated: bool
+    codes: ByteScale | None = None
+    codes_per_unit: float = 1.0
+    near: NearFactors = _NO_DROP
+    typical: float = _TYPICAL_REFLECTANCE
+    zero_value: float = 0.0
+    is_known: bool = True
+    note: str = ""
+
+    @classmethod
+    def for_recording(
+        cls,
+        recording: Recording,
+        model: Sensor | None = None,
+        assumed_reflectance: float | None = None,
+    ) -> Self:
+        """Determine the intensity scale of a recording from at most five sweeps.
+
+        The scale is known for results, for packet captures, and for 8-bit codes if the sensor model
+        is given. Otherwise it is assumed that the scale is a common one if surfaces then have
+        plausible reflectances. If no common scale is plausible, the intensity of a white surface is
+        estimated from the brightest surfaces.
+
+        Parameters
+        ----------
+        recording
+            The recording.
+        model
+            Sensor model of the recording, or None if it is unknown.
+        assumed_reflectance
+            Reflectance that all returns are assumed to have. Recorded intensities are then ignored,
+            and no intensities are written.
+
+        Raises
+        ------
+        LidarError
+            If the recording has no intensities, or if they are all equal.
+
+        Examples
+        --------
+        >>> scale = IntensityScale.for_recording(open_recording("drive.mcap"))  # doctest: +SKIP
+        >>> scale.energies(np.array([100.0]), np.array([20.0]))  # doctest: +SKIP
+        array([0.25])
+        """
+        if assumed_reflectance is not None:
+            return cls.with_reflectance(assumed_reflectance)
+        returns = RecordedReturns.from_recording(recording)
+        return cls.from_returns(recording, returns, model)
+
+    @classmethod
+    def with_reflectance(cls, reflectance: float) -> Self:
+        """Create the scale of a recording without intensities.
+
+        Raises LidarError if the reflectance is not greater than 0 or exceeds 1.
+        """
+        check_number("assumed_reflectance", reflectance, gt=0, le=1)
+        return cls(
+            column="",
+            dtype=np.dtype(np.float32),
+            quantization=Quantization(0, np.inf),
+            white=1.0,
+            compensated=True,
+            typical=reflectance,
+            is_known=False,
+            note=f"All returns are assumed to have a reflectance of {reflectance:g}.",
+        )
+
+    @classmethod
+    def from_returns(
+        cls, recording: Recording, returns: RecordedReturns, model: Sensor | None
+    ) -> Self:
+        """Determine the scale of a recording, some of whose returns have already been read.
+
+        Raises LidarError in the same cases as `for_recording`.
+        """
+        column = _primary_column(recording, returns, model)
+        recorded = returns.columns[column]
+        valid = is_valid(recorded)
+        if not valid.any() or (recorded[valid] == recorded[valid][0]).all():
+            raise LidarError(_missing_text(recording, column, recorded[valid]))
+        fit = _Fit(recording, column, returns.select(valid), model)
+        scale = fit.scale()
+        return cls(**scale.__dict__)
+
+    def energies(self, intensity: AnyArray | None, range_m: AnyFloats) -> Floats:
+        """Convert recorded intensities to received energies.
+
+        Parameters
+        ----------
+        intensity
+            Recorded values, or None if there are none. Shape (n,).
+        range_m
+            Ranges in meters. Shape (n,).
+
+        Returns
+        -------
+        array
+            Energies. Shape (n,).
+        """
+        typical = self.typical * range_factors(range_m)
+        if intensity is None or not self.column:
+            return typical
+        intensity = np.asarray(intensity)
+        valid = is_valid(intensity)
+        values = np.where(valid, intensity, 0).astype(np.float64)
+        energies = self._reflectances(values) * self._factors(range_m)
+        if not self.compensated and np.isfinite(self.quantization.max_value):
+            saturated = values >= self.quantization.max_value
+            energies[saturated] = np.maximum(energies[saturated], typical[saturated])
+        energies[~valid] = typical[~valid]
+        return energies
+
+    def intensities(self, energy: AnyFloats, range_m: AnyFloats) -> AnyArray:
+        """Convert received energies to the values that the sensor would record.
+
+        Parameters
+        ----------
+        energy
+            Received energies. Shape (n,).
+        range_m
+            Ranges in meters. Shape (n,).
+
+        Returns
+        -------
+        array
+            Values on the scale of the recording, which are quantized, clipped, and have the dtype
+            of the recording. Energies that are not positive have the value 0. Shape (n,).
+        """
+        energy = np.asarray(energy, np.float64)
+        positive = np.where(energy > 0, energy, 0.0)
+        values = self._values(positive / self._factors(range_m))
+        steps, max_value = self.quantization
+        if self.zero_value:
+            values[values <= self.zero_value * (1 + 1e-9)] = 0
+        if steps:
+            values = np.rint(values * steps) / steps
+        values = np.minimum(values, max_value)
+        if self.dtype.kind in "iu":
+            values = np.minimum(values, np.iinfo(self.dtype).max)
+        return values.astype(self.dtype)
+
+    def scale_intensities(
+        self,
+        intensity: AnyArray,
+        old_energy: AnyFloats,
+        new_energy: AnyFloats,
+        old_range_m: AnyFloats,
+        new_range_m: AnyFloats,
+    ) -> AnyArray:
+        """Return new recorded values for returns whose energy or range has changed.
+
+        The energy of a recorded value is multiplied by the ratio of the new to the old energy. If
+        neither the energy nor the range has changed, the recorded value is returned exactly.
+        Invalid values are not changed.
+
+        Parameters
+        ----------
+        intensity
+            Recorded values. Shape (n,).
+        old_energy, new_energy
+            Energies before and after the change. Shape (n,).
+        old_range_m, new_range_m
+            Ranges in meters before and after the change. Shape (n,).
+
+        Returns
+        -------
+        array
+            Values on the scale of the recording, as from `intensities`. Shape (n,).
+        """
+        intensity = np.asarray(intensity)
+        old_energy = np.asarray(old_energy, np.float64)
+        new_energy = np.asarray(new_energy, np.float64)
+        changed = (old_energy != new_energy) | (np.asarray(old_range_m) != np.asarray(new_range_m))
+        rows = np.flatnonzero(changed & is_valid(intensity))
+        recorded = self.energies(intensity[rows], np.asarray(old_range_m)[rows])
+        old = old_energy[rows]
+        new = new_energy[rows]
+        known = old > 0
+        scaled = np.where(known, recorded * (new / np.where(known, old, 1.0)), new)
+        result = intensity.astype(self.dtype)
+        result[rows] = self.intensities(scaled, np.asarray(new_range_m)[rows])
+        return result
+
+    def step_energies(self, range_m: AnyFloats) -> Floats:
+        """Return the smallest energies that the recorded values resolve reliably.
+
+        Both arrays have shape (n,).
+        """
+        steps = self.quantization.steps_per_unit
+        if not steps or not self.column:
+            return np.zeros(len(range_m))
+        # Without compensation, returns close to the threshold have values of a few steps.
+        resolved = (_RESOLVED_STEPS if self.compensated else 0.5) / steps
+        return self._reflectances(np.full(len(range_m), resolved)) * self._factors(range_m)
+
+    def _factors(self, range_m: AnyFloats) -> Floats:
+        """Return the energy of a return divided by the result of `_reflectances`."""
+        range_m = np.asarray(range_m, np.float64)
+        factors = range_factors(range_m) if self.compensated else np.ones(len(range_m))
+        return factors / self.near.at(range_m)
+
+    def _reflectances(self, values: Floats) -> Floats:
+        """Convert recorded values to reflectances, or to energies without compensation."""
+        values = np.minimum(values, self.quantization.max_value)
+        values = np.where(values > 0, values, self.zero_value)
+        if self.codes is None:
+            return values / self.white
+        return self.codes.decode(values * self.codes_per_unit)
+
+    def _values(self, reflectances: Floats) -> Floats:
+        """Convert reflectances to recorded values. This inverts `_reflectances`."""
+        if self.codes is None:
+            return reflectances * self.white
+        return self.codes.unrounded_codes(reflectances) / self.codes_per_unit
+
+
+def _primary_column(recording: Recording, returns: RecordedReturns, model: Sensor | None) -> str:
+    """Return the column that defines the energies.
+
+    A calibrated reflectivity is preferred, unless the intensities of the recording are known to be
+    energies or the user chose a column.
+    """
+    columns = returns.columns
+    available = [name for name in STRENGTHS if name in columns]
+    if not available:
+        raise LidarError(_missing_text(recording, "", None))
+    intensity, reflectivity = STRENGTHS
+    if available != [intensity, reflectivity] or recording.intensity_column is not None:
+        return available[0]
+    if recording.energies or recording.white is not None or _has_simulated_energies(returns):
+        return intensity
+    is_calibrated = model is not None or _is_ouster(columns)
+    return reflectivity if is_calibrated and _are_bytes(columns[reflectivity]) else intensity
+
+
+def _are_bytes(values: AnyArray) -> bool:
+    valid = values[is_valid(values)]
+    return bool(len(valid)) and Quantization.from_values(valid).is_byte
+
+
+def _is_ouster(columns: dict[str, AnyArray]) -> bool:
+    """Return whether the columns are those of an Ouster sensor."""
+    return "reflectivity" in columns and bool({"ambient", "near_ir", "signal"} & {*columns})
+
+
+def _is_livox(columns: dict[str, AnyArray]) -> bool:
+    """Return whether the columns are those of a Livox sensor."""
+    return "tag" in columns
+
+
+def _has_simulated_energies(returns: RecordedReturns) -> bool:
+    """Return whether intensities are energies that were computed by lidarpool.
+
+    In this case, the ratio of the reflectivity to the energy is that of a known scale.
+    """
+    columns = returns.columns
+    if not {*STRENGTHS} <= {*columns}:
+        return False
+    intensity, reflectivity = (np.asarray(columns[name], np.float64) for name in STRENGTHS)
+    lower, upper = _COMPARED_RANGES_M
+    low_code, high_code = _COMPARED_CODES
+    used = (returns.range_m > lower) & (returns.range_m < upper) & (intensity > 0)
+    used &= (reflectivity >= low_code) & (reflectivity <= high_code)
+    if used.sum() < 100:
+        return False
+    ratios = reflectivity[used] * range_factors(returns.range_m[used]) / intensity[used]
+    low, median, high = np.quantile(ratios, (0.1, 0.5, 0.9))
+    expected = [scale.code / scale.reflectance for scale in SCALES.values()]
+    return bool(
+        high < _MAX_RATIO_SPREAD * low
+        and min(abs(median / code - 1) for code in expected) < _MAX_RATIO_ERROR
+    )
+
+
+def _missing_text(recording: Recording, column: str, values: AnyArray | None) -> str:
+    """Return the error message for a recording without usable intensities."""
+    if values is None:
+        problem = f"{recording.name} has no intensity column"
+    elif not len(values):
+        problem = f"The column {column!r} of {recording.name} has no valid intensities"
+    else:
+        problem = f"All intensities of {recording.name} are {values[0]:g}"
+    return (
+        f"{problem}, so the energies of its returns are unknown. Pass `--intensity COLUMN` to use "
+        "another column, or `--reflectance 0.3` to assume the same reflectance for all returns."
+    )
+
+
+class _Convention(NamedTuple):
+    """A common intensity scale, and how it is described to the user."""
+
+    white: float
+    text: str
+    codes: ByteScale | None = None
+    codes_per_unit: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Returns with valid intensities, from which a scale is determined."""
+
+    recording: Recording
+    column: str
+    returns: RecordedReturns
+    model: Sensor | None
+
+    def scale(self) -> IntensityScale:
+        """Return the known, assumed or fitted scale."""
+        recorded = self.returns.columns[self.column]
+        quantization = Quantization.from_values(recorded)
+        values = recorded.astype(np.float64)
+        smallest = float(values[values > 0].min())
+        steps = quantization.steps_per_unit
+        common = IntensityScale(
+            column=self.column,
+            dtype=recorded.dtype,
+            quantization=quantization,
+            white=1.0,
+            compensated=True,
+            zero_value=_ZERO_STEPS / steps if steps else smallest / 2,
+        )
+        scale = self._known(common, values)
+        if scale is None:
+            scale = self._assumed(common, values)
+        levels = _levels(scale, values, self.returns.range_m)
+        typical = typical_level(levels, self.returns.range_m)
+        return replace(scale, typical=min(max(typical, 0.01), 1.0))
+
+    def _known(self, common: IntensityScale, values: Floats) -> IntensityScale | None:
+        """Return the scale if it is known, otherwise None."""
+        recording = self.recording
+        quantization = common.quantization
+        is_energy = recording.energies or _has_simulated_energies(self.returns)
+        if is_energy and self.column == "intensity":
+            # The energies of a result are not limited, even if several returns are equal.
+            limits = quantization._replace(max_value=np.inf)
+            return replace(common, compensated=False, quantization=limits)
+        maker = "velodyne" if self.model is None else self.model.optics.reflectivity
+        codes = SCALES[maker]
+        if recording.white is not None:
+            if quantization.is_byte and codes.code / codes.reflectance == recording.white:
+                return _with_codes(common, codes, 1.0)
+            return replace(common, white=recording.white)
+        if self.model is None or self._law(values, quantization) is False:
+            return None
+        if quantization.is_byte:
+            return _with_codes(common, codes, quantization.steps_per_unit)
+        if quantization.is_unit_byte:
+            return _with_codes(common, codes, 255.0)
+        return None
+
+    def _law(self, values: Floats, quantization: Quantization) -> bool | None:
+        return is_compensated(values, self.returns, quantization.max_value)
+
+    def _assumed(self, common: IntensityScale, values: Floats) -> IntensityScale:
+        """Return a common scale if it is plausible, otherwise a fitted scale."""
+        law = self._law(values, common.quantization)
+        compensated = True if law is None else law
+        scale = replace(common, compensated=compensated, is_known=False)
+        range_m = self.returns.range_m
+        lowest, highest = _PLAUSIBLE
+        for convention in self._conventions(scale.quantization, compensated):
+            assumed = replace(
+                scale,
+                white=convention.white,
+                codes=convention.codes,
+                codes_per_unit=convention.codes_per_unit,
+            )
+            levels = _levels(assumed, values, range_m)
+            if lowest <= typical_level(levels, range_m) <= highest:
+                return self._with_near(assumed, values, convention.text)
+        levels = _levels(scale, values, range_m)
+        white = white_level(levels, range_m)
+        at_reference = "" if compensated else " at 10 m"
+        text = (
+            f"A white surface{at_reference} was assumed to have the intensity "
+            f"{format_rounded(white)}, the 99th percentile."
+        )
+        return self._with_near(replace(scale, white=white), values, text)
+
+    def _with_near(self, scale: IntensityScale, values: Floats, text: str) -> IntensityScale:
+        """Add factors at close range and a note to an assumed scale."""
+        range_m = self.returns.range_m
+        unsaturated = values < scale.quantization.max_value
+        levels = _levels(scale, values[unsaturated], range_m[unsaturated])
+        near = NearFactors.from_returns(levels, self.returns.select(unsaturated))
+        sentences = [f"The intensity scale of {self.recording.name} is unknown.", text]
+        if near.range_m:
+            sentences.append(
+                f"Intensities decrease at ranges below {near.range_m[-1]:g} m, which was "
+                "attributed to the optics."
+            )
+        if self.model is None:
+            sentences.append(_SENSOR_ADVICE)
+        else:
+            sentences.append(
+                f"The scale of {self.model.model} was not used, because the intensities are not "
+                "8-bit codes that are compensated for the range."
+            )
+        return replace(scale, near=near, note=" ".join(sentences))
+
+    def _conventions(self, quantization: Quantization, compensated: bool) -> list[_Convention]:
+        """Return common scales that are consistent with the recorded values."""
+        if not compensated:
+            return _energy_conventions(quantization)
+        if quantization.is_byte or quantization.is_unit_byte:
+            is_byte = quantization.is_byte
+            codes_per_unit = quantization.steps_per_unit if is_byte else 255.0
+            name, codes = self._maker()
+            white = codes.code / codes.reflectance / codes_per_unit
+            text = (
+                f"A white surface was assumed to have the intensity {format_rounded(white)}, as "
+                f"on the scale of {name}."
+            )
+            return [_Convention(white, text, codes, codes_per_unit)]
+        if quantization.steps_per_unit == 0:
+            return [_Convention(1.0, "Its intensities were assumed to be reflectances.")]
+        return []
+
+    def _maker(self) -> tuple[str, ByteScale]:
+        """Return the manufacturer that the columns indicate, and its scale."""
+        columns = self.returns.columns
+        if _is_livox(columns):
+            return "Livox", SCALES["livox"]
+        if self.column == "reflectivity" and _is_ouster(columns):
+            return "Ouster", SCALES["ouster"]
+        return "Velodyne, Ouster and RoboSense", SCALES["velodyne"]
+
+
+def _energy_conventions(quantization: Quantization) -> list[_Convention]:
+    """Return common scales of energies that are consistent with the recorded values."""
+    if quantization.steps_per_unit and not quantization.is_byte:
+        text = f"A white surface at 10 m was assumed to have the intensity {COUNTS:,}."
+        return [_Convention(float(COUNTS), text)]
+    whites = [255.0] if quantization.max_value == 255 else [1.0, 255.0]
+    text = "A white surface at 10 m was assumed to have the intensity {:g}, as in simulations."
+    return [_Convention(white, text.format(white)) for white in whites]
+
+
+def _with_codes(scale: IntensityScale, codes: ByteScale, codes_per_unit: float) -> IntensityScale:
+    white = codes.code / codes.reflectance / codes_per_unit
+    return replace(scale, codes=codes, codes_per_unit=codes_per_unit, white=white)
+
+
+def _levels(scale: IntensityScale, values: Floats, range_m: Floats) -> Floats:
+    """Return the reflectances of surfaces multiplied by the cosine of the angle of incidence."""
+    reflectances = scale._reflectances(values)
+    return reflectances if scale.compensated else reflectances / range_factors(range_m)
+
+
+@dataclass(frozen=True)
+class DetectionThreshold:
+    """Energy at which half of the returns are detected.
+
+    Attributes
+    ----------
+    energy
+        Threshold on the scale of the simulator. It is 0 if all returns are detected.
+    range_m
+        Range in meters at which half of the pulses are detected on a perpendicular surface with
+        10 % reflectance.
+    is_known
+        Whether the threshold is from the data sheet of the sensor.
+    note
+        Sentence for the user.
+    """
+
+    energy: float
+    range_m: float
+    is_known: bool
+    note: str
+
+
+def detection_threshold(
+    scale: IntensityScale,
+    intensity: AnyArray | None,
+    range_m: Floats,
+    model: Sensor | None = None,
+) -> DetectionThreshold:
+    """Determine the detection threshold of the sensor of a recording.
+
+    The threshold is that of the sensor model, if the model was loaded with
+    ``performance="datasheet"``. Otherwise it is estimated from the weakest returns.
+
+    Parameters
+    ----------
+    scale
+        Intensity scale of the recording.
+    intensity
+        Recorded intensities of some sweeps, or None if there are none. Shape (n,).
+    range_m
+        Ranges in meters. Shape (n,).
+    model
+        Sensor model of the recording, or None if it is unknown.
+
+    Notes
+    -----
+    The estimate is too high if no surface in the recording is so dark or so distant that its
+    returns are lost.
+    """
+    if model is not None and model.noise is not None and model.noise.threshold > 0:
+        energy = model.noise.threshold
+        source = "from the data sheet"
+    elif len(range_m):
+        energies = scale.energies(intensity, range_m)
+        energy = weakest_energy(energies, range_m, scale.step_energies(range_m))
+        source = "estimated from the weakest returns"
+    else:
+        return DetectionThreshold(0.0, np.inf, False, "There are no returns, so none are lost.")
+    distance = range_of_energy(energy, TARGET_REFLECTANCE)
+    return DetectionThreshold(
+        energy,
+        distance,
+        source == "from the data sheet",
+        f"Half of the returns from a surface with 10 % reflectance are detected at "
+        f"{format_rounded(distance)} m ({source}).",
+    )
