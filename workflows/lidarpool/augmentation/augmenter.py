@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from lidarsim.columns.column_names import TIMES
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
-from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints
+from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints, Ints32
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.sensor import Noise, Returns, Sensor
 from lidarsim.simulator.recorded_sweeps import PulseAugmenter, RecordedSensor, SweepPulses
@@ -21,7 +21,7 @@ from lidarsim.simulator.steps.step import RecordedPulses
 from ..clouds.recording import Recording
 from .augmented_sweep import AugmentedSweep
 from .effects import Effects
-from .inserted_objects import InsertedObjects, SweepMotion
+from .inserted_objects import InsertedObjects
 from .intensity_scale import DetectionThreshold, IntensityScale, detection_threshold
 from .scan_pattern import PulseGrid, ScanPattern
 
@@ -75,7 +75,7 @@ class Augmenter:
                 )
         self.recording = recording
         self.effects = effects
-        self.pattern = ScanPattern.from_recording(recording)
+        self.pattern = ScanPattern.from_recording(recording, model)
         self.scale = IntensityScale.for_recording(recording, model, reflectance)
         self.model = model
         self._notes: list[str] = [self.pattern.note, self.scale.note]
@@ -106,8 +106,8 @@ class Augmenter:
             )
             if effects.weather.particles:
                 self._notes.append(
-                    f"The beam divergence of the sensor is unknown. A divergence of "
-                    f"{_DIVERGENCE_MRAD:g} mrad was assumed. Pass `--model` to use that of a sensor."
+                    "The beam divergence of the sensor is unknown and was assumed to be "
+                    f"{_DIVERGENCE_MRAD:g} mrad. Pass `--model` to use that of a sensor."
                 )
         recorded = RecordedSensor.create(
             pattern.channel_count, pattern.firings, sensor, pattern.max_range_m
@@ -206,22 +206,27 @@ class Augmenter:
         `number` selects the random numbers, the time of the sweep and the poses of actors.
         """
         grid = self.pattern.grid(sweep)
+        if not len(grid.row):
+            return self._without_returns(sweep)
         motion = self.objects.motion(sweep, number, grid.times_s - self._first_s)
-        rays = _Rays.from_grid(grid, motion)
+        if motion.origins is not None:
+            channels = grid.directions.shape[1]
+            origins = np.repeat(motion.origins[:, None], channels, axis=1)
+            grid = grid.with_origins(origins, motion.rotations)
         intensity = self._intensity(sweep)
         recorded = None if intensity is None else intensity[grid.row]
         # What was detected had at least the energy of the threshold.
-        energy = np.maximum(self.scale.energies(recorded, rays.range_m), self._simulation.threshold)
+        energy = np.maximum(self.scale.energies(recorded, grid.range_m), self._simulation.threshold)
         firing_ns = self._start_ns(number) + 1e9 * (grid.times_s - self._first_s)
         pulses = SweepPulses(
-            rays.directions,
+            grid.directions,
             firing_ns,
-            RecordedPulses(grid.cell, rays.range_m, energy, grid.fired.reshape(-1)),
-            rays.origins,
+            RecordedPulses(grid.cell, grid.range_m, energy, grid.fired.reshape(-1)),
+            grid.origins,
         )
         returns = self._simulation.apply(number, pulses, motion.poses)
-        points = _AugmentedPoints.from_returns(sweep, grid, rays, returns)
-        columns = self._columns(sweep, points, grid, rays, pulses.recorded, returns)
+        points = _AugmentedPoints.from_returns(sweep, grid, returns)
+        columns = self._columns(sweep, points, grid, pulses.recorded, returns)
         augmented = Sweep(
             points.positions,
             columns,
@@ -242,7 +247,7 @@ class Augmenter:
         self,
         sweep: Sweep,
         points: _AugmentedPoints,
-        rays: _Rays,
+        grid: PulseGrid,
         recorded: RecordedPulses,
         returns: PulseReturns,
     ) -> AnyArray:
@@ -258,7 +263,7 @@ class Augmenter:
         source = points.source[kept]
         unchanged = np.abs(energy[kept] - recorded.energy[source]) < _ROUNDING * energy[kept]
         energy[kept] = np.where(unchanged, recorded.energy[source], energy[kept])
-        old_m = rays.range_m[source]
+        old_m = grid.range_m[source]
         new_m = np.where(points.is_moved[kept], points.range_m[kept], old_m)
         values[kept] = self.scale.scale_intensities(
             values[kept],
@@ -268,6 +273,13 @@ class Augmenter:
             new_m,
         )
         return values
+
+    def _without_returns(self, sweep: Sweep) -> AugmentedSweep:
+        """Return a sweep that has no returns, whose pulses are therefore unknown."""
+        empty = sweep.returns()
+        columns = {**empty.columns, "cause": np.zeros(0, np.uint8)}
+        empty = empty.replace(columns=columns)
+        return AugmentedSweep(empty, np.zeros(0, np.int64), np.zeros(0, np.bool_))
 
     def _start_ns(self, number: int) -> float:
         """Return the timestamp of a sweep in nanoseconds since the first sweep."""
@@ -287,14 +299,13 @@ class Augmenter:
         sweep: Sweep,
         points: _AugmentedPoints,
         grid: PulseGrid,
-        rays: _Rays,
         recorded: RecordedPulses,
         returns: PulseReturns,
     ) -> dict[str, AnyArray]:
         """Return the columns of the augmented points."""
         columns = {name: np.asarray(v)[points.template] for name, v in sweep.columns.items()}
         if self.scale.column:
-            columns[self.scale.column] = self._intensities(sweep, points, rays, recorded, returns)
+            columns[self.scale.column] = self._intensities(sweep, points, grid, recorded, returns)
         added = np.flatnonzero(~points.is_recorded)
         ranges = np.linalg.norm(np.asarray(sweep.points, np.float64), axis=1)
         for name in columns.keys() & {*_RANGES}:
@@ -326,39 +337,6 @@ class Augmenter:
         return columns
 
 
-class _Rays(NamedTuple):
-    """Pulses as rays from the sensor at the time of each firing.
-
-    Attributes
-    ----------
-    directions
-        (f, c, 3): unit directions.
-    origins
-        (f, c, 3): origins in meters, or None if all pulses start at the origin of the frame.
-    range_m
-        (n,): ranges of the returns.
-    """
-
-    directions: Floats
-    origins: Floats | None
-    range_m: Floats
-
-    @classmethod
-    def from_grid(cls, grid: PulseGrid, motion: SweepMotion) -> _Rays:
-        """Compute the rays of a sweep, which start along the path of the sensor if it is known."""
-        if motion.origins is None or motion.rotations is None:
-            return cls(grid.directions, None, grid.range_m)
-        channels = grid.directions.shape[1]
-        directions = np.einsum("fij,fcj->fci", motion.rotations, grid.directions)
-        flat = directions.reshape(-1, 3)
-        ends = grid.directions.reshape(-1, 3)[grid.cell] * grid.range_m[:, None]
-        path = ends - motion.origins[grid.cell // channels]
-        range_m = np.linalg.norm(path, axis=1)
-        flat[grid.cell] = path / range_m[:, None]
-        origins = np.repeat(motion.origins[:, None], channels, axis=1)
-        return cls(directions, origins, range_m)
-
-
 @dataclass(frozen=True, eq=False)
 class _AugmentedPoints:
     """Points of an augmented sweep, sorted by template.
@@ -370,55 +348,46 @@ class _AugmentedPoints:
     positions: Floats  # (n, 3): meters
     range_m: Floats
     template: Ints
-    is_recorded: Bools
     is_moved: Bools  # whether a point is new or has another range
-    source: Ints  # row among the recorded returns, or -1
+    source: Ints32  # row among the recorded returns, or -1
     firing: Ints
     template_firing: Ints
 
     @classmethod
-    def from_returns(
-        cls, sweep: Sweep, grid: PulseGrid, rays: _Rays, returns: PulseReturns
-    ) -> _AugmentedPoints:
+    def from_returns(cls, sweep: Sweep, grid: PulseGrid, returns: PulseReturns) -> _AugmentedPoints:
         """Compute the points of reported returns."""
         channels = grid.directions.shape[1]
-        ray = returns.ray.astype(np.int64)
         assert returns.reported is not None
-        range_m = returns.reported
-        source = (
-            np.full(len(ray), -1) if returns.source is None else returns.source.astype(np.int64)
-        )
-        is_recorded = source >= 0
-        nearest = source.copy()
-        added = np.flatnonzero(~is_recorded)
-        nearest[added] = _nearest_returns(grid.cell, ray[added], channels)
+        assert returns.source is not None
+        nearest = returns.source.astype(np.int64)
+        added = np.flatnonzero(nearest < 0)
+        nearest[added] = _nearest_returns(grid.cell, returns.ray[added].astype(np.int64), channels)
         template = grid.row[nearest]
-        order = np.lexsort((~is_recorded, template))
-        ray, source, nearest, template = (v[order] for v in (ray, source, nearest, template))
-        range_m = range_m[order]
-        is_recorded = source >= 0
-        is_moved = ~is_recorded
-        rows = np.flatnonzero(is_recorded)
-        old_m = rays.range_m[source[rows]]
-        is_moved[rows] = np.abs(range_m[rows] - old_m) > _ROUNDING * old_m
+        order = np.lexsort((returns.source < 0, template))
+        ray = returns.ray[order].astype(np.int64)
+        range_m = returns.reported[order]
+        source = returns.source[order]
+        template = template[order]
+        old_m = grid.range_m[source]
+        is_moved = (source < 0) | (np.abs(range_m - old_m) > _ROUNDING * old_m)
         positions = np.asarray(sweep.points, np.float64)[template]
-        moved = np.flatnonzero(is_moved)
-        cells = ray[moved]
-        ends = rays.directions.reshape(-1, 3)[cells] * range_m[moved, None]
-        if rays.origins is not None:
-            ends += rays.origins.reshape(-1, 3)[cells]
-        positions[moved] = ends
+        rows = np.flatnonzero(is_moved)
+        positions[rows] = grid.ends(ray[rows], range_m[rows])
         return cls(
             order,
             positions,
             range_m,
             template,
-            is_recorded,
             is_moved,
             source,
             ray // channels,
-            grid.cell[nearest] // channels if len(nearest) else nearest,
+            grid.cell[nearest[order]] // channels,
         )
+
+    @property
+    def is_recorded(self) -> Bools:
+        """Whether each point is a recorded return."""
+        return np.asarray(self.source >= 0)
 
 
 def _nearest_returns(cells: Ints, rays: Ints, channels: int) -> Ints:

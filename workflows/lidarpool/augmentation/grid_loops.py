@@ -54,7 +54,7 @@ class GridReturns(NamedTuple):
 
 
 @compiled()
-def locate_returns(returns, tables, rotation, has_several, output):
+def locate_returns(returns, tables, rotation, has_several, output):  # noqa: PLR0914, PLR0915 - a compiled loop
     """Assign returns to firings, and sort them by cell and range.
 
     A channel fires every `stride` firings. Each return gets a pulse of its own, unless
@@ -107,7 +107,8 @@ def locate_returns(returns, tables, rotation, has_several, output):
     for k in range(count):
         cell = output.firing[k] * channels + max(returns.channel[k], 0)
         index = starts[cell] + filled[cell]
-        while index > starts[cell] and returns.range_m[output.order[index - 1]] > returns.range_m[k]:
+        range_m = returns.range_m[k]
+        while index > starts[cell] and returns.range_m[output.order[index - 1]] > range_m:
             output.order[index] = output.order[index - 1]
             index -= 1
         output.order[index] = k
@@ -117,7 +118,9 @@ def locate_returns(returns, tables, rotation, has_several, output):
 
 
 @compiled()
-def fill_pulses(returns, tables, rotation, min_rings, grid, firing_sines, directions, fired):
+def fill_pulses(  # noqa: PLR0914, PLR0917 - a compiled loop
+    returns, tables, rotation, min_rings, grid, firing_sines, directions, fired
+):
     """Write the directions of pulses, and whether they were fired.
 
     A pulse was fired if it has a return, or if its channel can receive returns from its sector of

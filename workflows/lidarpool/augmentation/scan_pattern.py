@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import Bools, Floats, Ints, to_writable
 from lidarsim.numerics.elementary import arctan2, sin_cos
 from lidarsim.numerics.even_samples import even_indices
+from lidarsim.sensor import Sensor
 
 from ..clouds.recording import Recording
 from ..clouds.rings import Rings
@@ -59,6 +61,8 @@ class PulseGrid(NamedTuple):
         (n,): ranges of the returns in meters.
     row
         (n,): rows of the returns in the sweep.
+    origins
+        (f, c, 3): origins of the pulses in meters, or None if all pulses start at the origin.
     """
 
     directions: Floats
@@ -67,6 +71,85 @@ class PulseGrid(NamedTuple):
     cell: Ints
     range_m: Floats
     row: Ints
+    origins: Floats | None = None
+
+    def ends(self, ray: Ints, range_m: Floats) -> Floats:
+        """Return the points at the given ranges along pulses, of shape (k, 3)."""
+        points = self.directions.reshape(-1, 3)[ray] * range_m[:, None]
+        if self.origins is not None:
+            points += self.origins.reshape(-1, 3)[ray]
+        return points
+
+    def with_origins(self, origins: Floats, rotations: Floats | None = None) -> PulseGrid:
+        """Return a grid whose pulses start at other origins but end at the same returns.
+
+        Parameters
+        ----------
+        origins
+            (f, c, 3): new origins in meters.
+        rotations
+            (f, 3, 3): rotations of the pulses without a return, or None.
+        """
+        ends = self.ends(self.cell, self.range_m)
+        directions = self.directions.copy()
+        if rotations is not None:
+            directions = np.einsum("fij,fcj->fci", rotations, directions)
+        path = ends - origins.reshape(-1, 3)[self.cell]
+        range_m = _ranges(path)
+        directions.reshape(-1, 3)[self.cell] = path / range_m[:, None]
+        return self._replace(directions=directions, range_m=range_m, origins=origins)
+
+
+@dataclass(frozen=True, eq=False)
+class Channels:
+    """Channels of a spinning sensor, from the lowest to the highest.
+
+    Attributes
+    ----------
+    rings
+        Rings of the recording.
+    elevation_rad
+        (c,): elevations in radians.
+    of_ring
+        (r,): channel of each ring.
+    offset_rad
+        (c,): azimuths relative to the firing according to the sensor model, or None.
+    origin
+        (c, 3): origins of the beams at azimuth 0 in meters, or None if they are unknown or 0.
+    """
+
+    rings: Rings
+    elevation_rad: Floats
+    of_ring: Ints
+    offset_rad: Floats | None = None
+    origin: Floats | None = None
+
+    @classmethod
+    def from_rings(cls, rings: Rings, model: Sensor | None) -> Channels:
+        """Match the rings of a recording with the channels of a sensor model, if possible.
+
+        A recording has no ring for a channel that never returns.
+        """
+        recorded = cls(rings, rings.elevation_rad[::-1], np.arange(len(rings))[::-1])
+        if model is None or model.channels < len(rings):
+            return recorded
+        order = np.argsort(model.beams.elevation, kind="stable")
+        elevation = model.beams.elevation[order]
+        apart = np.abs(rings.elevation_rad[:, None] - elevation)
+        nearest = apart.argmin(axis=1)
+        gap_rad = float(np.median(np.diff(elevation))) if len(elevation) > 1 else np.inf
+        if len(np.unique(nearest)) < len(rings) or (apart.min(axis=1) > gap_rad).any():
+            return recorded
+        origin = model.beams.origin[order] if model.beams.origin.any() else None
+        return cls(rings, elevation, nearest, model.beams.azimuth[order], origin)
+
+    def __len__(self) -> int:
+        return len(self.elevation_rad)
+
+    def numbers(self, sweep: Sweep) -> Ints:
+        """Return the channel of each return, or -1 if it is unknown."""
+        row = self.rings.ring_indices(sweep)
+        return np.append(self.of_ring, -1)[row]  # the last entry is that of row -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +158,10 @@ class ChannelPattern:
 
     Attributes
     ----------
-    rings
-        Rings of the recording.
+    channels
+        The c channels.
     offset_rad
-        (c,): azimuth of each channel relative to the mean of all channels in the same firing. The
-        first channel is the lowest.
+        (c,): azimuth of each channel relative to the mean of all channels in the same firing.
     stride
         (c,): number of firings from one pulse of a channel to the next.
     step_rad
@@ -93,7 +175,7 @@ class ChannelPattern:
         Whether a pulse can have several returns.
     """
 
-    rings: Rings
+    channels: Channels
     offset_rad: Floats
     stride: Ints
     step_rad: float
@@ -103,17 +185,17 @@ class ChannelPattern:
 
     @classmethod
     def from_sweeps(
-        cls, rings: Rings, sweeps: Sequence[Sweep], period_s: float
+        cls, channels: Channels, sweeps: Sequence[Sweep], period_s: float
     ) -> ChannelPattern | None:
         """Determine the pattern of several sweeps, or return None if there is none."""
         from .grid_loops import SECTORS
 
-        count = len(rings)
+        count = len(channels)
         if not count:
             return None
-        channels = [_channels(rings, sweep) for sweep in sweeps]
+        numbers = [channels.numbers(sweep) for sweep in sweeps]
         azimuths = [_azimuths(sweep.points) for sweep in sweeps]
-        found = map(_RingSteps.from_returns, azimuths, channels, [count] * len(sweeps))
+        found = map(_RingSteps.from_returns, azimuths, numbers, [count] * len(sweeps))
         steps = [step for step in found if step is not None]
         if not steps:
             return None
@@ -121,16 +203,18 @@ class ChannelPattern:
         ring_rad = np.stack([step.ring_rad for step in steps])
         ring_rad = np.nanmedian(np.where(np.isnan(ring_rad), step_rad, ring_rad), axis=0)
         stride = np.rint(ring_rad / step_rad).clip(1, _MAX_STRIDE).astype(np.int64)
-        offset_rad, clockwise = _offsets(sweeps, azimuths, channels, count, period_s)
+        offset_rad, clockwise = _offsets(sweeps, azimuths, numbers, count, period_s)
+        if channels.offset_rad is not None:
+            offset_rad = channels.offset_rad
         in_view = np.zeros((count, SECTORS), np.bool_)
-        for azimuth, channel in zip(azimuths, channels, strict=True):
+        for azimuth, number in zip(azimuths, numbers, strict=True):
             sector = np.floor(azimuth / _TURN * SECTORS).astype(np.int64) % SECTORS
-            in_view[channel[channel >= 0], sector[channel >= 0]] = True
+            in_view[number[number >= 0], sector[number >= 0]] = True
         # A ring above the horizon may observe nothing but the sky.
-        in_view[rings.elevation_rad[::-1] >= _LOW_RAD] = in_view.any(axis=0)
+        in_view[channels.elevation_rad >= _LOW_RAD] = in_view.any(axis=0)
         several = sum(step.several for step in steps)
         return cls(
-            rings,
+            channels,
             offset_rad,
             stride,
             step_rad,
@@ -160,30 +244,43 @@ class ChannelPattern:
         from . import grid_loops  # imported here because numba takes half a second to import
 
         returns = grid_loops.SweepReturns(
-            points, _azimuths(points), _ranges(points), _channels(self.rings, sweep)
+            points, _azimuths(points), _ranges(points), self.channels.numbers(sweep)
         )
         rotation = self._rotation(returns)
+        located = grid_loops.GridReturns(*np.empty((3, len(points)), np.int64))
         tables = self._tables(returns, rotation)
-        count = len(points)
-        located = grid_loops.GridReturns(*np.empty((3, count), np.int64))
         extra = grid_loops.locate_returns(returns, tables, rotation, self.has_several, located)
-        firings = rotation.firings + extra
-        turns = np.arange(firings) * rotation.step_rad + rotation.phase_rad
+        shape = rotation.firings + extra, len(self.channels)
+        turns = np.arange(shape[0]) * rotation.step_rad + rotation.phase_rad
         sines = np.stack(sin_cos(rotation.sign * turns))
-        directions = np.empty((firings, len(self.rings), 3))
-        fired = np.empty((firings, len(self.rings)), np.bool_)
-        min_rings = max(_MIN_RINGS * len(self.rings), 1)
+        directions = np.empty((*shape, 3))
+        fired = np.empty(shape, np.bool_)
+        min_rings = max(_MIN_RINGS * len(self.channels.rings), 1)
         grid_loops.fill_pulses(
             returns, tables, rotation, min_rings, located, sines, directions, fired
         )
         if times_s is None:
-            times = period_s * (np.arange(firings) % rotation.firings) / rotation.firings
+            times = period_s * (np.arange(shape[0]) % rotation.firings) / rotation.firings
         else:
-            times = _firing_times(located.firing, times_s, firings)
-        order = located.order
-        return PulseGrid(
-            directions, times, fired, located.cell, returns.range_m[order], rows[order]
-        )
+            times = _firing_times(located.firing, times_s, shape[0])
+        range_m = returns.range_m[located.order]
+        grid = PulseGrid(directions, times, fired, located.cell, range_m, rows[located.order])
+        return self._from_beam_origins(grid, sines)
+
+    def _from_beam_origins(self, grid: PulseGrid, sines: Floats) -> PulseGrid:
+        """Return a grid whose pulses start at the origins of the beams, if they are known.
+
+        `sines` (2, f) are the sines and cosines of the azimuths of the firings.
+        """
+        if self.channels.origin is None:
+            return grid
+        x, y, z = self.channels.origin.T
+        sine, cosine = sines[:, :, None]
+        origins = np.empty_like(grid.directions)
+        origins[..., 0] = cosine * x - sine * y
+        origins[..., 1] = sine * x + cosine * y
+        origins[..., 2] = z
+        return grid.with_origins(origins)
 
     def _rotation(self, returns: SweepReturns) -> Rotation:
         """Determine the rotation of a sweep, whose rate may differ from the median rate."""
@@ -208,7 +305,7 @@ class ChannelPattern:
             firing = np.rint(turn / rotation.step_rad).astype(np.int64) % rotation.firings
             if len(firing):
                 residue[ring] = np.bincount(firing % self.stride[ring]).argmax()
-        sine, cosine = sin_cos(self.rings.elevation_rad[::-1])
+        sine, cosine = sin_cos(self.channels.elevation_rad)
         return ChannelTables(sine, cosine, self.offset_rad, self.stride, residue, self.in_view)
 
 
@@ -235,8 +332,11 @@ class ScanPattern:
     note: str = ""
 
     @classmethod
-    def from_recording(cls, recording: Recording) -> ScanPattern:
+    def from_recording(cls, recording: Recording, model: Sensor | None = None) -> ScanPattern:
         """Determine the scan pattern from a few sweeps.
+
+        The sensor model, if it is known, adds channels that never return, and the origins of the
+        beams.
 
         Raises
         ------
@@ -247,7 +347,10 @@ class ScanPattern:
         sweeps = [sweep for n in numbers if len(sweep := recording[n].returns())]
         max_range_m = max((float(_ranges(sweep.points).max()) for sweep in sweeps), default=1.0)
         period_s = _period_s(recording)
-        pattern = ChannelPattern.from_sweeps(recording.rings, sweeps, period_s) if sweeps else None
+        pattern = None
+        if sweeps:
+            channels = Channels.from_rings(recording.rings, model)
+            pattern = ChannelPattern.from_sweeps(channels, sweeps, period_s)
         note = ""
         if pattern is None:
             note = (
@@ -260,7 +363,7 @@ class ScanPattern:
     @property
     def channel_count(self) -> int:
         """Number of channels, which is 1 if the rings are unknown."""
-        return 1 if self.channels is None else len(self.channels.rings)
+        return 1 if self.channels is None else len(self.channels.channels)
 
     @property
     def firings(self) -> int:
@@ -309,7 +412,7 @@ class _RingSteps(NamedTuple):
         same = (np.diff(ring) == 0) & (ring[:-1] >= 0)
         is_step = same & (gaps > _MIN_STEP_RAD)
         bounds = np.searchsorted(ring[:-1][is_step], np.arange(count + 1))
-        parts = [gaps[is_step][start:stop] for start, stop in zip(bounds, bounds[1:], strict=False)]
+        parts = [gaps[is_step][start:stop] for start, stop in pairwise(bounds)]
         ring_rad = np.array(
             [
                 _refined_step(part, float(np.median(part))) if len(part) >= _MIN_STEPS else np.nan
@@ -336,15 +439,7 @@ def _sweep_step(azimuth: Floats, channel: Ints, step_rad: float) -> float:
     gaps = np.diff(np.sort(azimuth[channel == counts.argmax()]))
     gaps = gaps[gaps > _MIN_STEP_RAD]
     refined = _refined_step(gaps, step_rad) if len(gaps) else step_rad
-    return round(
-        refined if abs(refined / step_rad - 1) < _MAX_STEP_CHANGE else step_rad, _DIGITS
-    )
-
-
-def _channels(rings: Rings, sweep: Sweep) -> Ints:
-    """Return the channel of each return, counted from the lowest ring, or -1."""
-    row = rings.ring_indices(sweep)
-    return np.where(row >= 0, len(rings) - 1 - row, -1)
+    return round(refined if abs(refined / step_rad - 1) < _MAX_STEP_CHANGE else step_rad, _DIGITS)
 
 
 def _offsets(

@@ -68,7 +68,7 @@ class PulseReturns(NamedTuple):
     # Recorded waveform (`columns.waveforms.record`), to which `BatchPoints` adds `location_ps` and
     # `toward`.
     waveform: Records | None = None
-    # Row of the recorded return in `RecordedPulses`, or -1 for other returns; None if rays are cast.
+    # Row of a recorded return in `RecordedPulses`, or -1 for other returns; None if rays are cast.
     source: Ints32 | None = None
     number: Bytes | None = None  # number among the reported returns of the pulse, starting at 1
     return_counts: Bytes | None = None  # number of reported returns of the pulse

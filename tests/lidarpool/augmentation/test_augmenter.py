@@ -1,0 +1,317 @@
+"""Effects on recorded sweeps, compared with the same effects on cast rays."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from lidarpool import Fault, Pose, Scanner, Scene, load_sensor
+from lidarpool.augmentation.augmenter import Augmenter
+from lidarpool.augmentation.effects import Effects, Insertion
+from lidarpool.clouds.recording import Recording
+from lidarsim.columns.sweep import Sweep
+from lidarsim.columns.table import CAUSES
+from lidarsim.errors import LidarError
+from lidarsim.media.weather import Weather
+from lidarsim.scene.actors import Actor, box
+from lidarsim.scene.scene_mesh import SceneMesh
+
+HEIGHT_M = 1.9
+SWEEPS = 4
+AIR = CAUSES.index("air")
+CAR = box("Car", (4.5, 1.8, 1.5))
+
+
+@pytest.fixture(scope="module")
+def sensor():
+    model = load_sensor("ouster/os1-32", columns=512, performance="datasheet")
+    return replace(model, returns=replace(model.returns, subrays=1))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A floor and two walls. About half of the pulses have no return."""
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    floor = np.array([[-80, -80, 0], [80, -80, 0], [80, 80, 0], [-80, 80, 0.0]])
+    wall = np.array([[30, -40, 0], [30, 40, 0], [30, 40, 8], [30, -40, 8.0]])
+    near = np.array([[-20, 6, 0], [10, 6, 0], [10, 6, 4], [-20, 6, 4.0]])
+    meshes = zip(("floor", "wall", "near"), (floor, wall, near), strict=True)
+    return Scene.from_meshes([SceneMesh(name, corners, faces) for name, corners in meshes])
+
+
+def scan(scene, sensor, count=SWEEPS, **weather):
+    """Simulate sweeps of a stationary sensor."""
+    columns = ["range", "intensity", "cause", "time"]
+    scanner = Scanner(scene, sensor, columns=columns, coordinates="sensor", **weather)
+    return [scanner.sweep(Pose((0, 0, HEIGHT_M))) for _ in range(count)]
+
+
+def recording_of(clouds, **fields):
+    """Make a recording with the energies of simulated sweeps."""
+
+    def read(number):
+        cloud = clouds[number]
+        columns = {
+            "channel": cloud["channel"],
+            "intensity": cloud["intensity"],
+            "time": 1e-9 * (cloud["time"] - cloud["time"].min()),
+        }
+        return Sweep(np.asarray(cloud.positions, np.float64), columns)
+
+    stamps_ns = 1e8 * np.arange(len(clouds))
+    options = {"energies": True, "read_stamps": lambda: stamps_ns, "compensated": False}
+    return Recording("drive", len(clouds), read, **options | fields)
+
+
+@pytest.fixture(scope="module")
+def clear(scene, sensor):
+    return recording_of(scan(scene, sensor))
+
+
+def augmented(recording, sensor, **effects):
+    augmenter = Augmenter(recording, Effects(**effects), sensor)
+    return [augmenter.sweep(number) for number in range(len(recording))]
+
+
+def concatenated(sweeps, name):
+    return np.concatenate([sweep.sweep.columns[name] for sweep in sweeps])
+
+
+def ranges_of(sweeps):
+    return np.concatenate([np.linalg.norm(sweep.sweep.points, axis=1) for sweep in sweeps])
+
+
+def assert_same_distribution(a, b):
+    """Compare two samples by the Kolmogorov-Smirnov statistic, at a significance of 1e-4."""
+    values = np.sort(np.concatenate([a, b]))
+    shares = [np.searchsorted(np.sort(part), values, "right") / len(part) for part in (a, b)]
+    distance = np.abs(shares[0] - shares[1]).max()
+    assert distance < 2.2 * np.sqrt(1 / len(a) + 1 / len(b))
+
+
+def test_without_effects_nothing_changes(clear, sensor):
+    for number, result in enumerate(augmented(clear, sensor)):
+        recorded = clear[number]
+        assert result.is_recorded.all()
+        np.testing.assert_array_equal(result.template, np.arange(len(recorded)))
+        np.testing.assert_array_equal(result.sweep.points, recorded.points)
+        for name, values in recorded.columns.items():
+            np.testing.assert_array_equal(result.sweep.columns[name], values)
+
+
+@pytest.mark.parametrize(
+    "weather",
+    [
+        {"visibility_km": 0.1},
+        {"rain_mm_h": 40.0},
+        {"snow_mm_h": 2.0},
+        {"dust_mg_m3": 60.0},
+    ],
+    ids=lambda weather: next(iter(weather)),
+)
+def test_weather_has_the_distributions_of_a_simulation_in_that_weather(
+    weather, clear, scene, sensor
+):
+    results = augmented(clear, sensor, weather=Weather(**weather))
+    clouds = scan(scene, sensor, **weather)
+    causes = concatenated(results, "cause"), np.concatenate([c["cause"] for c in clouds])
+    ranges = (
+        ranges_of(results),
+        np.concatenate([np.linalg.norm(c.positions, axis=1) for c in clouds]),
+    )
+    energies = concatenated(results, "intensity"), np.concatenate([c["intensity"] for c in clouds])
+    for cause in (CAUSES.index("surface"), AIR):
+        chosen = [values == cause for values in causes]
+        counts = np.array([mask.sum() for mask in chosen])
+        assert counts.min() > 30
+        assert abs(counts[0] - counts[1]) < 4 * np.sqrt(counts.sum())
+        for values in (ranges, energies):
+            assert_same_distribution(values[0][chosen[0]], values[1][chosen[1]])
+
+
+def test_pulses_without_a_return_return_from_fog(clear, sensor):
+    results = augmented(clear, sensor, weather=Weather(visibility_km=0.05))
+    directions = np.concatenate([r.sweep.points[~r.is_recorded] for r in results])
+    elevation = np.degrees(np.arcsin(directions[:, 2] / np.linalg.norm(directions, axis=1)))
+    assert (elevation > 10).sum() > 100  # nothing was recorded there
+    top = max(clear[number].points[:, 2].max() for number in range(SWEEPS))
+    assert top < 8
+
+
+def test_weak_returns_are_not_lost_again(clear, sensor):
+    """Recorded returns were detected, however weak they are, so clear air loses none of them."""
+    (first, *_) = augmented(clear, sensor, weather=Weather(visibility_km=1e6))
+    assert first.is_recorded.sum() == len(clear[0])
+
+
+def test_intensities_of_attenuated_returns_are_scaled(clear, sensor):
+    weather = Weather(visibility_km=0.5, fog_lidar_ratio_sr=None)
+    (first, *_) = augmented(clear, sensor, weather=weather)
+    recorded = clear[0]
+    range_m = np.linalg.norm(recorded.points, axis=1)[first.template]  # within 3 cm
+    extinction = weather.extinction_at(sensor.optics.wavelength_nm)
+    expected = recorded.columns["intensity"][first.template] * np.exp(-2 * extinction * range_m)
+    np.testing.assert_allclose(first.sweep.columns["intensity"], expected, rtol=1e-3)
+
+
+def test_dead_channels_and_dropped_packets(clear, sensor):
+    faults = (
+        Fault("dead_channels", channels=[3, 5]),
+        Fault("dropped_packets", share=0.25, packet=16),
+    )
+    results = augmented(clear, sensor, faults=faults)
+    channels = concatenated(results, "channel")
+    assert not np.isin(channels, [3, 5]).any()
+    recorded = np.concatenate([clear[number].columns["channel"] for number in range(SWEEPS)])
+    alive = (~np.isin(recorded, [3, 5])).sum()
+    assert 0.6 < len(channels) / alive < 0.9
+
+
+def test_dirt_blocks_a_sector(clear, sensor):
+    faults = (Fault("dirt", azimuth_deg=(-45, 45), transmission=0.0),)
+    (first, *_) = augmented(clear, sensor, faults=faults)
+    azimuth = np.degrees(np.arctan2(*first.sweep.points[:, 1::-1].T))
+    assert not (np.abs(azimuth) < 44.9).any()
+    expected = np.degrees(np.arctan2(*clear[0].points[:, 1::-1].T))
+    assert (np.abs(azimuth) > 45.1).sum() == (np.abs(expected) > 45.1).sum()
+
+
+def test_noise_is_added_to_recorded_ranges(clear, sensor):
+    (first, *_) = augmented(clear, sensor, noise={"range_m": 0.1})
+    recorded = clear[0].points[first.template]
+    shift = first.sweep.points - recorded
+    errors = np.linalg.norm(shift, axis=1)
+    assert 0.095 < np.sqrt((errors**2).mean()) < 0.105
+    along_beam = (shift * recorded).sum(axis=1) / np.linalg.norm(recorded, axis=1)
+    np.testing.assert_allclose(np.abs(along_beam), errors, rtol=1e-3)
+
+
+def test_the_number_of_a_sweep_determines_its_random_numbers(clear, sensor):
+    effects = Effects(weather=Weather(snow_mm_h=2.0))
+    augmenter = Augmenter(clear, effects, sensor)
+    forward = [augmenter.sweep(number).sweep.points for number in range(SWEEPS)]
+    again = Augmenter(clear, effects, sensor).sweep(2).sweep.points
+    np.testing.assert_array_equal(forward[2], again)
+    other = Augmenter(clear, replace(effects, seed=1), sensor).sweep(2).sweep.points
+    assert other.shape != again.shape or not np.array_equal(other, again)
+
+
+def test_inserted_car_has_the_points_of_a_simulation_with_the_car(scene, sensor):
+    ideal = replace(sensor, noise=None)
+    recording = recording_of(scan(scene, ideal, 1), energies=True)
+    pose = Pose((12, -3, 0), yaw_deg=30)
+    (truth,) = scan(scene.with_actors([_static(CAR, pose)]), ideal, 1)
+    insertion = Insertion(CAR, 12, -3, -HEIGHT_M, heading_deg=30, class_name="")
+    augmenter = Augmenter(recording, Effects(insertions=(insertion,)), ideal)
+    result = augmenter.sweep(0)
+    on_car = truth["object"] == len(scene.names)
+    expected = np.asarray(truth.positions)[on_car]
+    added = result.sweep.points[~result.is_recorded]
+    # Sub-rays at the outline also hit the car, and pulses into the sky were restored.
+    distance = np.linalg.norm(expected[:, None] - added, axis=2).min(axis=1)
+    assert np.quantile(distance, 0.95) < 0.02
+    assert abs(len(added) - len(expected)) < 0.1 * len(expected)
+    box_rows = result.boxes.rows
+    np.testing.assert_allclose(box_rows[0, :2], [12, -3], atol=0.5)
+    np.testing.assert_allclose(box_rows[0, 3:6], [4.5, 1.8, 1.5], atol=1e-6)
+    assert result.boxes.points[0] == len(added)
+    assert result.visibility[0] > 0.95
+
+
+def _static(mesh, pose):
+    vertices = mesh.vertices @ pose.rotation_matrix.T + pose.position
+    return Actor(replace(mesh, vertices=vertices))
+
+
+def test_no_point_is_visible_behind_an_inserted_car(clear, sensor):
+    insertion = Insertion(CAR, 12, -3, heading_deg=0)
+    result = Augmenter(clear, Effects(insertions=(insertion,)), sensor).sweep(0)
+    added = result.sweep.points[~result.is_recorded]
+    kept = result.sweep.points[result.is_recorded]
+    units = [points / np.linalg.norm(points, axis=1)[:, None] for points in (added, kept)]
+    cosine = units[1] @ units[0].T
+    nearest = cosine.argmax(axis=1)
+    same = cosine[np.arange(len(kept)), nearest] > np.cos(np.radians(0.05))
+    added_m = np.linalg.norm(added, axis=1)[nearest]
+    assert not (np.linalg.norm(kept, axis=1)[same] > added_m[same] + 2).any()
+
+
+def test_inserted_car_stands_on_the_ground(clear, sensor):
+    result = Augmenter(clear, Effects(insertions=(Insertion(CAR, 12, -3),)), sensor).sweep(0)
+    center, size = result.boxes.rows[0, 2], result.boxes.rows[0, 5]
+    assert center - size / 2 == pytest.approx(-HEIGHT_M, abs=0.02)
+
+
+def test_an_occluded_car_is_invisible(clear, sensor):
+    """The car stands behind the near wall at y = 6 m."""
+    insertion = Insertion(CAR, -5, 9, -HEIGHT_M)
+    result = Augmenter(clear, Effects(insertions=(insertion,)), sensor).sweep(0)
+    assert result.is_recorded.all()
+    assert result.boxes.points[0] == 0
+    assert result.visibility[0] == 0
+
+
+def test_a_stationary_car_keeps_its_place_while_the_sensor_moves(scene, sensor):
+    columns = ["range", "intensity", "cause", "time"]
+    scanner = Scanner(scene, sensor, columns=columns, coordinates="sensor")
+    clouds = [scanner.sweep(Pose((2.0 * k, 0, HEIGHT_M))) for k in range(3)]
+    poses = np.repeat(np.eye(4)[None], 3, axis=0)
+    poses[:, 0, 3] = [0, 2, 4]
+    recording = recording_of(clouds, read_poses=lambda: poses, compensated=None)
+    insertion = Insertion(CAR, 12, -3)
+    augmenter = Augmenter(recording, Effects(insertions=(insertion,)), sensor)
+    centers = [augmenter.sweep(number).boxes.rows[0, 0] for number in range(3)]
+    np.testing.assert_allclose(centers, [12, 10, 8], atol=1e-3)
+
+
+def test_cars_move_during_a_sweep(clear, sensor):
+    from lidarpool import Track
+
+    speed = 20.0
+    track = Track([0.0, 1.0], [[10, -3, -HEIGHT_M], [10 + speed, -3, -HEIGHT_M]], yaw_deg=0.0)
+    augmenter = Augmenter(clear, Effects(actors=(Actor(CAR, track),)), sensor)
+    first, second = (augmenter.sweep(number).boxes.rows[0, 0] for number in (0, 1))
+    assert second - first == pytest.approx(0.1 * speed, abs=1e-3)
+
+
+def test_unknown_rings_are_noted(clear, sensor):
+    def without_rings(number):
+        sweep = clear.read(number)
+        rows = np.random.default_rng(number).permutation(len(sweep))
+        columns = {"intensity": sweep.columns["intensity"][rows]}
+        noise = 0.02 * np.random.default_rng(number).normal(size=(len(rows), 3))
+        return Sweep(sweep.points[rows] + noise, columns)
+
+    recording = Recording("drive", SWEEPS, without_rings, energies=True)
+    augmenter = Augmenter(recording, Effects(weather=Weather(visibility_km=0.1)), sensor)
+    assert any("pulses without a return are unknown" in note for note in augmenter.notes)
+    result = augmenter.sweep(0)
+    recorded = clear[0].points
+    assert len(result.sweep) <= len(recorded)
+
+
+@pytest.mark.parametrize("kind", ["frozen", "time_jump"])
+def test_faults_of_timestamps_are_refused(kind, clear, sensor):
+    fault = Fault(kind, 0.2) if kind == "frozen" else Fault(kind, 0.2, by_s=1.0)
+    with pytest.raises(LidarError, match="cannot be simulated on a recording"):
+        Augmenter(clear, Effects(faults=(fault,)), sensor)
+
+
+def test_a_cloud_without_sweeps_is_refused(sensor):
+    cloud = Recording("cloud.ply", 1, partial(Sweep, np.zeros((0, 3))), is_cloud=True)
+    with pytest.raises(LidarError, match="contains no sweeps"):
+        Augmenter(cloud, Effects(), sensor)
+
+
+def test_a_sweep_without_points_stays_empty(scene, sensor):
+    clouds = scan(scene, sensor, 2)
+    full = recording_of(clouds)
+
+    def read(number):
+        return full.read(number) if number else full.read(0).select(slice(0))
+
+    recording = replace(full, read=read)
+    result = Augmenter(recording, Effects(weather=Weather(snow_mm_h=2.0)), sensor).sweep(0)
+    assert len(result.sweep) == 0
+    assert result.sweep.columns["cause"].shape == (0,)
