@@ -14,7 +14,7 @@ from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints, Ints32
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.sensor import Noise, Returns, Sensor
-from lidarsim.simulator.recorded_sweeps import PulseAugmenter, RecordedSensor, SweepPulses
+from lidarsim.simulator.recorded_sweeps import PulseAugmenter, RecordedSensor, FiredPulses
 from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.steps.step import RecordedPulses
 
@@ -218,7 +218,7 @@ class Augmenter:
         # What was detected had at least the energy of the threshold.
         energy = np.maximum(self.scale.energies(recorded, grid.range_m), self._simulation.threshold)
         firing_ns = self._start_ns(number) + 1e9 * (grid.times_s - self._first_s)
-        pulses = SweepPulses(
+        pulses = FiredPulses(
             grid.directions,
             firing_ns,
             RecordedPulses(grid.cell, grid.range_m, energy, grid.fired.reshape(-1)),

@@ -27,8 +27,8 @@ class ChannelTables(NamedTuple):
     in_view: Bools  # (c, SECTORS)
 
 
-class Rotation(NamedTuple):
-    """Rotation of the sensor during a sweep."""
+class SweepRotation(NamedTuple):
+    """SweepRotation of the sensor during a sweep."""
 
     sign: float  # 1 for a counterclockwise rotation, otherwise -1
     step_rad: float  # azimuth between firings

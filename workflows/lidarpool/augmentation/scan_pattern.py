@@ -24,7 +24,7 @@ from ..clouds.recording import Recording
 from ..clouds.rings import Rings
 
 if TYPE_CHECKING:
-    from .grid_loops import ChannelTables, Rotation, SweepReturns
+    from .grid_loops import ChannelTables, SweepRotation, SweepReturns
 
 _REFERENCE_SWEEPS = 5  # number of sweeps from which the pattern is determined
 _MIN_STEP_RAD = np.radians(0.02)  # closer returns of a ring belong to the same pulse
@@ -282,9 +282,9 @@ class ChannelPattern:
         origins[..., 2] = z
         return grid.with_origins(origins)
 
-    def _rotation(self, returns: SweepReturns) -> Rotation:
+    def _rotation(self, returns: SweepReturns) -> SweepRotation:
         """Determine the rotation of a sweep, whose rate may differ from the median rate."""
-        from .grid_loops import Rotation
+        from .grid_loops import SweepRotation
 
         sign = -1.0 if self.clockwise else 1.0
         step_rad = _sweep_step(returns.azimuth, returns.channel, self.step_rad)
@@ -292,9 +292,9 @@ class ChannelPattern:
         turn = sign * (returns.azimuth[rows] - self.offset_rad[returns.channel[rows]])
         sine, cosine = (values.sum() for values in sin_cos(turn * (_TURN / step_rad)))
         phase_rad = round(float(np.arctan2(sine, cosine)) * step_rad / _TURN, _DIGITS)
-        return Rotation(sign, step_rad, phase_rad, max(round(_TURN / step_rad), 1))
+        return SweepRotation(sign, step_rad, phase_rad, max(round(_TURN / step_rad), 1))
 
-    def _tables(self, returns: SweepReturns, rotation: Rotation) -> ChannelTables:
+    def _tables(self, returns: SweepReturns, rotation: SweepRotation) -> ChannelTables:
         """Return tables of the channels for compiled loops."""
         from .grid_loops import ChannelTables
 

@@ -75,7 +75,7 @@ class RecordedSensor(Sensor):
 
 
 @dataclass(frozen=True, eq=False)
-class SweepPulses:
+class FiredPulses:
     """Pulses of a recorded sweep in a grid of f firings and c channels.
 
     Attributes
@@ -165,7 +165,7 @@ class PulseAugmenter:
         return self.survey.noise_each[0].threshold
 
     def apply(
-        self, number: int, pulses: SweepPulses, pose: tuple[Floats, Floats] | None = None
+        self, number: int, pulses: FiredPulses, pose: tuple[Floats, Floats] | None = None
     ) -> PulseReturns:
         """Return the reported returns of a sweep.
 
@@ -210,7 +210,7 @@ class PulseAugmenter:
         return returns.take(pulses.recorded.fired[returns.ray])
 
     def pulses_on_objects(
-        self, pulses: SweepPulses, pose: tuple[Floats, Floats] | None, count: int
+        self, pulses: FiredPulses, pose: tuple[Floats, Floats] | None, count: int
     ) -> Ints:
         """Return the number of pulses that would hit each inserted object in clear air.
 
@@ -230,7 +230,7 @@ class PulseAugmenter:
         _, objects, _ = self.surfaces.triangles.locate(hits.triangle[fired])
         return np.bincount(objects - 1, minlength=count)
 
-    def _poses(self, pulses: SweepPulses, pose: tuple[Floats, Floats] | None) -> CastPoses:
+    def _poses(self, pulses: FiredPulses, pose: tuple[Floats, Floats] | None) -> CastPoses:
         """Return the poses of the rays of a sweep in the scene frame, with the clock of actors."""
         position, rotation = (np.zeros(3), None) if pose is None else pose
         poses = CastPoses(
@@ -259,7 +259,7 @@ class PulseAugmenter:
         return numbers
 
 
-def _pattern(pulses: SweepPulses) -> Pattern:
+def _pattern(pulses: FiredPulses) -> Pattern:
     """Return the rays of a sweep."""
     origins = None if pulses.origins is None else pulses.origins.reshape(-1, 3)
     channels = pulses.directions.shape[1]
