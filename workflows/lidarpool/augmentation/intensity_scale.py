@@ -28,6 +28,7 @@ from .intensity_fit import (
     is_compensated,
     is_valid,
     range_factors,
+    smallest_beside_zeros,
     typical_level,
     white_level,
 )
@@ -78,8 +79,8 @@ class IntensityScale:
         Share of the energy that is recorded at close range.
     typical
         Median of the reflectance multiplied by the cosine of the angle of incidence.
-    zero_value
-        Value that represents a recorded 0, which is a weak return that was rounded down.
+    smallest
+        Smallest positive value, if values are not quantized and some of them are 0.
     is_known
         Whether the scale is known, rather than assumed or fitted.
     note
@@ -104,7 +105,7 @@ class IntensityScale:
     codes_per_unit: float = 1.0
     near: NearFactors = _NO_DROP
     typical: float = _TYPICAL_REFLECTANCE
-    zero_value: float = 0.0
+    smallest: float = 0.0
     is_known: bool = True
     note: str = ""
 
@@ -182,6 +183,12 @@ class IntensityScale:
         fit = _Fit(recording, column, returns.select(valid), model)
         return fit.scale()
 
+    @property
+    def zero_value(self) -> float:
+        """Value that represents a recorded 0, which is a weak return that was rounded down."""
+        steps = self.quantization.steps_per_unit
+        return _ZERO_STEPS / steps if steps else self.smallest / 2
+
     def with_codes(self, codes: ByteScale) -> Self:
         """Return a copy whose values are codes on a scale, one for each step of the values."""
         codes_per_unit = self.quantization.steps_per_unit
@@ -240,8 +247,7 @@ class IntensityScale:
         positive = np.where(energy > 0, energy, 0.0)
         values = self._values(positive / self._factors(range_m))
         steps, max_value = self.quantization
-        if self.zero_value:
-            values[values <= self.zero_value * (1 + 1e-9)] = 0
+        values[values <= self.zero_value * (1 + 1e-9)] = 0
         if steps:
             values = np.rint(values * steps) / steps
         values = np.minimum(values, max_value)
@@ -410,15 +416,13 @@ class _Fit:
         recorded = self.returns.columns[self.column]
         quantization = Quantization.from_values(recorded)
         values = recorded.astype(np.float64)
-        smallest = float(values[values > 0].min())
-        steps = quantization.steps_per_unit
         common = IntensityScale(
             column=self.column,
             dtype=recorded.dtype,
             quantization=quantization,
             white=1.0,
             compensated=True,
-            zero_value=_ZERO_STEPS / steps if steps else smallest / 2,
+            smallest=smallest_beside_zeros(values),
         )
         scale = self._known(common, values)
         if scale is None:

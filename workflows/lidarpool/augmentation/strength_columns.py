@@ -20,7 +20,13 @@ from lidarsim.sensor.sensor import Sensor
 
 from ..clouds.recording import Recording
 from .detection_threshold import DetectionThreshold, detection_threshold
-from .intensity_fit import Quantization, RecordedReturns, is_valid, range_factors
+from .intensity_fit import (
+    Quantization,
+    RecordedReturns,
+    is_valid,
+    range_factors,
+    smallest_beside_zeros,
+)
 from .intensity_scale import IntensityScale
 
 # Columns that contain the strength of returns. Ambient light, such as `ambient` and `near_ir`, does
@@ -194,7 +200,6 @@ def _fit_column(
         _fit_factor(values[used], received, False),
         key=lambda factor: factor.spread,
     )
-    smallest = float(values[used].min())
     scale = replace(
         primary,
         column=name,
@@ -204,7 +209,7 @@ def _fit_column(
         compensated=factor.compensated,
         codes=None,
         codes_per_unit=1.0,
-        zero_value=0.25 / steps if steps else smallest / 2,
+        smallest=smallest_beside_zeros(values[valid]),
         note="",
     )
     codes = _matching_codes(scale, model)
