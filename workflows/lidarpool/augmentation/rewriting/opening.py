@@ -10,7 +10,9 @@ from ...clouds.format_table import format_of_path
 from ...clouds.kitti import KITTI
 from ...clouds.pcd import PCD
 from ...clouds.recording import Recording, RecordingSource
+from ...clouds.ros.bags import Rosbag2
 from ...datasets.dataset import INDEX_FILE
+from .bag_rewriter import BagRewriter
 from .kitti_rewriter import KittiRewriter
 from .pcd_rewriter import PCDRewriter
 from .rewriter import Rewriter
@@ -47,6 +49,8 @@ def open_rewriter(source: str | Path, recording: Recording, sensor: str | None =
         return KittiRewriter(opened, recording)
     if cloud_format is PCD:
         return PCDRewriter(opened, recording)
+    if cloud_format is not None and issubclass(cloud_format, Rosbag2):
+        return BagRewriter(opened, recording)
     kind = cloud_format.title if cloud_format is not None and cloud_format.title else "this format"
     raise LidarError(
         f"{source} cannot be augmented in its own format. Recordings can be rewritten in the "

@@ -65,7 +65,7 @@ class StoredRecords:
         added points that were not simulated are 0.
         """
         template = np.asarray(augmented.template, np.intp)
-        rows = self.records[template]
+        rows = _take(self.records, template)
         points = np.asarray(augmented.sweep.points, np.float64)
         before = np.asarray(self.recorded.points, np.float64)[template]
         is_added = ~np.asarray(augmented.is_recorded, bool)
@@ -103,6 +103,11 @@ class StoredRecords:
             is_computed = bool(differs[is_added].any())
         if is_strength and not is_computed and (column != "intensity" or values is None):
             rows[name][is_added] = 0
+
+    @property
+    def axes(self) -> dict[str, str]:
+        """Fields of the coordinates x, y and z."""
+        return self._field_names()[0]
 
     def _field_names(self) -> tuple[dict[str, str], dict[str, str]]:
         """Return the fields of the coordinates and of the other columns, keyed by column name."""
@@ -154,8 +159,15 @@ class StoredRecords:
         for name in columns.values():
             if name.lower() in _STRENGTH_FIELDS | _RANGE_FIELDS:
                 cells[name][is_lost] = 0
-        cells[template] = rows
+        raw = np.dtype((np.void, cells.dtype.itemsize))
+        cells.view(raw)[template] = rows.view(raw)
         return cells
+
+
+def _take(records: Records, rows: Ints) -> Records:
+    """Return copies of records, including bytes that belong to no field."""
+    raw = np.ascontiguousarray(records).view(np.dtype((np.void, records.dtype.itemsize)))
+    return raw[rows].view(records.dtype)
 
 
 def _differs(values: AnyArray, others: AnyArray) -> Bools:
