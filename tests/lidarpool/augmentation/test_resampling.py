@@ -98,6 +98,30 @@ def test_pulses_without_a_return_stay_without_one(dense):
     assert (organized.template == np.flatnonzero(~is_lost)[augmented.template]).all()
 
 
+@pytest.mark.parametrize("share", [0.2, 0.7])
+def test_random_losses_remove_the_same_pulses(dense, share):
+    complete = SensorResampler(recording(dense), SPARSE).sweep(0).template
+    remaining = np.flatnonzero(np.random.default_rng(3).random(len(dense)) >= share)
+    augmented = SensorResampler(recording(dense.select(remaining)), SPARSE).sweep(0)
+    assert (remaining[augmented.template] == np.intersect1d(complete, remaining)).all()
+
+
+def test_noisy_directions_have_the_same_resolution(dense):
+    random = np.random.default_rng(4)
+    noisy = dense.replace(points=dense.points * random.normal(1, 0.0015, dense.points.shape))
+    augmented = SensorResampler(recording(noisy), SPARSE).sweep(0)
+    assert len(augmented.sweep) > 0.99 * 240 * 16
+
+
+def test_times_are_those_of_the_recorded_points(dense):
+    seconds = np.arange(len(dense)) / len(dense) / 10
+    timed = dense.replace(columns={**dense.columns, "time": seconds})
+    drive = recording(timed)
+    sweep = drive[0]
+    augmented = SensorResampler(drive, SPARSE).sweep(sweep)
+    assert np.allclose(augmented.sweep.times_s, seconds[augmented.template])
+
+
 def test_all_returns_of_a_pulse_are_copied(dense):
     twice = Sweep.concatenate([dense, dense.replace(points=0.5 * dense.points)])
     augmented = SensorResampler(recording(twice), SPARSE).sweep(0)

@@ -27,7 +27,8 @@ _MAX_STEPS = 3.0  # maximum step of a ring relative to the typical step
 _MAX_GAP_RAD = np.radians(60)  # A wider sector without returns is outside the field of view.
 _MAX_COLUMNS = 4096  # maximum number of cells per ring in which returns are sorted
 _SMALL_GAPS = 0.1  # quantile of the gaps in a ring that contain no lost pulses
-_MAX_SMALL_GAP = 1.5  # maximum gap without lost pulses relative to this quantile
+_MAX_DEVIATION = 0.5  # maximum relative deviation of gaps without lost pulses from the step
+_REFINEMENTS = 5
 _SPREAD_QUANTILE = 0.99
 
 
@@ -243,7 +244,7 @@ def _steps_rad(sweeps: list[tuple[Floats, Ints]], ring_count: int) -> Floats:
 
     In some sensors, certain rings fire at half the rate of the others. The step of a ring with few
     returns is assumed to be the typical step. In a ring that hits trees or the sky, most gaps may
-    contain lost pulses. Only the smaller gaps are therefore used.
+    contain lost pulses. Gaps of several steps are therefore ignored.
     """
     rings = []
     gaps = []
@@ -267,5 +268,12 @@ def _steps_rad(sweeps: list[tuple[Floats, Ints]], ring_count: int) -> Floats:
 
 
 def _smallest_step(gaps: Floats) -> float:
-    small = np.quantile(gaps, _SMALL_GAPS)
-    return float(np.median(gaps[gaps < _MAX_SMALL_GAP * small]))
+    """Return the typical gap without lost pulses.
+
+    The smallest gaps are too small if azimuths are noisy, so the estimate is refined.
+    """
+    step = float(np.quantile(gaps, _SMALL_GAPS, method="inverted_cdf"))
+    for _ in range(_REFINEMENTS):
+        near = gaps[np.abs(gaps / step - 1) < _MAX_DEVIATION]
+        step = float(np.median(near))
+    return step

@@ -41,9 +41,10 @@ class SensorResampler:
     For each pulse in one revolution of the other sensor, the recorded pulse with the closest
     direction is determined: of the rings around the elevation of the pulse, the ring with the
     smallest elevation difference, and in this ring the pulse with the smallest azimuth difference.
-    Neither difference may exceed half of the recorded spacing. If the recorded pulse has a return,
-    the point is copied with all of its columns. If it has none, the resampled pulse has none
-    either. All returns of a pulse are copied, and each return is used at most once.
+    Neither difference may exceed half of the recorded spacing, apart from the scatter of the
+    measured elevations within a ring. If the recorded pulse has a return, the point is copied with
+    all of its columns. If it has none, the resampled pulse has none either. All returns of a pulse
+    are copied, and each return is used at most once.
 
     The result therefore contains no interpolated positions, but its directions differ from those of
     the other sensor by up to half of the recorded spacing. Directions are measured from the origin
