@@ -150,6 +150,22 @@ def test_tilted_rings_are_measured(dense):
     assert len(np.unique(tilted.columns["channel"][augmented.template[channel == 4]])) > 7
 
 
+def test_compensated_results_use_the_directions_as_fired(dense):
+    moved = dense.points + np.linspace(0, 0.5, len(dense))[:, None] * [1, 0, 0]
+    compensated = Recording(
+        "drive", 1, lambda _: dense.replace(points=moved), compensated=True, fired=lambda _: dense
+    )
+    augmented = SensorResampler(compensated, SPARSE).sweep(0)
+    assert (augmented.template == SensorResampler(recording(dense), SPARSE).sweep(0).template).all()
+    assert (augmented.sweep.points == moved[augmented.template]).all()
+    # Without these directions, the measured directions are used.
+    measured = SensorResampler(recording(dense.replace(points=moved)), SPARSE).sweep(0)
+    channel = measured.sweep.columns["channel"]
+    up_deg, across_deg = angles_deg(measured.sweep.points, channel, SPARSE)
+    assert len(channel) > 0.95 * 240 * 16 and up_deg.max() < 1.05
+    assert np.quantile(up_deg, 0.9) < 0.6 and np.quantile(across_deg, 0.9) < 0.3
+
+
 def test_returns_outside_the_range_are_removed(dense):
     near = replace(SPARSE, min_range_m=13.0, max_range_m=16.0)
     augmented = SensorResampler(recording(dense), near).sweep(0)

@@ -2,6 +2,7 @@
 
 The directions are measured from the returns of a few sweeps. The elevation of a ring is therefore a
 function of the azimuth, so that tilted sensors and motion-compensated points need no special cases.
+Results of lidarpool contain the exact directions, which are used instead.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import numpy as np
 
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
-from lidarsim.numerics.arrays import Bools, Floats, Ints, to_writable
+from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints, to_writable
 from lidarsim.numerics.even_samples import even_indices
 
 from ..clouds.recording import Recording
@@ -110,12 +111,20 @@ class RecordedPulses:
         """
         rows = np.flatnonzero(sweep.has_return)
         columns = {"channel": sweep.columns["channel"]} if "channel" in sweep.columns else {}
-        returns = Sweep(sweep.points, columns)
+        returns = Sweep(self._points_as_fired(sweep), columns)
         if len(rows) < len(sweep):
             returns = returns.select(rows)
         points = to_writable(returns.points)
         rings = self.recording.rings.ring_indices(returns)
         return rows, points, np.where(rings < 0, -1, rings + self.silent_above)
+
+    def _points_as_fired(self, sweep: Sweep) -> AnyArray:
+        """Return the points without motion compensation, as far as the recording contains them."""
+        recording = self.recording
+        if recording.fired is None or not sweep.compensated:
+            return sweep.points
+        fired = recording.read_fired(sweep.number)
+        return fired.points if len(fired) == len(sweep) else sweep.points
 
     def ringed_rows(self, sweep: Sweep) -> tuple[Ints, Ints]:
         """Return the rows of a sweep that have a return, and the ring of each of them.

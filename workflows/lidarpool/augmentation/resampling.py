@@ -51,6 +51,7 @@ class SensorResampler:
     of the recorded points, so the offsets of the other sensor's beams from its origin are ignored.
     In motion-compensated sweeps, the recorded spacing varies. Where it is wider than that of the
     other sensor, two rays may be closest to the same pulse. The farther ray then has no return.
+    Results of lidarpool also contain the directions before the compensation, which are used.
     The revolution always starts at the azimuth at which the other sensor starts, but all points
     keep their recorded times. The detection range of the other sensor is not simulated. Only
     returns outside its `min_range_m` and `max_range_m` are removed.
@@ -339,7 +340,7 @@ def _match_channel(
         channel=np.full(len(azimuth), channel),
         ring=distance.argmin(axis=1),
         offset=offset,
-        is_outside=offset > _SLACK * half,
+        is_outside=offset > _SLACK * half + pulses.spread_rad,
         is_distant=offset > _SLACK * limit_rad,
         is_beside=~pulses.is_in_view(azimuth),
     )
