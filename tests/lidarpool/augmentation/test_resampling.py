@@ -294,6 +294,8 @@ def test_thinning_to_listed_rings(dense):
     assert np.bincount(augmented.sweep.columns["channel"]).tolist() == [720] * 3
     with pytest.raises(LidarError, match="drive has no ring 31, 40"):
         SweepThinner(recording(dense), rings=[3, 31, 40])
+    with pytest.raises(LidarError, match="`rings` is empty"):
+        SweepThinner(recording(dense), rings=[])
     with pytest.raises(LidarError, match="`rings` and `every_ring` cannot be combined"):
         SweepThinner(recording(dense), rings=[3], every_ring=2)
 

@@ -89,12 +89,13 @@ class SweepThinner:
         numbers = self.recording.rings.numbers
         if numbers is None:
             numbers = np.arange(len(self._pulses))[::-1]
+        if not len(rings):
+            raise LidarError("`rings` is empty. List the numbers of the rings to keep.")
         unknown = [str(number) for number in rings if number not in numbers]
-        if unknown or not len(rings):
-            problem = f"has no ring {list_names(unknown)}" if unknown else "requires a ring to keep"
+        if unknown:
             raise LidarError(
-                f"{self.recording.name} {problem}. Its rings are numbered from {numbers.min()} to "
-                f"{numbers.max()}."
+                f"{self.recording.name} has no ring {list_names(unknown)}. Its rings are numbered "
+                f"from {numbers.min()} to {numbers.max()}."
             )
         return np.flatnonzero(np.isin(numbers, rings))[::-1]
 
