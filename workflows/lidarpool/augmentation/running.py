@@ -1,0 +1,416 @@
+"""Augment all sweeps of a recording in worker processes, and write the augmented copy.
+
+Sweeps are encoded independently of each other and collected in a work folder. A run that was
+stopped at any time continues with the missing sweeps, and its output has the same bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lidarsim.errors import LidarError
+from lidarsim.io.storage import Storage
+from lidarsim.sensor import Sensor
+from lidarsim.words import plural
+
+from ..clouds.folder import result_folder
+from ..identity.fingerprint import fingerprint
+from ..identity.software import software
+from ..run.cluster.worker_map import parallel_map
+from .rewriting.rewriter import Rewriter
+from .sweep_tasks import (
+    MAX_VARIANTS,
+    AugmentationPlan,
+    EncodedFiles,
+    PlanProcess,
+    PointCounts,
+    RecordingFile,
+    SharedPlan,
+    SweepTask,
+    augment_sweeps,
+    close_plans,
+    open_plan,
+)
+from .variants import TABLE_FILE, Variants, variants_table
+from .work_folder import WorkFolder
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+_WORKER_BYTES = 2 << 30  # memory per process for a sensor with 128 channels
+_TASK_SWEEPS = 8  # maximum number of sweeps in a task
+_MIN_TASKS = 64  # so that all workers are busy until the end, if there are enough sweeps
+
+ShowProgress = Callable[[int, int], None]  # called with the numbers of finished and of all sweeps
+
+
+@dataclass(frozen=True, eq=False)
+class AugmentedRecording:
+    """Summary of an augmented recording.
+
+    Attributes
+    ----------
+    outputs
+        Augmented copies of the recording, one for each variant.
+    table
+        Table with the values of the variants, or None if there is a single variant.
+    sweeps
+        Number of augmented sweeps in each output.
+    counts
+        Point counts of all outputs.
+    seconds
+        Duration of the augmentation in seconds.
+    notes
+        Notes for the user.
+    """
+
+    outputs: tuple[Path, ...]
+    table: Path | None
+    sweeps: int
+    counts: PointCounts
+    seconds: float
+    notes: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        counts = self.counts
+        copies = f" in each of {len(self.outputs):,} variants" if self.table else ""
+        share = 100 * (1 - counts.kept / counts.returns) if counts.returns else 0.0
+        added = ", ".join(f"{count:,} from {cause}" for cause, count in counts.added.items())
+        return (
+            f"{plural(self.sweeps, 'sweep')} augmented{copies}: {share:.1f} % of "
+            f"{counts.returns:,} returns are lost or hidden, "
+            f"{sum(counts.added.values()):,} returns are added{f' ({added})' if added else ''} "
+            f"({self.seconds:.1f} s)"
+        )
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """Values for JSON."""
+        counts = self.counts
+        return {
+            "outputs": [str(path) for path in self.outputs],
+            "table": None if self.table is None else str(self.table),
+            "sweeps": self.sweeps,
+            "returns": counts.returns,
+            "kept": counts.kept,
+            "added": dict(counts.added),
+            "seconds": self.seconds,
+            "notes": list(self.notes),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Augmentation:
+    """Augmentation of a recording, which writes an augmented copy for each variant.
+
+    Attributes
+    ----------
+    file
+        File or folder of the recording.
+    variants
+        Variants of effects.
+    model
+        Model of the recording's sensor, or None if it is unknown.
+    numbers
+        Numbers of the sweeps to augment, or None for all. Other sweeps are not changed.
+    output_format
+        Name of the output format, or None for the format of the recording.
+    """
+
+    file: RecordingFile
+    variants: Variants
+    model: Sensor | None = None
+    numbers: range | None = None
+    output_format: str | None = None
+
+    def run(
+        self,
+        out: Path,
+        *,
+        client: Client | None = None,
+        workers: int | None = None,
+        resume: bool = False,
+        overwrite: bool = False,
+        progress: ShowProgress = lambda done, total: None,
+    ) -> AugmentedRecording:
+        """Augment the recording, and write the copies.
+
+        Parameters
+        ----------
+        out
+            Output file or folder. If there are several variants, or if the recording is a file and
+            `out` has another extension, the copies are written to this folder.
+        client
+            Client of a cluster whose OTHER workers can read the recording at the same path. By
+            default, processes on this machine augment the sweeps.
+        workers
+            Number of processes on this machine. By default, it depends on the number of cores and
+            the memory. The output does not depend on it.
+        resume
+            Whether to continue with the sweeps of an earlier run that was stopped.
+        overwrite
+            Whether to discard an unfinished run, and to replace existing copies.
+        progress
+            Function that is called with the numbers of finished and of all sweeps.
+
+        Raises
+        ------
+        LidarError
+            If the recording cannot be read or augmented, if the output exists or cannot be
+            written, or if the unfinished run has other inputs.
+        """
+        out = Path(out)
+        folder = WorkFolder.for_output(out)
+        targets = self._targets(out)
+        try:
+            with ExitStack() as stack:
+                if targets[0] != out:
+                    stack.enter_context(result_folder(out))
+                stack.enter_context(result_folder(folder))
+                identity = self._identity()
+                work = WorkFolder.create_or_resume(
+                    out, identity, resume=resume, overwrite=overwrite
+                )
+                run = _Run(self, work, targets, identity, progress)
+                with run.kept_on_error():
+                    return run.augment(out, client, workers)
+        finally:
+            close_plans()
+
+    def _targets(self, out: Path) -> tuple[Path, ...]:
+        """Return the path of the copy for each variant."""
+        path = self.file.path
+        suffix = path.suffix if path.is_file() else ""
+        if self.variants.is_campaign:
+            return tuple(out / f"{number:04}{suffix}" for number in range(self.variants.count))
+        if suffix and out.suffix.lower() != suffix.lower():
+            return (out / path.name,)
+        return (out,)
+
+    def _identity(self) -> dict[str, str]:
+        """Return hashes of the inputs, keyed by a noun for messages."""
+        return {
+            "recording": fingerprint_files(self.file.path),
+            "effects": self.variants.identity,
+            "options": fingerprint(
+                str(self.file.path.absolute()),
+                self.file.sensor,
+                self.file.intensity,
+                self.model,
+                None if self.numbers is None else [self.numbers.start, self.numbers.stop],
+                self.output_format,
+            ),
+            "version of lidarpool": software()["lidarpool"],
+        }
+
+
+def fingerprint_files(path: Path) -> str:
+    """Return a hash of the names, sizes and modification times of a file or of all in a folder."""
+    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    states = [
+        (str(file.relative_to(path)), status.st_size, status.st_mtime_ns)
+        for file in files
+        if file.is_file() and (status := file.stat())
+    ]
+    return fingerprint(states)
+
+
+@dataclass(eq=False)
+class _Run:
+    """Run of an augmentation, whose sweeps are collected in a work folder."""
+
+    augmentation: Augmentation
+    work: WorkFolder
+    targets: tuple[Path, ...]
+    identity: Mapping[str, str]
+    progress: ShowProgress
+    _notes: dict[str, None] = field(default_factory=dict)  # in the order of their discovery
+    _done: int = 0  # number of finished sweeps of all variants
+    _count: int = 0  # number of sweeps of the recording
+    _started: float = field(default_factory=time.monotonic)
+
+    def kept_on_error(self) -> _KeptFolder:
+        """Return a context that keeps a work folder with sweeps if the body fails."""
+        return _KeptFolder(self.work)
+
+    def augment(self, out: Path, client: Client | None, workers: int | None) -> AugmentedRecording:
+        """Augment the missing sweeps, and write the copies that are not complete."""
+        variants = self.augmentation.variants
+        first = self._shared_plan(self._groups()[0])
+        process = open_plan(first)
+        self._count = len(process.recording)
+        self._check(process)
+        total = self._count * variants.count
+        tasks = min(total, max(_MIN_TASKS, total // _TASK_SWEEPS))
+        with parallel_map(client, tasks, _WORKER_BYTES, workers) as run:
+            for group in self._groups():
+                self._augment_group(group, run)
+        return self._summary(out)
+
+    def _groups(self) -> list[range]:
+        """Return the variants in groups, whose sweeps are read only once."""
+        count = self.augmentation.variants.count
+        return [
+            range(start, min(start + MAX_VARIANTS, count))
+            for start in range(0, count, MAX_VARIANTS)
+        ]
+
+    def _check(self, process: PlanProcess) -> None:
+        """Raise LidarError if the recording cannot be augmented, before anything is written."""
+        numbers = self.augmentation.numbers
+        if numbers is not None and (not len(numbers) or numbers[-1] >= self._count):
+            raise LidarError(
+                f"{process.recording.name} has {plural(self._count, 'sweep')}, which are numbered "
+                f"from 0 to {self._count - 1}. Specify some of them with `--sweeps`."
+            )
+        rewriter = process.rewriter
+        for variant, target in enumerate(self.targets):
+            if self.work.summary(variant) is None:
+                overwrite = self.work.may_replace(variant)
+                rewriter.check_target(target, overwrite=overwrite)
+        process.augmenter(0)
+        self._add_notes(process.notes())
+
+    def _shared_plan(self, group: range) -> SharedPlan:
+        augmentation = self.augmentation
+        effects = {number: augmentation.variants.effects(number) for number in group}
+        self._add_notes(note for one in effects.values() for note in one.notes)
+        file = replace(augmentation.file, path=augmentation.file.path.absolute())
+        plan = AugmentationPlan(
+            file, effects, augmentation.model, augmentation.numbers, augmentation.output_format
+        )
+        key = fingerprint(dict(self.identity), group.start)
+        return SharedPlan.from_plan(key, self.work, plan)
+
+    def _add_notes(self, notes: Iterable[str]) -> None:
+        self._notes |= dict.fromkeys(notes)
+
+    def _augment_group(self, group: range, run: Any) -> None:
+        """Augment the missing sweeps of some variants, and write their copies."""
+        variants = [number for number in group if self.work.summary(number) is None]
+        self._done += self._count * (len(group) - len(variants))
+        if not variants:
+            return
+        shared = self._shared_plan(group)
+        rewriter = open_plan(shared).rewriter
+        missing = self._missing(variants, rewriter)
+        pending = sum(len(numbers) for _, numbers in missing)
+        self._done += self._count * len(variants) - pending
+        self._show_progress()
+        for encoded in _closed_iteration(run(augment_sweeps, self._tasks(shared, missing))):
+            if encoded.files is not None:
+                self.work.write(encoded.files)
+            self._add_notes(encoded.notes)
+            self._done += encoded.count
+            self._show_progress()
+        self._check_unchanged()
+        rewriter = open_plan(shared).rewriter
+        for variant in variants:
+            self._write_copy(variant, rewriter)
+
+    def _show_progress(self) -> None:
+        self.progress(self._done, self._count * self.augmentation.variants.count)
+
+    def _missing(
+        self, variants: list[int], rewriter: Rewriter
+    ) -> list[tuple[int, tuple[int, ...]]]:
+        """Return the numbers of the sweeps that are not encoded, with their variants."""
+        work = self.work
+        missing = [
+            (number, tuple(v for v in variants if not rewriter.is_written(work.encoded(v), number)))
+            for number in range(self._count)
+        ]
+        return [(number, without) for number, without in missing if without]
+
+    def _tasks(
+        self, shared: SharedPlan, missing: list[tuple[int, tuple[int, ...]]]
+    ) -> Iterator[SweepTask]:
+        """Yield tasks of consecutive sweeps, which are read in a single pass."""
+        size = min(-(-len(missing) // _MIN_TASKS), _TASK_SWEEPS)
+        for start in range(0, len(missing), size):
+            yield SweepTask(shared, tuple(missing[start : start + size]))
+
+    def _check_unchanged(self) -> None:
+        """Raise LidarError if the recording has changed since the run began."""
+        path = self.augmentation.file.path
+        if fingerprint_files(path) != self.identity["recording"]:
+            raise LidarError(
+                f"{path} was changed while it was augmented. Start again with `--overwrite`."
+            )
+
+    def _write_copy(self, variant: int, rewriter: Rewriter) -> None:
+        """Write the copy of a variant, and remove its encoded sweeps."""
+        work = self.work
+        counts = PointCounts.total(
+            json.loads(work.counts(variant, number).read_bytes()) for number in range(self._count)
+        )
+        overwrite = work.begin_output(variant)
+        notes = rewriter.finish(self.targets[variant], work.encoded(variant), overwrite=overwrite)
+        summary = {"returns": counts.returns, "kept": counts.kept, "added": dict(counts.added)}
+        work.end_output(variant, summary | {"notes": list(notes)})
+
+    def _summary(self, out: Path) -> AugmentedRecording:
+        """Write the table of a campaign, remove the work folder, and return a summary."""
+        variants = self.augmentation.variants
+        summaries = [self.work.summary(number) or {} for number in range(variants.count)]
+        self._add_notes(chain.from_iterable(summary["notes"] for summary in summaries))
+        table = None
+        if variants.is_campaign:
+            table = out / TABLE_FILE
+            columns = [
+                {
+                    "returns": summary["returns"],
+                    "kept": summary["kept"],
+                    "added": sum(summary["added"].values()),
+                }
+                for summary in summaries
+            ]
+            names = [target.name for target in self.targets]
+            Storage(str(out)).write(TABLE_FILE, variants_table(variants, names, columns))
+        self.work.remove()
+        numbers = self.augmentation.numbers
+        return AugmentedRecording(
+            self.targets,
+            table,
+            self._count if numbers is None else len(numbers),
+            PointCounts.total(summaries),
+            time.monotonic() - self._started,
+            tuple(self._notes),
+        )
+
+
+@dataclass(frozen=True)
+class _KeptFolder:
+    """Context that keeps a work folder with sweeps if the body fails, or else removes it."""
+
+    work: WorkFolder
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
+        if error is None:
+            return
+        if self.work.has_sweeps:
+            error.add_note(
+                f"Finished sweeps are stored in {self.work.folder}. Continue with `--resume`."
+            )
+        else:
+            self.work.remove()
+
+
+def _closed_iteration(results: Iterable[EncodedFiles]) -> Iterator[EncodedFiles]:
+    """Iterate over the results of a map, and cancel waiting tasks if the iteration stops early."""
+    try:
+        yield from results
+    finally:
+        close = getattr(results, "close", None)
+        if close is not None:
+            close()
