@@ -16,12 +16,8 @@ from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.files.mesh_formats import endings, format_of
 from lidarsim.scene.files.meshfile import load_objects
 from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.schema.vocabulary import INSERTIONS
 from lidarsim.words import did_you_mean
-
-BUILT_IN: dict[str, Callable[[], SceneMesh]] = {
-    "car": lambda: car(MODELS[0]),
-    "pedestrian": pedestrian,
-}
 
 
 def load_insertion(shape: str | Path, report: Callable[[str], None] = lambda _: None) -> SceneMesh:
@@ -40,15 +36,17 @@ def load_insertion(shape: str | Path, report: Callable[[str], None] = lambda _: 
     LidarError
         If there is no such mesh or file, or if the file cannot be read.
     """
-    if (create := BUILT_IN.get(str(shape))) is not None:
-        return replace(create(), name=str(shape))
+    if str(shape) == "car":
+        return replace(car(MODELS[0]), name="car")
+    if str(shape) == "pedestrian":
+        return pedestrian()
     path = Path(shape)
     if not path.exists():
         if path.suffix and format_of(path):
             raise LidarError(not_found(path))
-        names = ", ".join(BUILT_IN)
+        names = ", ".join(INSERTIONS)
         raise LidarError(
-            f"There is no object {str(shape)!r} to insert.{did_you_mean(str(shape), BUILT_IN)} "
+            f"There is no object {str(shape)!r} to insert.{did_you_mean(str(shape), INSERTIONS)} "
             f"Specify {names} or a mesh file ({' '.join(endings())})."
         )
     objects = load_objects(path, report=report, axes=report)

@@ -122,6 +122,8 @@ class Augmentation:
         Numbers of the sweeps to augment, or None for all. Other sweeps are not changed.
     output_format
         Name of the output format, or None for the format of the recording.
+    resampled
+        Sensor to which the sweeps are resampled, or None to keep the rays of the recorded sensor.
     """
 
     file: RecordingFile
@@ -129,6 +131,7 @@ class Augmentation:
     model: Sensor | None = None
     numbers: range | None = None
     output_format: str | None = None
+    resampled: Sensor | None = None
 
     def run(
         self,
@@ -206,6 +209,7 @@ class Augmentation:
                 self.model,
                 None if self.numbers is None else [self.numbers.start, self.numbers.stop],
                 self.output_format,
+                self.resampled,
             ),
             "version of lidarpool": software()["lidarpool"],
         }
@@ -265,17 +269,22 @@ class _Run:
     def _check(self, process: PlanProcess) -> None:
         """Raise LidarError if the recording cannot be augmented, before anything is written."""
         numbers = self.augmentation.numbers
-        if numbers is not None and (not len(numbers) or numbers[-1] >= self._count):
+        if numbers is not None and numbers.start >= self._count:
             raise LidarError(
-                f"{process.recording.name} has {plural(self._count, 'sweep')}, which are numbered "
-                f"from 0 to {self._count - 1}. Specify some of them with `--sweeps`."
+                f"{self.augmentation.file.path} has {plural(self._count, 'sweep')}, so "
+                f"`--sweeps` must start before {self._count}, but starts at {numbers.start}."
+            )
+        if numbers is not None and self.augmentation.resampled is not None:
+            raise LidarError(
+                "`--sweeps` and `--sensor` cannot be combined, because the other sweeps would "
+                "keep the rays of the recorded sensor."
             )
         rewriter = process.rewriter
         for variant, target in enumerate(self.targets):
             if self.work.summary(variant) is None:
                 overwrite = self.work.may_replace(variant)
                 rewriter.check_target(target, overwrite=overwrite)
-        process.augmenter(0)
+        process.prepare(0)
         self._add_notes(process.notes())
 
     def _shared_plan(self, group: range) -> SharedPlan:
@@ -284,7 +293,12 @@ class _Run:
         self._add_notes(note for one in effects.values() for note in one.notes)
         file = replace(augmentation.file, path=augmentation.file.path.absolute())
         plan = AugmentationPlan(
-            file, effects, augmentation.model, augmentation.numbers, augmentation.output_format
+            file,
+            effects,
+            augmentation.model,
+            augmentation.numbers,
+            augmentation.output_format,
+            augmentation.resampled,
         )
         key = fingerprint(dict(self.identity), group.start)
         return SharedPlan.from_plan(key, self.work, plan)
@@ -379,7 +393,7 @@ class _Run:
         return AugmentedRecording(
             self.targets,
             table,
-            self._count if numbers is None else len(numbers),
+            self._count if numbers is None else len(range(self._count)[_as_slice(numbers)]),
             PointCounts.total(summaries),
             time.monotonic() - self._started,
             tuple(self._notes),
@@ -404,6 +418,10 @@ class _KeptFolder:
             )
         else:
             self.work.remove()
+
+
+def _as_slice(numbers: range) -> slice:
+    return slice(numbers.start, numbers.stop, numbers.step)
 
 
 def _closed_iteration(results: Iterable[EncodedFiles]) -> Iterator[EncodedFiles]:

@@ -23,12 +23,13 @@ from lidarsim.columns.table import CAUSES
 from lidarsim.errors import LidarError
 from lidarsim.sensor import Sensor
 
-from ..clouds.recording import Recording
+from ..clouds.recording import METERS, Recording
 from ..processes.per_process import PerProcess
 from ..recordings.opening import open_recording
 from .augmented_sweep import AugmentedSweep
 from .augmenter import Augmenter
 from .effects import Effects
+from .resampling import SensorResampler
 from .rewriting.opening import open_rewriter
 from .rewriting.rewriter import Rewriter
 from .work_folder import WorkFolder, counts_name
@@ -84,6 +85,8 @@ class AugmentationPlan:
         Numbers of the sweeps to augment. Other sweeps are not changed.
     output_format
         Name of the output format, or None for the format of the recording.
+    resampled
+        Sensor to which the sweeps are resampled, or None.
     """
 
     file: RecordingFile
@@ -91,6 +94,7 @@ class AugmentationPlan:
     model: Sensor | None = None
     numbers: range | None = None
     output_format: str | None = None
+    resampled: Sensor | None = None
 
     def open_rewriter(self, recording: Recording) -> Rewriter:
         """Return the rewriter for the output format."""
@@ -192,25 +196,64 @@ class PlanProcess:
         """Rewriter for the output format."""
         return self.plan.open_rewriter(self.recording)
 
+    @cached_property
+    def resampler(self) -> Resampler | None:
+        """Resampler of the sweeps, or None if they keep the rays of the recorded sensor."""
+        sensor = self.plan.resampled
+        if sensor is None:
+            return None
+        return Resampler(SensorResampler(self.recording, sensor, self.plan.model))
+
+    @cached_property
+    def source(self) -> Recording:
+        """The resampled recording, which is the recording itself without a resampler."""
+        if self.resampler is None:
+            return self.recording
+        # The resampled sweeps have standard names and units.
+        return replace(
+            self.recording,
+            read=lambda number: self.resampler(number).sweep,
+            fired=None,
+            meters=METERS,
+            intensity_column=None,
+        )
+
+    def prepare(self, variant: int) -> None:
+        """Raise LidarError if the recording cannot be augmented."""
+        if self.resampler is None or not self.plan.variants[variant].is_empty:
+            self.augmenter(variant)
+
+    def augmented(self, number: int, variant: int) -> AugmentedSweep:
+        """Return an augmented sweep, whose templates are rows of the recorded sweep."""
+        resampled = None if self.resampler is None else self.resampler(number)
+        if resampled is None:
+            return self.augmenter(variant).sweep(number)
+        if self.plan.variants[variant].is_empty:
+            return resampled
+        augmented = self.augmenter(variant).sweep(number)
+        return replace(augmented, template=resampled.template[augmented.template])
+
     def augmenter(self, variant: int) -> Augmenter:
         """Return the augmenter of a variant. Up to `MAX_VARIANTS` augmenters are kept."""
         if variant not in self._augmenters:
             while len(self._augmenters) >= MAX_VARIANTS:
                 del self._augmenters[next(iter(self._augmenters))]
             effects = self.plan.variants[variant]
-            self._augmenters[variant] = Augmenter(self.recording, effects, self.plan.model)
+            self._augmenters[variant] = Augmenter(self.source, effects, self.plan.model)
         return self._augmenters[variant]
 
     def notes(self) -> tuple[str, ...]:
-        """Return the notes of all augmenters."""
+        """Return the notes of the resampler and of all augmenters."""
         notes = [note for augmenter in self._augmenters.values() for note in augmenter.notes]
+        if self.resampler is not None:
+            notes = [*self.resampler.notes, *notes]
         return tuple(dict.fromkeys(notes))
 
     def files(self, number: int, variant: int) -> dict[str, bytes]:
         """Return the files of a sweep in the order in which they must be written."""
         numbers = self.plan.numbers
         if numbers is None or number in numbers:
-            augmented = self.augmenter(variant).sweep(number)
+            augmented = self.augmented(number, variant)
         else:
             augmented = unchanged_sweep(self.recording[number])
         encoded = self.rewriter.sweep_files(number, augmented)
@@ -220,6 +263,26 @@ class PlanProcess:
             counts_name(variant, number): json.dumps(counts).encode(),
             **{f"{folder}/{name}": content for name, content in encoded.items()},
         }
+
+
+class Resampler:
+    """Function that resamples a sweep to another sensor, and keeps the last one in memory."""
+
+    def __init__(self, resampler: SensorResampler) -> None:
+        self._resampler = resampler
+        self._last: tuple[int, AugmentedSweep] | None = None
+
+    def __call__(self, number: int) -> AugmentedSweep:
+        """Return a resampled sweep."""
+        if self._last is None or self._last[0] != number:
+            self._last = None
+            self._last = number, self._resampler.sweep(number)
+        return self._last[1]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes for the user."""
+        return tuple(self._resampler.notes)
 
 
 MAX_VARIANTS = 8  # maximum number of variants of a task, whose augmenters are in memory
