@@ -18,7 +18,7 @@ from lidarsim.numerics.arrays import AnyArray, Floats, Ints
 from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
-from lidarsim.simulator.recorded_sweeps import PulseAugmenter, FiredPulses, scene_of_bodies
+from lidarsim.simulator.recorded_sweeps import FiredPulses, PulseAugmenter, scene_of_bodies
 from lidarsim.simulator.returns import PulseReturns
 from lidarsim.words import did_you_mean
 

@@ -21,7 +21,7 @@ from lidarsim.words import format_rounded, list_names, plural
 from ..clouds.recording import Recording
 from .augmented_sweep import AugmentedSweep
 from .nearest_pulse_loops import CandidateRings
-from .recorded_pulses import RecordedPulses
+from .ring_directions import RingDirections
 
 _SLACK = 1.05  # tolerance of the checks, because recorded directions are measured
 _MAX_MISSING = 0.02  # maximum share of rays, or of rays in a channel, that cannot be resampled
@@ -100,7 +100,7 @@ class SensorResampler:
         self.recording = recording
         self.sensor = sensor
         silent_rad = None if recorded_sensor is None else _silent_rad(recording, recorded_sensor)
-        self._pulses = RecordedPulses(recording, silent_rad)
+        self._pulses = RingDirections(recording, silent_rad)
         self.notes: list[str] = []
         self._check_range(recorded_sensor)
         rays, candidates = _matched_rays(self._pulses, sensor)
@@ -297,7 +297,7 @@ def _select(rays: _Rays, candidates: CandidateRings, chosen: Bools) -> tuple[_Ra
     )
 
 
-def _matched_rays(pulses: RecordedPulses, sensor: Sensor) -> tuple[_Rays, CandidateRings]:
+def _matched_rays(pulses: RingDirections, sensor: Sensor) -> tuple[_Rays, CandidateRings]:
     """Match the rays of the first revolution of a sensor with recorded rings."""
     steps = sensor.steps_of_revolution(0)
     firings = np.arange(sensor.firings(steps[0])[0], sensor.firings(steps[-1])[1])
@@ -321,7 +321,7 @@ def _matched_rays(pulses: RecordedPulses, sensor: Sensor) -> tuple[_Rays, Candid
 
 
 def _match_channel(
-    pulses: RecordedPulses, directions: Floats, channel: int, limit_rad: float
+    pulses: RingDirections, directions: Floats, channel: int, limit_rad: float
 ) -> tuple[_Rays, CandidateRings]:
     """Match the rays of a channel with recorded rings.
 

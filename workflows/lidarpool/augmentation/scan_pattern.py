@@ -24,7 +24,7 @@ from ..clouds.recording import Recording
 from ..clouds.rings import Rings
 
 if TYPE_CHECKING:
-    from .grid_loops import ChannelTables, SweepRotation, SweepReturns
+    from .grid_loops import ChannelTables, SweepReturns, SweepRotation
 
 _REFERENCE_SWEEPS = 5  # number of sweeps from which the pattern is determined
 _MIN_STEP_RAD = np.radians(0.02)  # closer returns of a ring belong to the same pulse

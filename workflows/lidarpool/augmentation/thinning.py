@@ -15,8 +15,8 @@ from lidarsim.words import list_names
 from ..clouds.recording import Recording
 from .augmented_sweep import AugmentedSweep
 from .nearest_pulse_loops import CandidateRings
-from .recorded_pulses import RecordedPulses
 from .resampling import copied_returns
+from .ring_directions import RingDirections
 
 
 class SweepThinner:
@@ -71,7 +71,7 @@ class SweepThinner:
             raise LidarError("`rings` and `every_ring` cannot be combined.")
         self.recording = recording
         self.notes: list[str] = []
-        self._pulses = RecordedPulses(recording)
+        self._pulses = RingDirections(recording)
         ring_count = len(self._pulses)
         if rings is None:
             kept = np.arange(ring_count - 1, -1, -every_ring)
@@ -139,7 +139,7 @@ class _Rays:
     azimuth: Floats  # (k,), radians
     candidates: CandidateRings
 
-    def __init__(self, pulses: RecordedPulses, rings: Ints, every_column: int) -> None:
+    def __init__(self, pulses: RingDirections, rings: Ints, every_column: int) -> None:
         spacing = every_column * pulses.step_rad[rings]
         azimuths = [
             -np.pi + step * np.arange(max(int(2 * np.pi / step + 0.5), 1)) for step in spacing

@@ -33,7 +33,7 @@ _REFINEMENTS = 5
 _SPREAD_QUANTILE = 0.99
 
 
-class RecordedPulses:
+class RingDirections:
     """Directions of the pulses in a recording.
 
     Rings are sorted from the highest to the lowest, as in `Recording.rings`.
