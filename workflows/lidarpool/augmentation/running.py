@@ -10,7 +10,7 @@ import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -124,6 +124,8 @@ class Augmentation:
         Name of the output format, or None for the format of the recording.
     resampled
         Sensor to which the sweeps are resampled, or None to keep the rays of the recorded sensor.
+    reflectance
+        Reflectance of all recorded surfaces if the recording has no intensities.
     """
 
     file: RecordingFile
@@ -132,6 +134,7 @@ class Augmentation:
     numbers: range | None = None
     output_format: str | None = None
     resampled: Sensor | None = None
+    reflectance: float | None = None
 
     def run(
         self,
@@ -203,13 +206,14 @@ class Augmentation:
             "recording": fingerprint_files(self.file.path),
             "effects": self.variants.identity,
             "options": fingerprint(
-                str(self.file.path.absolute()),
+                str(self.file.folder / self.file.path),
                 self.file.sensor,
                 self.file.intensity,
                 self.model,
                 None if self.numbers is None else [self.numbers.start, self.numbers.stop],
                 self.output_format,
                 self.resampled,
+                self.reflectance,
             ),
             "version of lidarpool": software()["lidarpool"],
         }
@@ -291,14 +295,14 @@ class _Run:
         augmentation = self.augmentation
         effects = {number: augmentation.variants.effects(number) for number in group}
         self._add_notes(note for one in effects.values() for note in one.notes)
-        file = replace(augmentation.file, path=augmentation.file.path.absolute())
         plan = AugmentationPlan(
-            file,
+            augmentation.file,
             effects,
             augmentation.model,
             augmentation.numbers,
             augmentation.output_format,
             augmentation.resampled,
+            augmentation.reflectance,
         )
         key = fingerprint(dict(self.identity), group.start)
         return SharedPlan.from_plan(key, self.work, plan)

@@ -37,11 +37,29 @@ from .work_folder import WorkFolder, counts_name
 
 @dataclass(frozen=True)
 class RecordingFile:
-    """File or folder of a recording, with the sensor and the column that the user chose."""
+    """File or folder of a recording, with the sensor and the column that the user chose.
+
+    Attributes
+    ----------
+    path
+        Path, which may be relative to `folder`.
+    sensor
+        Sensor or topic, if there are several.
+    intensity
+        Column that contains the intensities, if it is not ``intensity``.
+    folder
+        Working directory of the process that created this object.
+    """
 
     path: Path
     sensor: str | None = None
     intensity: str | None = None
+    folder: Path = field(default_factory=Path.cwd)
+
+    @property
+    def located(self) -> Path:
+        """Path that is valid in this process. It is the given path if possible, for messages."""
+        return self.path if Path.cwd() == self.folder else self.folder / self.path
 
     def open(self) -> Recording:
         """Open the recording with all points of its file.
@@ -49,7 +67,7 @@ class RecordingFile:
         The last sweep stays in memory, so variants and rewriters do not read it again. A bag would
         even be read from its start.
         """
-        recording = open_recording(self.path, self.sensor, self.intensity, keep_noise=True)
+        recording = open_recording(self.located, self.sensor, self.intensity, keep_noise=True)
         return replace(recording, read=_LastSweep(recording))
 
 
@@ -87,6 +105,8 @@ class AugmentationPlan:
         Name of the output format, or None for the format of the recording.
     resampled
         Sensor to which the sweeps are resampled, or None.
+    reflectance
+        Reflectance of all recorded surfaces if the recording has no intensities.
     """
 
     file: RecordingFile
@@ -95,6 +115,7 @@ class AugmentationPlan:
     numbers: range | None = None
     output_format: str | None = None
     resampled: Sensor | None = None
+    reflectance: float | None = None
 
     def open_rewriter(self, recording: Recording) -> Rewriter:
         """Return the rewriter for the output format."""
@@ -103,7 +124,7 @@ class AugmentationPlan:
                 f"The output format {self.output_format!r} is not supported. Omit `--format` to "
                 "write the format of the recording."
             )
-        return open_rewriter(self.file.path, recording, self.file.sensor)
+        return open_rewriter(self.file.located, recording, self.file.sensor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,8 +204,8 @@ class PlanProcess:
     @cached_property
     def recording(self) -> Recording:
         """The recording."""
-        path = self.plan.file.path
-        if not path.exists():
+        path = self.plan.file.located
+        if path.is_absolute() and not path.exists():
             raise LidarError(
                 f"{path} does not exist on {socket.gethostname()}. Use a path that all workers "
                 "can access."
@@ -202,7 +223,7 @@ class PlanProcess:
         sensor = self.plan.resampled
         if sensor is None:
             return None
-        return Resampler(SensorResampler(self.recording, sensor, self.plan.model))
+        return Resampler(SensorResampler(self.recording, sensor, recorded_sensor=self.plan.model))
 
     @cached_property
     def source(self) -> Recording:
@@ -239,7 +260,9 @@ class PlanProcess:
             while len(self._augmenters) >= MAX_VARIANTS:
                 del self._augmenters[next(iter(self._augmenters))]
             effects = self.plan.variants[variant]
-            self._augmenters[variant] = Augmenter(self.source, effects, self.plan.model)
+            self._augmenters[variant] = Augmenter(
+                self.source, effects, self.plan.model, self.plan.reflectance
+            )
         return self._augmenters[variant]
 
     def notes(self) -> tuple[str, ...]:

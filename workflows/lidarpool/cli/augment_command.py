@@ -115,6 +115,12 @@ class _Placement(NamedTuple):
     "--topic", metavar="NAME", help="Sensor or topic of the recording, if it contains several."
 )
 @click.option("--intensity", metavar="COLUMN", help="Column that contains the intensity.")
+@click.option(
+    "--reflectance",
+    type=click.FloatRange(0, 1, min_open=True),
+    metavar="SHARE",
+    help="Reflectance of all recorded surfaces, for a recording without intensities.",
+)
 @click.option("--rain", type=click.FloatRange(0, 300), metavar="MM_H", help="Rain rate in mm/h.")
 @click.option(
     "--snow",
@@ -235,6 +241,7 @@ def augment(
     model: str | None,
     topic: str | None,
     intensity: str | None,
+    reflectance: float | None,
     output_format: str | None,
     sensor: str | None,
     sweeps: range | None,
@@ -287,6 +294,7 @@ def augment(
         sweeps,
         output_format,
         None if sensor is None else _load_model(sensor),
+        reflectance,
     )
     client = nullcontext() if scheduler is None else connect_client(scheduler, files)
     try:
