@@ -462,10 +462,11 @@ class _Fit:
         compensated = True if law is None else law
         scale = replace(common, compensated=compensated, is_known=False)
         range_m = self.returns.range_m
-        lowest, highest = _PLAUSIBLE
         for assumed, text in self._conventions(scale):
+            # Fog reduces typical codes of a real sensor to 1 or 2.
+            lowest = _PLAUSIBLE[0] if assumed.codes is None else 0.0
             levels = _levels(assumed, values, range_m)
-            if lowest <= typical_level(levels, range_m) <= highest:
+            if lowest <= typical_level(levels, range_m) <= _PLAUSIBLE[1]:
                 return self._with_near(assumed, values, text)
         levels = _levels(scale, values, range_m)
         white = white_level(levels, range_m)
