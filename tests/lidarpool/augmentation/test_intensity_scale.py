@@ -218,7 +218,6 @@ def test_livox_columns_are_recognized():
         (energies_times(1.0), 1),  # messages with the layout of velodyne_pointcloud
         (energies_times(255.0, max_value=255.0), 255),  # nuScenes
         (energies_times(255.0, np.uint8, 255), 255),  # messages of Autoware
-        (energies_times(10_000, np.uint16, 65_535), 10_000),  # messages of ouster-ros
     ],
 )
 def test_energies_are_recognized(columns, white):

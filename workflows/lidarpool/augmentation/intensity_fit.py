@@ -105,7 +105,7 @@ def is_valid(values: AnyArray) -> Bools:
     return np.asarray(np.isfinite(values) & (values >= 0))
 
 
-def smallest_beside_zeros(values: AnyArray) -> float:
+def smallest_positive(values: AnyArray) -> float:
     """Return the smallest positive value, or 0 if no value is 0. The values must be valid."""
     positive = values[values > 0]
     return float(positive.min()) if 0 < len(positive) < len(values) else 0.0
