@@ -192,6 +192,15 @@ def test_codes_of_an_unknown_sensor_are_assumed_to_be_calibrated():
     assert np.median(errors_of(recording, scale)) == pytest.approx(1, abs=0.01)
 
 
+def test_codes_recorded_in_fog_are_assumed_to_be_calibrated():
+    def columns(energy, range_m):
+        attenuated = reflectances(energy, range_m) * np.exp(-0.05 * range_m)
+        return {"intensity": VELODYNE.encode(attenuated)}
+
+    scale = IntensityScale.for_recording(record(columns))
+    assert (scale.white, scale.codes) == (100, VELODYNE)
+
+
 def test_livox_columns_are_recognized():
     def columns(energy, range_m):
         codes = SCALES["livox"].encode(reflectances(energy, range_m))
@@ -209,7 +218,6 @@ def test_livox_columns_are_recognized():
         (energies_times(1.0), 1),  # messages with the layout of velodyne_pointcloud
         (energies_times(255.0, max_value=255.0), 255),  # nuScenes
         (energies_times(255.0, np.uint8, 255), 255),  # messages of Autoware
-        (energies_times(10_000, np.uint16, 65_535), 10_000),  # messages of ouster-ros
     ],
 )
 def test_energies_are_recognized(columns, white):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 from tests.street_recordings import record, reflectances
@@ -147,3 +149,8 @@ def test_nothing_is_lost_without_returns():
     scale = IntensityScale.with_reflectance(0.3)
     threshold = detection_threshold(scale, None, np.zeros(0))
     assert (threshold.energy, threshold.range_m) == (0, np.inf)
+
+
+def test_scales_can_be_sent_to_workers():
+    strengths = StrengthColumns.for_recording(record(ouster))
+    assert pickle.loads(pickle.dumps(strengths)) == strengths

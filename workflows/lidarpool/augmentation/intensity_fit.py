@@ -32,7 +32,9 @@ _CLIPPED_SHARE = 1e-3  # minimum share of returns with the same largest value if
 # Returns above this height in the sensor frame are not from the ground, whose incidence angle
 # increases with the range.
 _ABOVE_GROUND_M = -0.5
-_LAW_RANGES_M = (2.0, 5.0, 80.0)  # minimum, preferred minimum and maximum for `is_compensated`
+# Minimum, preferred minimum and maximum range for `is_compensated`. At long range, fog and the
+# detection threshold change intensities more than the distance does.
+_LAW_RANGES_M = (2.0, 5.0, 40.0)
 # Typical intensities decrease with a power of the range between 0 and -1 if they are compensated,
 # and between -2 and -3 if they are energies. The second values apply to level ground, for which the
 # cosine of the angle of incidence is inversely proportional to the range.
@@ -103,7 +105,7 @@ def is_valid(values: AnyArray) -> Bools:
     return np.asarray(np.isfinite(values) & (values >= 0))
 
 
-def smallest_beside_zeros(values: AnyArray) -> float:
+def smallest_positive(values: AnyArray) -> float:
     """Return the smallest positive value, or 0 if no value is 0. The values must be valid."""
     positive = values[values > 0]
     return float(positive.min()) if 0 < len(positive) < len(values) else 0.0
@@ -213,7 +215,7 @@ def _levels_by_range(
 ) -> list[tuple[float, float]]:
     """Return the logarithms of range and mean intensity for unsaturated range intervals."""
     levels = []
-    edges = _LAW_RANGES_M[0] * 1.25 ** np.arange(18)
+    edges = _LAW_RANGES_M[0] * 1.25 ** np.arange(15)
     for lower, upper in pairwise(edges):
         inside = (range_m >= lower) & (range_m < upper)
         if inside.sum() < _MIN_RETURNS:

@@ -16,7 +16,7 @@ from lidarsim.columns.column_names import STRENGTHS
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import AnyArray, AnyFloats, Floats
 from lidarsim.schema.checks import check_number
-from lidarsim.sensor.reflectivity import COUNTS, SCALES, ByteScale
+from lidarsim.sensor.reflectivity import SCALES, ByteScale
 from lidarsim.sensor.sensor import Sensor
 from lidarsim.words import format_rounded
 
@@ -28,14 +28,16 @@ from .intensity_fit import (
     is_compensated,
     is_valid,
     range_factors,
-    smallest_beside_zeros,
+    smallest_positive,
     typical_level,
     white_level,
 )
 
-# Typical values of the reflectance multiplied by the cosine of the angle of incidence. An assumed
-# scale must result in a median between these limits.
-_PLAUSIBLE = (0.03, 0.6)
+# An assumed scale must result in plausible reflectances, multiplied by the cosine of the angle of
+# incidence. The median of codes has no lower limit, because fog reduces typical codes of real
+# sensors to 1 or 2. The other limits apply to the 99th percentile.
+_MAX_MEDIAN = 0.6
+_BRIGHTEST = (0.25, 1.3)
 _ZERO_STEPS = 0.25  # value that represents a recorded 0, in steps
 _TYPICAL_REFLECTANCE = 0.2  # reflectance times cosine of the incidence, if it cannot be estimated
 _RESOLVED_STEPS = 3  # smallest value, in steps, that is used to estimate the detection threshold
@@ -422,7 +424,7 @@ class _Fit:
             quantization=quantization,
             white=1.0,
             compensated=True,
-            smallest=smallest_beside_zeros(values),
+            smallest=smallest_positive(values),
         )
         scale = self._known(common, values)
         if scale is None:
@@ -462,10 +464,13 @@ class _Fit:
         compensated = True if law is None else law
         scale = replace(common, compensated=compensated, is_known=False)
         range_m = self.returns.range_m
-        lowest, highest = _PLAUSIBLE
         for assumed, text in self._conventions(scale):
             levels = _levels(assumed, values, range_m)
-            if lowest <= typical_level(levels, range_m) <= highest:
+            if assumed.codes is not None:
+                is_plausible = typical_level(levels, range_m) <= _MAX_MEDIAN
+            else:
+                is_plausible = _BRIGHTEST[0] <= white_level(levels, range_m) <= _BRIGHTEST[1]
+            if is_plausible:
                 return self._with_near(assumed, values, text)
         levels = _levels(scale, values, range_m)
         white = white_level(levels, range_m)
@@ -504,10 +509,9 @@ class _Fit:
                 return [(assumed, text)]
             whites = [quantization.max_value]
         elif quantization.steps_per_unit:
-            # No sensor is known to record counts that are compensated for the range.
-            whites = [] if scale.compensated else [float(COUNTS)]
+            whites = []  # counts, whose unit depends on the sensor
         else:
-            whites = [1.0, 255.0]
+            whites = [1.0] if scale.compensated else [1.0, 255.0]
         candidates = [replace(scale, white=white) for white in whites]
         return [(assumed, f"{_white_text(assumed)}, as in simulations.") for assumed in candidates]
 

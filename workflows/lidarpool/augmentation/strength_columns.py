@@ -25,7 +25,7 @@ from .intensity_fit import (
     RecordedReturns,
     is_valid,
     range_factors,
-    smallest_beside_zeros,
+    smallest_positive,
 )
 from .intensity_scale import IntensityScale
 
@@ -209,7 +209,7 @@ def _fit_column(
         compensated=factor.compensated,
         codes=None,
         codes_per_unit=1.0,
-        smallest=smallest_beside_zeros(values[valid]),
+        smallest=smallest_positive(values[valid]),
         note="",
     )
     codes = _matching_codes(scale, model)
