@@ -23,9 +23,13 @@ VERSION = "v1.0-lidarpool"
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
+    return write_drive(tmp_path_factory.mktemp("nuscenes") / "drive", CLASSES)
+
+
+def write_drive(path, classes):
+    """Write a data set, with labels if classes have names."""
     scene = the_scene()
-    path = tmp_path_factory.mktemp("nuscenes") / "drive"
-    sweeps = replace(the_sweeps(scene), classes=CLASSES)
+    sweeps = replace(the_sweeps(scene), classes=classes)
     ExportSpec("nuscenes").write(path, points_of(scene, 0), sweeps)
     tables = path / VERSION
     levels = ("v0-40", "v40-60", "v60-80", "v80-100")
@@ -244,11 +248,26 @@ def test_visibility_levels():
     assert found == ["1", "1", "", "4", "4", ""]
 
 
-def test_the_devkit_reads_the_copy(drive, tmp_path):
+def test_types_without_a_category_in_lidarseg(drive, tmp_path):
+    source = tmp_path / "source"
+    shutil.copytree(drive, source)
+    rows = json.loads((source / VERSION / "category.json").read_text())
+    rows.append({"token": "other", "name": "static.other", "description": "", "index": 4})
+    (source / VERSION / "category.json").write_text(json.dumps(rows))
+    notes = rewrite(opened(source), tmp_path / "new", tmp_path / "work", with_objects)
+    assert "nuScenes has no category for walker, so these inserted objects have the" in notes[-2]
+    tables = tables_of(tmp_path / "new")
+    assert len(tables["category"]) == len(rows)
+    assert "other" in {row["category_token"] for row in tables["instance"].values()}
+
+
+def test_the_devkit_reads_the_copy(tmp_path):
     nuscenes = pytest.importorskip("nuscenes.nuscenes")
     from nuscenes.utils.data_classes import LidarPointCloud
     from nuscenes.utils.geometry_utils import points_in_box as inside
 
+    # Without labels, because the devkit accepts only the labels of nuScenes.
+    drive = write_drive(tmp_path / "drive", {})
     new = tmp_path / "new"
     rewrite(opened(drive), new, tmp_path / "work", with_objects)
     data = nuscenes.NuScenes(VERSION, str(new), verbose=False)

@@ -24,6 +24,8 @@ _OFFICIAL = {
     "van": "vehicle.car",
     "walker": "human.pedestrian.adult",
 }
+# Category of all other objects in nuScenes-lidarseg, whose devkit accepts no new categories.
+OTHER_CATEGORY = "static.other"
 _LEVELS = {"v0-40": 0.4, "v40-60": 0.6, "v60-80": 0.8, "v80-100": 1.0}  # {level: upper limit}
 _MIN_SPEED = 0.2  # m/s; slower objects are stationary
 # {prefix of a category: attributes of a stationary and of a moving object}
@@ -52,7 +54,8 @@ def find_category(kind: str, names: Iterable[str]) -> str | None:
     last_words = {plain.rpartition(".")[2]: name for plain, name in known.items()}
     plain = _plain(kind)
     official = _OFFICIAL.get(plain, "")
-    return known.get(plain) or known.get(official) or last_words.get(plain)
+    found = known.get(plain) or known.get(official) or last_words.get(plain)
+    return found or known.get(OTHER_CATEGORY)
 
 
 def visibility_token(rows: Iterable[Mapping[str, Any]], visibility: float | None) -> str:

@@ -16,13 +16,18 @@ from lidarsim.io.input_files import read_input
 from lidarsim.motion.rotations import matrices, quaternions_of
 from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Ints
 from lidarsim.scene.files.float_rows import NUSCENES
-from lidarsim.words import plural
+from lidarsim.words import join_names, plural
 
 from ...clouds.nuscenes import NuScenesTables, tables_folder
 from ...clouds.recording import Recording, RecordingSource
 from ..augmented_sweep import AugmentedSweep
 from .data_set_copy import DataSetCopy, place_file
-from .nuscenes_categories import attribute_tokens, find_category, visibility_token
+from .nuscenes_categories import (
+    OTHER_CATEGORY,
+    attribute_tokens,
+    find_category,
+    visibility_token,
+)
 from .rewriter import EncodedSweeps, Rewriter, box_details
 from .stored_records import StoredRecords, unchanged
 
@@ -153,6 +158,11 @@ class NuScenesRewriter(Rewriter):
         if tables.added_categories:
             names = ", ".join(tables.added_categories)
             notes.append(f"These categories were added for inserted objects: {names}.")
+        if tables.other_types:
+            notes.append(
+                f"nuScenes has no category for {join_names(tables.other_types)}, so these inserted "
+                f"objects have the category {OTHER_CATEGORY}."
+            )
         return notes
 
 
@@ -239,6 +249,7 @@ class _AnnotationTables:
         self._indices: dict[str, int] = {}  # {type of an object: index of its new category}
         self._added: set[str] = set()  # tokens of annotations of inserted objects
         self.added_categories: list[str] = []
+        self.other_types: list[str] = []  # types of objects in the category for other objects
 
     def changed(self) -> dict[str, list[dict[str, Any]]]:
         """Return the tables that differ from those of the data set."""
@@ -250,7 +261,9 @@ class _AnnotationTables:
         Raises LidarError if there are more categories than labels.
         """
         for kind in dict.fromkeys(box["type"] for box in details["boxes"]):
-            self._category(kind)
+            name = self._category(kind)["name"]
+            if name == OTHER_CATEGORY != kind and kind not in self.other_types:
+                self.other_types.append(kind)
 
     def _category(self, kind: str) -> dict[str, Any]:
         """Return the row of an object type in the table of categories, which may be added."""
