@@ -13,6 +13,8 @@ import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
+from tests.drives import points_of, the_scene, the_sweeps
+from tests.fake_augmenters import changed, content, identity, rewrite, two_boxes
 
 from lidarpool import LidarError
 from lidarpool.augmentation.rewriting.opening import open_rewriter
@@ -20,8 +22,6 @@ from lidarpool.clouds.ros.messages import message_store
 from lidarpool.clouds.writing import ExportSpec
 from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.bags import POINT_CLOUD, point_columns
-from tests.drives import points_of, the_scene, the_sweeps
-from tests.fake_augmenters import changed, content, identity, rewrite, two_boxes
 
 TOPIC = "/front/points"
 

@@ -8,12 +8,14 @@ from lidarsim.errors import LidarError
 
 from ...clouds.format_table import format_of_path
 from ...clouds.kitti import KITTI
+from ...clouds.nuscenes import NuScenes
 from ...clouds.pcd import PCD
 from ...clouds.recording import Recording, RecordingSource
 from ...clouds.ros.bags import Rosbag2
 from ...datasets.dataset import INDEX_FILE
 from .bag_rewriter import BagRewriter
 from .kitti_rewriter import KittiRewriter
+from .nuscenes_rewriter import NuScenesRewriter
 from .pcd_rewriter import PCDRewriter
 from .rewriter import Rewriter
 
@@ -49,6 +51,8 @@ def open_rewriter(source: str | Path, recording: Recording, sensor: str | None =
         return KittiRewriter(opened, recording)
     if cloud_format is PCD:
         return PCDRewriter(opened, recording)
+    if cloud_format is NuScenes:
+        return NuScenesRewriter(opened, recording)
     if cloud_format is not None and issubclass(cloud_format, Rosbag2):
         return BagRewriter(opened, recording)
     kind = cloud_format.title if cloud_format is not None and cloud_format.title else "this format"

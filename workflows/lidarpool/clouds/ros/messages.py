@@ -306,6 +306,15 @@ def _sent(topic: str, content: Any, time_ns: int) -> RosMessage:
     return RosMessage(topic, kind, time_ns, message_store().serialize_cdr(content, kind))
 
 
+class _NamedBox(NamedTuple):
+    """Box that a marker shows."""
+
+    name: str
+    center: Floats  # (3,), meters
+    quaternion: Floats  # (4,), x, y, z, w
+    size: Floats  # (3,), meters
+
+
 class _Messages:
     """Factory for messages and their common parts."""
 
@@ -439,8 +448,8 @@ class _Messages:
         actions = [marker.ADD if present else marker.DELETE for present in boxes.present]
         header = self.header(WORLD, time_ns)
         cubes = [
-            self._cube(header, "actors", number, action, name, *box)
-            for number, (action, name, *box) in enumerate(
+            self._cube(header, "actors", number, action, _NamedBox(*box))
+            for number, (action, *box) in enumerate(
                 zip(actions, actors, boxes.centers, boxes.quaternions, boxes.sizes, strict=True)
             )
         ]
@@ -449,11 +458,11 @@ class _Messages:
     def sweep_markers(self, boxes: SweepBoxes, namespace: str, header: Any) -> Any:
         """Return a MarkerArray with boxes in the frame of a header. It removes earlier markers."""
         (marker,) = self.types_of("visualization_msgs", "Marker")
-        nowhere = np.zeros(3), np.array([0.0, 0, 0, 1]), np.zeros(3)
-        cubes = [self._cube(header, namespace, 0, marker.DELETEALL, "", *nowhere)]
+        nowhere = _NamedBox("", np.zeros(3), np.array([0.0, 0, 0, 1]), np.zeros(3))
+        cubes = [self._cube(header, namespace, 0, marker.DELETEALL, nowhere)]
         cubes += [
-            self._cube(header, namespace, number, marker.ADD, name, *box)
-            for number, name, *box in zip(
+            self._cube(header, namespace, number, marker.ADD, _NamedBox(*box))
+            for number, *box in zip(
                 boxes.objects.tolist(),
                 boxes.names,
                 boxes.centers,
@@ -464,17 +473,7 @@ class _Messages:
         ]
         return self._types["visualization_msgs/msg/MarkerArray"](cubes)
 
-    def _cube(
-        self,
-        header: Any,
-        namespace: str,
-        number: int,
-        action: int,
-        name: str,
-        center: Floats,
-        quaternion: Floats,
-        size: Floats,
-    ) -> Any:
+    def _cube(self, header: Any, namespace: str, number: int, action: int, box: _NamedBox) -> Any:
         """Return a Marker with a box."""
         types = self._types
         names = ("Point", "Quaternion", "Pose", "Vector3")
@@ -488,8 +487,8 @@ class _Messages:
             id=number,
             type=marker.CUBE,
             action=action,
-            pose=pose(point(*center.tolist()), rotation(*quaternion.tolist())),
-            scale=vector(*size.tolist()),
+            pose=pose(point(*box.center.tolist()), rotation(*box.quaternion.tolist())),
+            scale=vector(*box.size.tolist()),
             color=types["std_msgs/msg/ColorRGBA"](1, 0.6, 0, 0.4),  # orange
             lifetime=types["builtin_interfaces/msg/Duration"](0, 0),
             frame_locked=False,
@@ -498,7 +497,7 @@ class _Messages:
             texture_resource="",
             texture=image(header, "", none),
             uv_coordinates=[],
-            text=name,
+            text=box.name,
             mesh_resource="",
             mesh_file=mesh("", none),
             mesh_use_embedded_materials=False,
