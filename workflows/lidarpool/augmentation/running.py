@@ -351,7 +351,7 @@ class _Run:
         self, shared: SharedPlan, missing: list[tuple[int, tuple[int, ...]]]
     ) -> Iterator[SweepTask]:
         """Yield tasks of consecutive sweeps, which are read in a single pass."""
-        size = min(-(-len(missing) // _MIN_TASKS), _TASK_SWEEPS)
+        size = min(len(missing) // _MIN_TASKS + 1, _TASK_SWEEPS)
         for start in range(0, len(missing), size):
             yield SweepTask(shared, tuple(missing[start : start + size]))
 
