@@ -7,14 +7,14 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from distributed import Client
 from tests.recorded_drives import recorded_points, write_pcd_drive
 
+import poolpart.deploy
 from lidarpool import LidarError, box, load_sensor, open_recording
 from lidarpool.augmentation.effects import Effects, Insertion
 from lidarpool.augmentation.running import Augmentation
@@ -22,7 +22,7 @@ from lidarpool.augmentation.sweep_tasks import RecordingFile, unchanged_sweep
 from lidarpool.augmentation.variants import CampaignVariants, Variants
 from lidarpool.augmentation.work_folder import WorkFolder
 
-SWEEPS = 12
+SWEEPS = 8
 RAIN = {"weather": {"rain_mm_h": 50, "visibility_km": 0.2}}
 CAMPAIGN = """\
 base: effects.yaml
@@ -101,7 +101,7 @@ def test_points_are_counted(augmentation, drive, tmp_path):
     assert augmented.counts.returns == sum(len(sweep) for sweep in recorded)
     assert augmented.counts.points == sum(len(sweep) for sweep in wet)
     assert augmented.counts.kept < augmented.counts.returns
-    assert "12 sweeps augmented" in repr(augmented)
+    assert "8 sweeps augmented" in repr(augmented)
     assert json.dumps(augmented.figures, allow_nan=False)
 
 
@@ -141,7 +141,7 @@ def test_a_killed_process_is_resumed(augmentation, drive, tmp_path, sweeps):
                 os.kill(process.pid, signal.SIGKILL)
                 break
     assert process.returncode == -signal.SIGKILL
-    with pytest.raises(LidarError, match=r"unfinished augmentation. Continue it with `--resume`"):
+    with pytest.raises(LidarError, match=r"unfinished augmentation\. Continue it with `--resume`"):
         augmentation.run(out, workers=1)
     steps = []
     augmentation.run(out, workers=1, resume=True, progress=lambda *step: steps.append(step))
@@ -180,9 +180,6 @@ def test_workers_without_the_work_folder_return_files(augmentation, tmp_path, mo
 
 
 def test_a_cluster_augments_sweeps(augmentation, tmp_path):
-    import poolpart.deploy
-    from distributed import Client
-
     augmentation.run(tmp_path / "expected", workers=1)
     with (
         poolpart.deploy.local_cluster({"OTHER": (2, 1)}, dashboard_port=None) as cluster,
@@ -234,7 +231,7 @@ def test_damaged_manifests_are_reported(augmentation, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         augmentation.run(out, workers=1, progress=stop_after(2))
     (WorkFolder.for_output(out) / "manifest.json").write_text("{")
-    with pytest.raises(LidarError, match="is damaged. Start again with `--overwrite`"):
+    with pytest.raises(LidarError, match=r"is damaged\. Start again with `--overwrite`"):
         augmentation.run(out, workers=1, resume=True)
     augmentation.run(out, workers=1, overwrite=True)
     assert out.exists()
@@ -254,7 +251,7 @@ def test_outputs_are_only_replaced_on_request(augmentation, tmp_path):
     out = tmp_path / "wet"
     augmentation.run(out, workers=1)
     before = content(out)
-    with pytest.raises(LidarError, match="already exists. Use another path, or pass `--overwrite`"):
+    with pytest.raises(LidarError, match=r"already exists\. .* pass `--overwrite`"):
         augmentation.run(out, workers=1)
     other = replace(augmentation, variants=Variants(replace(Effects.load(options=RAIN), seed=1)))
     with pytest.raises(KeyboardInterrupt):
@@ -294,8 +291,8 @@ def test_other_sweeps_are_unchanged(augmentation, drive, tmp_path):
 
 
 def test_sweeps_that_do_not_exist_are_refused(augmentation, tmp_path):
-    with pytest.raises(LidarError, match=r"has 12 sweeps, so `--sweeps` must start before 12"):
-        replace(augmentation, numbers=range(12, 20)).run(tmp_path / "wet", workers=1)
+    with pytest.raises(LidarError, match=r"has 8 sweeps, so `--sweeps` must start before 8"):
+        replace(augmentation, numbers=range(8, 20)).run(tmp_path / "wet", workers=1)
 
 
 def test_unchanged_sweeps_have_the_cause_of_surfaces(drive):
@@ -377,9 +374,9 @@ def test_interrupted_campaigns_continue(augmentation, campaign, tmp_path, monkey
     variants = replace(augmentation, variants=CampaignVariants(campaign))
     variants.run(tmp_path / "expected", workers=1)
     out = tmp_path / "out"
-    for sweeps in (7, 30):
+    for sweeps in (5, 20):
         with pytest.raises(KeyboardInterrupt):
-            variants.run(out, workers=1, resume=sweeps > 7, progress=stop_after(sweeps))
+            variants.run(out, workers=1, resume=sweeps > 5, progress=stop_after(sweeps))
     assert (out / "0001").exists()
     assert not (out / "0002").exists()
     variants.run(out, workers=1, resume=True)
