@@ -216,8 +216,15 @@ class FormatConverter(Rewriter):
                 f"is written to a {suffix} file. Specify a path that ends in {suffix}."
             )
 
-    def assemble(self, target: Path, encoded: EncodedSweeps) -> list[str]:
-        """Write the format from the parts of all sweeps."""
+    def assemble(self, target: Path, encoded: EncodedSweeps, base: Path) -> list[str]:
+        """Write the format from the parts of all sweeps.
+
+        Raises LidarError if the sweeps of another sensor have already been written.
+        """
+        if base == target:
+            raise LidarError(
+                f"Only one sensor can be converted to {self.spec.title}. Choose it with `--sensor`."
+            )
         summary = _Summary.from_details(encoded)
         spec = self.spec
         has_times = "time" in summary.known
