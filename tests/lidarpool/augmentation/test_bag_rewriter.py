@@ -76,8 +76,7 @@ def test_identity_keeps_all_messages(written, tmp_path, name):
     notes = rewrite(opened(path), new, tmp_path / "work", identity)
     assert messages(new) == messages(path)
     assert notes == [
-        f"Only the messages on {TOPIC} were augmented. The points on /rear_left/points are "
-        "unchanged."
+        f"Only the sweeps of {TOPIC} were augmented. /rear_left/points in {path} is unchanged."
     ]
     assert open_recording(new, TOPIC).compensated is False  # custom data of the bag
     assert before == (content(path) if path.is_dir() else path.read_bytes())
@@ -156,7 +155,7 @@ def test_livox_messages(written, tmp_path):
     rewrite(rewriter, tmp_path / "same.mcap", tmp_path / "w", identity)
     assert messages(tmp_path / "same.mcap") == messages(path)
     notes = rewrite(rewriter, tmp_path / "new.mcap", tmp_path / "w2", changed)
-    assert "The points on /front/points, /rear_left/livox, /rear_left/points are" in notes[0]
+    assert "/front/points, /rear_left/livox, /rear_left/points in" in notes[0]
     recording = open_recording(tmp_path / "new.mcap", "/front/livox", keep_noise=True)
     store = message_store()
     with AnyReader([tmp_path / "new.mcap"], default_typestore=store) as bag:
@@ -198,7 +197,7 @@ def test_organized_clouds(written, tmp_path):
     assert heights(tmp_path / "less.mcap") == heights(path) != {1}
     more = partial(changed, returns_only=True)
     notes = rewrite(rewriter, tmp_path / "more.mcap", tmp_path / "w3", more)
-    assert notes[0].startswith("2 sweeps cannot stay organized")  # the second sweep is empty
+    assert notes[1].startswith("2 sweeps cannot stay organized")  # the second sweep is empty
     with AnyReader([tmp_path / "more.mcap"]) as bag:
         chosen = [c for c in bag.connections if c.topic == TOPIC]
         (_, _, data) = next(bag.messages(chosen))
@@ -260,6 +259,30 @@ def test_order_of_sweeps_and_several_readers(written, tmp_path):
     found = [messages(tmp_path / f"{name}.mcap") for name in "ab"]
     assert found[0] == found[1]
     assert not [*tmp_path.glob(".lidarpool*")]
+
+
+@pytest.mark.parametrize("name", ["mcap", "rosbag2"])
+def test_several_topics(written, tmp_path, name):
+    path = written(name)
+    topics = (TOPIC, "/rear_left/points")
+    rewriters = [opened(path, topic) for topic in topics]
+    works = [tmp_path / "w0", tmp_path / "w1"]
+    for rewriter, work in zip(rewriters, works, strict=True):
+        for number in range(3):
+            rewriter.write_sweep(work, number, changed(rewriter.recording, number, two_boxes()))
+    new = tmp_path / path.name
+    notes = rewriters[0].finish(new, works[0], others=[(rewriters[1], works[1])])
+    assert [note for note in notes if "Only the sweeps" in note] == []
+    for topic, rewriter in zip(topics, rewriters, strict=True):
+        recording = open_recording(new, topic, keep_noise=True)
+        for number in range(3):
+            expected = changed(rewriter.recording, number).sweep.points
+            np.testing.assert_allclose(recording[number].points, expected, rtol=1e-6)
+    assert (
+        messages(new, {*topics, "/augmented_objects", "/augmented_objects_2"})[0]
+        == (messages(path, topics)[0])
+    )
+    assert not [*tmp_path.glob(".lidarpool*")] and not [*tmp_path.glob("previous*")]
 
 
 def test_files_need_the_extension(written, tmp_path):

@@ -38,7 +38,7 @@ def test_identity_keeps_all_bytes(drive, tmp_path):
     before = content(drive)
     notes = rewrite(opened(drive, "00"), tmp_path / "new", tmp_path / "work", identity)
     assert content(tmp_path / "new") == before == content(drive)
-    assert notes[0].startswith("Only the sequence 00 was augmented. The other 1 sequence in")
+    assert notes[0].startswith("Only the sweeps of 00 were augmented. 01 in ")
     assert "hard links" in notes[-1]
     poses = "sequences/01/poses.txt"
     assert (tmp_path / "new" / poses).stat().st_ino != (drive / poses).stat().st_ino
@@ -88,6 +88,29 @@ def test_encoded_sweeps_are_the_same_in_any_order(drive, tmp_path):
         rewrite(opened(drive, "01"), tmp_path / folder, tmp_path / f"{folder}w", changed, numbers)
     assert content(tmp_path / "aw") == content(tmp_path / "bw")
     assert content(tmp_path / "a") == content(tmp_path / "b")
+
+
+def test_several_sequences(drive, tmp_path):
+    rewriters = [opened(drive, name) for name in ("00", "01")]
+    works = [tmp_path / name for name in ("w0", "w1")]
+    augment = partial(changed, boxes=two_boxes())
+    for rewriter, work in zip(rewriters, works, strict=True):
+        for number in range(3):
+            rewriter.write_sweep(work, number, augment(rewriter.recording, number))
+    others = [(rewriters[1], works[1])]
+    notes = rewriters[0].finish(tmp_path / "both", works[0], others=others)
+    assert not any("Only the sweeps" in note for note in notes)
+    both = content(tmp_path / "both")
+    for sensor in ("00", "01"):
+        rewrite(opened(drive, sensor), tmp_path / sensor, tmp_path / f"w-{sensor}", augment)
+        single = content(tmp_path / sensor)
+        for name in single:
+            if name.startswith((f"sequences/{sensor}/", f"label_02/{sensor}")):
+                assert both[name] == single[name]
+    assert (
+        content(drive)["sequences/01/velodyne/000000.bin"]
+        != both["sequences/01/velodyne/000000.bin"]
+    )
 
 
 @pytest.mark.parametrize("inner", [".", "velodyne", "velodyne_points/data"])

@@ -68,7 +68,7 @@ def test_identity_keeps_all_bytes(drive, tmp_path):
             opened(source), tmp_path / "new", tmp_path / "work", identity, overwrite=True
         )
         assert content(tmp_path / "new") == before == content(drive)
-    assert notes[0].startswith("Only the sweeps of LIDAR_TOP were augmented. The other 1 lidar")
+    assert notes[0].startswith("Only the sweeps of LIDAR_TOP were augmented. rear_left in")
 
 
 def test_points_and_labels(drive, tmp_path):
@@ -232,6 +232,27 @@ def test_augmented_copies_can_be_augmented_again(drive, tmp_path):
     assert len(tables["instance"]) == len(tables_of(drive)["instance"]) + 4
 
 
+def test_several_channels(drive, tmp_path):
+    channels = ("LIDAR_TOP", "rear_left")
+    rewriters = [opened(drive, channel) for channel in channels]
+    works = [tmp_path / "w0", tmp_path / "w1"]
+    for rewriter, work in zip(rewriters, works, strict=True):
+        for number in range(3):
+            rewriter.write_sweep(work, number, with_objects(rewriter.recording, number))
+    new = tmp_path / "new"
+    rewriters[0].finish(new, works[0], others=[(rewriters[1], works[1])])
+    tables = tables_of(new)
+    assert len(tables["instance"]) == len(tables_of(drive)["instance"]) + 4
+    assert [row["name"] for row in tables["category"].values()].count("walker") == 1
+    for channel, rewriter in zip(channels, rewriters, strict=True):
+        recording = open_recording(new, channel, keep_noise=True)
+        expected = with_objects(rewriter.recording, 2)
+        np.testing.assert_allclose(recording[2].points, expected.sweep.points, rtol=1e-6)
+        added = ~expected.is_recorded
+        (name,) = (new / "lidarseg" / VERSION).glob(f"*-{channel}-000002.pcd.bin")
+        assert set(np.fromfile(name, "u1")[added]) == {2, 4}
+
+
 def test_tables_of_other_versions_are_unchanged(drive, tmp_path):
     source = tmp_path / "source"
     shutil.copytree(drive, source)
@@ -255,7 +276,7 @@ def test_types_without_a_category_in_lidarseg(drive, tmp_path):
     rows.append({"token": "other", "name": "static.other", "description": "", "index": 4})
     (source / VERSION / "category.json").write_text(json.dumps(rows))
     notes = rewrite(opened(source), tmp_path / "new", tmp_path / "work", with_objects)
-    assert "nuScenes has no category for walker, so these inserted objects have the" in notes[-2]
+    assert "nuScenes has no category for walker, so these inserted objects have the" in notes[-1]
     tables = tables_of(tmp_path / "new")
     assert len(tables["category"]) == len(rows)
     assert "other" in {row["category_token"] for row in tables["instance"].values()}

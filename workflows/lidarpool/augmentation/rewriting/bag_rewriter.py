@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from dataclasses import replace as replace_fields
-from functools import partial
+from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from threading import RLock
@@ -29,13 +29,12 @@ from lidarsim.columns.bags import (
 from lidarsim.columns.mcap_chunks import has_attachments, has_compressed_chunks, read_metadata
 from lidarsim.errors import CutShortError, LidarError
 from lidarsim.io.input_files import read_input_text
-from lidarsim.words import list_names
 
 from ...clouds.recording import Recording, RecordingSource, sweep_from_columns
 from ...clouds.ros.bags import header_of, point_connection
 from ...processes.per_process import PerProcess
 from ..augmented_sweep import AugmentedSweep
-from .data_set_copy import DataSetCopy
+from .data_set_copy import copy_data_set
 from .rewriter import EncodedSweeps, Rewriter, organization_notes
 from .stored_records import StoredRecords, unchanged
 
@@ -141,37 +140,52 @@ class BagRewriter(Rewriter):
                 f"Specify a path that ends in {suffix}."
             )
 
-    def assemble(self, target: Path, encoded: EncodedSweeps) -> list[str]:
+    def sensors(self) -> list[str]:
+        """Return the topics with points."""
+        with opened_bag(self.path, self.source.name) as bag:
+            topics = {c.topic for c in bag.connections if c.msgtype in _POINT_TYPES}
+        return sorted(topics)
+
+    @cached_property
+    def sensor(self) -> str:
+        """Topic with the sweeps."""
+        with opened_bag(self.path, self.source.name) as bag:
+            return str(point_connection(self.source, bag).topic)
+
+    def assemble(self, target: Path, encoded: EncodedSweeps, base: Path) -> list[str]:
         """Write the bag, message by message."""
         notes = organization_notes(encoded.details())
-        if self.path.is_dir():
-            self._write_folder(target, encoded, notes)
-            copy = DataSetCopy(self.path, target, self._bag_files())
-            copy.write()
-            return notes + copy.notes()
-        folder = target.with_name(f"{target.name}.bag")
+        folder = target if self.path.is_dir() else target.with_name(f"{target.name}.bag")
+        if base == target:
+            base = target.with_name(f"previous-{target.name}")
+            target.rename(base)
         try:
-            self._write_folder(folder, encoded, notes)
-            (written,) = folder.glob("*.mcap")
-            written.replace(target)
+            notes += self._write_folder(folder, encoded, base)
+            if self.path.is_dir():
+                notes += copy_data_set(base, target, self._bag_files(base))
+            else:
+                (written,) = folder.glob("*.mcap")
+                written.replace(target)
         finally:
-            shutil.rmtree(folder, ignore_errors=True)
+            if folder != target:
+                shutil.rmtree(folder, ignore_errors=True)
         return notes
 
-    def _bag_files(self) -> set[str]:
-        """Return the names of the files that belong to the bag in its folder."""
-        files = {file.name for file in self.path.iterdir() if file.suffix.lower() in _BAG_SUFFIXES}
+    def _bag_files(self, folder: Path) -> set[str]:
+        """Return the names of the files that belong to the bag in a folder."""
+        files = {file.name for file in folder.iterdir() if file.suffix.lower() in _BAG_SUFFIXES}
         return files | {_METADATA_FILE}
 
-    def _write_folder(self, folder: Path, encoded: EncodedSweeps, notes: list[str]) -> None:
-        """Write a bag folder, and add notes for the user."""
+    def _write_folder(self, folder: Path, encoded: EncodedSweeps, base: Path) -> list[str]:
+        """Write a bag folder, and return notes for the user."""
         from rosbags.rosbag2 import Writer
 
-        layout = _BagLayout.from_path(self.path)
+        notes = []
+        layout = _BagLayout.from_path(base)
         writer = Writer(folder, version=layout.version, storage_plugin=layout.plugin)
         writer.set_compression(layout.compression, _zstd())
         has_boxes = any(sweep["boxes"] for sweep in encoded.details())
-        with opened_bag(self.path, self.source.name) as bag, writer as target:
+        with opened_bag(base, self.source.name) as bag, writer as target:
             for key, value in layout.custom_data.items():
                 target.set_custom_data(key, value)
             chosen = point_connection(self.source, bag)
@@ -192,7 +206,6 @@ class BagRewriter(Rewriter):
                 raise CutShortError(
                     f"{encoded.count:,} sweeps were expected, but it has {number:,}"
                 )
-            notes += self._notes(bag, chosen)
             if boxes is not None:
                 notes.append(
                     f"The boxes of inserted objects are published on {boxes.topic} as a "
@@ -200,21 +213,7 @@ class BagRewriter(Rewriter):
                 )
         if layout.has_attachments:
             notes.append(f"The attachments of {self.source.name} are not copied.")
-
-    def _notes(self, bag: Any, chosen: Any) -> list[str]:
-        others = sorted(
-            connection.topic
-            for connection in bag.connections
-            if connection.id != chosen.id and connection.msgtype in _POINT_TYPES
-        )
-        if not others:
-            return []
-        return [
-            (
-                f"Only the messages on {chosen.topic} were augmented. The points on "
-                f"{list_names(others)} are unchanged."
-            )
-        ]
+        return notes
 
 
 def _message_file(number: int) -> str:

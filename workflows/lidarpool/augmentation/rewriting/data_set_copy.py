@@ -31,9 +31,10 @@ _TEXT_SUFFIXES = {
 def place_file(source: Path, target: Path) -> bool:
     """Link a file to a new path, or copy it if it is a text file or cannot be linked.
 
-    Symbolic links are followed. Returns whether the file was linked.
+    Symbolic links are followed. An existing file is replaced. Returns whether the file was linked.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
+    target.unlink(missing_ok=True)  # it may be a link to a file of the recording
     if source.suffix.lower() not in _TEXT_SUFFIXES:
         with suppress(OSError):  # the folders are on different disks, or links are not supported
             os.link(source.resolve(), target)
@@ -42,17 +43,35 @@ def place_file(source: Path, target: Path) -> bool:
     return False
 
 
-@dataclass
-class DataSetCopy:
-    """A copy of a folder, without the files that are written anew.
+def copy_data_set(source: Path, target: Path, replaced: Collection[str]) -> list[str]:
+    """Link or copy all files of a folder to a new folder, except those that are written anew.
 
-    Attributes
+    Broken links and special files are skipped.
+
+    Parameters
     ----------
     source, target
         Folder to copy, and the new folder.
     replaced
         Paths of files that are not copied, relative to the source.
+
+    Returns
+    -------
+    Sentences for the user about linked and skipped files.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be read or written.
     """
+    copy = _FolderCopy(source, target, replaced)
+    copy.write()
+    return copy.notes()
+
+
+@dataclass
+class _FolderCopy:
+    """A copy of a folder (see `copy_data_set`)."""
 
     source: Path
     target: Path
@@ -62,10 +81,6 @@ class DataSetCopy:
     _skipped: list[str] = field(default_factory=list, init=False)
 
     def write(self) -> None:
-        """Link or copy the files. Broken links and special files are skipped.
-
-        Raises OSError if a file cannot be read or written.
-        """
         self.target.mkdir(parents=True, exist_ok=True)
         for name in self._files():
             if name in self.replaced:
@@ -76,7 +91,6 @@ class DataSetCopy:
                 self.copied += 1
 
     def notes(self) -> list[str]:
-        """Return sentences for the user about linked and skipped files."""
         notes = []
         if self.linked:
             files = plural(self.linked, "unchanged file")

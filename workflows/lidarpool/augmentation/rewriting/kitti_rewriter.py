@@ -16,7 +16,7 @@ from lidarsim.words import plural
 from ...clouds.kitti import CALIBRATION_FILE, MAX_INSTANCES, point_files, sequence_folders
 from ...clouds.recording import Recording, RecordingSource
 from ..augmented_sweep import AugmentedSweep
-from .data_set_copy import DataSetCopy, place_file
+from .data_set_copy import copy_data_set, place_file
 from .kitti_labels import KittiCamera, Label
 from .rewriter import EncodedSweeps, Rewriter
 from .stored_records import StoredRecords, unchanged
@@ -96,34 +96,35 @@ class KittiRewriter(Rewriter):
             self._camera = KittiCamera.from_sequence(self._folder / CALIBRATION_FILE)
         return list(self._camera.labels(augmented))
 
-    def assemble(self, target: Path, encoded: EncodedSweeps) -> list[str]:
+    def sensors(self) -> list[str]:
+        """Return the names of all sequences."""
+        return [*sequence_folders(self.path)] if self.path.is_dir() else [""]
+
+    @property
+    def sensor(self) -> str:
+        """Name of the sequence."""
+        return self.recording.sequence
+
+    def assemble(self, target: Path, encoded: EncodedSweeps, base: Path) -> list[str]:
         """Write the file, or the folder with all files of the data set."""
         if not self.path.is_dir():
             place_file(encoded.folder / self.path.name, target)
             has_labels = (self._folder / "labels" / f"{self.path.stem}.label").exists()
             return [_SINGLE_FILE] if has_labels else []
         names = encoded.names()
-        tracks_name = f"label_02/{self._folder.name}.txt"
-        tracks = [line for sweep in encoded.details() for line in sweep.get("tracks", ())]
-        has_tracks = bool(tracks) and (self.path / tracks_name).exists()
-        copy = DataSetCopy(self.path, target, names | ({tracks_name} if has_tracks else set()))
-        copy.write()
+        notes = self._notes(encoded)
+        if base != target:
+            notes += copy_data_set(base, target, names)
         for name in sorted(names):
             place_file(encoded.folder / name, target / name)
-        if has_tracks:
-            text = read_input_text(self.path / tracks_name)
-            (target / tracks_name).write_text(_merge_tracks(text, tracks))
-        return [*self._notes(encoded), *copy.notes()]
+        tracks_file = target / f"label_02/{self._folder.name}.txt"
+        tracks = [line for sweep in encoded.details() for line in sweep.get("tracks", ())]
+        if tracks and tracks_file.exists():
+            tracks_file.write_text(_merge_tracks(read_input_text(tracks_file), tracks))
+        return notes
 
     def _notes(self, encoded: EncodedSweeps) -> list[str]:
         notes = []
-        others = sequence_folders(self.path).keys() - {self.recording.sequence}
-        if others:
-            notes.append(
-                f"Only the sequence {self.recording.sequence} was augmented. The other "
-                f"{plural(len(others), 'sequence')} in {self.source.name} "
-                f"{'is' if len(others) == 1 else 'are'} unchanged."
-            )
         boxes = labels = 0
         has_labels = False
         for sweep in encoded.details():

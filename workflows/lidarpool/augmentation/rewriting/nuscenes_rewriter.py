@@ -21,7 +21,7 @@ from lidarsim.words import join_names, plural
 from ...clouds.nuscenes import NuScenesTables, tables_folder
 from ...clouds.recording import Recording, RecordingSource
 from ..augmented_sweep import AugmentedSweep
-from .data_set_copy import DataSetCopy, place_file
+from .data_set_copy import copy_data_set, place_file
 from .nuscenes_categories import (
     OTHER_CATEGORY,
     attribute_tokens,
@@ -54,8 +54,9 @@ class NuScenesRewriter(Rewriter):
         folder = tables_folder(source)
         self.path = folder.parent
         self._tables = NuScenesTables(folder)
-        lidars = self._tables.lidar_rows()
-        self._rows = lidars[source.choose("sensors", lidars)]
+        self._lidars = self._tables.lidar_rows()
+        self._channel = source.choose("sensors", self._lidars)
+        self._rows = self._lidars[self._channel]
         self._categories = list(self._tables.table("category").values())
         self._panoptic: dict[str, str] = {}  # {token of a sweep: its file}
         if (folder / "panoptic.json").exists():
@@ -118,52 +119,38 @@ class NuScenesRewriter(Rewriter):
             labels[mask] = index
         return labels
 
-    def assemble(self, target: Path, encoded: EncodedSweeps) -> list[str]:
+    def sensors(self) -> list[str]:
+        """Return the names of all lidar channels."""
+        return [*self._lidars]
+
+    @property
+    def sensor(self) -> str:
+        """Name of the lidar channel."""
+        return self._channel
+
+    def assemble(self, target: Path, encoded: EncodedSweeps, base: Path) -> list[str]:
         """Write the folder with all files of the data set."""
-        tables = _AnnotationTables(self._tables, self._categories, self._rows, self.recording.name)
-        for details in encoded.details():
-            tables.add_new_categories(details)
-        tables.add_boxes(encoded)
-        counts = tables.count_points(encoded)
         folder = self._tables.folder.name
-        changed = {f"{folder}/{name}.json": rows for name, rows in tables.changed().items()}
+        tables = _AnnotationTables(NuScenesTables(base / folder), self._rows, self.source.name)
         names = encoded.names()
-        copy = DataSetCopy(self.path, target, names | changed.keys())
-        copy.write()
+        notes = [] if base == target else copy_data_set(base, target, names)
         for name in sorted(names):
             place_file(encoded.folder / name, target / name)
-        for name, rows in changed.items():
-            (target / name).write_text(json.dumps(rows, indent=0))
+        for details in encoded.details():
+            tables.add_new_categories(details)
         for details in encoded.details():
             if details["new_categories"]:
                 tables.replace_placeholders(target, details)
-        return [*self._notes(tables, counts), *copy.notes()]
-
-    def _notes(self, tables: _AnnotationTables, counts: int) -> list[str]:
-        notes = []
-        lidars = self._tables.lidar_rows()
-        if len(lidars) > 1:
-            chosen = next(name for name, rows in lidars.items() if rows == self._rows)
-            others = len(lidars) - 1
-            notes.append(
-                f"Only the sweeps of {chosen} were augmented. The other "
-                f"{plural(others, 'lidar channel')} in {self.source.name} "
-                f"{'is' if others == 1 else 'are'} unchanged."
-            )
+        tables.add_boxes(encoded)
+        counts = tables.count_points(encoded, target)
+        for name, rows in tables.changed().items():
+            (target / folder / f"{name}.json").write_text(json.dumps(rows, indent=0))
         if counts:
             notes.append(
                 f"`num_lidar_pts` was updated in {plural(counts, 'annotation')}. The visibility of "
                 "recorded objects is unchanged."
             )
-        if tables.added_categories:
-            names = ", ".join(tables.added_categories)
-            notes.append(f"These categories were added for inserted objects: {names}.")
-        if tables.other_types:
-            notes.append(
-                f"nuScenes has no category for {join_names(tables.other_types)}, so these inserted "
-                f"objects have the category {OTHER_CATEGORY}."
-            )
-        return notes
+        return notes + tables.notes()
 
 
 class _NewCategories:
@@ -230,30 +217,35 @@ def _panoptic_labels(
 class _AnnotationTables:
     """Tables with categories, instances and annotations, to which inserted objects are added."""
 
-    def __init__(
-        self,
-        tables: NuScenesTables,
-        categories: Sequence[_Row],
-        sweeps: Sequence[_Row],
-        name: str,
-    ) -> None:
+    def __init__(self, tables: NuScenesTables, sweeps: Sequence[_Row], name: str) -> None:
         self._tables = tables
         self._sweeps = sweeps
         self._name = name
         self._rows = {
             table: [dict(row) for row in tables.table(table).values()]
-            for table in ("instance", "sample_annotation")
+            for table in ("category", "instance", "sample_annotation")
         }
-        self._rows["category"] = [dict(row) for row in categories]
         self._changed: set[str] = set()
-        self._indices: dict[str, int] = {}  # {type of an object: index of its new category}
         self._added: set[str] = set()  # tokens of annotations of inserted objects
-        self.added_categories: list[str] = []
-        self.other_types: list[str] = []  # types of objects in the category for other objects
+        self._added_categories: list[str] = []
+        self._other_types: list[str] = []  # types of objects in the category for other objects
 
     def changed(self) -> dict[str, list[dict[str, Any]]]:
         """Return the tables that differ from those of the data set."""
         return {name: self._rows[name] for name in sorted(self._changed)}
+
+    def notes(self) -> list[str]:
+        """Return sentences about the categories of inserted objects."""
+        notes = []
+        if self._added_categories:
+            names = ", ".join(self._added_categories)
+            notes.append(f"These categories were added for inserted objects: {names}.")
+        if self._other_types:
+            notes.append(
+                f"nuScenes has no category for {join_names(self._other_types)}, so these inserted "
+                f"objects have the category {OTHER_CATEGORY}."
+            )
+        return notes
 
     def add_new_categories(self, details: Mapping[str, Any]) -> None:
         """Add the categories of the inserted objects in a sweep.
@@ -262,8 +254,8 @@ class _AnnotationTables:
         """
         for kind in dict.fromkeys(box["type"] for box in details["boxes"]):
             name = self._category(kind)["name"]
-            if name == OTHER_CATEGORY != kind and kind not in self.other_types:
-                self.other_types.append(kind)
+            if name == OTHER_CATEGORY != kind and kind not in self._other_types:
+                self._other_types.append(kind)
 
     def _category(self, kind: str) -> dict[str, Any]:
         """Return the row of an object type in the table of categories, which may be added."""
@@ -284,15 +276,14 @@ class _AnnotationTables:
                     f"because lidarseg supports at most {_MAX_LABEL + 1}. Use the type of an "
                     "existing category."
                 )
-        self._indices[kind] = row.get("index", 0)
         rows.append(row)
         self._changed.add("category")
-        self.added_categories.append(kind)
+        self._added_categories.append(kind)
         return row
 
     def replace_placeholders(self, target: Path, details: Mapping[str, Any]) -> None:
         """Replace the placeholders of new categories in the label files of a sweep."""
-        new = [self._indices[kind] for kind in details["new_categories"]]
+        new = [self._category(kind).get("index", 0) for kind in details["new_categories"]]
         if "label_file" in details:
             table = np.arange(_MAX_LABEL + 1)
             table[_MAX_LABEL - np.arange(len(new))] = new
@@ -373,7 +364,7 @@ class _AnnotationTables:
         self._changed |= {"instance", "sample_annotation"}
         self._added.update(key)
 
-    def count_points(self, encoded: EncodedSweeps) -> int:
+    def count_points(self, encoded: EncodedSweeps, target: Path) -> int:
         """Count the points in the boxes of changed key frames, as nuscenes-devkit counts them.
 
         The key frames of all lidar channels of a sample count. Returns the number of annotations
@@ -396,10 +387,9 @@ class _AnnotationTables:
             rows = annotations[sample]
             if not details["changed"]:
                 rows = [row for row in rows if row["token"] in self._added]
-            points = [self._points(sweep, encoded.folder / sweep["filename"])]
+            points = [self._points(sweep, target / sweep["filename"])]
             points += [
-                self._points(other, self._tables.files(other)[0])
-                for other in others.get(sample, ())
+                self._points(other, target / other["filename"]) for other in others.get(sample, ())
             ]
             everything = np.concatenate(points)
             for row in rows:

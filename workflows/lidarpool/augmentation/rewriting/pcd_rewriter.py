@@ -13,7 +13,7 @@ from lidarsim.scene.files.pcd import PCDRecords
 from ...clouds.pcd import point_files
 from ...clouds.recording import Recording, RecordingSource
 from ..augmented_sweep import AugmentedSweep
-from .data_set_copy import DataSetCopy, place_file
+from .data_set_copy import copy_data_set, place_file
 from .rewriter import EncodedSweeps, Rewriter, organization_notes
 from .stored_records import unchanged
 
@@ -55,7 +55,7 @@ class PCDRewriter(Rewriter):
             return {file.name: read_input(file)}, details
         return {file.name: pcd.encode(rows, template, height)}, details
 
-    def assemble(self, target: Path, encoded: EncodedSweeps) -> list[str]:
+    def assemble(self, target: Path, encoded: EncodedSweeps, base: Path) -> list[str]:
         """Write the file, or the folder with all files."""
         notes = organization_notes(encoded.details())
         if any(sweep["boxes"] for sweep in encoded.details()):
@@ -64,8 +64,7 @@ class PCDRewriter(Rewriter):
             place_file(encoded.folder / self.path.name, target)
             return notes
         names = encoded.names()
-        copy = DataSetCopy(self.path, target, names)
-        copy.write()
+        notes += copy_data_set(base, target, names)
         for name in sorted(names):
             place_file(encoded.folder / name, target / name)
-        return notes + copy.notes()
+        return notes

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,7 +19,7 @@ import numpy as np
 from lidarsim.environment.extras import reading
 from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.io.storage import Storage
-from lidarsim.words import plural
+from lidarsim.words import list_names, plural
 
 from ...clouds.recording import Recording, RecordingSource
 from ..augmented_sweep import AugmentedSweep
@@ -102,8 +102,28 @@ class Rewriter(ABC):
         """
 
     @abstractmethod
-    def assemble(self, target: Path, encoded: EncodedSweeps) -> list[str]:
-        """Write the augmented copy to a new file or folder, and return notes for the user."""
+    def assemble(self, target: Path, encoded: EncodedSweeps, base: Path) -> list[str]:
+        """Write the augmented copy, and return notes for the user.
+
+        Parameters
+        ----------
+        target
+            File or folder to write.
+        encoded
+            Encoded sweeps.
+        base
+            File or folder that contains everything else. This is the recording, or the target if
+            the sweeps of another sensor have already been written there.
+        """
+
+    def sensors(self) -> Sequence[str]:
+        """Return the names of all sensors, topics or sequences in the file or folder."""
+        return [self.sensor]
+
+    @property
+    def sensor(self) -> str:
+        """Name of the sensor, topic or sequence that is augmented."""
+        return ""
 
     def sweep_files(self, number: int, augmented: AugmentedSweep) -> dict[str, bytes]:
         """Return the encoded files of an augmented sweep, keyed by name.
@@ -149,7 +169,14 @@ class Rewriter(ABC):
         """Raise LidarError unless the augmented copy can be written to a path."""
         check_target(target, self.path, overwrite=overwrite)
 
-    def finish(self, target: Path, encoded: Path, *, overwrite: bool = False) -> list[str]:
+    def finish(
+        self,
+        target: Path,
+        encoded: Path,
+        *,
+        overwrite: bool = False,
+        others: Sequence[tuple[Rewriter, Path]] = (),
+    ) -> list[str]:
         """Write the augmented copy of the recording from the encoded sweeps.
 
         The copy is written completely or not at all. Sweeps are read one after the other. The work
@@ -163,6 +190,9 @@ class Rewriter(ABC):
             Work folder with the encoded files of all sweeps.
         overwrite
             Whether to replace a file, or a folder that was written by this method.
+        others
+            Rewriters of other sensors in the same recording, with their work folders. Their sweeps
+            are written to the same target.
 
         Returns
         -------
@@ -173,11 +203,34 @@ class Rewriter(ABC):
         LidarError
             If a sweep is missing, or if the target exists or cannot be written.
         """
-        sweeps = EncodedSweeps(encoded, len(self.recording))
-        sweeps.check_complete()
+        parts = [
+            (rewriter, EncodedSweeps(folder, len(rewriter.recording)))
+            for rewriter, folder in ((self, encoded), *others)
+        ]
+        for _, sweeps in parts:
+            sweeps.check_complete()
         self.check_target(target, overwrite=overwrite)
+        chosen = [rewriter.sensor for rewriter, _ in parts]
+        notes = self._sensor_notes(chosen)
         with new_target(target) as staged:
-            return self.assemble(staged, sweeps)
+            base = self.path
+            for rewriter, sweeps in parts:
+                notes += rewriter.assemble(staged, sweeps, base)
+                base = staged
+        return list(dict.fromkeys(notes))
+
+    def _sensor_notes(self, chosen: Sequence[str]) -> list[str]:
+        """Return a note if the sweeps of some sensors are unchanged."""
+        unchanged = [name for name in self.sensors() if name not in chosen]
+        if not unchanged:
+            return []
+        verb = "is" if len(unchanged) == 1 else "are"
+        return [
+            (
+                f"Only the sweeps of {list_names(chosen)} were augmented. {list_names(unchanged)} "
+                f"in {self.source.name} {verb} unchanged."
+            )
+        ]
 
     def stored_records(self, number: int, records: Any) -> StoredRecords:
         """Combine the records of a file with the points of the recording."""
