@@ -145,14 +145,14 @@ def test_options_of_each_insertion_follow_it(captured):
 def test_recording_and_run_options(captured):
     augmentation, options = captured(
         *("--rain", 1, "--topic", "/points", "--intensity", "signal", "--model", "ouster/os1-64"),
-        *("--sweeps", "2:5", "--sensor", "velodyne/vlp16", "--reflectance", 0.2),
+        *("--sensor", "velodyne/vlp16", "--reflectance", 0.2),
         *("--workers", 3, "--resume", "--format", "pcd"),
     )
     assert (augmentation.file.sensor, augmentation.file.intensity) == ("/points", "signal")
     assert augmentation.model.name == "Ouster OS1-64"
     assert augmentation.model.noise is not None
     assert augmentation.resampled.name == "Velodyne VLP-16"
-    assert augmentation.numbers == range(2, 5)
+    assert augmentation.numbers is None
     assert augmentation.reflectance == 0.2
     assert augmentation.output_format == "pcd"
     assert options["workers"] == 3
@@ -194,6 +194,10 @@ def test_resampling_requires_no_effects(captured):
         (["--sweeps", "5:2", "--rain", 1], "'5:2' is not a range of sweeps"),
         (["--sweeps", "x", "--rain", 1], "'x' is not a range of sweeps"),
         (["--sweeps", "30:40", "--rain", 1], "has 3 sweeps, so `--sweeps` must start before 3"),
+        (
+            ["--sweeps", "0:2", "--sensor", "velodyne/vlp16"],
+            "`--sweeps` and `--sensor` cannot be combined",
+        ),
         (["--rain", 1, "--resume", "--overwrite"], "`--resume` and `--overwrite` cannot be"),
         (["--rain", -1], "-1.0 is not in the range"),
         (["--rain", 1, "--model", "velodyne/none"], "velodyne/none"),
@@ -228,19 +232,6 @@ def test_files_without_effects_are_refused(run, drive, tmp_path):
     path.write_text("classes: {3: car}\n")
     result = run(drive, path, "--out", tmp_path / "out", fails=True)
     assert "effects.yaml has no effects" in str(result.exception)
-
-
-def test_one_of_several_sensors_is_chosen_by_topic(run, drive, tmp_path, monkeypatch):
-    from lidarpool.clouds.recording import SeveralSensorsError
-
-    def refuse(*arguments, **options):
-        raise SeveralSensorsError("drive has the topics a and b.", ["a", "b"])
-
-    monkeypatch.setattr("lidarpool.augmentation.sweep_tasks.open_recording", refuse)
-    result = run(drive, "--rain", 1, "--out", tmp_path / "out", fails=True)
-    assert str(result.exception) == (
-        "drive has the topics a and b. Choose one of them with `--topic`."
-    )
 
 
 def test_names_of_the_options():

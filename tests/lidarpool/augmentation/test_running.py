@@ -213,7 +213,7 @@ def test_changed_inputs_are_refused(augmentation, drive, tmp_path, change, noun)
         augmentation = change(augmentation)
     with pytest.raises(LidarError, match=rf"different inputs \({noun}\)"):
         augmentation.run(out, workers=1, resume=True)
-    assert len([*WorkFolder.for_output(out).glob("counts/*/*.json")]) == 2
+    assert len([*WorkFolder.for_output(out).glob("*/*/.counts/*.json")]) == 2
 
 
 def test_other_software_is_refused(augmentation, tmp_path, monkeypatch):
@@ -325,7 +325,7 @@ def test_recordings_are_resampled_and_augmented(augmentation, drive, tmp_path):
         recorded = {tuple(row) for row in open_recording(drive)[number].points.tolist()}
         assert {tuple(row) for row in sweep.points.tolist()} <= recorded
     with pytest.raises(LidarError, match="`--sweeps` and `--sensor` cannot be combined"):
-        replace(clear, numbers=range(2)).run(tmp_path / "some", workers=1)
+        replace(clear, numbers=range(2))
 
 
 def test_objects_are_inserted(augmentation, tmp_path):
@@ -334,6 +334,78 @@ def test_objects_are_inserted(augmentation, tmp_path):
     inserted = replace(augmentation, variants=effects).run(tmp_path / "crate", workers=1)
     assert inserted.counts.added["surface"] > 50
     assert inserted.counts.kept < inserted.counts.returns
+
+
+def write_kitti(folder, sweeps, sequences=("00", "01")):
+    """Write each sweep to both sequences of a KITTI data set."""
+    for name in sequences:
+        (folder / "sequences" / name / "velodyne").mkdir(parents=True)
+        for number, rows in enumerate(sweeps):
+            names = ("x", "y", "z", "intensity")
+            values = np.column_stack([rows[column] for column in names]).astype("<f4")
+            values[:, 3] /= 255
+            path = folder / "sequences" / name / "velodyne" / f"{number:06}.bin"
+            path.write_bytes(values.tobytes())
+    return folder
+
+
+@pytest.fixture
+def kitti(points, tmp_path):
+    return write_kitti(tmp_path / "kitti", points[:2])
+
+
+def test_all_sequences_of_a_data_set_are_augmented(kitti, tmp_path):
+    everything = Augmentation(RecordingFile(kitti), Variants(Effects.load(options=RAIN)))
+    assert everything.run(tmp_path / "all", workers=1).sweeps == 4
+    files = content(tmp_path / "all")
+    before = content(kitti)
+    names = [
+        f"sequences/{name}/velodyne/{number:06}.bin" for name in ("00", "01") for number in (0, 1)
+    ]
+    assert all(files[name] != before[name] for name in names)
+    assert files[names[0]] != files[names[2]]  # sequences have different random numbers
+    everything.run(tmp_path / "together", workers=3)
+    assert content(tmp_path / "together") == files
+    with pytest.raises(KeyboardInterrupt):
+        everything.run(tmp_path / "resumed", workers=1, progress=stop_after(3))
+    everything.run(tmp_path / "resumed", workers=1, resume=True)
+    assert content(tmp_path / "resumed") == files
+    one = replace(everything, file=replace(everything.file, sensor="01"))
+    augmented = one.run(tmp_path / "one", workers=1)
+    assert augmented.sweeps == 2
+    after = content(tmp_path / "one")
+    assert [after[name] == before[name] for name in names] == [True, True, False, False]
+    assert [after[name] == files[name] for name in names[2:]] == [True, True]
+
+
+def test_one_of_several_sensors_is_converted(kitti, tmp_path):
+    augmentation = Augmentation(
+        RecordingFile(kitti), Variants(Effects.load(options=RAIN)), output_format="pcd"
+    )
+    with pytest.raises(LidarError, match="Choose it with `--topic`"):
+        augmentation.run(tmp_path / "wet", workers=1)
+    assert not (tmp_path / "wet").exists()
+    one = replace(augmentation, file=replace(augmentation.file, sensor="01"))
+    augmented = one.run(tmp_path / "wet", workers=1)
+    counts = [len(sweep.returns()) for sweep in open_recording(tmp_path / "wet")]
+    assert sum(counts) == augmented.counts.points
+
+
+def test_recordings_are_converted(drive, tmp_path):
+    wet = Variants(Effects.load(options=RAIN))
+    augmentation = Augmentation(RecordingFile(drive), wet, output_format="mcap")
+    augmented = augmentation.run(tmp_path / "into", workers=1)
+    assert augmented.outputs == (tmp_path / "into" / "drive.mcap",)
+    assert len(open_recording(augmented.outputs[0])) == SWEEPS
+    other = tmp_path / "other" / "drive.mcap"  # bags contain their name
+    augmentation.run(other, workers=3)
+    assert other.read_bytes() == augmented.outputs[0].read_bytes()
+    same = replace(augmentation, output_format="pcd")
+    same.run(tmp_path / "pcd", workers=1)
+    replace(augmentation, output_format=None).run(tmp_path / "own", workers=1)
+    assert content(tmp_path / "pcd") == content(tmp_path / "own")
+    with pytest.raises(LidarError, match="'pdf'"):
+        replace(augmentation, output_format="pdf").run(tmp_path / "none", workers=1)
 
 
 @pytest.fixture

@@ -6,9 +6,8 @@ stopped at any time continues with the missing sweeps, and its output has the sa
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import chain
@@ -18,17 +17,20 @@ from typing import TYPE_CHECKING, Any
 from lidarsim.errors import LidarError
 from lidarsim.io.storage import Storage
 from lidarsim.sensor import Sensor
-from lidarsim.words import plural
+from lidarsim.words import join_names, plural
 
 from ..clouds.folder import result_folder
+from ..clouds.format_table import format_of_path
+from ..clouds.writing import ExportSpec
 from ..identity.fingerprint import fingerprint
 from ..identity.software import software
-from ..run.cluster.worker_map import parallel_map
-from .rewriting.rewriter import Rewriter
+from ..run.cluster.worker_map import MapFunction, parallel_map
 from .sweep_tasks import (
     MAX_VARIANTS,
     AugmentationPlan,
     EncodedFiles,
+    PartProcess,
+    PlannedSweep,
     PlanProcess,
     PointCounts,
     RecordingFile,
@@ -62,7 +64,7 @@ class AugmentedRecording:
     table
         Table with the values of the variants, or None if there is a single variant.
     sweeps
-        Number of augmented sweeps in each output.
+        Number of augmented sweeps in each output, of all sensors together.
     counts
         Point counts of all outputs.
     seconds
@@ -113,7 +115,8 @@ class Augmentation:
     Attributes
     ----------
     file
-        File or folder of the recording.
+        File or folder of the recording. If it has several sensors or sequences and none is chosen,
+        all of them are augmented.
     variants
         Variants of effects.
     model
@@ -136,6 +139,13 @@ class Augmentation:
     resampled: Sensor | None = None
     reflectance: float | None = None
 
+    def __post_init__(self) -> None:
+        if self.numbers is not None and self.resampled is not None:
+            raise LidarError(
+                "`--sweeps` and `--sensor` cannot be combined, because the other sweeps would "
+                "keep the rays of the recorded sensor."
+            )
+
     def run(
         self,
         out: Path,
@@ -151,7 +161,7 @@ class Augmentation:
         Parameters
         ----------
         out
-            Output file or folder. If there are several variants, or if the recording is a file and
+            Output file or folder. If there are several variants, or if the output is a file and
             `out` has another extension, the copies are written to this folder.
         client
             Client of a cluster whose OTHER workers can read the recording at the same path. By
@@ -173,31 +183,43 @@ class Augmentation:
             written, or if the unfinished run has other inputs.
         """
         out = Path(out)
-        folder = WorkFolder.for_output(out)
-        targets = self._targets(out)
+        files = self.file.each_sensor()
+        output = self._output()
+        targets = self._targets(out, output)
         try:
             with ExitStack() as stack:
                 if targets[0] != out:
                     stack.enter_context(result_folder(out))
-                stack.enter_context(result_folder(folder))
+                stack.enter_context(result_folder(WorkFolder.for_output(out)))
                 identity = self._identity()
                 work = WorkFolder.create_or_resume(
                     out, identity, resume=resume, overwrite=overwrite
                 )
-                run = _Run(self, work, targets, identity, progress)
-                with run.kept_on_error():
+                run = _Run(self, files, output, work, targets, progress)
+                with _KeptFolder(work):
                     return run.augment(out, client, workers)
         finally:
             close_plans()
 
-    def _targets(self, out: Path) -> tuple[Path, ...]:
+    def _output(self) -> ExportSpec | None:
+        """Return the output format, or None if it is the format of the recording."""
+        if self.output_format is None:
+            return None
+        path = self.file.path
+        spec = ExportSpec(self.output_format)
+        recorded = format_of_path(path, str(path))
+        return None if recorded is spec.cloud_format else spec
+
+    def _targets(self, out: Path, output: ExportSpec | None) -> tuple[Path, ...]:
         """Return the path of the copy for each variant."""
         path = self.file.path
         suffix = path.suffix if path.is_file() else ""
+        if output is not None:
+            suffix = Path(output.row.file).suffix
         if self.variants.is_campaign:
             return tuple(out / f"{number:04}{suffix}" for number in range(self.variants.count))
         if suffix and out.suffix.lower() != suffix.lower():
-            return (out / path.name,)
+            return (out / f"{path.stem}{suffix}",)
         return (out,)
 
     def _identity(self) -> dict[str, str]:
@@ -235,32 +257,37 @@ class _Run:
     """Run of an augmentation, whose sweeps are collected in a work folder."""
 
     augmentation: Augmentation
+    files: tuple[RecordingFile, ...]  # the recording, once for each sensor
+    output: ExportSpec | None
     work: WorkFolder
     targets: tuple[Path, ...]
-    identity: Mapping[str, str]
     progress: ShowProgress
     _notes: dict[str, None] = field(default_factory=dict)  # in the order of their discovery
     _done: int = 0  # number of finished sweeps of all variants
-    _count: int = 0  # number of sweeps of the recording
+    _counts: tuple[int, ...] = ()  # number of sweeps of each sensor
     _started: float = field(default_factory=time.monotonic)
-
-    def kept_on_error(self) -> _KeptFolder:
-        """Return a context that keeps a work folder with sweeps if the body fails."""
-        return _KeptFolder(self.work)
 
     def augment(self, out: Path, client: Client | None, workers: int | None) -> AugmentedRecording:
         """Augment the missing sweeps, and write the copies that are not complete."""
-        variants = self.augmentation.variants
-        first = self._shared_plan(self._groups()[0])
-        process = open_plan(first)
-        self._count = len(process.recording)
-        self._check(process)
-        total = self._count * variants.count
-        tasks = min(total, max(_MIN_TASKS, total // _TASK_SWEEPS))
+        groups = self._groups()
+        plan = open_plan(self._shared_plan(groups[0]))
+        self._counts = tuple(len(part.recording) for part in plan.all_parts())
+        self._check(plan)
+        tasks = min(self._total, max(_MIN_TASKS, self._total // _TASK_SWEEPS))
         with parallel_map(client, tasks, _WORKER_BYTES, workers) as run:
-            for group in self._groups():
+            for group in groups:
                 self._augment_group(group, run)
         return self._summary(out)
+
+    @property
+    def _count(self) -> int:
+        """Number of sweeps in a copy."""
+        return sum(self._counts)
+
+    @property
+    def _total(self) -> int:
+        """Number of sweeps in all copies."""
+        return self._count * self.augmentation.variants.count
 
     def _groups(self) -> list[range]:
         """Return the variants in groups, whose sweeps are read only once."""
@@ -270,86 +297,101 @@ class _Run:
             for start in range(0, count, MAX_VARIANTS)
         ]
 
-    def _check(self, process: PlanProcess) -> None:
+    def _check(self, plan: PlanProcess) -> None:
         """Raise LidarError if the recording cannot be augmented, before anything is written."""
         numbers = self.augmentation.numbers
-        if numbers is not None and numbers.start >= self._count:
+        longest = max(self._counts)
+        if numbers is not None and numbers.start >= longest:
             raise LidarError(
-                f"{self.augmentation.file.path} has {plural(self._count, 'sweep')}, so "
-                f"`--sweeps` must start before {self._count}, but starts at {numbers.start}."
+                f"{self.augmentation.file.path} has {plural(longest, 'sweep')}, so `--sweeps` must "
+                f"start before {longest}, but starts at {numbers.start}."
             )
-        if numbers is not None and self.augmentation.resampled is not None:
-            raise LidarError(
-                "`--sweeps` and `--sensor` cannot be combined, because the other sweeps would "
-                "keep the rays of the recorded sensor."
-            )
-        rewriter = process.rewriter
+        parts = plan.all_parts()
+        for part in parts:  # reports formats that cannot be written
+            rewriter = part.rewriter
         for variant, target in enumerate(self.targets):
             if self.work.summary(variant) is None:
-                overwrite = self.work.may_replace(variant)
-                rewriter.check_target(target, overwrite=overwrite)
-        process.prepare(0)
-        self._add_notes(process.notes())
+                rewriter.check_target(target, overwrite=self.work.may_replace(variant))
+        if len(parts) > 1:
+            self._check_several(plan)
+        first = plan.part(0)
+        first.prepare(0)
+        self._add_notes(first.notes())
+
+    def _check_several(self, plan: PlanProcess) -> None:
+        """Raise LidarError if several sensors of the recording cannot be augmented together."""
+        names = join_names([str(file.sensor) for file in self.files])
+        path = self.augmentation.file.path
+        if self.output is not None:
+            raise LidarError(
+                f"{path} contains {names}, but only one of them can be written in another format. "
+                "Choose it with `--topic`."
+            )
+        has_insertions = any(effects.insertions for effects in plan.plan.variants.values())
+        if has_insertions and not all(part.recording.sequence for part in plan.all_parts()):
+            raise LidarError(
+                f"{path} contains {names}, so the sensor to which `--at` refers is ambiguous. "
+                "Choose it with `--topic`, or use `actors` in an effects file."
+            )
 
     def _shared_plan(self, group: range) -> SharedPlan:
         augmentation = self.augmentation
         effects = {number: augmentation.variants.effects(number) for number in group}
         self._add_notes(note for one in effects.values() for note in one.notes)
         plan = AugmentationPlan(
-            augmentation.file,
+            self.files,
             effects,
             augmentation.model,
             augmentation.numbers,
-            augmentation.output_format,
+            self.output,
             augmentation.resampled,
             augmentation.reflectance,
         )
-        key = fingerprint(dict(self.identity), group.start)
+        key = fingerprint(dict(self.work.identity), str(self.work.folder), group.start)
         return SharedPlan.from_plan(key, self.work, plan)
 
     def _add_notes(self, notes: Iterable[str]) -> None:
         self._notes |= dict.fromkeys(notes)
 
-    def _augment_group(self, group: range, run: Any) -> None:
+    def _augment_group(self, group: range, run: MapFunction) -> None:
         """Augment the missing sweeps of some variants, and write their copies."""
         variants = [number for number in group if self.work.summary(number) is None]
         self._done += self._count * (len(group) - len(variants))
         if not variants:
             return
         shared = self._shared_plan(group)
-        rewriter = open_plan(shared).rewriter
-        missing = self._missing(variants, rewriter)
-        pending = sum(len(numbers) for _, numbers in missing)
+        missing = [*self._missing(variants, open_plan(shared).all_parts())]
+        pending = sum(len(sweep.variants) for sweep in missing)
         self._done += self._count * len(variants) - pending
         self._show_progress()
-        for encoded in _closed_iteration(run(augment_sweeps, self._tasks(shared, missing))):
+        results = run(augment_sweeps, self._tasks(shared, missing))
+        for encoded in _closed_iteration(results):
             if encoded.files is not None:
                 self.work.write(encoded.files)
             self._add_notes(encoded.notes)
-            self._done += encoded.count
+            self._done += encoded.finished
             self._show_progress()
         self._check_unchanged()
-        rewriter = open_plan(shared).rewriter
         for variant in variants:
-            self._write_copy(variant, rewriter)
+            self._write_copy(variant, open_plan(shared).all_parts())
 
     def _show_progress(self) -> None:
-        self.progress(self._done, self._count * self.augmentation.variants.count)
+        self.progress(self._done, self._total)
 
     def _missing(
-        self, variants: list[int], rewriter: Rewriter
-    ) -> list[tuple[int, tuple[int, ...]]]:
-        """Return the numbers of the sweeps that are not encoded, with their variants."""
+        self, variants: Sequence[int], parts: Sequence[PartProcess]
+    ) -> Iterator[PlannedSweep]:
+        """Yield the sweeps that are not encoded, with their variants."""
         work = self.work
-        missing = [
-            (number, tuple(v for v in variants if not rewriter.is_written(work.encoded(v), number)))
-            for number in range(self._count)
-        ]
-        return [(number, without) for number, without in missing if without]
+        for index, part in enumerate(parts):
+            rewriter = part.rewriter
+            folders = [(variant, work.encoded(variant, index)) for variant in variants]
+            for number in range(self._counts[index]):
+                missing = [v for v, folder in folders if not rewriter.is_written(folder, number)]
+                if missing:
+                    yield PlannedSweep(index, number, tuple(missing))
 
-    def _tasks(
-        self, shared: SharedPlan, missing: list[tuple[int, tuple[int, ...]]]
-    ) -> Iterator[SweepTask]:
+    def _tasks(self, shared: SharedPlan, missing: Sequence[PlannedSweep]) -> Iterator[SweepTask]:
         """Yield tasks of consecutive sweeps, which are read in a single pass."""
         size = min(len(missing) // _MIN_TASKS + 1, _TASK_SWEEPS)
         for start in range(0, len(missing), size):
@@ -358,19 +400,24 @@ class _Run:
     def _check_unchanged(self) -> None:
         """Raise LidarError if the recording has changed since the run began."""
         path = self.augmentation.file.path
-        if fingerprint_files(path) != self.identity["recording"]:
+        if fingerprint_files(path) != self.work.identity["recording"]:
             raise LidarError(
                 f"{path} was changed while it was augmented. Start again with `--overwrite`."
             )
 
-    def _write_copy(self, variant: int, rewriter: Rewriter) -> None:
+    def _write_copy(self, variant: int, parts: Sequence[PartProcess]) -> None:
         """Write the copy of a variant, and remove its encoded sweeps."""
         work = self.work
         counts = PointCounts.total(
-            json.loads(work.counts(variant, number).read_bytes()) for number in range(self._count)
+            work.counts(variant, index, number)
+            for index, count in enumerate(self._counts)
+            for number in range(count)
         )
         overwrite = work.begin_output(variant)
-        notes = rewriter.finish(self.targets[variant], work.encoded(variant), overwrite=overwrite)
+        (first, folder), *others = (
+            (part.rewriter, work.encoded(variant, index)) for index, part in enumerate(parts)
+        )
+        notes = first.finish(self.targets[variant], folder, overwrite=overwrite, others=others)
         summary = {"returns": counts.returns, "kept": counts.kept, "added": dict(counts.added)}
         work.end_output(variant, summary | {"notes": list(notes)})
 
@@ -397,11 +444,16 @@ class _Run:
         return AugmentedRecording(
             self.targets,
             table,
-            self._count if numbers is None else len(range(self._count)[_as_slice(numbers)]),
+            sum(count if numbers is None else _overlap(numbers, count) for count in self._counts),
             PointCounts.total(summaries),
             time.monotonic() - self._started,
             tuple(self._notes),
         )
+
+
+def _overlap(numbers: range, count: int) -> int:
+    """Return how many of the first `count` sweeps are in a range."""
+    return max(0, min(numbers.stop, count) - numbers.start)
 
 
 @dataclass(frozen=True)
@@ -422,10 +474,6 @@ class _KeptFolder:
             )
         else:
             self.work.remove()
-
-
-def _as_slice(numbers: range) -> slice:
-    return slice(numbers.start, numbers.stop, numbers.step)
 
 
 def _closed_iteration(results: Iterable[EncodedFiles]) -> Iterator[EncodedFiles]:

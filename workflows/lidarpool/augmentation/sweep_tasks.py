@@ -10,7 +10,7 @@ import json
 import pickle
 import socket
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -21,18 +21,21 @@ import numpy as np
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES
 from lidarsim.errors import LidarError
+from lidarsim.numerics.random_numbers import named_seed
 from lidarsim.sensor import Sensor
 
-from ..clouds.recording import METERS, Recording
+from ..clouds.recording import METERS, Recording, RecordingSource, SeveralSensorsError
+from ..clouds.writing import ExportSpec
 from ..processes.per_process import PerProcess
 from ..recordings.opening import open_recording
 from .augmented_sweep import AugmentedSweep
 from .augmenter import Augmenter
+from .conversion import FormatConverter
 from .effects import Effects
 from .resampling import SensorResampler
 from .rewriting.opening import open_rewriter
 from .rewriting.rewriter import Rewriter
-from .work_folder import WorkFolder, counts_name
+from .work_folder import WorkFolder, counts_name, encoded_name
 
 
 @dataclass(frozen=True)
@@ -62,29 +65,24 @@ class RecordingFile:
         return self.path if Path.cwd() == self.folder else self.folder / self.path
 
     def open(self) -> Recording:
-        """Open the recording with all points of its file.
+        """Open the recording with all points of its file."""
+        return open_recording(self.located, self.sensor, self.intensity, keep_noise=True)
 
-        The last sweep stays in memory, so variants and rewriters do not read it again. A bag would
-        even be read from its start.
+    def each_sensor(self) -> tuple[RecordingFile, ...]:
+        """Return this file once for each of its sensors, or only for the chosen sensor.
+
+        The sequences of a KITTI data set count as sensors.
+
+        Raises
+        ------
+        LidarError
+            If the recording cannot be read.
         """
-        recording = open_recording(self.located, self.sensor, self.intensity, keep_noise=True)
-        return replace(recording, read=_LastSweep(recording))
-
-
-class _LastSweep:
-    """Function that reads a sweep of a recording, and keeps the last one in memory."""
-
-    def __init__(self, recording: Recording) -> None:
-        self._read = recording.read
-        self._number = -1
-        self._sweep: Sweep | None = None
-
-    def __call__(self, number: int) -> Sweep:
-        if self._sweep is None or self._number != number:
-            self._sweep = None  # frees its memory before the next sweep is read
-            self._sweep = self._read(number)
-            self._number = number
-        return self._sweep
+        try:
+            self.open()
+        except SeveralSensorsError as error:
+            return tuple(replace(self, sensor=name) for name in error.names)
+        return (self,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,38 +91,29 @@ class AugmentationPlan:
 
     Attributes
     ----------
-    file
-        File of the recording.
+    files
+        File of the recording, once for each of its sensors.
     variants
         Effects by the number of their variant.
     model
         Model of the recording's sensor, or None if it is unknown.
     numbers
         Numbers of the sweeps to augment. Other sweeps are not changed.
-    output_format
-        Name of the output format, or None for the format of the recording.
+    output
+        Format of the output, or None for the format of the recording.
     resampled
         Sensor to which the sweeps are resampled, or None.
     reflectance
         Reflectance of all recorded surfaces if the recording has no intensities.
     """
 
-    file: RecordingFile
+    files: Sequence[RecordingFile]
     variants: Mapping[int, Effects]
     model: Sensor | None = None
     numbers: range | None = None
-    output_format: str | None = None
+    output: ExportSpec | None = None
     resampled: Sensor | None = None
     reflectance: float | None = None
-
-    def open_rewriter(self, recording: Recording) -> Rewriter:
-        """Return the rewriter for the output format."""
-        if self.output_format is not None:
-            raise LidarError(
-                f"The output format {self.output_format!r} is not supported. Omit `--format` to "
-                "write the format of the recording."
-            )
-        return open_rewriter(self.file.located, recording, self.file.sensor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,17 +140,25 @@ class SharedPlan:
         return cls(key, work, pickle.dumps(plan))
 
 
+class PlannedSweep(NamedTuple):
+    """A sweep to augment."""
+
+    part: int  # index of the sensor in `AugmentationPlan.files`
+    number: int
+    variants: tuple[int, ...]
+
+
 class SweepTask(NamedTuple):
     """Task of augmenting sweeps."""
 
     shared: SharedPlan
-    sweeps: tuple[tuple[int, tuple[int, ...]], ...]  # numbers of sweeps, with their variants
+    sweeps: tuple[PlannedSweep, ...]
 
 
 class EncodedFiles(NamedTuple):
     """Files of the sweeps of a task."""
 
-    count: int  # number of sweeps, which are counted once for each variant
+    finished: int  # number of sweeps, which are counted once for each variant
     notes: tuple[str, ...]
     # {name: content} of the files in the order in which they must be written, unless the worker has
     # written them
@@ -176,46 +173,63 @@ def augment_sweeps(task: SweepTask) -> EncodedFiles:
     LidarError
         If the recording cannot be read, or if the format cannot store the points.
     """
-    process = open_plan(task.shared)
+    plan = open_plan(task.shared)
     work = task.shared.work
     is_accessible = work.is_accessible()
     unwritten: dict[str, bytes] = {}
-    count = 0
-    for number, variants in task.sweeps:
-        for variant in variants:
-            files = process.files(number, variant)
+    notes: dict[str, None] = {}
+    finished = 0
+    for sweep in task.sweeps:
+        part = plan.part(sweep.part)
+        for variant in sweep.variants:
+            folder = encoded_name(variant, sweep.part)
+            files = part.files(sweep.number, variant)
+            named = {f"{folder}/{name}": content for name, content in files.items()}
             if is_accessible:
-                work.write(files)
+                work.write(named)
             else:
-                unwritten |= files
-            count += 1
-    return EncodedFiles(count, process.notes(), None if is_accessible else unwritten)
+                unwritten |= named
+            finished += 1
+        notes |= dict.fromkeys(part.notes())
+    return EncodedFiles(finished, tuple(notes), None if is_accessible else unwritten)
 
 
 @dataclass(eq=False)
-class PlanProcess:
-    """Recording, rewriter and augmenters of a plan in one process, opened on first use."""
+class PartProcess:
+    """Recording of one sensor with its rewriter and augmenters, which are opened on first use."""
 
-    key: str
     plan: AugmentationPlan
-    work: WorkFolder
+    file: RecordingFile
     _augmenters: dict[int, Augmenter] = field(default_factory=dict)  # {variant: augmenter}
 
     @cached_property
-    def recording(self) -> Recording:
-        """The recording."""
-        path = self.plan.file.located
+    def _read(self) -> _LastSweep:
+        path = self.file.located
         if path.is_absolute() and not path.exists():
             raise LidarError(
                 f"{path} does not exist on {socket.gethostname()}. Use a path that all workers "
                 "can access."
             )
-        return self.plan.file.open()
+        return _LastSweep(self.file.open())
+
+    @cached_property
+    def recording(self) -> Recording:
+        """Recording whose last sweep stays in memory.
+
+        Variants and rewriters therefore do not read it again. A bag would even be read from its
+        start.
+        """
+        return replace(self._read.recording, read=self._read)
 
     @cached_property
     def rewriter(self) -> Rewriter:
         """Rewriter for the output format."""
-        return self.plan.open_rewriter(self.recording)
+        path = self.file.located
+        spec = self.plan.output
+        if spec is None:
+            return open_rewriter(path, self.recording, self.file.sensor)
+        source = RecordingSource(path, str(path), self.file.sensor, self.file.intensity)
+        return FormatConverter(source, self.recording, spec)
 
     @cached_property
     def resampler(self) -> Resampler | None:
@@ -223,17 +237,19 @@ class PlanProcess:
         sensor = self.plan.resampled
         if sensor is None:
             return None
-        return Resampler(SensorResampler(self.recording, sensor, recorded_sensor=self.plan.model))
+        model = self.plan.model
+        return Resampler(SensorResampler(self.recording, sensor, recorded_sensor=model))
 
     @cached_property
     def source(self) -> Recording:
         """The resampled recording, which is the recording itself without a resampler."""
-        if self.resampler is None:
+        resampler = self.resampler
+        if resampler is None:
             return self.recording
         # The resampled sweeps have standard names and units.
         return replace(
             self.recording,
-            read=lambda number: self.resampler(number).sweep,
+            read=lambda number: resampler(number).sweep,
             fired=None,
             meters=METERS,
             intensity_column=None,
@@ -244,25 +260,17 @@ class PlanProcess:
         if self.resampler is None or not self.plan.variants[variant].is_empty:
             self.augmenter(variant)
 
-    def augmented(self, number: int, variant: int) -> AugmentedSweep:
-        """Return an augmented sweep, whose templates are rows of the recorded sweep."""
-        resampled = None if self.resampler is None else self.resampler(number)
-        if resampled is None:
-            return self.augmenter(variant).sweep(number)
-        if self.plan.variants[variant].is_empty:
-            return resampled
-        augmented = self.augmenter(variant).sweep(number)
-        return replace(augmented, template=resampled.template[augmented.template])
-
     def augmenter(self, variant: int) -> Augmenter:
         """Return the augmenter of a variant. Up to `MAX_VARIANTS` augmenters are kept."""
         if variant not in self._augmenters:
             while len(self._augmenters) >= MAX_VARIANTS:
                 del self._augmenters[next(iter(self._augmenters))]
             effects = self.plan.variants[variant]
-            self._augmenters[variant] = Augmenter(
-                self.source, effects, self.plan.model, self.plan.reflectance
-            )
+            if len(self.rewriter.sensors()) > 1:  # sensors have different random numbers
+                effects = replace(effects, seed=named_seed(effects.seed, self.rewriter.sensor))
+            plan = self.plan
+            augmenter = Augmenter(self.source, effects, plan.model, plan.reflectance)
+            self._augmenters[variant] = augmenter
         return self._augmenters[variant]
 
     def notes(self) -> tuple[str, ...]:
@@ -272,20 +280,51 @@ class PlanProcess:
             notes = [*self.resampler.notes, *notes]
         return tuple(dict.fromkeys(notes))
 
+    def augmented(self, number: int, variant: int) -> AugmentedSweep:
+        """Return an augmented sweep, whose templates are rows of the recorded sweep."""
+        numbers = self.plan.numbers
+        if numbers is not None and number not in numbers:
+            return unchanged_sweep(self.recording[number])
+        if self.resampler is None:
+            return self.augmenter(variant).sweep(number)
+        resampled = self.resampler(number)
+        if self.plan.variants[variant].is_empty:
+            return resampled
+        augmented = self.augmenter(variant).sweep(number)
+        return replace(augmented, template=resampled.template[augmented.template])
+
     def files(self, number: int, variant: int) -> dict[str, bytes]:
         """Return the files of a sweep in the order in which they must be written."""
-        numbers = self.plan.numbers
-        if numbers is None or number in numbers:
-            augmented = self.augmented(number, variant)
-        else:
-            augmented = unchanged_sweep(self.recording[number])
-        encoded = self.rewriter.sweep_files(number, augmented)
+        augmented = self.augmented(number, variant)
         counts = count_points(self.recording[number], augmented)
-        folder = self.work.encoded(variant).name
         return {
-            counts_name(variant, number): json.dumps(counts).encode(),
-            **{f"{folder}/{name}": content for name, content in encoded.items()},
+            counts_name(number): json.dumps(counts).encode(),
+            **self.rewriter.sweep_files(number, augmented),
         }
+
+    def release(self) -> None:
+        """Release the augmenters and the last sweep."""
+        self._augmenters.clear()
+        self._read.clear()
+        self.__dict__.pop("resampler", None)
+        self.__dict__.pop("source", None)
+
+
+class _LastSweep:
+    """Function that reads a sweep of a recording, and keeps the last one in memory."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.recording = recording
+        self._last: tuple[int, Sweep] | None = None
+
+    def __call__(self, number: int) -> Sweep:
+        if self._last is None or self._last[0] != number:
+            self._last = None  # frees its memory before the next sweep is read
+            self._last = number, self.recording.read(number)
+        return self._last[1]
+
+    def clear(self) -> None:
+        self._last = None
 
 
 class Resampler:
@@ -310,6 +349,29 @@ class Resampler:
 
 MAX_VARIANTS = 8  # maximum number of variants of a task, whose augmenters are in memory
 
+
+class PlanProcess:
+    """Recordings of a plan in one process. Only the sweeps of one recording are in memory."""
+
+    def __init__(self, plan: AugmentationPlan) -> None:
+        self.plan = plan
+        self._parts: dict[int, PartProcess] = {}
+        self._current = -1
+
+    def part(self, index: int) -> PartProcess:
+        """Return the recording of a sensor."""
+        if index not in self._parts:
+            self._parts[index] = PartProcess(self.plan, self.plan.files[index])
+        if index != self._current and self._current in self._parts:
+            self._parts[self._current].release()
+        self._current = index
+        return self._parts[index]
+
+    def all_parts(self) -> list[PartProcess]:
+        """Return the recordings of all sensors."""
+        return [self.part(index) for index in range(len(self.plan.files))]
+
+
 _processes = PerProcess[dict[str, PlanProcess]](dict)
 
 
@@ -319,7 +381,7 @@ def open_plan(shared: SharedPlan) -> PlanProcess:
     if shared.key not in states:
         states.clear()
         plan = pickle.loads(shared.content)  # noqa: S301 - from the driver of the command
-        states[shared.key] = PlanProcess(shared.key, plan, shared.work)
+        states[shared.key] = PlanProcess(plan)
     return states[shared.key]
 
 

@@ -342,7 +342,12 @@ def _with_boxes(recorded: Sweep, augmented: AugmentedSweep) -> Sweep:
 def _join_boxes(first: SweepBoxes | None, second: SweepBoxes) -> SweepBoxes:
     if first is None or not len(first):
         return second
-    pairs = [(getattr(first, f.name), getattr(second, f.name)) for f in fields(SweepBoxes)]
     return SweepBoxes(
-        *(a + b if isinstance(a, tuple) else np.concatenate([a, b]) for a, b in pairs)
+        names=first.names + second.names,
+        types=first.types + second.types,
+        objects=np.concatenate([first.objects, second.objects]),
+        centers=np.concatenate([first.centers, second.centers]),
+        quaternions=np.concatenate([first.quaternions, second.quaternions]),
+        sizes=np.concatenate([first.sizes, second.sizes]),
+        points=np.concatenate([first.points, second.points]),
     )

@@ -124,13 +124,15 @@ class WorkFolder:
         except OSError:
             return False
 
-    def encoded(self, variant: int) -> Path:
-        """Return the folder for the encoded sweeps of a variant."""
-        return self.folder / f"{variant:04}"
+    def encoded(self, variant: int, part: int) -> Path:
+        """Return the folder for the encoded sweeps of a variant of one sensor."""
+        return self.folder / encoded_name(variant, part)
 
-    def counts(self, variant: int, number: int) -> Path:
-        """Return the path of the file with the point counts of a sweep."""
-        return self.folder / counts_name(variant, number)
+    def counts(self, variant: int, part: int, number: int) -> dict[str, Any]:
+        """Return the point counts of an encoded sweep."""
+        file = self.encoded(variant, part) / counts_name(number)
+        counts: dict[str, Any] = json.loads(file.read_bytes())
+        return counts
 
     def write(self, files: Mapping[str, bytes]) -> None:
         """Write files atomically and in the given order. Names are relative to the folder."""
@@ -147,7 +149,7 @@ class WorkFolder:
     @property
     def has_sweeps(self) -> bool:
         """Whether the folder contains encoded sweeps."""
-        return any(self.folder.glob("counts/*/*.json"))
+        return any(self.folder.glob("*/*/.counts/*.json"))
 
     def may_replace(self, variant: int) -> bool:
         """Return whether the output of a variant may be replaced if it exists.
@@ -169,7 +171,7 @@ class WorkFolder:
     def end_output(self, variant: int, summary: Mapping[str, Any]) -> None:
         """Record that the output of a variant is complete, and remove its encoded sweeps."""
         self.write({_finished_name(variant): json.dumps(summary).encode()})
-        shutil.rmtree(self.encoded(variant), ignore_errors=True)
+        shutil.rmtree(self.folder / f"{variant:04}", ignore_errors=True)
 
     def remove(self) -> None:
         """Remove the folder."""
@@ -192,6 +194,11 @@ def _finished_name(variant: int) -> str:
     return f"{variant:04}.finished"
 
 
-def counts_name(variant: int, number: int) -> str:
-    """Return the name of the file with the point counts of a sweep, relative to the work folder."""
-    return f"counts/{variant:04}/{number:08}.json"
+def encoded_name(variant: int, part: int) -> str:
+    """Return the name of the folder with encoded sweeps, relative to the work folder."""
+    return f"{variant:04}/{part:04}"
+
+
+def counts_name(number: int) -> str:
+    """Return the name of the file with the point counts of a sweep, next to its other files."""
+    return f".counts/{number:08}.json"

@@ -112,7 +112,9 @@ class _Placement(NamedTuple):
     "sensitivity (default: estimated from the recording).",
 )
 @click.option(
-    "--topic", metavar="NAME", help="Sensor or topic of the recording, if it contains several."
+    "--topic",
+    metavar="NAME",
+    help="Augment only this sensor, topic or sequence of the recording (default: all).",
 )
 @click.option("--intensity", metavar="COLUMN", help="Column that contains the intensity.")
 @click.option(
@@ -231,9 +233,7 @@ class _Placement(NamedTuple):
 @overwrite
 @options.flag("--quiet", "-q", help="Do not show progress.")
 @options.as_json
-@click.pass_context
 def augment(
-    context: click.Context,
     recording: Path,
     effects: Path | None,
     out: Path,
@@ -276,11 +276,10 @@ def augment(
             "`--workers` and `--scheduler` cannot be combined, because the workers are those of "
             "the cluster."
         )
-    placements = _placements(context, settings)
+    placements = _placements(settings)
     print_first_step("reading the recording", quiet=quiet)
     from ..augmentation.running import Augmentation
     from ..augmentation.sweep_tasks import RecordingFile
-    from ..clouds.recording import SeveralSensorsError
     from ..processes.fork_server import keep_freed_memory
     from ..run.cluster.connection import connect_client
     from .terminal import Terminal
@@ -297,18 +296,15 @@ def augment(
         reflectance,
     )
     client = nullcontext() if scheduler is None else connect_client(scheduler, files)
-    try:
-        with client as connected, terminal.writing("augmenting the sweeps") as show:
-            augmented = augmentation.run(
-                out,
-                client=connected,
-                workers=workers,
-                resume=resume,
-                overwrite=overwrite,
-                progress=lambda done, total: show("augment", done, total, "sweeps"),
-            )
-    except SeveralSensorsError as error:
-        raise LidarError(f"{error.contents} Choose one of them with `--topic`.") from error
+    with client as connected, terminal.writing("augmenting the sweeps") as show:
+        augmented = augmentation.run(
+            out,
+            client=connected,
+            workers=workers,
+            resume=resume,
+            overwrite=overwrite,
+            progress=lambda done, total: show("augment", done, total, "sweeps"),
+        )
     first = shlex.quote(str(augmented.outputs[0]))
     lines = [*terminal.notes(augmented.notes), repr(augmented)]
     lines.append(f"{'variants' if augmented.table else 'result'} in {click.format_filename(out)}")
@@ -391,11 +387,11 @@ def _sections(settings: dict[str, Any]) -> dict[str, Any]:
     return {name: content for name, content in sections.items() if content}
 
 
-def _placements(context: click.Context, settings: dict[str, Any]) -> list[_Placement]:
+def _placements(settings: dict[str, Any]) -> list[_Placement]:
     """Return the inserted objects, whose options follow each --insert."""
     values = {name: iter(settings.pop(name)) for name in _INSERTION_OPTIONS}
     objects: list[dict[str, Any]] = []
-    for name in context.meta[_ORDER]:
+    for name in click.get_current_context().meta[_ORDER]:
         if name == "insert":
             objects.append({"insert": next(values["insert"])})
         elif name in values:
