@@ -27,7 +27,7 @@ from lidarsim.columns.bags import (
     point_rows,
 )
 from lidarsim.columns.mcap_chunks import has_attachments, has_compressed_chunks, read_metadata
-from lidarsim.errors import CutShortError, LidarError
+from lidarsim.errors import CutShortError
 from lidarsim.io.input_files import read_input_text
 
 from ...clouds.recording import Recording, RecordingSource, sweep_from_columns
@@ -129,16 +129,6 @@ class BagRewriter(Rewriter):
         return StoredRecords(
             records, recording[number], recording.meters, recording.intensity_column
         )
-
-    def check_target(self, target: Path, *, overwrite: bool = False) -> None:
-        """Raise LidarError unless the bag can be written to a path."""
-        super().check_target(target, overwrite=overwrite)
-        if not self.path.is_dir() and target.suffix.lower() != self.path.suffix.lower():
-            suffix = self.path.suffix
-            raise LidarError(
-                f"{target} has the extension {target.suffix!r}, but a {suffix} file is written. "
-                f"Specify a path that ends in {suffix}."
-            )
 
     def sensors(self) -> list[str]:
         """Return the topics with points."""
