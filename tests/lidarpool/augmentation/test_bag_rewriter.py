@@ -290,28 +290,155 @@ def test_files_need_the_extension(written, tmp_path):
         opened(written("mcap")).check_target(tmp_path / "new.bag")
 
 
-def test_attachments_and_several_publishers(written, tmp_path):
-    """Two publishers of a topic, and an attachment, in a file of another program."""
-    path = tmp_path / "source.mcap"
-    with written("mcap").open("rb") as file, path.open("wb") as output:
+def plain_copy(source, target, *, publish_offset=0, **options):
+    """Write the messages of a bag with the library of MCAP's authors, and with an attachment.
+
+    `/tf` has two publishers.
+    """
+    with source.open("rb") as file, target.open("wb") as output:
         reader = mcap.reader.make_reader(file)
-        writer = mcap.writer.Writer(output)
+        writer = mcap.writer.Writer(output, **options)
         writer.start("ros2", "test")
         ids = {}
-        for schema, channel, message in reader.iter_messages():
+        for number, (schema, channel, message) in enumerate(reader.iter_messages()):
             if channel.topic not in ids:
-                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
                 ids[channel.topic] = [
-                    writer.register_channel(channel.topic, "cdr", number, channel.metadata)
-                    for _ in range(2)
+                    writer.register_channel(channel.topic, "cdr", schema_id, channel.metadata)
+                    for _ in range(1 + (channel.topic == "/tf"))
                 ]
-            turn = len(ids) % 2 if channel.topic == "/tf" else 0
             writer.add_message(
-                ids[channel.topic][turn], message.log_time, message.data, message.publish_time
+                ids[channel.topic][number % 2 if channel.topic == "/tf" else 0],
+                message.log_time,
+                message.data,
+                message.publish_time + publish_offset,
+                sequence=number,
             )
-        writer.add_attachment(0, 0, "map.png", "image/png", b"png")
+        writer.add_attachment(3, 4, "map.png", "image/png", b"png")
+        writer.add_metadata("car", {"color": "red"})
         writer.finish()
+    return target
+
+
+def records(path, skipped=()):
+    """Return all messages, attachments and metadata that MCAP's authors read."""
+    with path.open("rb") as file:
+        reader = mcap.reader.make_reader(file, validate_crcs=True)
+        messages = [
+            (channel.topic, channel.id, schema.name, message)
+            for schema, channel, message in reader.iter_messages(log_time_order=False)
+            if channel.topic not in skipped
+        ]
+        summary = reader.get_summary()
+        return messages, [*reader.iter_attachments()], [*reader.iter_metadata()], summary
+
+
+KINDS = [
+    {"compression": mcap.writer.CompressionType.ZSTD, "chunk_size": 5000},
+    {"compression": mcap.writer.CompressionType.LZ4, "chunk_size": 100},
+    {"compression": mcap.writer.CompressionType.NONE},
+    {"use_chunking": False},
+    {"use_statistics": False, "use_summary_offsets": False},
+    {"index_types": mcap.writer.IndexType.ATTACHMENT | mcap.writer.IndexType.METADATA},
+]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_all_other_records_keep_their_bytes(written, tmp_path, kind):
+    path = plain_copy(written("mcap"), tmp_path / "source.mcap", publish_offset=-7, **kind)
+    before = path.read_bytes()
     rewriter = opened(path)
-    notes = rewrite(rewriter, tmp_path / "new.mcap", tmp_path / "work", identity)
-    assert messages(tmp_path / "new.mcap")[0] == messages(path)[0]
-    assert notes[-1] == f"The attachments of {path} are not copied."
+    rewrite(rewriter, tmp_path / "same.mcap", tmp_path / "work", identity)
+    assert records(tmp_path / "same.mcap")[:3] == records(path)[:3]
+    boxed = partial(changed, boxes=two_boxes())
+    rewrite(rewriter, tmp_path / "new.mcap", tmp_path / "work2", boxed)
+    topics = (TOPIC, "/augmented_objects")
+    found, *others, summary = records(tmp_path / "new.mcap", topics)
+    expected, *expected_others, _ = records(path, topics)
+    assert found == expected and others == expected_others
+    everything, *_ = records(tmp_path / "new.mcap")
+    assert summary.statistics.message_count == len(everything) == len(records(path)[0]) + 3
+    counts = {}
+    for _, channel, *_ in everything:
+        counts[channel] = counts.get(channel, 0) + 1
+    assert summary.statistics.channel_message_counts == counts
+    assert summary.statistics.attachment_count == summary.statistics.metadata_count == 1
+    stamps = [message.log_time for *_, message in everything]
+    statistics = summary.statistics
+    assert (statistics.message_start_time, statistics.message_end_time) == (
+        min(stamps),
+        max(stamps),
+    )
+    clouds = [entry for entry in everything if entry[0] in topics]
+    assert [topic for topic, *_ in clouds] == [*topics] * 3
+    for (*_, cloud), (*_, boxes) in zip(clouds[::2], clouds[1::2], strict=True):
+        assert (cloud.log_time, cloud.publish_time) == (boxes.log_time, boxes.publish_time)
+        assert cloud.publish_time == cloud.log_time - 7
+    recording = open_recording(tmp_path / "new.mcap", TOPIC, keep_noise=True)
+    for number in (2, 0):
+        expected = boxed(rewriter.recording, number).sweep.points
+        np.testing.assert_allclose(recording[number].points, expected, rtol=1e-6)
+    assert path.read_bytes() == before
+
+
+def test_bags_of_several_files(written, tmp_path):
+    folder = tmp_path / "source"
+    folder.mkdir()
+    (whole,) = written("rosbag2").glob("*.mcap")
+    with whole.open("rb") as file:
+        everything = [*mcap.reader.make_reader(file).iter_messages()]
+    half = len(everything) // 2
+    names = ["bag_0.mcap", "bag_1.mcap"]
+    for name, part in zip(names, (everything[:half], everything[half:]), strict=True):
+        with (folder / name).open("wb") as output:
+            writer = mcap.writer.Writer(output)
+            writer.start("ros2", "test")
+            for schema, channel, message in part:
+                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channel_id = writer.register_channel(
+                    channel.topic, "cdr", schema_id, channel.metadata
+                )
+                writer.add_message(channel_id, message.log_time, message.data, message.publish_time)
+            writer.finish()
+    content = yaml.safe_load((written("rosbag2") / "metadata.yaml").read_text())
+    stated = content["rosbag2_bagfile_information"]
+    stated["relative_file_paths"] = names
+    (entry,) = stated["files"]
+    counts = [half, len(everything) - half]
+    stated["files"] = [
+        entry | {"path": name, "message_count": count}
+        for name, count in zip(names, counts, strict=True)
+    ]
+    (folder / "metadata.yaml").write_text(yaml.safe_dump(content))
+    rewriter = opened(folder)
+    rewrite(rewriter, tmp_path / "same", tmp_path / "w", identity)
+    assert messages(tmp_path / "same") == messages(folder)
+    metadata = "metadata.yaml"
+    assert (tmp_path / "same" / metadata).read_bytes() == (folder / metadata).read_bytes()
+    boxed = partial(changed, boxes=two_boxes())
+    rewrite(rewriter, tmp_path / "new", tmp_path / "w2", boxed)
+    skipped = (TOPIC, "/augmented_objects")
+    assert messages(tmp_path / "new", skipped)[0] == messages(folder, skipped)[0]
+    new = yaml.safe_load((tmp_path / "new" / metadata).read_text())["rosbag2_bagfile_information"]
+    assert new["relative_file_paths"] == names
+    assert new["message_count"] == len(everything) + 3 == len(messages(tmp_path / "new")[0])
+    assert sum(file["message_count"] for file in new["files"]) == len(everything) + 3
+    recording = open_recording(tmp_path / "new", TOPIC, keep_noise=True)
+    for number in range(3):
+        expected = boxed(rewriter.recording, number).sweep.points
+        np.testing.assert_allclose(recording[number].points, expected, rtol=1e-6)
+
+
+def test_damaged_chunks(written, tmp_path):
+    path = plain_copy(
+        written("mcap"), tmp_path / "source.mcap", compression=mcap.writer.CompressionType.NONE
+    )
+    rewriter = opened(path)
+    rewrite(rewriter, tmp_path / "new.mcap", tmp_path / "work", changed)
+    data = path.read_bytes()
+    position = data.index(rewriter._messages().read(2)[2][-40:])
+    path.write_bytes(data[:position] + b"damaged!" + data[position + 8 :])
+    with pytest.raises(LidarError, match=r"source\.mcap"):
+        rewriter.finish(tmp_path / "other.mcap", tmp_path / "work")
+    assert not (tmp_path / "other.mcap").exists()
+    assert not [*tmp_path.glob(".lidarpool*")]

@@ -11,8 +11,7 @@ from tests.drives import points_of, the_scene, the_sweeps
 from tests.fake_augmenters import changed, content, identity, rewrite, two_boxes
 
 from lidarpool import LidarError, read_cloud
-from lidarpool.augmentation.conversion import FormatConverter
-from lidarpool.clouds.recording import RecordingSource
+from lidarpool.augmentation.conversion import open_converter
 from lidarpool.clouds.writing import ExportSpec
 from lidarpool.recordings.opening import open_recording
 
@@ -38,7 +37,7 @@ def written(tmp_path_factory):
 def converter(path, spec, sensor=None):
     spec = ExportSpec(spec) if isinstance(spec, str) else spec
     recording = open_recording(path, sensor, keep_noise=True)
-    return FormatConverter(RecordingSource(path, str(path), sensor), recording, spec)
+    return open_converter(path, recording, spec, sensor)
 
 
 def same_points(recording, expected, scale=1.0, atol=1e-4):

@@ -259,6 +259,26 @@ def test_targets_are_checked(drive, tmp_path):
     assert not [*tmp_path.glob(".lidarpool-writing-*")]
 
 
+def test_endings_of_files(drive, tmp_path):
+    path = tmp_path / "a.pcd.bin"
+    np.arange(20, dtype="<f4").tofile(path)
+    with pytest.raises(LidarError, match=r"Specify a path that ends in \.pcd\.bin"):
+        opened(path).check_target(tmp_path / "b.bin")
+    rewrite(opened(path), tmp_path / "b.pcd.bin", tmp_path / "work", identity)
+    assert (tmp_path / "b.pcd.bin").read_bytes() == path.read_bytes()
+
+
+def test_damaged_files_are_named_once(drive, tmp_path):
+    path = tmp_path / "a.bin"
+    np.arange(8, dtype="<f4").tofile(path)
+    rewriter = opened(path)
+    augmented = identity(rewriter.recording, 0)
+    path.write_bytes(b"12345")
+    with pytest.raises(LidarError) as caught:
+        rewriter.sweep_files(0, augmented)
+    assert str(caught.value).count(str(path)) == 1
+
+
 def test_links_in_the_source(drive, tmp_path):
     source = tmp_path / "set"
     (source / "velodyne").mkdir(parents=True)

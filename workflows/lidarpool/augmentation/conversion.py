@@ -47,6 +47,31 @@ _STRENGTHS = ("intensity", "reflectivity", "signal")  # formats store one of the
 _DERIVED = ("range", "azimuth", "elevation")  # columns that follow from the positions
 
 
+def open_converter(
+    source: str | Path, recording: Recording, spec: ExportSpec, sensor: str | None = None
+) -> FormatConverter:
+    """Return the converter that writes an augmented recording in another format.
+
+    Parameters
+    ----------
+    source
+        File or folder of the recording.
+    recording
+        The recording, opened with `keep_noise=True`.
+    spec
+        Format to write.
+    sensor
+        Sensor or topic that the user chose, or None if there is only one.
+
+    Raises
+    ------
+    LidarError
+        If the format requires columns that recordings do not contain.
+    """
+    opened = RecordingSource(Path(source), str(source), sensor, recording.intensity_column)
+    return FormatConverter(opened, recording, spec)
+
+
 class FormatConverter(Rewriter):
     """Writer of an augmented recording in any export format.
 
@@ -205,16 +230,15 @@ class FormatConverter(Rewriter):
         known = {column.name for column in columns_in_parts(self._optional)}
         return [name for name in sweep.columns if name not in known and name not in TIMES]
 
+    @property
+    def ending(self) -> str:
+        """End of the name of the file that is written, or an empty string for a folder."""
+        return Path(self.spec.row.file).suffix
+
     def check_target(self, target: Path, *, overwrite: bool = False) -> None:
         """Raise LidarError unless the format can be written to a path."""
-        super().check_target(target, overwrite=overwrite)
         self.spec.check_installed()
-        suffix = Path(self.spec.row.file).suffix
-        if suffix and target.suffix.lower() != suffix:
-            raise LidarError(
-                f"{target} has the extension {target.suffix!r}, but the format {self.spec.format} "
-                f"is written to a {suffix} file. Specify a path that ends in {suffix}."
-            )
+        super().check_target(target, overwrite=overwrite)
 
     def assemble(self, target: Path, encoded: EncodedSweeps, base: Path) -> list[str]:
         """Write the format from the parts of all sweeps.

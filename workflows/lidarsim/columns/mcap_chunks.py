@@ -18,7 +18,6 @@ from ..io.input_files import input_size, open_input
 _MAGIC_BYTES = 8
 _CHUNK = 0x06
 _CHUNK_INDEX = 0x08
-_ATTACHMENT = 0x09
 _METADATA = 0x0C
 _RECORD = Struct("<BQ")  # record type and content length
 _LENGTH_BYTES = 8  # size of the field that states the length of the compressed messages
@@ -89,32 +88,6 @@ def read_metadata(path: Path) -> dict[str, dict[str, str]]:
                 name, *texts = _strings(data[start:stop])
                 records[name] = dict(zip(texts[::2], texts[1::2], strict=False))
     return records
-
-
-def has_compressed_chunks(path: Path) -> bool:
-    """Return whether the first chunk of an MCAP file is compressed.
-
-    Raises OSError if the file cannot be read.
-    """
-    if input_size(path) < _MAGIC_BYTES:
-        return False
-    with open_input(path) as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
-        for kind, start, _ in _records(data):
-            if kind == _CHUNK:
-                *_, name_length = _CHUNK_HEAD.unpack_from(data, start)
-                return bool(name_length)
-    return False
-
-
-def has_attachments(path: Path) -> bool:
-    """Return whether an MCAP file contains attachments.
-
-    Raises OSError if the file cannot be read.
-    """
-    if input_size(path) < _MAGIC_BYTES:
-        return False
-    with open_input(path) as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
-        return any(kind == _ATTACHMENT for kind, _, _ in _records(data))
 
 
 def _strings(content: bytes) -> Iterator[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from dataclasses import replace as replace_fields
@@ -11,7 +11,8 @@ from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from threading import RLock
-from typing import Any, NamedTuple
+from typing import Any, Literal
+from zlib import crc32
 
 import numpy as np
 import yaml
@@ -26,15 +27,16 @@ from lidarsim.columns.bags import (
     opened_bag,
     point_rows,
 )
-from lidarsim.columns.mcap_chunks import has_attachments, has_compressed_chunks, read_metadata
-from lidarsim.errors import CutShortError, LidarError
+from lidarsim.errors import CutShortError
 from lidarsim.io.input_files import read_input_text
+from lidarsim.words import plural
 
 from ...clouds.recording import Recording, RecordingSource, sweep_from_columns
 from ...clouds.ros.bags import header_of, point_connection
 from ...processes.per_process import PerProcess
 from ..augmented_sweep import AugmentedSweep
 from .data_set_copy import copy_data_set
+from .mcap_copy import AddedTopic, NewContent, copy_mcap
 from .rewriter import EncodedSweeps, Rewriter, organization_notes
 from .stored_records import StoredRecords, unchanged
 
@@ -42,11 +44,12 @@ _BOX_NAMESPACE = "augmented_objects"  # the topic has the same name
 _BAG_SUFFIXES = (".mcap", ".db3", ".zstd")
 _METADATA_FILE = "metadata.yaml"
 _SCAN = "sensor_msgs/msg/LaserScan"
+_MARKERS = "visualization_msgs/msg/MarkerArray"
 _POINT_TYPES = (POINT_CLOUD, _SCAN, *LIVOX_CLOUDS)
 _UNKNOWN_HASH = f"RIHS01_{'0' * 64}"  # hash of a message type whose definition is unknown
 # ROS 2 Humble cannot read later versions, because QoS profiles are lists from version 9 on.
-_OLDEST_VERSION = 8
-_NEWEST_VERSION = 9
+_OLDEST_VERSION: Literal[8] = 8
+_NEWEST_VERSION: Literal[9] = 9
 
 
 class BagRewriter(Rewriter):
@@ -130,16 +133,6 @@ class BagRewriter(Rewriter):
             records, recording[number], recording.meters, recording.intensity_column
         )
 
-    def check_target(self, target: Path, *, overwrite: bool = False) -> None:
-        """Raise LidarError unless the bag can be written to a path."""
-        super().check_target(target, overwrite=overwrite)
-        if not self.path.is_dir() and target.suffix.lower() != self.path.suffix.lower():
-            suffix = self.path.suffix
-            raise LidarError(
-                f"{target} has the extension {target.suffix!r}, but a {suffix} file is written. "
-                f"Specify a path that ends in {suffix}."
-            )
-
     def sensors(self) -> list[str]:
         """Return the topics with points."""
         with opened_bag(self.path, self.source.name) as bag:
@@ -155,64 +148,20 @@ class BagRewriter(Rewriter):
     def assemble(self, target: Path, encoded: EncodedSweeps, base: Path) -> list[str]:
         """Write the bag, message by message."""
         notes = organization_notes(encoded.details())
-        folder = target if self.path.is_dir() else target.with_name(f"{target.name}.bag")
         if base == target:
             base = target.with_name(f"previous-{target.name}")
             target.rename(base)
-        try:
-            notes += self._write_folder(folder, encoded, base)
-            if self.path.is_dir():
-                notes += copy_data_set(base, target, self._bag_files(base))
-            else:
-                (written,) = folder.glob("*.mcap")
-                written.replace(target)
-        finally:
-            if folder != target:
-                shutil.rmtree(folder, ignore_errors=True)
-        return notes
-
-    def _bag_files(self, folder: Path) -> set[str]:
-        """Return the names of the files that belong to the bag in a folder."""
-        files = {file.name for file in folder.iterdir() if file.suffix.lower() in _BAG_SUFFIXES}
-        return files | {_METADATA_FILE}
-
-    def _write_folder(self, folder: Path, encoded: EncodedSweeps, base: Path) -> list[str]:
-        """Write a bag folder, and return notes for the user."""
-        from rosbags.rosbag2 import Writer
-
-        notes = []
-        layout = _BagLayout.from_path(base)
-        writer = Writer(folder, version=layout.version, storage_plugin=layout.plugin)
-        writer.set_compression(layout.compression, _zstd())
         has_boxes = any(sweep["boxes"] for sweep in encoded.details())
-        with opened_bag(base, self.source.name) as bag, writer as target:
-            for key, value in layout.custom_data.items():
-                target.set_custom_data(key, value)
-            chosen = point_connection(self.source, bag)
-            connections = _copy_connections(bag, target)
-            boxes = _add_box_topic(bag, target) if has_boxes else None
-            number = 0
-            for connection, time_ns, data in bag.messages():
-                if connection.id != chosen.id:
-                    target.write(connections[connection.id], time_ns, data)
-                    continue
-                content = (encoded.folder / _message_file(number)).read_bytes()
-                target.write(connections[connection.id], time_ns, content)
-                if boxes is not None:
-                    markers = (encoded.folder / _marker_file(number)).read_bytes()
-                    target.write(boxes, time_ns, markers)
-                number += 1
-            if number != encoded.count:
-                raise CutShortError(
-                    f"{encoded.count:,} sweeps were expected, but it has {number:,}"
-                )
-            if boxes is not None:
-                notes.append(
-                    f"The boxes of inserted objects are published on {boxes.topic} as a "
-                    "MarkerArray in the sensor frame."
-                )
-        if layout.has_attachments:
-            notes.append(f"The attachments of {self.source.name} are not copied.")
+        with opened_bag(base, self.source.name) as bag:
+            bag_copy = _BagCopy(bag, base, target, point_connection(self.source, bag), encoded)
+            topic = bag_copy.write(has_boxes=has_boxes)
+            if self.path.is_dir():
+                notes += copy_data_set(base, target, bag_copy.files())
+        if topic is not None:
+            notes.append(
+                f"The boxes of inserted objects are published on {topic} as a MarkerArray in the "
+                "sensor frame."
+            )
         return notes
 
 
@@ -222,12 +171,6 @@ def _message_file(number: int) -> str:
 
 def _marker_file(number: int) -> str:
     return f"markers/{number:08}.cdr"
-
-
-def _zstd() -> Any:
-    from rosbags.rosbag2.enums import CompressionFormat
-
-    return CompressionFormat.ZSTD
 
 
 @dataclass
@@ -264,44 +207,154 @@ class _TopicMessages:
             return connection.msgtype, time_ns, bytes(data)
 
 
-class _BagLayout(NamedTuple):
-    """Options with which a bag is written like the original."""
+class _BagCopy:
+    """A copy of a bag with augmented messages."""
 
-    version: Any
-    plugin: Any
-    compression: Any
-    custom_data: dict[str, str]
-    has_attachments: bool
-
-    @classmethod
-    def from_path(cls, path: Path) -> _BagLayout:
-        """Determine the options from the metadata of a bag, which is a folder or an .mcap file."""
-        from rosbags.rosbag2 import StoragePlugin
-        from rosbags.rosbag2.enums import CompressionMode
-
+    def __init__(
+        self, bag: Any, path: Path, target: Path, chosen: Any, encoded: EncodedSweeps
+    ) -> None:
+        self._bag = bag
+        self._path = path
+        self._target = target
+        self._chosen = chosen
+        self._encoded = encoded
+        text = ""
         if path.is_dir():
             text = read_input_text(path / _METADATA_FILE, errors="replace")
-            metadata = _mapping(_mapping(text).get("rosbag2_bagfile_information"))
-            files = sorted(path.glob("*.mcap"))
+        self._metadata = _mapping(_mapping(text).get("rosbag2_bagfile_information"))
+
+    def write(self, *, has_boxes: bool) -> str | None:
+        """Write the bag, and return the topic of the boxes, if there are boxes."""
+        topic = self._box_topic() if has_boxes else None
+        names = [Path(name).name for name in self._metadata.get("relative_file_paths", ())]
+        if not self._path.is_dir():
+            self._copy_mcap(self._path, self._target, topic)
+        elif names and all(name.endswith(".mcap") for name in names):
+            self._target.mkdir()
+            counts = {
+                name: self._copy_mcap(self._path / name, self._target / name, topic)
+                for name in names
+            }
+            self._write_metadata(topic, counts)
         else:
-            stated = read_metadata(path).get("rosbag2", {}).get("serialized_metadata", "")
-            metadata = _mapping(stated)
-            files = [path] if path.suffix.lower() == ".mcap" else []
-        is_mcap = bool(files) or metadata.get("storage_identifier") == "mcap"
-        mode = str(metadata.get("compression_mode") or "").upper()
-        compression = CompressionMode.__members__.get(mode, CompressionMode.NONE)
-        if compression is CompressionMode.NONE and files and has_compressed_chunks(files[0]):
-            compression = CompressionMode.STORAGE
+            self._write_with_rosbags(topic)
+        return topic
+
+    def files(self) -> set[str]:
+        """Return the names of the files that belong to the bag in its folder."""
+        inside = self._path.iterdir()
+        names = {file.name for file in inside if file.suffix.lower() in _BAG_SUFFIXES}
+        return names | {_METADATA_FILE}
+
+    def _box_topic(self) -> str:
+        """Return the name of a topic for boxes that does not occur in the bag."""
+        topics = {connection.topic for connection in self._bag.connections}
+        topic = f"/{_BOX_NAMESPACE}"
+        number = 1
+        while topic in topics:
+            number += 1
+            topic = f"/{_BOX_NAMESPACE}_{number}"
+        return topic
+
+    def _contents(self, number: int, topic: str | None) -> NewContent:
+        """Return the new content of a message, and the boxes that follow it."""
+        folder = self._encoded.folder
+        data = (folder / _message_file(number)).read_bytes()
+        boxes = None if topic is None else (folder / _marker_file(number)).read_bytes()
+        return NewContent(data, boxes)
+
+    @cached_property
+    def _numbers(self) -> dict[tuple[int, int], int]:
+        """Numbers of the sweeps, by the log times and checksums of their messages."""
+        numbers: dict[tuple[int, int], int] = {}
+        count = 0
+        for _, time_ns, data in self._bag.messages([self._chosen]):
+            numbers[time_ns, crc32(data)] = count
+            count += 1
+        self._check_count(count)
+        return numbers
+
+    def _check_count(self, count: int) -> None:
+        if count != self._encoded.count:
+            raise CutShortError(
+                f"{plural(self._encoded.count, 'sweep')} were expected, but it has {count:,}"
+            )
+
+    def _copy_mcap(self, source: Path, target: Path, topic: str | None) -> int:
+        """Copy an MCAP file, and return the number of messages on the topic of the boxes."""
+        count = 0
+
+        def replacement(_: str, kind: str, time_ns: int, data: bytes) -> NewContent | None:
+            nonlocal count
+            number = self._numbers.get((time_ns, crc32(data)))
+            if number is None or kind != self._chosen.msgtype:
+                return None
+            count += topic is not None
+            return self._contents(number, topic)
+
+        added = None
+        if topic is not None:
+            added = AddedTopic(topic, _MARKERS, _marker_definition())
+        copy_mcap(source, target, self._chosen.topic, replacement, added)
+        return count
+
+    def _write_metadata(self, topic: str | None, counts: Mapping[str, int]) -> None:
+        """Write the metadata of a folder, with the topic of the boxes."""
+        if topic is None:
+            shutil.copyfile(self._path / _METADATA_FILE, self._target / _METADATA_FILE)
+            return
+        text = read_input_text(self._path / _METADATA_FILE, errors="replace")
+        content = _mapping(text)
+        metadata = content["rosbag2_bagfile_information"]
+        is_new = metadata.get("version", 0) >= _NEWEST_VERSION
+        topic_metadata = {
+            "name": topic,
+            "type": _MARKERS,
+            "serialization_format": "cdr",
+            "offered_qos_profiles": [] if is_new else "",
+            "type_description_hash": _marker_hash(),
+        }
+        total = sum(counts.values())
+        entry = {"topic_metadata": topic_metadata, "message_count": total}
+        metadata["topics_with_message_count"].append(entry)
+        metadata["message_count"] += total
+        for file in metadata.get("files") or ():
+            file["message_count"] += counts.get(Path(file["path"]).name, 0)
+        (self._target / _METADATA_FILE).write_text(yaml.safe_dump(content, sort_keys=False))
+
+    def _write_with_rosbags(self, topic: str | None) -> None:
+        """Write a bag folder with SQLite files, or with compressed files."""
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
+
+        metadata = self._metadata
+        is_mcap = metadata.get("storage_identifier") == "mcap"
         version = metadata.get("version")
         is_new = isinstance(version, int) and version >= _NEWEST_VERSION
-        custom = _mapping(metadata.get("custom_data"))
-        return cls(
-            _NEWEST_VERSION if is_new else _OLDEST_VERSION,
-            StoragePlugin.MCAP if is_mcap else StoragePlugin.SQLITE3,
-            compression,
-            {str(key): str(value) for key, value in custom.items()},
-            any(has_attachments(file) for file in files),
+        mode = str(metadata.get("compression_mode") or "").upper()
+        writer = Writer(
+            self._target,
+            version=_NEWEST_VERSION if is_new else _OLDEST_VERSION,
+            storage_plugin=StoragePlugin.MCAP if is_mcap else StoragePlugin.SQLITE3,
         )
+        compression = CompressionMode.__members__.get(mode, CompressionMode.NONE)
+        writer.set_compression(compression, CompressionFormat.ZSTD)
+        with writer as target:
+            for key, value in _mapping(metadata.get("custom_data")).items():
+                target.set_custom_data(str(key), str(value))
+            connections = _copy_connections(self._bag, target)
+            boxes = None if topic is None else _add_box_topic(topic, target)
+            number = 0
+            for connection, time_ns, data in self._bag.messages():
+                if connection.id != self._chosen.id:
+                    target.write(connections[connection.id], time_ns, data)
+                    continue
+                new = self._contents(number, topic)
+                number += 1
+                target.write(connections[connection.id], time_ns, new.data)
+                if boxes is not None and new.added is not None:
+                    target.write(boxes, time_ns, new.added)
+        self._check_count(number)
 
 
 def _mapping(content: Any) -> dict[str, Any]:
@@ -357,16 +410,20 @@ def _type_hash(connection: Any) -> str:
     return _UNKNOWN_HASH
 
 
-def _add_box_topic(bag: Any, target: Any) -> Any:
-    """Add a topic for boxes, whose name does not occur in the bag."""
+def _add_box_topic(topic: str, target: Any) -> Any:
     from ...clouds.ros.messages import message_store
 
-    topics = {connection.topic for connection in bag.connections}
-    topic = f"/{_BOX_NAMESPACE}"
-    number = 1
-    while topic in topics:
-        number += 1
-        topic = f"/{_BOX_NAMESPACE}_{number}"
-    return target.add_connection(
-        topic, "visualization_msgs/msg/MarkerArray", typestore=message_store()
-    )
+    return target.add_connection(topic, _MARKERS, typestore=message_store())
+
+
+def _marker_definition() -> str:
+    from ...clouds.ros.messages import message_store
+
+    definition, _ = message_store().generate_msgdef(_MARKERS, ros_version=2)
+    return str(definition)
+
+
+def _marker_hash() -> str:
+    from ...clouds.ros.messages import message_store
+
+    return str(message_store().hash_rihs01(_MARKERS))

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidarsim.errors import LidarError
+from lidarsim.io.archives import pack_arrays
 from lidarsim.io.input_files import read_input
 from lidarsim.motion.rotations import matrices, quaternions_of
 from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Ints
@@ -89,9 +90,7 @@ class NuScenesRewriter(Rewriter):
             with np.load(io.BytesIO(read_input(self.path / name))) as archive:
                 panoptic = archive["data"]
             panoptic = _panoptic_labels(panoptic, augmented, new_categories)
-            memory = io.BytesIO()
-            np.savez_compressed(memory, data=panoptic)
-            files[name] = memory.getvalue()
+            files[name] = pack_arrays({"data": panoptic})
             details["panoptic_file"] = name
         details["new_categories"] = new_categories.names
         return files, details
@@ -300,7 +299,7 @@ class _AnnotationTables:
             table[_MAX_PANOPTIC - np.arange(len(new))] = new
             path.unlink()
             data = (table[categories] * _PANOPTIC_FACTOR + instances).astype(labels.dtype)
-            np.savez_compressed(path, data=data)
+            path.write_bytes(pack_arrays({"data": data}))
 
     def _token(self, table: str, key: object) -> str:
         first = self._sweeps[0]["token"] if self._sweeps else ""

@@ -16,8 +16,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from lidarsim.environment.extras import reading
-from lidarsim.errors import LidarError, explain_os_errors
+from lidarsim.errors import LidarError, explain_os_errors, unreadable_message
 from lidarsim.io.storage import Storage
 from lidarsim.words import list_names, plural
 
@@ -26,6 +25,7 @@ from ..augmented_sweep import AugmentedSweep
 from .data_set_copy import check_target, new_target
 from .stored_records import StoredRecords
 
+_LONG_ENDINGS = (".pcd.bin",)  # endings of files whose format the suffix does not determine
 DETAILS_FOLDER = ".details"  # folder in the work folder, with one JSON file per sweep
 
 
@@ -144,8 +144,10 @@ class Rewriter(ABC):
         LidarError
             If the sweep cannot be read, or if the format cannot store its points.
         """
-        with reading(self.recording.name):
+        try:
             files, details = self.encode(number, augmented)
+        except (OSError, ValueError) as error:
+            raise LidarError(unreadable_message(self.recording.name, error)) from error
         details |= {"number": number, "files": sorted(files), "points": len(augmented.sweep)}
         return files | {details_name(number): json.dumps(details).encode()}
 
@@ -165,9 +167,24 @@ class Rewriter(ABC):
         """Return whether a work folder contains all files of a sweep."""
         return (encoded / details_name(number)).exists()
 
+    @property
+    def ending(self) -> str:
+        """End of the name of the file that is written, or an empty string for a folder."""
+        if self.path.is_dir():
+            return ""
+        return next(
+            (ending for ending in _LONG_ENDINGS if self.path.name.lower().endswith(ending)),
+            self.path.suffix.lower(),
+        )
+
     def check_target(self, target: Path, *, overwrite: bool = False) -> None:
         """Raise LidarError unless the augmented copy can be written to a path."""
         check_target(target, self.path, overwrite=overwrite)
+        if not target.name.lower().endswith(self.ending):
+            raise LidarError(
+                f"{target} does not end in {self.ending}, but a {self.ending} file is written. "
+                f"Specify a path that ends in {self.ending}."
+            )
 
     def finish(
         self,
@@ -280,7 +297,7 @@ def organization_notes(details: Iterator[Mapping[str, Any]]) -> list[str]:
         return []
     return [
         (
-            f"{plural(lost, 'sweep')} cannot stay organized, because a pulse has several returns. "
+            f"{plural(lost, 'sweep')} cannot stay organized, because not every added return has a free cell. "
             "Their height is 1, and they contain no points for pulses without a return."
         )
     ]

@@ -19,6 +19,7 @@ from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints, Records
 from lidarsim.scene.files.stated_system import Meters
 
 from ..augmented_sweep import AugmentedSweep
+from .organized_cells import assign_cells
 
 # Fields with the strength of a return or of the ambient light, in lower case.
 _STRENGTH_FIELDS = {
@@ -129,8 +130,7 @@ class StoredRecords:
     def organize(self, rows: Records, augmented: AugmentedSweep) -> Records | None:
         """Arrange augmented records in the grid of the recorded sweep.
 
-        A point is stored in the cell of its template. Cells whose return was lost are marked like
-        the other cells without a return.
+        Cells whose return was lost are marked like the other cells without a return.
 
         Parameters
         ----------
@@ -141,14 +141,14 @@ class StoredRecords:
 
         Returns
         -------
-        Records of shape (n,), or None if two points belong to the same cell.
+        Records of shape (n,), or None if a point has no free cell (see `assign_cells`).
         """
-        template = np.asarray(augmented.template, np.intp)
-        if len(np.unique(template)) != len(template):
+        places = assign_cells(self.recorded, augmented)
+        if places is None:
             return None
         cells = self.records.copy()
         is_lost = self.recorded.has_return
-        is_lost[template] = False
+        is_lost[places] = False
         axes, columns = self._field_names()
         missing = ~self.recorded.has_return
         zeros = missing & ~self.recorded.points.any(axis=1)
@@ -160,7 +160,7 @@ class StoredRecords:
             if name.lower() in _STRENGTH_FIELDS | _RANGE_FIELDS:
                 cells[name][is_lost] = 0
         raw = np.dtype((np.void, cells.dtype.itemsize))
-        cells.view(raw)[template] = rows.view(raw)
+        cells.view(raw)[places] = rows.view(raw)
         return cells
 
 
