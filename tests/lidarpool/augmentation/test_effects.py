@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lidarpool import LidarError
-from lidarpool.augmentation.effects import Effects
+from lidarpool.augmentation.effects import Effects, Insertion
 from lidarpool.augmentation.insertions import load_insertion
 from lidarpool.identity.fingerprint import fingerprint
 from lidarpool.scenario.scenario import Scenario
@@ -141,14 +141,17 @@ def test_traffic_becomes_actors(effects):
         ("noise: {stray_light: 1.0e-6}", ["`noise.stray_light` cannot be simulated", "twin"]),
         (
             "faults: [{kind: frozen, from_s: 1}]",
-            ["faults[0]: The fault 'frozen' cannot be applied"],
+            ["faults[0]: A fault of kind 'frozen' cannot be simulated"],
         ),
-        ("faults: [{kind: time_jump, by_s: 1}]", ["The fault 'time_jump' cannot be applied"]),
+        (
+            "faults: [{kind: time_jump, by_s: 1}]",
+            ["A fault of kind 'time_jump' cannot be simulated"],
+        ),
         (
             "faults: [{kind: dirt, transmission: 0.5, sensor: roof}]",
             ["faults[0]: `sensor` cannot be set", "Remove `sensor`"],
         ),
-        ("weather: {wet: 0.5}", ["`weather.wet` cannot be applied", "lidarpool twin"]),
+        ("weather: {wet: 0.5}", ["`weather.wet` cannot be simulated", "lidarpool twin"]),
         ("weather: {spray_g_m3: 2}", ["`weather.spray_g_m3` requires wet ground"]),
         ("weather: {spray_g_m3: 2, wet: 1}", ["requires an inserted vehicle that moves"]),
         (
@@ -189,6 +192,25 @@ def test_every_step_has_a_reason_or_acts_on_recordings():
     assert {"AngleNoiseStep", "RippleStep", "CrosstalkStep", "WaveformStep"} <= refused
     assert all(step.on_recordings for step in STEPS if Role.AIMS in step.role)
     assert all(step.on_recordings.endswith(".") for step in STEPS if step.on_recordings)
+
+
+@pytest.mark.parametrize(
+    ("create", "words"),
+    [
+        (lambda: Effects(noise={"dropot": 0.1}), "Did you mean 'dropout'?"),
+        (lambda: Effects(noise={"angle_deg": 0.1}), "`noise.angle_deg` cannot be simulated"),
+        (lambda: Effects(weather=3), "weather must"),
+        (lambda: Effects(weather=Weather(wet=1)), "`weather.wet` cannot be simulated"),
+        (lambda: Effects(faults=(Fault("frozen", from_s=1),)), "'frozen' cannot be simulated"),
+        (lambda: Effects(mode="best"), "mode must"),
+        (lambda: Insertion("car", 1, 2), "mesh must"),
+        (lambda: Insertion(load_insertion("car"), "1", 2), "x_m must"),
+    ],
+)
+def test_arguments_are_checked(create, words):
+    with pytest.raises(LidarError) as refused:
+        create()
+    assert words in str(refused.value)
 
 
 def test_scenarios_become_effects():

@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
 
-from lidarsim.errors import LidarError
+from lidarsim.errors import LidarError, Mistakes
 from lidarsim.io.yamlfile import read_yaml
 from lidarsim.media.materials import Material
 from lidarsim.media.weather import Weather
 from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.schema.checks import check_fields
 from lidarsim.schema.declared import declared_values
 from lidarsim.sensor import Noise
 from lidarsim.sensor.optics import Mode
 from lidarsim.survey.faults import Fault
+from lidarsim.words import did_you_mean
 
 from ..scenario.campaign_file import is_campaign
 from ..scenario.prepare import prepare_actors
 from ..scenario.scenario import Scenario
-from .recorded_sections import check_content, check_sections, check_spray
+from .recorded_sections import check_content, check_sections, check_spray, effect_errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +52,9 @@ class Insertion:
     z_m: float | None = None
     heading_deg: float = 0.0
     class_name: str = ""
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +98,18 @@ class Effects:
     classes: Mapping[int, str] = field(default_factory=dict)
     seed: int = 0
     notes: tuple[str, ...] = field(default=(), compare=False)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        names = [entry.name for entry in fields(Noise)]
+        for name in self.noise:
+            if name not in names:
+                raise LidarError(
+                    f"{name!r} is not a field of the noise.{did_you_mean(name, names)}"
+                )
+        mistakes = Mistakes()
+        mistakes.lines += effect_errors(self.noise, self.faults, self.weather)
+        mistakes.raise_if_any()
 
     @classmethod
     def load(

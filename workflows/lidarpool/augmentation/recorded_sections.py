@@ -7,16 +7,18 @@ module refuses everything else with the reason and a remedy.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from lidarsim.errors import Mistakes
+from lidarsim.media.weather import Weather
 from lidarsim.motion.trajectory import CENTER
 from lidarsim.scene.actors import Actor
 from lidarsim.sensor import Noise, Returns, Sensor
 from lidarsim.simulator.recorded_sweeps import scene_of_bodies
 from lidarsim.simulator.steps.step import Setup
 from lidarsim.simulator.steps.step_list import STEPS
+from lidarsim.survey.faults import Fault
 from lidarsim.survey.survey import Mounted, Survey
 
 from ..scenario.scenario import Scenario
@@ -141,10 +143,25 @@ def _section_errors(scenario: Scenario) -> Iterator[str]:
         for name in sorted(_changed_fields(getattr(scenario, section))):
             if reason := _OTHER_FIELDS.get(f"{section}.{name}"):
                 yield f"`{section}.{name}` cannot be applied to a recording, {reason}"
-    yield from _step_errors(scenario)
-    yield from _fault_errors(scenario)
-    yield from _weather_errors(scenario)
+    yield from effect_errors(dict(scenario.noise), scenario.faults, scenario.weather)
     yield from _placement_errors(scenario)
+
+
+def effect_errors(
+    noise: Mapping[str, Any], faults: Sequence[Fault], weather: Weather
+) -> Iterator[str]:
+    """Yield a sentence for each effect that cannot be applied to a recording.
+
+    Parameters
+    ----------
+    noise
+        Values of fields of `Noise`.
+    faults, weather
+        Faults and weather.
+    """
+    yield from _step_errors(noise)
+    yield from _fault_errors(faults)
+    yield from _weather_errors(weather)
 
 
 def _changed_fields(section: Any) -> set[str]:
@@ -157,11 +174,14 @@ def _changed_fields(section: Any) -> set[str]:
     }
 
 
-def _step_errors(scenario: Scenario) -> Iterator[str]:
+def _step_errors(noise: Mapping[str, Any]) -> Iterator[str]:
     """Yield the reason of each simulation step that applies, but cannot act on recorded pulses."""
-    noise = dict(scenario.noise)
-    noise["detection_range_m"] = noise["detection_range_m"] or _DETECTION_RANGE_M
-    returns = Returns(mode=scenario.returns.mode, divergence_mrad=1.0)
+    if not noise.keys() - {"range_m", "range_per_m", "dropout", "seed"}:
+        return
+    noise = {"detection_range_m": _DETECTION_RANGE_M} | {
+        name: value for name, value in noise.items() if value is not None
+    }
+    returns = Returns(divergence_mrad=1.0)
     sensor = Sensor.grid(max_range_m=_DETECTION_RANGE_M)
     survey = Survey(
         sensors=[Mounted(sensor, name="lidar"), Mounted(sensor, name="other")],  # for crosstalk
@@ -175,11 +195,11 @@ def _step_errors(scenario: Scenario) -> Iterator[str]:
             yield step.on_recordings
 
 
-def _fault_errors(scenario: Scenario) -> Iterator[str]:
-    for number, fault in enumerate(scenario.faults):
+def _fault_errors(faults: Sequence[Fault]) -> Iterator[str]:
+    for number, fault in enumerate(faults):
         if fault.kind in _OTHER_FAULTS:
             yield (
-                f"faults[{number}]: The fault {fault.kind!r} cannot be applied to a recording, "
+                f"faults[{number}]: A fault of kind {fault.kind!r} cannot be simulated on a recording, "
                 f"{_OTHER_FAULTS[fault.kind]}"
             )
         if fault.sensor is not None:
@@ -189,11 +209,10 @@ def _fault_errors(scenario: Scenario) -> Iterator[str]:
             )
 
 
-def _weather_errors(scenario: Scenario) -> Iterator[str]:
-    weather = scenario.weather
+def _weather_errors(weather: Weather) -> Iterator[str]:
     if weather.wet and not weather.spray_g_m3:
         yield (
-            "`weather.wet` cannot be applied to a recording, because the reflection of recorded "
+            "`weather.wet` cannot be simulated on a recording, because the reflection of recorded "
             f"surfaces does not change. {_TWIN}"
         )
     if weather.spray_g_m3 and not weather.wet:

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 _WORKER_BYTES = 2 << 30  # memory per process for a sensor with 128 channels
+_WORKER_SWEEPS = 32  # starting a process takes about as long as augmenting this many sweeps
 _TASK_SWEEPS = 8  # maximum number of sweeps in a task
 _MIN_TASKS = 64  # so that all workers are busy until the end, if there are enough sweeps
 
@@ -273,8 +274,8 @@ class _Run:
         plan = open_plan(self._shared_plan(groups[0]))
         self._counts = tuple(len(part.recording) for part in plan.all_parts())
         self._check(plan)
-        tasks = min(self._total, max(_MIN_TASKS, self._total // _TASK_SWEEPS))
-        with parallel_map(client, tasks, _WORKER_BYTES, workers) as run:
+        useful_workers = max(self._total // (_WORKER_SWEEPS if workers is None else 1), 1)
+        with parallel_map(client, useful_workers, _WORKER_BYTES, workers) as run:
             for group in groups:
                 self._augment_group(group, run)
         return self._summary(out)
