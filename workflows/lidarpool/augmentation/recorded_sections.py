@@ -199,8 +199,8 @@ def _fault_errors(faults: Sequence[Fault]) -> Iterator[str]:
     for number, fault in enumerate(faults):
         if fault.kind in _OTHER_FAULTS:
             yield (
-                f"faults[{number}]: A fault of kind {fault.kind!r} cannot be simulated on a recording, "
-                f"{_OTHER_FAULTS[fault.kind]}"
+                f"faults[{number}]: A fault of kind {fault.kind!r} cannot be simulated on a "
+                f"recording, {_OTHER_FAULTS[fault.kind]}"
             )
         if fault.sensor is not None:
             yield (
