@@ -213,6 +213,8 @@ def test_organized_clouds(written, tmp_path):
         (StoragePlugin.SQLITE3, CompressionMode.FILE),
         (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
         (StoragePlugin.MCAP, CompressionMode.STORAGE),
+        (StoragePlugin.MCAP, CompressionMode.MESSAGE),
+        (StoragePlugin.MCAP, CompressionMode.FILE),
     ],
 )
 def test_kinds_of_bags(written, tmp_path, plugin, mode):
@@ -242,6 +244,10 @@ def test_kinds_of_bags(written, tmp_path, plugin, mode):
     ]
     for key in ("version", "compression_mode", "compression_format", "storage_identifier"):
         assert stated[0][key] == stated[1][key]
+    rewrite(rewriter, tmp_path / "changed", tmp_path / "work2", partial(changed, boxes=two_boxes()))
+    recording = open_recording(tmp_path / "changed", TOPIC, keep_noise=True)
+    expected = changed(rewriter.recording, 2).sweep.points
+    np.testing.assert_allclose(recording[2].points, expected, rtol=1e-6)
     for topics in zip(*(one["topics_with_message_count"] for one in stated), strict=True):
         assert topics[0] == topics[1]
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.drives import points_of, the_scene, the_sweeps
+from tests.drives import points_of, the_scene, the_sweeps, write_set
 from tests.fake_augmenters import changed, content, identity, rewrite, two_boxes
 
 from lidarpool.augmentation.rewriting.nuscenes_categories import visibility_token
@@ -251,6 +251,23 @@ def test_several_channels(drive, tmp_path):
         added = ~expected.is_recorded
         (name,) = (new / "lidarseg" / VERSION).glob(f"*-{channel}-000002.pcd.bin")
         assert set(np.fromfile(name, "u1")[added]) == {2, 4}
+
+
+def test_one_of_several_scenes(tmp_path):
+    scene = the_scene()
+    source = tmp_path / "set"
+    write_set(source, "nuscenes", scene, the_sweeps(scene))
+    sensor = "01 LIDAR_TOP"
+    rewriter = opened(source / VERSION, sensor)
+    new = tmp_path / "new"
+    notes = rewrite(rewriter, new, tmp_path / "work", with_objects)
+    assert notes[0].startswith("Only the sweeps of 01 LIDAR_TOP were augmented. 00 LIDAR_TOP, 00")
+    before, after = content(source), content(new)
+    differ = {name for name in before if before[name] != after[name]}
+    tables = {f"{VERSION}/{name}.json" for name in ("category", "instance", "sample_annotation")}
+    # The second sweep is empty.
+    assert differ == tables | {f"samples/LIDAR_TOP/01/00000{number}.pcd.bin" for number in (0, 2)}
+    assert before.keys() == after.keys()
 
 
 def test_tables_of_other_versions_are_unchanged(drive, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -32,7 +33,9 @@ from .rewriting.stored_records import convert_values
 
 _PRECISION_M = 0.001  # of positions in world coordinates
 _SENSOR_PRECISION_M = 0.0001  # of positions in the sensor frame, which formats store as float32
-_SCALES = (1.0, 255.0, 65535.0)  # full scales of intensities
+_BYTE_SCALE = 255.0  # full scale of most intensities
+# Intensities with decimals that are lower are relative to a white surface.
+_MAX_RELATIVE_INTENSITY = 16.0
 _REFERENCE_SWEEPS = 5  # number of sweeps that determine the full scale
 _PERIOD_NS = 1e8  # time between sweeps without timestamps
 _MIN_EPOCH_NS = 1e17  # larger timestamps are times since 1970
@@ -115,16 +118,10 @@ class FormatConverter(Rewriter):
         self._precision_m = _SENSOR_PRECISION_M if self._in_sensor else _PRECISION_M
 
     @cached_property
-    def _full_scale(self) -> float:
-        """Intensity of the recording that becomes 1."""
-        if self.recording.energies:
-            return 1.0
-        highest = 0.0
-        for number in even_indices(len(self.recording), _REFERENCE_SWEEPS).tolist():
-            intensity = self.recording[number].intensity
-            if intensity is not None and len(intensity):
-                highest = max(highest, float(np.nan_to_num(intensity).max()))
-        return next((scale for scale in _SCALES if highest <= scale), highest)
+    def _intensity_scale(self) -> _IntensityScale:
+        numbers = even_indices(len(self.recording), _REFERENCE_SWEEPS).tolist()
+        sweeps = [self.recording[number] for number in numbers]
+        return _IntensityScale.from_sweeps(sweeps, energies=self.recording.energies)
 
     @cached_property
     def _poses(self) -> Floats | None:
@@ -190,7 +187,7 @@ class FormatConverter(Rewriter):
             "objects": int(columns["object"].max(initial=-1)) + 1,
             "object_names": list(sweep.object_names),
             "boxes": box_details(augmented),
-            "full_scale": self._full_scale,
+            "full_scale": self._intensity_scale.full_scale,
         }
         return {_part_file(number): b"".join(pack(part))}, details
 
@@ -206,13 +203,13 @@ class FormatConverter(Rewriter):
             if rings is not None:
                 values["channel"] = np.maximum(rings[augmented.template][mask], 0)
         intensity = augmented.sweep.intensity
+        full_scale = self._intensity_scale.full_scale
         for name in ("intensity", "signal", "time"):  # their scale and clock are unknown
             values.pop(name, None)
-        is_uint8 = "reflectivity" in values and values["reflectivity"].dtype == np.uint8
-        if not is_uint8 or "intensity" not in columns:
+        if not self._intensity_scale.has_reflectivity:
             values.pop("reflectivity", None)
         if intensity is not None:
-            energies = np.nan_to_num(np.asarray(intensity, np.float64)[mask]) / self._full_scale
+            energies = np.nan_to_num(np.asarray(intensity, np.float64)[mask]) / full_scale
             values["intensity"] = energies
             values.setdefault("reflectivity", 255 * energies)
             values["signal"] = 10_000 * energies
@@ -228,6 +225,7 @@ class FormatConverter(Rewriter):
     def _skipped(self, sweep: Sweep) -> list[str]:
         """Return the names of columns that are not converted."""
         known = {column.name for column in columns_in_parts(self._optional)}
+        known |= {"scan", "distance", *_STRENGTHS, *_DERIVED}
         return [name for name in sweep.columns if name not in known and name not in TIMES]
 
     @property
@@ -359,6 +357,39 @@ class FormatConverter(Rewriter):
             noun = "column" if len(summary.skipped) == 1 else "columns"
             notes.append(f"The {noun} {skipped} of {name} cannot be converted.")
         return notes
+
+
+class _IntensityScale(NamedTuple):
+    """Scale of the intensities of a recording."""
+
+    full_scale: float  # intensity that becomes 1
+    has_reflectivity: bool  # whether there are intensities and also reflectivities from 0 to 255
+
+    @classmethod
+    def from_sweeps(cls, sweeps: Sequence[Sweep], *, energies: bool) -> _IntensityScale:
+        """Determine the scale from several sweeps.
+
+        The full scale is 1, 255 or a power of two. `energies` states whether the intensities
+        already are energies.
+        """
+        parts = [s.intensity for s in sweeps if s.intensity is not None and len(s)]
+        values = np.nan_to_num(np.concatenate(parts)) if parts else np.zeros(1)
+        highest = float(values.max())
+        has_decimals = bool((values % 1 != 0).any())
+        if energies or highest <= 1 or (has_decimals and highest <= _MAX_RELATIVE_INTENSITY):
+            full_scale = 1.0
+        elif highest <= _BYTE_SCALE:
+            full_scale = _BYTE_SCALE
+        else:
+            full_scale = 2.0 ** np.ceil(np.log2(highest))
+        columns = [sweep.columns for sweep in sweeps]
+        bytes_of_sweeps = [
+            np.asarray(values["reflectivity"]).max(initial=0) <= _BYTE_SCALE
+            and np.asarray(values["reflectivity"]).dtype.kind in "iu"
+            for values in columns
+            if values.keys() >= {"intensity", "reflectivity"}
+        ]
+        return cls(full_scale, bool(bytes_of_sweeps) and all(bytes_of_sweeps))
 
 
 def _part_file(number: int) -> str:

@@ -570,18 +570,21 @@ class NuScenesTables:
         self._scenes = self.table("scene")
         self._samples = self.table("sample")
         self._labels: dict[str, str] = {}  # {token of a sweep: its label file}
-        if (folder / "lidarseg.json").exists():
-            rows = self.table("lidarseg").values()
-            self._labels = {row["sample_data_token"]: row["filename"] for row in rows}
+        for row in self.table("lidarseg", optional=True).values():
+            self._labels[row["sample_data_token"]] = row["filename"]
         # Class number of each label. Data sets from other sources have no class numbers.
         self.classes = np.arange(256, dtype=np.uint16)
-        known = self._labels and (folder / "category.json").exists()
-        for row in self.table("category").values() if known else ():
-            if "class" in row:
+        for row in self.table("category", optional=True).values():
+            if self._labels and "class" in row:
                 self.classes[row["index"]] = row["class"]
 
-    def table(self, name: str) -> dict[str, _Row]:
-        """Read a table, whose rows are keyed by token."""
+    def table(self, name: str, *, optional: bool = False) -> dict[str, _Row]:
+        """Read a table, whose rows are keyed by token.
+
+        An optional table is empty if its file does not exist.
+        """
+        if optional and not (self.folder / f"{name}.json").exists():
+            return {}
         rows = json.loads(read_input(self.folder / f"{name}.json"))
         return {row["token"]: row for row in rows}
 

@@ -218,6 +218,7 @@ class _BagCopy:
         self._target = target
         self._chosen = chosen
         self._encoded = encoded
+        self._replaced = 0  # number of replaced messages
         text = ""
         if path.is_dir():
             text = read_input_text(path / _METADATA_FILE, errors="replace")
@@ -229,7 +230,7 @@ class _BagCopy:
         names = [Path(name).name for name in self._metadata.get("relative_file_paths", ())]
         if not self._path.is_dir():
             self._copy_mcap(self._path, self._target, topic)
-        elif names and all(name.endswith(".mcap") for name in names):
+        elif names and all(name.endswith(".mcap") for name in names) and not self._compression:
             self._target.mkdir()
             counts = {
                 name: self._copy_mcap(self._path / name, self._target / name, topic)
@@ -238,7 +239,17 @@ class _BagCopy:
             self._write_metadata(topic, counts)
         else:
             self._write_with_rosbags(topic)
+        self._check_count(self._replaced)
         return topic
+
+    @property
+    def _compression(self) -> str:
+        """Compression mode of a folder, which is FILE, MESSAGE or empty.
+
+        Compressed chunks do not count.
+        """
+        mode = str(self._metadata.get("compression_mode") or "").upper()
+        return "" if mode == "NONE" else mode
 
     def files(self) -> set[str]:
         """Return the names of the files that belong to the bag in its folder."""
@@ -266,13 +277,10 @@ class _BagCopy:
     @cached_property
     def _numbers(self) -> dict[tuple[int, int], int]:
         """Numbers of the sweeps, by the log times and checksums of their messages."""
-        numbers: dict[tuple[int, int], int] = {}
-        count = 0
-        for _, time_ns, data in self._bag.messages([self._chosen]):
-            numbers[time_ns, crc32(data)] = count
-            count += 1
-        self._check_count(count)
-        return numbers
+        messages = self._bag.messages([self._chosen])
+        return {
+            (time_ns, crc32(data)): number for number, (_, time_ns, data) in enumerate(messages)
+        }
 
     def _check_count(self, count: int) -> None:
         if count != self._encoded.count:
@@ -290,6 +298,7 @@ class _BagCopy:
             if number is None or kind != self._chosen.msgtype:
                 return None
             count += topic is not None
+            self._replaced += 1
             return self._contents(number, topic)
 
         added = None
@@ -331,30 +340,27 @@ class _BagCopy:
         is_mcap = metadata.get("storage_identifier") == "mcap"
         version = metadata.get("version")
         is_new = isinstance(version, int) and version >= _NEWEST_VERSION
-        mode = str(metadata.get("compression_mode") or "").upper()
         writer = Writer(
             self._target,
             version=_NEWEST_VERSION if is_new else _OLDEST_VERSION,
             storage_plugin=StoragePlugin.MCAP if is_mcap else StoragePlugin.SQLITE3,
         )
-        compression = CompressionMode.__members__.get(mode, CompressionMode.NONE)
+        compression = CompressionMode.__members__.get(self._compression, CompressionMode.NONE)
         writer.set_compression(compression, CompressionFormat.ZSTD)
         with writer as target:
             for key, value in _mapping(metadata.get("custom_data")).items():
                 target.set_custom_data(str(key), str(value))
             connections = _copy_connections(self._bag, target)
             boxes = None if topic is None else _add_box_topic(topic, target)
-            number = 0
             for connection, time_ns, data in self._bag.messages():
                 if connection.id != self._chosen.id:
                     target.write(connections[connection.id], time_ns, data)
                     continue
-                new = self._contents(number, topic)
-                number += 1
+                new = self._contents(self._replaced, topic)
+                self._replaced += 1
                 target.write(connections[connection.id], time_ns, new.data)
                 if boxes is not None and new.added is not None:
                     target.write(boxes, time_ns, new.added)
-        self._check_count(number)
 
 
 def _mapping(content: Any) -> dict[str, Any]:

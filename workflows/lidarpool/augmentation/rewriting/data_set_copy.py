@@ -93,11 +93,10 @@ class _FolderCopy:
     def notes(self) -> list[str]:
         notes = []
         if self.linked:
-            files = plural(self.linked, "unchanged file")
             notes.append(
-                f"{files} {'is a hard link' if self.linked == 1 else 'are hard links'} to the "
-                f"original data in {self.source}, with which they share their storage. Copy a file "
-                "before you modify it."
+                f"Hard links to the original data in {self.source} were created for "
+                f"{plural(self.linked, 'unchanged file')}. They share their storage with the "
+                "original files, so copy a file before you modify it."
             )
         if self._skipped:
             notes.append(

@@ -14,6 +14,7 @@ import numpy as np
 from lidarsim.errors import LidarError
 from lidarsim.io.archives import pack_arrays
 from lidarsim.io.input_files import read_input
+from lidarsim.io.named_files import check_name
 from lidarsim.motion.rotations import matrices, quaternions_of
 from lidarsim.numerics.arrays import AnyArray, Bytes, Floats, Ints
 from lidarsim.scene.files.float_rows import NUSCENES
@@ -58,11 +59,11 @@ class NuScenesRewriter(Rewriter):
         self._lidars = self._tables.lidar_rows()
         self._channel = source.choose("sensors", self._lidars)
         self._rows = self._lidars[self._channel]
-        self._categories = list(self._tables.table("category").values())
+        self._categories = list(self._tables.table("category", optional=True).values())
         self._panoptic: dict[str, str] = {}  # {token of a sweep: its file}
-        if (folder / "panoptic.json").exists():
-            rows = self._tables.table("panoptic").values()
-            self._panoptic = {row["sample_data_token"]: row["filename"] for row in rows}
+        for row in self._tables.table("panoptic", optional=True).values():
+            check_name(row["filename"], f"{folder.name}/panoptic.json, token {row['token']},")
+            self._panoptic[row["sample_data_token"]] = row["filename"]
 
     def encode(
         self, number: int, augmented: AugmentedSweep
@@ -143,7 +144,8 @@ class NuScenesRewriter(Rewriter):
         tables.add_boxes(encoded)
         counts = tables.count_points(encoded, target)
         for name, rows in tables.changed().items():
-            (target / folder / f"{name}.json").write_text(json.dumps(rows, indent=0))
+            with (target / folder / f"{name}.json").open("w") as file:
+                json.dump(rows, file, indent=0)
         if counts:
             notes.append(
                 f"`num_lidar_pts` was updated in {plural(counts, 'annotation')}. The visibility of "
@@ -221,7 +223,7 @@ class _AnnotationTables:
         self._sweeps = sweeps
         self._name = name
         self._rows = {
-            table: [dict(row) for row in tables.table(table).values()]
+            table: [dict(row) for row in tables.table(table, optional=True).values()]
             for table in ("category", "instance", "sample_annotation")
         }
         self._changed: set[str] = set()
@@ -327,9 +329,11 @@ class _AnnotationTables:
     def _add_instance(self, name: str, boxes: Sequence[_KeyFrameBox]) -> None:
         category = self._category(boxes[0].details["type"])
         attributes = attribute_tokens(
-            [*self._tables.table("attribute").values()], category["name"], _speed(boxes)
+            [*self._tables.table("attribute", optional=True).values()],
+            category["name"],
+            _speed(boxes),
         )
-        visibilities = [*self._tables.table("visibility").values()]
+        visibilities = [*self._tables.table("visibility", optional=True).values()]
         instance = self._token("instance", name)
         key = [self._token("sample_annotation", (name, box.sweep["token"])) for box in boxes]
         self._rows["instance"].append(

@@ -8,6 +8,7 @@ ring.
 from __future__ import annotations
 
 from bisect import bisect_left
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,10 +45,11 @@ def assign_cells(recorded: Sweep, augmented: AugmentedSweep) -> Ints | None:
     if len(np.unique(cells[is_recorded])) != is_recorded.sum():
         return None
     taken[cells[is_recorded]] = True
+    returned = recorded.has_return
     added = np.flatnonzero(~is_recorded)
     # If the template is the cell of a pulse without a return, it is the pulse of the added return.
     templates, first = np.unique(cells[added], return_index=True)
-    own = first[~taken[templates] & ~recorded.has_return[templates]]
+    own = first[~taken[templates] & ~returned[templates]]
     taken[cells[added[own]]] = True
     remaining = np.delete(added, own)
     if not len(remaining):
@@ -55,56 +57,66 @@ def assign_cells(recorded: Sweep, augmented: AugmentedSweep) -> Ints | None:
     rings = recorded.rings
     if rings is None:
         return None
+    positions = np.asarray(recorded.points, np.float64)
     for ring in np.unique(rings[cells[remaining]]).tolist():
         points = remaining[rings[cells[remaining]] == ring]
         rows = np.flatnonzero(rings == ring)
-        found = _cells_in_ring(recorded, rows, taken, np.asarray(augmented.sweep.points)[points])
+        ring_of_cells = _Ring(positions[rows], returned[rows], ~taken[rows])
+        found = ring_of_cells.closest_free_cells(np.asarray(augmented.sweep.points)[points])
         if found is None:
             return None
-        cells[points] = found
-        taken[found] = True
+        cells[points] = rows[found]
+        taken[rows[found]] = True
     return cells
 
 
-def _cells_in_ring(recorded: Sweep, rows: Ints, taken: Bools, points: Floats) -> Ints | None:
-    """Return the free cells of a ring that are closest to the azimuths of points, or None."""
-    positions = _positions_in_ring(recorded, rows, points)
-    if positions is None:
-        return None
-    free = np.flatnonzero(~taken[rows]).tolist()
-    found = np.empty(len(points), np.intp)
-    for point in np.argsort(positions, kind="stable").tolist():
-        index = bisect_left(free, positions[point])
-        candidates = [k for k in (index - 1, index) if 0 <= k < len(free)]
-        best = min(candidates, key=lambda k: abs(free[k] - positions[point]), default=None)
-        if best is None or abs(free[best] - positions[point]) > _MAX_OFFSET:
+class _Ring(NamedTuple):
+    """Cells of a ring."""
+
+    points: Floats  # (m, 3)
+    has_return: Bools  # (m,)
+    is_free: Bools  # (m,)
+
+    def closest_free_cells(self, points: Floats) -> Ints | None:
+        """Return the free cell that is closest to the azimuth of each point, or None."""
+        positions = self._positions(points)
+        if positions is None:
             return None
-        found[point] = rows[free.pop(best)]
-    return found
+        free = np.flatnonzero(self.is_free).tolist()
+        found = np.empty(len(points), np.intp)
+        for point in np.argsort(positions, kind="stable").tolist():
+            position = float(positions[point])
+            index = bisect_left(free, position)
+            if index and (
+                index == len(free) or position - free[index - 1] <= free[index] - position
+            ):
+                index -= 1
+            if index == len(free) or abs(free[index] - position) > _MAX_OFFSET:
+                return None
+            found[point] = free.pop(index)
+        return found
 
+    def _positions(self, points: Floats) -> Floats | None:
+        """Return the positions of points among the cells, according to their azimuths.
 
-def _positions_in_ring(recorded: Sweep, rows: Ints, points: Floats) -> Floats | None:
-    """Return the positions of points among the cells of a ring, according to their azimuths.
-
-    Returns None if the azimuths of the recorded points do not increase or decrease steadily.
-    """
-    known = np.flatnonzero(recorded.has_return[rows])
-    if len(known) < 2:
-        return None
-    x, y, _ = np.asarray(recorded.points, np.float64)[rows[known]].T
-    angles = np.unwrap(np.arctan2(y, x))
-    direction = np.sign(angles[-1] - angles[0])
-    angles *= direction
-    if direction == 0 or (np.diff(angles) < 0).mean() > _MAX_REVERSED:
-        return None
-    angles = np.maximum.accumulate(angles)
-    step = (angles[-1] - angles[0]) / (known[-1] - known[0])
-    azimuths = direction * np.arctan2(points[:, 1], points[:, 0])
-    azimuths = angles[0] + (azimuths - angles[0]) % (2 * np.pi)
-    positions = np.interp(azimuths, angles, known)
-    after = known[-1] + (azimuths - angles[-1]) / step
-    before = known[0] - (angles[0] + 2 * np.pi - azimuths) / step
-    is_after = azimuths > angles[-1]
-    is_behind_end = after > len(rows) - 0.5
-    positions = np.where(is_after, np.where(is_behind_end, before, after), positions)
-    return np.asarray(positions.clip(0, len(rows) - 1), np.float64)
+        Returns None if the azimuths of the recorded points do not increase or decrease steadily.
+        """
+        known = np.flatnonzero(self.has_return)
+        if len(known) < 2:
+            return None
+        x, y, _ = self.points[known].T
+        angles = np.unwrap(np.arctan2(y, x))
+        direction = np.sign(angles[-1] - angles[0])
+        angles *= direction
+        if direction == 0 or (np.diff(angles) < 0).mean() > _MAX_REVERSED:
+            return None
+        angles = np.maximum.accumulate(angles)
+        step = (angles[-1] - angles[0]) / (known[-1] - known[0])
+        azimuths = direction * np.arctan2(points[:, 1], points[:, 0])
+        azimuths = angles[0] + (azimuths - angles[0]) % (2 * np.pi)
+        after = known[-1] + (azimuths - angles[-1]) / step
+        before = known[0] - (angles[0] + 2 * np.pi - azimuths) / step
+        outside = np.where(after > len(self.points) - 0.5, before, after)
+        inside = np.interp(azimuths, angles, known)
+        positions = np.where(azimuths > angles[-1], outside, inside)
+        return np.asarray(positions.clip(0, len(self.points) - 1), np.float64)

@@ -297,7 +297,7 @@ def organization_notes(details: Iterator[Mapping[str, Any]]) -> list[str]:
         return []
     return [
         (
-            f"{plural(lost, 'sweep')} cannot stay organized, because not every added return has a free cell. "
-            "Their height is 1, and they contain no points for pulses without a return."
+            f"{plural(lost, 'sweep')} cannot stay organized, because not every added return has a "
+            "free cell. Their height is 1, and they contain no points for pulses without a return."
         )
     ]

@@ -147,12 +147,12 @@ class StoredRecords:
         if places is None:
             return None
         cells = self.records.copy()
-        is_lost = self.recorded.has_return
+        returned = self.recorded.has_return
+        is_lost = returned.copy()
         is_lost[places] = False
         axes, columns = self._field_names()
-        missing = ~self.recorded.has_return
-        zeros = missing & ~self.recorded.points.any(axis=1)
-        marker = 0 if zeros.sum() * 2 > missing.sum() else np.nan
+        zeros = ~returned & ~self.recorded.points.any(axis=1)
+        marker = 0 if 2 * zeros.sum() > (~returned).sum() else np.nan
         for name in axes.values():
             is_float = cells.dtype[name].kind == "f"
             cells[name][is_lost] = marker if is_float else 0
