@@ -163,6 +163,16 @@ def test_references_have_several_forms(points, drive):
         assert np.array_equal(result, results[0])
 
 
+def test_arrays_may_lack_columns_of_the_reference(points, drive):
+    """The rings are then determined from the points of the reference."""
+    augmented = Augment(reference=drive, **RAIN)
+    result = augmented(points[0][:, :4], 3)
+    assert result.shape[1] == 4
+    assert len(result) > len(points[0]) + 100
+    (sweep,) = [Augment(reference=drive, **RAIN)(open_recording(drive)[0], 3)]
+    assert len(sweep) > len(points[0]) + 100
+
+
 def test_sweeps_keep_their_identity(drive):
     recorded = open_recording(drive)[1].replace(
         pose=np.diag([1.0, 1, 1, 1]), job="a", job_number=3, split="train", values={"rain": 1}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from threading import Lock
@@ -156,10 +156,11 @@ class Augment:
                 f"The columns must have different names, but are {join_names(self.columns)}."
             )
         self._reference = None if reference is None else _reference_sweeps(reference)
-        self._state: _SensorState | None = None  # of the reference
+        # {columns of a sweep: state of the reference with these columns}
+        self._states: dict[frozenset[str], _SensorState] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_state": None}
+        return self.__dict__ | {"_states": {}}
 
     @overload
     def __call__(self, points: Sweep, seed: int = 0) -> Sweep: ...
@@ -225,9 +226,13 @@ class Augment:
         """Augment a sweep, using the seed as its number."""
         if self._reference is None:
             return self._sensor_state([sweep]).augment(sweep, seed)
-        if self._state is None:
-            self._state = self._sensor_state(self._reference)
-        return self._state.augment(sweep, seed)
+        names = frozenset(standard_names(sweep.columns))
+        if names not in self._states:
+            # Rings and times are determined from the columns that the sweep also has.
+            self._states[names] = self._sensor_state(
+                [_with_columns(reference, names) for reference in self._reference]
+            )
+        return self._states[names].augment(sweep, seed)
 
     def _sensor_state(self, sweeps: Sequence[Sweep]) -> _SensorState:
         source = _SweepSource(sweeps)
@@ -324,10 +329,11 @@ def _reference_sweeps(
 
 
 def _without_pose(sweep: Sweep) -> Sweep:
-    """Return the points of a sweep with their columns, including the rings if they are known."""
-    columns = dict(sweep.columns)
-    if "channel" not in columns and sweep.rings is not None:
-        columns["channel"] = sweep.rings
+    return Sweep(sweep.points, dict(sweep.columns), compensated=sweep.compensated)
+
+
+def _with_columns(sweep: Sweep, names: Collection[str]) -> Sweep:
+    columns = {name: values for name, values in sweep.columns.items() if name in names}
     return Sweep(sweep.points, columns, compensated=sweep.compensated)
 
 
