@@ -218,6 +218,11 @@ def test_invalid_options_are_refused(run, drive, tmp_path, arguments, words):
     assert not [*tmp_path.iterdir()]
 
 
+def test_urls_are_refused(run, drive):
+    result = run(drive, "--rain", 1, "--out", "s3://bucket/wet", fails=True)
+    assert "s3://bucket/wet is a URL" in str(result.exception)
+
+
 @pytest.mark.parametrize("option", [["--rain", 3], ["--seed", 3], ["--dirt", 0.5]])
 def test_options_are_refused_with_campaigns(run, drive, tmp_path, option):
     (tmp_path / "effects.yaml").write_text("weather: {rain_mm_h: 5}")

@@ -198,6 +198,7 @@ def test_every_step_has_a_reason_or_acts_on_recordings():
     ("create", "words"),
     [
         (lambda: Effects(noise={"dropot": 0.1}), "Did you mean 'dropout'?"),
+        (lambda: Effects(noise={"seed": 3}), "Set `seed` of the effects instead"),
         (lambda: Effects(noise={"angle_deg": 0.1}), "`noise.angle_deg` cannot be simulated"),
         (lambda: Effects(weather=3), "weather must"),
         (lambda: Effects(weather=Weather(wet=1)), "`weather.wet` cannot be simulated"),

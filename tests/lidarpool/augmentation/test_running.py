@@ -280,7 +280,10 @@ def test_folders_with_other_files_are_kept(augmentation, tmp_path):
 
 def test_other_sweeps_are_unchanged(augmentation, drive, tmp_path):
     some = replace(augmentation, numbers=range(2, 4))
-    assert some.run(tmp_path / "wet", workers=1).sweeps == 2
+    augmented = some.run(tmp_path / "wet", workers=1)
+    assert augmented.sweeps == 2
+    recorded = open_recording(drive)
+    assert augmented.counts.returns == len(recorded[2]) + len(recorded[3])
     before = content(drive)
     after = content(tmp_path / "wet")
     changed = [name for name, data in before.items() if after[name] != data]

@@ -101,7 +101,9 @@ class Effects:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        names = [entry.name for entry in fields(Noise)]
+        names = [entry.name for entry in fields(Noise) if entry.name != "seed"]
+        if "seed" in self.noise:
+            raise LidarError("`noise` must not contain a seed. Set `seed` of the effects instead.")
         for name in self.noise:
             if name not in names:
                 raise LidarError(

@@ -67,7 +67,7 @@ class AugmentedRecording:
     sweeps
         Number of augmented sweeps in each output, of all sensors together.
     counts
-        Point counts of all outputs.
+        Point counts of the augmented sweeps in all outputs.
     seconds
         Duration of the augmentation in seconds.
     notes
@@ -101,9 +101,7 @@ class AugmentedRecording:
             "outputs": [str(path) for path in self.outputs],
             "table": None if self.table is None else str(self.table),
             "sweeps": self.sweeps,
-            "returns": counts.returns,
-            "kept": counts.kept,
-            "added": dict(counts.added),
+            **counts.to_json(),
             "seconds": self.seconds,
             "notes": list(self.notes),
         }
@@ -419,8 +417,7 @@ class _Run:
             (part.rewriter, work.encoded(variant, index)) for index, part in enumerate(parts)
         )
         notes = first.finish(self.targets[variant], folder, overwrite=overwrite, others=others)
-        summary = {"returns": counts.returns, "kept": counts.kept, "added": dict(counts.added)}
-        work.end_output(variant, summary | {"notes": list(notes)})
+        work.end_output(variant, counts.to_json() | {"notes": list(notes)})
 
     def _summary(self, out: Path) -> AugmentedRecording:
         """Write the table of a campaign, remove the work folder, and return a summary."""

@@ -282,8 +282,7 @@ class PartProcess:
 
     def augmented(self, number: int, variant: int) -> AugmentedSweep:
         """Return an augmented sweep, whose templates are rows of the recorded sweep."""
-        numbers = self.plan.numbers
-        if numbers is not None and number not in numbers:
+        if not self._is_chosen(number):
             return unchanged_sweep(self.recording[number])
         if self.resampler is None:
             return self.augmenter(variant).sweep(number)
@@ -293,12 +292,17 @@ class PartProcess:
         augmented = self.augmenter(variant).sweep(number)
         return replace(augmented, template=resampled.template[augmented.template])
 
+    def _is_chosen(self, number: int) -> bool:
+        return self.plan.numbers is None or number in self.plan.numbers
+
     def files(self, number: int, variant: int) -> dict[str, bytes]:
         """Return the files of a sweep in the order in which they must be written."""
         augmented = self.augmented(number, variant)
-        counts = count_points(self.recording[number], augmented)
+        counts = PointCounts()
+        if self._is_chosen(number):
+            counts = PointCounts.from_sweep(self.recording[number], augmented)
         return {
-            counts_name(number): json.dumps(counts).encode(),
+            counts_name(number): json.dumps(counts.to_json()).encode(),
             **self.rewriter.sweep_files(number, augmented),
         }
 
@@ -399,35 +403,41 @@ def unchanged_sweep(sweep: Sweep) -> AugmentedSweep:
     )
 
 
-def count_points(recorded: Sweep, augmented: AugmentedSweep) -> dict[str, Any]:
-    """Return point counts of an augmented sweep.
-
-    `returns` is the number of recorded returns, `kept` is the number of those that remain, and
-    `added` contains the numbers of added returns by cause.
-    """
-    has_return = augmented.sweep.has_return
-    added = has_return & ~augmented.is_recorded
-    causes = np.asarray(augmented.sweep.columns.get("cause", np.zeros(len(added), np.uint8)))
-    numbers, counts = np.unique(causes[added], return_counts=True)
-    names = [CAUSES[int(number)] for number in numbers]
-    return {
-        "returns": int(recorded.has_return.sum()),
-        "kept": int((has_return & augmented.is_recorded).sum()),
-        "added": dict(zip(names, counts.tolist(), strict=True)),
-    }
-
-
 @dataclass(frozen=True)
 class PointCounts:
-    """Point counts of several sweeps (see `count_points`)."""
+    """Point counts of augmented sweeps.
+
+    Attributes
+    ----------
+    returns
+        Number of recorded returns.
+    kept
+        Number of recorded returns that remain.
+    added
+        Numbers of added returns by cause.
+    """
 
     returns: int = 0
     kept: int = 0
     added: Mapping[str, int] = field(default_factory=dict)
 
     @classmethod
+    def from_sweep(cls, recorded: Sweep, augmented: AugmentedSweep) -> PointCounts:
+        """Count the points of a sweep."""
+        has_return = augmented.sweep.has_return
+        added = has_return & ~augmented.is_recorded
+        causes = np.asarray(augmented.sweep.columns.get("cause", np.zeros(len(added), np.uint8)))
+        numbers, counts = np.unique(causes[added], return_counts=True)
+        names = [CAUSES[int(number)] for number in numbers]
+        return cls(
+            int(recorded.has_return.sum()),
+            int((has_return & augmented.is_recorded).sum()),
+            dict(zip(names, counts.tolist(), strict=True)),
+        )
+
+    @classmethod
     def total(cls, counts: Iterable[Mapping[str, Any]]) -> PointCounts:
-        """Add the counts of sweeps."""
+        """Add counts that were converted with `to_json`."""
         returns = kept = 0
         added: Counter[str] = Counter()
         for entry in counts:
@@ -435,6 +445,10 @@ class PointCounts:
             kept += entry["kept"]
             added.update(entry["added"])
         return cls(returns, kept, dict(sorted(added.items())))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the counts as a dictionary for JSON."""
+        return {"returns": self.returns, "kept": self.kept, "added": dict(self.added)}
 
     @property
     def points(self) -> int:

@@ -49,7 +49,8 @@ def augment(
     Parameters
     ----------
     recording
-        Recording in any format that `open_recording` supports.
+        Recording in any format that `open_recording` supports. If it has several sensors, open one
+        of them with ``open_recording(path, sensor)``.
     effects
         Effects, an effects file, or a mapping with the sections of an effects file.
     model

@@ -96,7 +96,14 @@ class _Placement(NamedTuple):
 @click.argument(
     "effects", metavar="[EFFECTS|CAMPAIGN]", required=False, type=click.Path(path_type=Path)
 )
-@options.path("--out", "-o", metavar="PATH", required=True, help="Output file or folder.")
+@click.option(
+    "--out",
+    "-o",
+    type=options.StoragePath(),
+    metavar="PATH",
+    required=True,
+    help="Output file or folder.",
+)
 @click.option(
     "--format",
     "output_format",
@@ -236,7 +243,7 @@ class _Placement(NamedTuple):
 def augment(
     recording: Path,
     effects: Path | None,
-    out: Path,
+    out: Any,
     *,
     model: str | None,
     topic: str | None,
@@ -275,6 +282,11 @@ def augment(
         raise click.UsageError(
             "`--workers` and `--scheduler` cannot be combined, because the workers are those of "
             "the cluster."
+        )
+    if not isinstance(out, Path):
+        raise LidarError(
+            f"{out} is a URL, but files are linked to the recording. Specify a local path with "
+            "`--out`, and copy the result afterwards."
         )
     placements = _placements(settings)
     print_first_step("reading the recording", quiet=quiet)
