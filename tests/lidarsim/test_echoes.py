@@ -183,7 +183,7 @@ def test_a_surface_that_continues_takes_hits_between_its_hits():
         ),
         neighbors=SubrayNeighbors(4, pairs, normals.T.copy(), directions.T.copy()),
         receiver=Receiver(4, 0.3, ALL, False, 0.0, 0.0, 0.0, np.zeros(0)),
-        keys=RandomKeys(np.zeros(0, np.uint64), 0, np.zeros(1, np.int64), 0),
+        keys=RandomKeys(np.zeros((1, 0), np.uint64), np.zeros(1, np.int64), 0),
         output=found,
     )
     assert count == 2 and found.row[:count].tolist() == [-1, 3]

@@ -12,7 +12,7 @@ from tests.shapes import quad
 
 from lidarpool import Beams, Material, Noise, Optics, Returns, Scene, Sensor, Spin, Survey
 from lidarsim.media.weather import Air, spray_clumps
-from lidarsim.numerics.random_numbers import Purpose, initial_states, named_seed, raw
+from lidarsim.numerics.random_numbers import Purpose, named_seed, raw, scan_states
 from lidarsim.sensor.disc import Beam
 from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
 from lidarsim.simulator.casting.surfaces import SceneSurfaces, SensorLight
@@ -337,8 +337,9 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
     light = np.ones(len(hits))
     crossings = spray_loops.BoxCrossings(beam, crossed)
     spray_loops.attenuate(crossings, each, 0.1, far, SampledHits(hits, place, light))
-    begun = initial_states(9, SPRAY_DEPTH, SPRAY_SUBRAY, SPRAY_DIAMETER)
-    keys = RandomKeys(begun, KEYS.scan, KEYS.scan_starts, FIRST)
+    purposes = SPRAY_DEPTH, SPRAY_SUBRAY, SPRAY_DIAMETER
+    states = scan_states(9, purposes, KEYS.scan + np.arange(len(KEYS.scan_starts)))
+    keys = RandomKeys(states, KEYS.scan_starts, FIRST)
     out = SampledHits(np.empty(4000, np.int64), *np.empty((2, 4000)))
     clumps = []
     left = []

@@ -60,24 +60,25 @@ def sample_particles(beam, stop, subrays, tables, keys, reach, hits):
     range that the light of each sub-ray reaches, in meters. The function writes `SampledHits`, and
     returns the first beam that has not been sampled and the number of hits.
     """
-    starts = keys.starts
+    states = keys.states
     count = 0
     scan_index = 0
     while beam < stop and count + len(tables.counts) <= len(hits.ray):
         scan_index = scan_row(keys.scan_starts, keys.first + beam, scan_index)
-        scan = keys.scan + scan_index
         number_in_scan = keys.first + beam - keys.scan_starts[scan_index]
-        probability = uniform(starts[0], scan, number_in_scan, 0)
+        probability = uniform(states[scan_index, 0], number_in_scan, 0)
         particle = 0
         while tables.counts[particle] <= probability:
-            index = np.int64(bits(starts[1], scan, number_in_scan, particle) >> SHIFT_TO_INDEX)
+            index = np.int64(
+                bits(states[scan_index, 1], number_in_scan, particle) >> SHIFT_TO_INDEX
+            )
             ray = beam * subrays
             if subrays > 1:
                 ray += np.int64(
-                    bits(starts[2], scan, number_in_scan, particle) % np.uint64(subrays)
+                    bits(states[scan_index, 2], number_in_scan, particle) % np.uint64(subrays)
                 )
             if tables.by_range[0, index] < reach[ray]:
-                quantile = uniform(starts[3], scan, number_in_scan, particle)
+                quantile = uniform(states[scan_index, 3], number_in_scan, particle)
                 write_particle(ray, index, quantile, subrays, tables, hits=hits, row=count)
                 count += 1
             particle += 1
@@ -93,6 +94,7 @@ def sample_fog(subrays, tables, keys, reach, hits):
     light from the cell with the highest peak in front of its surface, which is the surface hit by
     its first, central sub-ray. A beam whose surface is within the first cell returns nothing.
     """
+    states = keys.states
     cells = len(tables.energies)
     count = 0
     scan_index = 0
@@ -102,10 +104,9 @@ def sample_fog(subrays, tables, keys, reach, hits):
             continue
         fog_cells = cells if free_cells >= cells else np.int64(free_cells)
         scan_index = scan_row(keys.scan_starts, keys.first + beam, scan_index)
-        scan = keys.scan + scan_index
         number_in_scan = keys.first + beam - keys.scan_starts[scan_index]
         # Row n of the table is n plus the probabilities (`particles.FogCells.peaks`).
-        probability = fog_cells + uniform(keys.starts[0], scan, number_in_scan, 0)
+        probability = fog_cells + uniform(states[scan_index, 0], number_in_scan, 0)
         cell = 0  # the cell with the highest peak, found by binary search
         upper = cells
         while cell < upper:
@@ -114,7 +115,7 @@ def sample_fog(subrays, tables, keys, reach, hits):
                 cell = middle + 1
             else:
                 upper = middle
-        position_in_cell = uniform(keys.starts[1], scan, number_in_scan, 0)
+        position_in_cell = uniform(states[scan_index, 1], number_in_scan, 0)
         hits.ray[count] = beam * subrays
         hits.distance[count] = tables.begin_m + (cell + position_in_cell) * tables.cell_m
         hits.energy[count] = subrays * tables.energies[cell]

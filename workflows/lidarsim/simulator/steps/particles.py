@@ -20,7 +20,7 @@ from ...media.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles, partic
 from ...numerics.arrays import Bools, Floats, Indices, Ints, to_writable
 from ...numerics.elementary import exp, expm1, geomspace, interp, log1p
 from ...numerics.elementary_scalars import exp_of
-from ...numerics.random_numbers import Purpose, initial_states, named_seed
+from ...numerics.random_numbers import Purpose, named_seed, scan_states
 from ...sensor.noise import THRESHOLD_SIGMAS
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import SceneSurfaces
@@ -283,9 +283,9 @@ def random_keys(seed: int, purposes: tuple[Purpose, ...], keys: Keys, first: int
     """Return the keys of random numbers for beams, starting with beam number `first`."""
     from .random_loops import RandomKeys
 
-    return RandomKeys(
-        initial_states(seed, *purposes), keys.scan, to_writable(keys.scan_starts, np.int64), first
-    )
+    scans = keys.scan + np.arange(len(keys.scan_starts))
+    states = scan_states(seed, purposes, scans)
+    return RandomKeys(states, to_writable(keys.scan_starts, np.int64), first)
 
 
 def empty_hits(size: int) -> SampledHits:

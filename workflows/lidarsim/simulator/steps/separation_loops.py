@@ -46,7 +46,7 @@ class Receiver(NamedTuple):
 
 
 class _Detection(NamedTuple):
-    """Detection settings of a `Receiver`, and the hash starts of its random numbers."""
+    """Detection settings of a `Receiver`."""
 
     dropout: float  # fraction of returns that are lost
     threshold: float  # energy at which half of the returns are detected; 0 without detection
@@ -54,8 +54,14 @@ class _Detection(NamedTuple):
     quantiles: Floats  # pointer to the quantiles of the normal distribution
     lowest: float  # first quantile
     highest: float  # last quantile
-    loss_start: np.uint64  # hash starts (`random_numbers.starts`)
-    detection_start: np.uint64
+
+
+class _BeamKeys(NamedTuple):
+    """Keys of the random numbers of a beam."""
+
+    loss_state: np.uint64  # hash states of the beam's scan (`random_numbers.scan_states`)
+    detection_state: np.uint64
+    number_in_scan: int
 
 
 class ReturnArrays(NamedTuple):
@@ -93,7 +99,7 @@ class _BeamRows(NamedTuple):
 class _BeamScratch(NamedTuple):
     """Scratch memory for the hits and returns of one beam."""
 
-    hits: PulseHits  # row[k, 0] is the row on surfaces, or -1, -2, … in the air
+    hits: PulseHits  # row[k] is the row on surfaces, or -1, -2, … in the air
     marks: SurfaceMarks
     energy: Floats
     velocity: Floats
@@ -126,6 +132,42 @@ def _pointers_to_returns(output):
     )
 
 
+@inlined
+def _pointers_to_receiver(receiver):
+    """Return a `Receiver` with a pointer to the quantiles of `receiver`, which must stay alive."""
+    return Receiver(
+        receiver.subrays,
+        receiver.gap_m,
+        receiver.mode,
+        receiver.with_velocity,
+        receiver.dropout,
+        receiver.threshold,
+        receiver.threshold_sigmas,
+        float64s(receiver.quantiles.ctypes.data),
+    )
+
+
+@inlined
+def _pointers_to_scratch(scratch):
+    """Return a `_BeamScratch` with pointers to the arrays of `scratch`, which must stay alive."""
+    hits = scratch.hits
+    starts_return = uint8s(scratch.marks.starts_return.ctypes.data)
+    return _BeamScratch(
+        PulseHits(
+            int64s(hits.subray.ctypes.data),
+            float64s(hits.distance.ctypes.data),
+            int64s(hits.row.ctypes.data),
+            int64s(hits.return_begin.ctypes.data),
+            int64s(hits.subray_hits.ctypes.data),
+            int64s(hits.changes.ctypes.data),
+        ),
+        SurfaceMarks(uint8s(scratch.marks.solid.ctypes.data), starts_return, starts_return),
+        float64s(scratch.energy.ctypes.data),
+        float64s(scratch.velocity.ctypes.data),
+        uint8s(scratch.shown.ctypes.data),
+    )
+
+
 @noinline
 def _max_hits(ray, subrays):
     """Return the maximum number of hits in a beam."""
@@ -145,7 +187,8 @@ def _room_for_hits(size, subrays):
     pulse_hits = PulseHits(
         np.empty(size, np.int64),
         np.empty(size),
-        np.empty((size, 2), np.int64),
+        np.empty(size, np.int64),
+        np.empty(size, np.int64),
         np.empty(size * subrays, np.int64),
         np.empty(size + 1, np.int64),
     )
@@ -205,6 +248,33 @@ def _single_return(hits, beam_rows, beam, receiver, count, output):
 
 
 @inlined
+def _surely_detected(energy, detection):
+    """Return whether a return is detected whatever the random numbers are."""
+    return detection.dropout == 0 and (
+        detection.threshold == 0
+        or detection.threshold_sigmas * (energy / detection.threshold - 1) + detection.lowest > 0
+    )
+
+
+@inlined
+def _outshines_air(hits, air, beam_rows, receiver, detection):
+    """Return whether the first surface hit of a beam surely becomes the strongest return.
+
+    Its return must be brighter than all hits in the air together, contain none of them, and be
+    detected.
+    """
+    distance = hits.distance[beam_rows.start]
+    energy = hits.energy[beam_rows.start]
+    energy_in_air = 0.0
+    for k in range(beam_rows.air_start, beam_rows.air_stop):
+        energy_in_air += air.energy[k]
+        if not abs(distance - air.distance[k]) > receiver.gap_m:
+            return False
+    # The margin allows for sums that are rounded differently.
+    return energy > 1.001 * energy_in_air and _surely_detected(energy / receiver.subrays, detection)
+
+
+@inlined
 def _collect_hits(hits, air, beam_rows, scratch):
     """Write the hits of a beam that have energy to `scratch`, sorted by sub-ray.
 
@@ -222,12 +292,12 @@ def _collect_hits(hits, air, beam_rows, scratch):
     while surface_row < beam_rows.stop or air_row < beam_rows.air_stop:
         in_air = air_row < beam_rows.air_stop
         if in_air and (surface_row == beam_rows.stop or air.ray[air_row] <= hits.ray[surface_row]):
-            row[count, 0] = -1 - air_row
+            row[count] = -1 - air_row
             distance[count] = air.distance[air_row]
             energy[count] = air.energy[air_row]
             air_row += 1
         else:
-            row[count, 0] = surface_row
+            row[count] = surface_row
             distance[count] = hits.distance[surface_row]
             energy[count] = hits.energy[surface_row]
             surface_row += 1
@@ -244,29 +314,30 @@ def _sort_by_distance(pulse_hits, count):
     row = pulse_hits.row
     distance = pulse_hits.distance
     for k in range(1, count):
-        row_k = row[k, 0]
+        row_k = row[k]
         distance_k = distance[k]
         index = k
         while index > 0 and distance[index - 1] > distance_k:
-            row[index, 0] = row[index - 1, 0]
+            row[index] = row[index - 1]
             distance[index] = distance[index - 1]
             index -= 1
-        row[index, 0] = row_k
+        row[index] = row_k
         distance[index] = distance_k
 
 
 @inlined
-def _mark_returns(hits, air, count, exceeds_gap, receiver, neighbors, scratch):
+def _mark_returns(hits, air, count, exceeds_gap, receiver, scratch):
     """Mark the hits in `scratch` at which returns start, and fill in the columns of the hits.
 
     `count` is the number of hits. `exceeds_gap` is False if all hits of the beam are within the
-    receiver's gap of each other. A surface that continues from sub-ray to sub-ray belongs to a
-    single return.
+    receiver's gap of each other. Returns whether surface hits are in several returns. Then
+    `continue_surfaces` must be called, because a surface that continues from sub-ray to sub-ray
+    belongs to a single return.
 
     In the example of `continue_surfaces` with a gap of 0.3 m, `_collect_hits` has written the drop
     and then the hits of sub-rays 0 to 3, and `_sort_by_distance` has moved the post before the
-    ground hits of sub-rays 1 and 2. `row[k, 0]` is -1, 0, 3, 1 and 2, because the drop is row 0 of
-    the table of hits in the air. Each hit is farther than the gap from the previous one, so
+    ground hits of sub-rays 1 and 2. `row` is -1, 0, 3, 1 and 2, because the drop is row 0 of the
+    table of hits in the air. Each hit is farther than the gap from the previous one, so
     `starts_return` is True for all five. Because surface hits are in several returns,
     `continue_surfaces` looks for surfaces that continue, and clears `starts_return` of hits 2, 3
     and 4. `_write_returns` then writes two returns: the drop at 8.0 m, and hits 1 to 4 at their
@@ -281,7 +352,7 @@ def _mark_returns(hits, air, count, exceeds_gap, receiver, neighbors, scratch):
     surface_number = -1
     number = 0
     for k in range(count):
-        row_k = row[k, 0]
+        row_k = row[k]
         solid[k] = row_k >= 0 and hits.solid[row_k] != 0
         scratch.hits.subray[k] = hits.ray[row_k] if row_k >= 0 else air.ray[-1 - row_k]
         scratch.energy[k] = hits.energy[row_k] if row_k >= 0 else air.energy[-1 - row_k]
@@ -295,8 +366,7 @@ def _mark_returns(hits, air, count, exceeds_gap, receiver, neighbors, scratch):
         if solid[k]:  # a surface can continue only if its hits are in several returns
             several |= surface_number >= 0 and surface_number != number
             surface_number = number
-    if several and len(neighbors.pairs):
-        continue_surfaces(0, count, scratch.marks, scratch.hits, receiver.gap_m, neighbors)
+    return several
 
 
 @inlined
@@ -327,7 +397,7 @@ def _write_returns(hit_count, beam, receiver, scratch, count, output):
             if k == hit_count or starts_return[k]:
                 break
         output.beam[count] = beam
-        output.row[count] = row[strongest, 0]
+        output.row[count] = row[strongest]
         output.distance[count] = sum_distance / sum_energy
         output.energy[count] = sum_energy / receiver.subrays
         if receiver.with_velocity:
@@ -348,12 +418,8 @@ def _keep(output, k, count):
 
 
 @inlined
-def _detection_of(receiver, starts):
-    """Return the detection settings of a receiver.
-
-    `starts` is empty if no returns are lost.
-    """
-    loses = len(starts) > 0
+def _detection_of(receiver):
+    """Return the detection settings of a receiver."""
     count = len(receiver.quantiles)
     return _Detection(
         dropout=receiver.dropout,
@@ -362,28 +428,26 @@ def _detection_of(receiver, starts):
         quantiles=float64s(receiver.quantiles.ctypes.data),
         lowest=receiver.quantiles[0] if count else 0.0,
         highest=receiver.quantiles[count - 1] if count else 0.0,
-        loss_start=starts[0] if loses else np.uint64(0),
-        detection_start=starts[1] if loses else np.uint64(0),
     )
 
 
 @inlined
-def _detected(energy, scan, number_in_scan, return_index, detection):
-    """Return whether a return is detected, with the same result as `detection.detected`.
+def _detected(energy, beam_keys, return_index, detection):
+    """Return whether a return is detected, with the same result as `detection.is_detected`.
 
-    The keys of the random number are `scan`, the beam's `number_in_scan`, and the `return_index`
-    within the beam, from 0.
+    The keys of the random number are `beam_keys`, and the `return_index` within the beam, from 0.
     """
     detected = (
         detection.dropout == 0
-        or uniform(detection.loss_start, scan, number_in_scan, return_index) >= detection.dropout
+        or uniform(beam_keys.loss_state, beam_keys.number_in_scan, return_index)
+        >= detection.dropout
     )
     if detected and detection.threshold > 0:
         signal = detection.threshold_sigmas * (energy / detection.threshold - 1)
         detected = signal + detection.lowest > 0  # detected with any random number
         if not detected and signal + detection.highest > 0:
             index = np.int64(
-                bits(detection.detection_start, scan, number_in_scan, return_index)
+                bits(beam_keys.detection_state, beam_keys.number_in_scan, return_index)
                 >> SHIFT_TO_INDEX
             )
             detected = signal + detection.quantiles[index] > 0
@@ -391,16 +455,35 @@ def _detected(energy, scan, number_in_scan, return_index, detection):
 
 
 @inlined
-def _keep_detected(begin, stop, scan, number_in_scan, detection, output):
-    """Keep the detected returns among rows `begin` to `stop`. Return the next free row.
-
-    `scan` and the beam's `number_in_scan` are keys of the random numbers (`_detected`).
-    """
+def _keep_detected(begin, stop, beam_keys, detection, output):
+    """Keep the detected returns among rows `begin` to `stop`. Return the next free row."""
     count = begin
     for k in range(begin, stop):
-        if _detected(output.energy[k], scan, number_in_scan, k - begin, detection):
+        if _detected(output.energy[k], beam_keys, k - begin, detection):
             count = _keep(output, k, count)
     return count
+
+
+@inlined
+def _keep_strongest_detected(begin, stop, beam_keys, detection, lost, output):
+    """Keep the strongest detected return among rows `begin` to `stop`. Return the next free row.
+
+    Returns are tried in the order of their energy, which mostly takes a single random number.
+    `lost` is scratch memory.
+    """
+    for k in range(begin, stop):
+        lost[k - begin] = False
+    for _ in range(begin, stop):
+        strongest = -1
+        for k in range(begin, stop):
+            if not lost[k - begin] and (
+                strongest < 0 or output.energy[k] > output.energy[strongest]
+            ):
+                strongest = k
+        if _detected(output.energy[strongest], beam_keys, strongest - begin, detection):
+            return _keep(output, strongest, begin)
+        lost[strongest - begin] = True
+    return begin
 
 
 @noinline
@@ -462,25 +545,22 @@ def mark_reported(ray, energy, mode, shown):
         begin = stop
 
 
-@compiled()
-def separate(hits, air, neighbors, receiver, keys, output):  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Combine the hits of beams into returns, and write these to `output`.
-
-    `hits` and `air` are `SubrayHits` on surfaces and in the air, `neighbors` is a
-    `SubrayNeighbors`, `receiver` a `Receiver`, and `output` a `ReturnArrays`. `keys` is a
-    `RandomKeys`, which has starts if returns can be lost. Beams are numbered from 0 at sub-ray 0,
-    and beam 0 is beam `keys.first` of the scans in `keys`. Returns the number of returns.
-    """
+@inlined
+def _separate_beams(hits, air, neighbors, receiver, keys, scratch, output):  # noqa: C901, PLR0914, PLR0915 - a compiled loop
+    """Separate the hits of all beams, as in `separate`, with the scratch memory of one beam."""
     subrays = receiver.subrays
-    size = _max_hits(hits.ray, subrays) + _max_hits(air.ray, subrays)
-    scratch = _room_for_hits(size, subrays)
     hit_count = len(hits.ray)
     air_count = len(air.ray)
     hits = _pointers_to_hits(hits)
     air = _pointers_to_hits(air)
+    scratch = _pointers_to_scratch(scratch)
     output = _pointers_to_returns(output)
-    loses = len(keys.starts) > 0
-    detection = _detection_of(receiver, keys.starts)
+    loses = keys.states.shape[1] > 0
+    detection = _detection_of(receiver)
+    receiver = _pointers_to_receiver(receiver)
+    has_neighbors = len(neighbors.pairs) > 0
+    loss_state = np.uint64(0)
+    detection_state = np.uint64(0)
     row = 0
     air_row = 0
     count = 0
@@ -499,24 +579,23 @@ def separate(hits, air, neighbors, receiver, keys, output):  # noqa: PLR0914, PL
         air_row = air_stop
         begin = count
         single = False
-        if (
-            beam_rows.air_start == beam_rows.air_stop
-        ):  # mostly, there is one surface, and no hit in the air
+        # Mostly, there is one surface, and hits in the air are faint.
+        if air_row == beam_rows.air_start or (
+            receiver.mode == STRONGEST
+            and stop == beam_rows.start + 1
+            and _outshines_air(hits, air, beam_rows, receiver, detection)
+        ):
             single, count = _single_return(hits, beam_rows, beam, receiver, count, output)
         if not single:
             collected, extent_m = _collect_hits(hits, air, beam_rows, scratch)
             exceeds_gap = extent_m > receiver.gap_m
             if exceeds_gap:  # only few beams hit an edge or graze a surface
                 _sort_by_distance(scratch.hits, collected)
-            _mark_returns(
-                hits,
-                air,
-                count=collected,
-                exceeds_gap=exceeds_gap,
-                receiver=receiver,
-                neighbors=neighbors,
-                scratch=scratch,
-            )
+            several = _mark_returns(hits, air, collected, exceeds_gap, receiver, scratch)
+            if several and has_neighbors:
+                continue_surfaces(
+                    0, collected, scratch.marks, scratch.hits, receiver.gap_m, neighbors
+                )
             count = _write_returns(collected, beam, receiver, scratch, count, output)
         if loses and count > begin:
             number = keys.first + beam
@@ -524,9 +603,30 @@ def separate(hits, air, neighbors, receiver, keys, output):  # noqa: PLR0914, PL
                 scan_index = scan_row(keys.scan_starts, number, scan_index)
                 scan_start = keys.scan_starts[scan_index]
                 scan_stop = _start_of_scan(keys.scan_starts, scan_index + 1)
-            count = _keep_detected(
-                begin, count, keys.scan + scan_index, number - scan_start, detection, output
-            )
+                loss_state = keys.states[scan_index, 0]
+                detection_state = keys.states[scan_index, 1]
+            beam_keys = _BeamKeys(loss_state, detection_state, number - scan_start)
+            if receiver.mode == STRONGEST:
+                count = _keep_strongest_detected(
+                    begin, count, beam_keys, detection, scratch.shown, output
+                )
+            else:
+                count = _keep_detected(begin, count, beam_keys, detection, output)
         if receiver.mode != ALL and count - begin > 1:
             count = _keep_reported(begin, count, receiver.mode, scratch, output)
     return count
+
+
+@compiled()
+def separate(hits, air, neighbors, receiver, keys, output):
+    """Combine the hits of beams into returns, and write these to `output`.
+
+    `hits` and `air` are `SubrayHits` on surfaces and in the air, `neighbors` is a
+    `SubrayNeighbors`, `receiver` a `Receiver`, and `output` a `ReturnArrays`. `keys` is a
+    `RandomKeys`, which has purposes if returns can be lost. Beams are numbered from 0 at sub-ray 0,
+    and beam 0 is beam `keys.first` of the scans in `keys`. Returns the number of returns.
+    """
+    subrays = receiver.subrays
+    size = _max_hits(hits.ray, subrays) + _max_hits(air.ray, subrays)
+    scratch = _room_for_hits(size, subrays)
+    return _separate_beams(hits, air, neighbors, receiver, keys, scratch, output)

@@ -203,7 +203,7 @@ def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PL
     beam = crossings.beam
     spans = crossings.spans
     exponential = tables.exponential
-    starts = keys.starts
+    states = keys.states
     ranges = tables.by_range[0]
     part_m = ranges[-1] / _GUIDE_PARTS
     clumps_per_column = tables.mean / len(ranges)
@@ -216,10 +216,11 @@ def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PL
         scan_index = scan_row(
             keys.scan_starts, key, scan_index if keys.scan_starts[scan_index] <= key else 0
         )
-        scan = keys.scan + scan_index
         number_in_scan = key - keys.scan_starts[scan_index]
         clump = 0
-        depth = exponential[np.int64(bits(starts[0], scan, number_in_scan, 0) >> SHIFT_TO_INDEX)]
+        depth = exponential[
+            np.int64(bits(states[scan_index, 0], number_in_scan, 0) >> SHIFT_TO_INDEX)
+        ]
         begin = k
         max_depth = 0.0  # number of columns
         while k < len(beam) and beam[k] == this_beam:
@@ -241,14 +242,16 @@ def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PL
                 ray = this_beam * subrays
                 if subrays > 1:
                     ray += np.int64(
-                        bits(starts[1], scan, number_in_scan, clump) % np.uint64(subrays)
+                        bits(states[scan_index, 1], number_in_scan, clump) % np.uint64(subrays)
                     )
                 if ranges[column] < reach[ray]:
-                    quantile = uniform(starts[2], scan, number_in_scan, clump)
+                    quantile = uniform(states[scan_index, 2], number_in_scan, clump)
                     write_particle(ray, column, quantile, subrays, tables, hits=hits, row=count)
                     count += 1
                 clump += 1
-                index = np.int64(bits(starts[0], scan, number_in_scan, clump) >> SHIFT_TO_INDEX)
+                index = np.int64(
+                    bits(states[scan_index, 0], number_in_scan, clump) >> SHIFT_TO_INDEX
+                )
                 depth = exponential[index]
             depth -= (end - position) * rate
             k += 1
