@@ -120,8 +120,8 @@ def watch_loops(monkeypatch, draws):
     """Have the loops that draw random numbers run in plain Python, and draw by `draws`."""
     # Some are private: every function is replaced by which a random number reaches a loop.
     sampling = {
-        particle_loops: ["write_particle", "sample_particles", "sample_fog"],
-        spray_loops: ["write_particle", "_column", "_guide", "sample_clumps"],
+        particle_loops: ["particle_energy", "sample_particles", "sample_fog"],
+        spray_loops: ["particle_energy", "_column", "_guide", "sample_clumps"],
     }
     for loops, names in sampling.items():
         # Others are compiled without these.

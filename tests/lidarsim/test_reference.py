@@ -303,7 +303,7 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
         ):
             precipitation = reference.Precipitation(kind, air, noise.threshold)
             seed = named_seed(9, "kind 1" if number else "")
-            tables = seen.counts, seen.by_range[0]
+            tables = seen.counts, seen.by_range[:, 0].astype(float)
             drawn += reference.particles(precipitation, seed, key, own, tables)
         if cloud is not None:
             table = cloud.peaks.reshape(-1, len(cloud.energy))
@@ -351,7 +351,9 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
         boxes = [tuple(one) for one in crossed[:, beam == pulse].T.tolist()]
         own = far[pulse * each : (pulse + 1) * each].tolist()
         key = key_of(FIRST + pulse)
-        seen = reference.clumps(precipitation, 9, key, own, boxes, (mean, tables[0]))
+        seen = reference.clumps(
+            precipitation, 9, key, own, boxes, (mean, tables[:, 0].astype(float))
+        )
         clumps += [(pulse * each + one.subray, one.distance, one.energy) for one in seen]
         left += [reference.veiled(end, boxes, 0.1) for end in own if end < np.inf]
     ray, distance, energy = map(np.array, zip(*clumps, strict=True))

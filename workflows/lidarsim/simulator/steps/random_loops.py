@@ -10,7 +10,7 @@ import numpy as np
 
 from raybeam.compiled import inlined
 
-from ...numerics.arrays import AnyArray, Ints
+from ...numerics.arrays import Ints, UInts64
 
 SHIFT_TO_INDEX = np.uint64(48)  # keeps the upper 16 of 64 bits as an index below 65,536
 
@@ -28,8 +28,8 @@ _NEXT = np.uint64(1)
 class RandomKeys(NamedTuple):
     """Keys for the random numbers of consecutive beams."""
 
-    # uint64 (scans, purposes), from `random_numbers.scan_states`; no purposes if none are needed
-    states: AnyArray
+    # (scans, purposes), from `random_numbers.scan_states`; no purposes if none are needed
+    states: UInts64
     scan_starts: Ints  # (scans,): number of the first beam of each scan
     first: int  # number of the first beam
 
