@@ -86,7 +86,7 @@ def sample_particles(beam, stop, subrays, tables, keys, reach, hits):  # noqa: P
             hit_distance[count] = by_range[index, 0]
             hit_energy[count] = subrays * energy
             # The next particle overwrites a particle behind the surface. A branch would be slower.
-            count += np.int64(by_range[index, 0] < reach[ray])
+            count += int(by_range[index, 0] < reach[ray])
             particle += 1
         beam += 1
     return beam, count

@@ -104,9 +104,12 @@ def separate_hits(
     )
     output = output.first(count)
     returns = _columns(hits, air_hits, output)
+    # Copies, because the output arrays are as long as the table of hits.
     return returns._replace(
         ray=output.beam + reporting.first,
-        velocity=output.velocity if with_velocity else None,
+        distance=output.distance.copy(),
+        energy=output.energy.copy(),
+        velocity=output.velocity.copy() if with_velocity else None,
     )
 
 

@@ -77,13 +77,13 @@ class ReturnArrays(NamedTuple):
     velocity: Floats  # radial, m/s
 
     def first(self, count: int) -> ReturnArrays:
-        """Return copies of the first `count` returns."""
+        """Return the first `count` returns, without copying them."""
         return ReturnArrays(
-            self.beam[:count].copy(),
-            self.row[:count].copy(),
-            self.distance[:count].copy(),
-            self.energy[:count].copy(),
-            self.velocity[:count].copy(),
+            self.beam[:count],
+            self.row[:count],
+            self.distance[:count],
+            self.energy[:count],
+            self.velocity[:count],
         )
 
 
@@ -96,13 +96,20 @@ class _BeamRows(NamedTuple):
     air_stop: int
 
 
+class _AirInBeam(NamedTuple):
+    """Hits of a beam in the air."""
+
+    stop: int  # first row of the next beam
+    farthest_m: float  # distance of the farthest hit
+    energy: float  # sum of the energies, as if each sub-ray carried the whole beam
+
+
 class _BeamScratch(NamedTuple):
     """Scratch memory for the hits and returns of one beam."""
 
     hits: PulseHits  # row[k] is the row on surfaces, or -1, -2, … in the air
     marks: SurfaceMarks
     energy: Floats
-    velocity: Floats
     shown: Bools  # whether the mode reports a return
 
 
@@ -163,22 +170,20 @@ def _pointers_to_scratch(scratch):
         ),
         SurfaceMarks(uint8s(scratch.marks.solid.ctypes.data), starts_return, starts_return),
         float64s(scratch.energy.ctypes.data),
-        float64s(scratch.velocity.ctypes.data),
         uint8s(scratch.shown.ctypes.data),
     )
 
 
 @noinline
 def _max_hits(ray, subrays):
-    """Return the maximum number of hits in a beam."""
-    max_count = 0
-    begin = 0
-    end = -1
-    for k in range(len(ray)):
-        if ray[k] >= end:
-            begin = k
-            end = (beam_of(ray[k], subrays) + 1) * subrays
-        max_count = max(max_count, k + 1 - begin)
+    """Return the maximum number of hits in `subrays` consecutive sub-rays.
+
+    This is at least the maximum number of hits in a beam.
+    """
+    max_count = min(len(ray), 1)
+    for k in range(1, len(ray)):
+        if ray[k] - ray[k - max_count] < subrays:
+            max_count += 1
     return max_count
 
 
@@ -197,7 +202,6 @@ def _room_for_hits(size, subrays):
         pulse_hits,
         SurfaceMarks(np.empty(size, np.bool_), starts_return, starts_return),
         np.empty(size),
-        np.empty(size),
         np.empty(size, np.bool_),
     )
 
@@ -208,6 +212,18 @@ def _end_of_beam(ray, size, row, end_ray):
     while row < size and ray[row] < end_ray:
         row += 1
     return row
+
+
+@inlined
+def _air_in_beam(air, size, row, end_ray):
+    """Return the hits in the air, starting at `row`, whose sub-rays are less than `end_ray`."""
+    farthest_m = -np.inf
+    energy = 0.0
+    while row < size and air.ray[row] < end_ray:
+        farthest_m = max(farthest_m, air.distance[row])
+        energy += air.energy[row]
+        row += 1
+    return _AirInBeam(row, farthest_m, energy)
 
 
 @inlined
@@ -257,21 +273,17 @@ def _surely_detected(energy, detection):
 
 
 @inlined
-def _outshines_air(hits, air, beam_rows, receiver, detection):
-    """Return whether the first surface hit of a beam surely becomes the strongest return.
+def _outshines_air(distance, energy, air_in_beam, receiver, detection):
+    """Return whether the only surface hit of a beam surely becomes the strongest return.
 
-    Its return must be brighter than all hits in the air together, contain none of them, and be
-    detected.
+    Its return must be detected, be brighter than all hits in the air together, and be behind them.
     """
-    distance = hits.distance[beam_rows.start]
-    energy = hits.energy[beam_rows.start]
-    energy_in_air = 0.0
-    for k in range(beam_rows.air_start, beam_rows.air_stop):
-        energy_in_air += air.energy[k]
-        if not abs(distance - air.distance[k]) > receiver.gap_m:
-            return False
-    # The margin allows for sums that are rounded differently.
-    return energy > 1.001 * energy_in_air and _surely_detected(energy / receiver.subrays, detection)
+    return (
+        # The margin allows for sums that are rounded differently.
+        energy > 1.001 * air_in_beam.energy
+        and distance - air_in_beam.farthest_m > receiver.gap_m
+        and _surely_detected(energy / receiver.subrays, detection)
+    )
 
 
 @inlined
@@ -309,30 +321,34 @@ def _collect_hits(hits, air, beam_rows, scratch):
 
 
 @inlined
-def _sort_by_distance(pulse_hits, count):
+def _sort_by_distance(scratch, count):
     """Sort the first `count` hits by distance, keeping the order of equal distances."""
-    row = pulse_hits.row
-    distance = pulse_hits.distance
+    row = scratch.hits.row
+    distance = scratch.hits.distance
+    energy = scratch.energy
     for k in range(1, count):
         row_k = row[k]
         distance_k = distance[k]
+        energy_k = energy[k]
         index = k
         while index > 0 and distance[index - 1] > distance_k:
             row[index] = row[index - 1]
             distance[index] = distance[index - 1]
+            energy[index] = energy[index - 1]
             index -= 1
         row[index] = row_k
         distance[index] = distance_k
+        energy[index] = energy_k
 
 
 @inlined
-def _mark_returns(hits, air, count, exceeds_gap, receiver, scratch):
-    """Mark the hits in `scratch` at which returns start, and fill in the columns of the hits.
+def _mark_returns(count, exceeds_gap, receiver, scratch):
+    """Mark the hits in `scratch` at which returns start.
 
     `count` is the number of hits. `exceeds_gap` is False if all hits of the beam are within the
-    receiver's gap of each other. Returns whether surface hits are in several returns. Then
-    `continue_surfaces` must be called, because a surface that continues from sub-ray to sub-ray
-    belongs to a single return.
+    receiver's gap of each other. If beams have several sub-rays, `_in_several_returns` then
+    finds the beams for which `continue_surfaces` must be called, because a surface that continues
+    from sub-ray to sub-ray belongs to a single return.
 
     In the example of `continue_surfaces` with a gap of 0.3 m, `_collect_hits` has written the drop
     and then the hits of sub-rays 0 to 3, and `_sort_by_distance` has moved the post before the
@@ -344,10 +360,22 @@ def _mark_returns(hits, air, count, exceeds_gap, receiver, scratch):
     mean distance, weighted by energy. If the post returns twice the energy of a ground hit, the
     mean is 10.88 m, and the return has row 3, the row of the post.
     """
-    row = scratch.hits.row
     distance = scratch.hits.distance
-    solid = scratch.marks.solid
     starts_return = scratch.marks.starts_return
+    for k in range(count):
+        starts_return[k] = k == 0 or (
+            exceeds_gap and distance[k] - distance[k - 1] > receiver.gap_m
+        )
+
+
+@inlined
+def _in_several_returns(hits, air, count, scratch):
+    """Return whether hits on surfaces are in several returns. Only then can a surface continue.
+
+    Fills in the sub-rays of the first `count` hits in `scratch`, and whether they are solid.
+    """
+    row = scratch.hits.row
+    solid = scratch.marks.solid
     several = False
     surface_number = -1
     number = 0
@@ -355,22 +383,15 @@ def _mark_returns(hits, air, count, exceeds_gap, receiver, scratch):
         row_k = row[k]
         solid[k] = row_k >= 0 and hits.solid[row_k] != 0
         scratch.hits.subray[k] = hits.ray[row_k] if row_k >= 0 else air.ray[-1 - row_k]
-        scratch.energy[k] = hits.energy[row_k] if row_k >= 0 else air.energy[-1 - row_k]
-        if receiver.with_velocity:
-            velocity_k = hits.velocity[row_k] if row_k >= 0 else air.velocity[-1 - row_k]
-            scratch.velocity[k] = velocity_k
-        starts_return[k] = k == 0 or (
-            exceeds_gap and distance[k] - distance[k - 1] > receiver.gap_m
-        )
-        number += int(starts_return[k])
-        if solid[k]:  # a surface can continue only if its hits are in several returns
+        number += int(scratch.marks.starts_return[k])
+        if solid[k]:
             several |= surface_number >= 0 and surface_number != number
             surface_number = number
     return several
 
 
 @inlined
-def _write_returns(hit_count, beam, receiver, scratch, count, output):
+def _write_returns(hits, air, hit_count, beam, receiver, scratch, count, output):  # noqa: PLR0917 - a compiled loop
     """Write the returns of the first `hit_count` hits in `scratch`.
 
     Return the number of returns.
@@ -379,7 +400,6 @@ def _write_returns(hit_count, beam, receiver, scratch, count, output):
     distance = scratch.hits.distance
     starts_return = scratch.marks.starts_return
     energy = scratch.energy
-    velocity = scratch.velocity
     k = 0
     while k < hit_count:
         strongest = k
@@ -390,7 +410,8 @@ def _write_returns(hit_count, beam, receiver, scratch, count, output):
             sum_energy += energy[k]
             sum_distance += energy[k] * distance[k]
             if receiver.with_velocity:
-                sum_velocity += energy[k] * velocity[k]
+                velocity = hits.velocity[row[k]] if row[k] >= 0 else air.velocity[-1 - row[k]]
+                sum_velocity += energy[k] * velocity
             if energy[k] > energy[strongest]:
                 strongest = k
             k += 1
@@ -409,6 +430,8 @@ def _write_returns(hit_count, beam, receiver, scratch, count, output):
 @inlined
 def _keep(output, k, count):
     """Move return `k` behind the `count` kept returns, and return the new count."""
+    if k == count:
+        return count + 1
     output.beam[count] = output.beam[k]
     output.row[count] = output.row[k]
     output.distance[count] = output.distance[k]
@@ -573,31 +596,34 @@ def _separate_beams(hits, air, neighbors, receiver, keys, scratch, output):  # n
             beam = min(beam, beam_of(air.ray[air_row], subrays))
         end_ray = (beam + 1) * subrays
         stop = _end_of_beam(hits.ray, hit_count, row, end_ray)
-        air_stop = _end_of_beam(air.ray, air_count, air_row, end_ray)
-        beam_rows = _BeamRows(row, stop, air_row, air_stop)
+        air_in_beam = _air_in_beam(air, air_count, air_row, end_ray)
+        beam_rows = _BeamRows(row, stop, air_row, air_in_beam.stop)
         row = stop
-        air_row = air_stop
+        air_row = air_in_beam.stop
         begin = count
         single = False
         # Mostly, there is one surface, and hits in the air are faint.
-        if air_row == beam_rows.air_start or (
+        outshines_air = (
             receiver.mode == STRONGEST
             and stop == beam_rows.start + 1
-            and _outshines_air(hits, air, beam_rows, receiver, detection)
-        ):
+            and _outshines_air(
+                hits.distance[stop - 1], hits.energy[stop - 1], air_in_beam, receiver, detection
+            )
+        )
+        if outshines_air or air_row == beam_rows.air_start:
             single, count = _single_return(hits, beam_rows, beam, receiver, count, output)
         if not single:
             collected, extent_m = _collect_hits(hits, air, beam_rows, scratch)
             exceeds_gap = extent_m > receiver.gap_m
             if exceeds_gap:  # only few beams hit an edge or graze a surface
-                _sort_by_distance(scratch.hits, collected)
-            several = _mark_returns(hits, air, collected, exceeds_gap, receiver, scratch)
-            if several and has_neighbors:
+                _sort_by_distance(scratch, collected)
+            _mark_returns(collected, exceeds_gap, receiver, scratch)
+            if has_neighbors and _in_several_returns(hits, air, collected, scratch):
                 continue_surfaces(
                     0, collected, scratch.marks, scratch.hits, receiver.gap_m, neighbors
                 )
-            count = _write_returns(collected, beam, receiver, scratch, count, output)
-        if loses and count > begin:
+            count = _write_returns(hits, air, collected, beam, receiver, scratch, count, output)
+        if loses and count > begin and not outshines_air:
             number = keys.first + beam
             if number >= scan_stop:
                 scan_index = scan_row(keys.scan_starts, number, scan_index)
@@ -606,7 +632,7 @@ def _separate_beams(hits, air, neighbors, receiver, keys, scratch, output):  # n
                 loss_state = keys.states[scan_index, 0]
                 detection_state = keys.states[scan_index, 1]
             beam_keys = _BeamKeys(loss_state, detection_state, number - scan_start)
-            if receiver.mode == STRONGEST:
+            if receiver.mode == STRONGEST and count - begin > 1:
                 count = _keep_strongest_detected(
                     begin, count, beam_keys, detection, scratch.shown, output
                 )
