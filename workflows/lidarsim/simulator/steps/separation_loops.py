@@ -180,10 +180,14 @@ def _max_hits(ray, subrays):
 
     This is at least the maximum number of hits in a beam.
     """
-    max_count = min(len(ray), 1)
-    for k in range(1, len(ray)):
-        if ray[k] - ray[k - max_count] < subrays:
-            max_count += 1
+    max_count = 0
+    begin = 0
+    end = -1
+    for k in range(len(ray)):
+        if ray[k] >= end:
+            begin = k
+            end = (beam_of(ray[k], subrays) + 1) * subrays
+        max_count = max(max_count, k + 1 - begin)
     return max_count
 
 
