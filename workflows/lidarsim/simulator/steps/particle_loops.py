@@ -116,7 +116,8 @@ def sample_fog(subrays, tables, keys, reach, hits):
         # Row n of the table is n plus the probabilities (`particles.FogCells.peaks`).
         probability = fog_cells + fraction
         cell = np.int64(tables.guide[fog_cells, np.int64(fraction * parts)])
-        while tables.peaks[fog_cells * cells + cell] <= probability:
+        # The sum may be rounded up to the last probability, which belongs to the last cell.
+        while cell < fog_cells - 1 and tables.peaks[fog_cells * cells + cell] <= probability:
             cell += 1
         position_in_cell = uniform(states[scan_index, 1], number_in_scan, 0)
         hits.ray[count] = beam * subrays

@@ -51,7 +51,7 @@ AIR = CAUSES.index("air")
 QUANTILES = 1 << 16  # number of equal parts of a distribution in tables
 CACHED_TABLES = 32  # cached because a scanner rebuilds its casters whenever an object is moved
 MAX_FOG_CELLS = 255  # cells of half a pulse length
-PEAK_PARTS = 256  # number of equal parts of [0, 1) for which a search in `FogCells.peaks` starts
+PEAK_PARTS = 256  # number of equal parts of [0, 1) in `FogCells.guide`
 # Probabilities are summed up to this many standard deviations below and above the highest signal.
 TAIL_SIGMAS = 6.0
 
@@ -440,8 +440,7 @@ def _fog_cells(
     energy = energy[: int(np.sum(np.cumprod(energy >= FAINTEST * threshold)))]
     if not len(energy):
         return None
-    peaks = highest_probabilities(THRESHOLD_SIGMAS * energy / threshold)
-    peaks = round_to_single(peaks)
+    peaks = round_to_single(highest_probabilities(THRESHOLD_SIGMAS * energy / threshold))
     guide = [np.searchsorted(row, np.arange(PEAK_PARTS) / PEAK_PARTS, "right") for row in peaks]
     peak_rows = np.arange(len(energy) + 1)[:, None] + peaks
     return FogCells(
