@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
+import cloudpickle
 import laspy
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from tests.fake_augmenters import changed, content, identity, rewrite, two_boxes
 
 from lidarpool import LidarError, read_cloud
 from lidarpool.augmentation.conversion import open_converter
+from lidarpool.augmentation.rewriting.opening import open_rewriter
 from lidarpool.clouds.writing import ExportSpec
 from lidarpool.recordings.opening import open_recording
 
@@ -151,6 +153,19 @@ def test_parts_depend_on_their_sweep_only(written, tmp_path):
         rewrite(made, tmp_path / folder, tmp_path / f"{folder}w", changed, numbers)
     assert content(tmp_path / "aw") == content(tmp_path / "bw")
     assert content(tmp_path / "a") == content(tmp_path / "b")
+
+
+@pytest.mark.parametrize("name", ["kitti", "pcd", "nuscenes", "mcap"])
+def test_other_processes_receive_rewriters(written, name):
+    sensor = {"kitti": "00", "nuscenes": "LIDAR_TOP", "mcap": "/front/points"}.get(name)
+    path = written(name)
+    if name == "pcd":
+        path = path / "000000.pcd"
+    recording = open_recording(path, sensor, keep_noise=True)
+    for made in (open_rewriter(path, recording, sensor), converter(path, "ply", sensor)):
+        expected = made.sweep_files(0, changed(made.recording, 0))
+        copy = cloudpickle.loads(cloudpickle.dumps(made))
+        assert copy.sweep_files(0, changed(copy.recording, 0)) == expected
 
 
 def test_bad_input(written, tmp_path):

@@ -199,6 +199,22 @@ def test_organized_clouds(tmp_path, marker, kind):
     assert (tmp_path / "new.pcd").read_bytes().startswith(header(kind, count))
 
 
+def test_ranges_keep_the_unit_of_the_file():
+    rows = rows_of()
+    points = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(float)
+    rows["range"] = np.rint(1000 * np.linalg.norm(points, axis=1))
+    sweep = Sweep(points, {"range": rows["range"]})
+    moved = identity([sweep], 0)
+    ranges_m = np.linalg.norm(points, axis=1) / 2  # of the simulation
+    moved = type(moved)(
+        moved.sweep.replace(points=points / 2, columns={"range": ranges_m}),
+        moved.template,
+        moved.is_recorded,
+    )
+    stored = StoredRecords(rows, sweep).augment(moved)["range"]
+    np.testing.assert_allclose(stored, 1000 * ranges_m, atol=1.5)
+
+
 def test_intensities_without_a_column_of_that_name():
     records = np.array([(1.0, 2, 3, 100), (4, 5, 6, 90)], "f4,f4,f4,u1")
     records.dtype.names = ("x", "y", "z", "reflectivity")

@@ -81,7 +81,8 @@ class StoredRecords:
             self._store_column(rows, column, name, augmented, is_added)
         for name in columns.values():
             if name.lower() in _RANGE_FIELDS:
-                ranges = _ranges(rows[name], before, points)
+                # A simulated range can have another unit than the file.
+                ranges = _ranges(self.records[name][template], before, points)
                 if ranges is not None:
                     _store(rows, name, is_moved, ranges)
         return rows

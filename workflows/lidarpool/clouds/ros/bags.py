@@ -293,7 +293,8 @@ def point_connection(source: RecordingSource, bag: Any) -> Any:
         if connection.msgtype in LIVOX_CLOUDS
     }
     topics = livox_clouds if source.sensor in livox_clouds else clouds or livox_clouds
-    return topics[source.choose("PointCloud2 topics", topics)]
+    chosen = topics[source.choose("PointCloud2 topics", topics)]
+    return chosen._replace(owner=None)  # the bag that contains the connection cannot be pickled
 
 
 def _open_bag(source: RecordingSource) -> Recording:
