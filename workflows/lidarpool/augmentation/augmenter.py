@@ -14,7 +14,7 @@ from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints, Ints32
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.sensor import Noise, Returns, Sensor
-from lidarsim.simulator.recorded_sweeps import PulseAugmenter, RecordedSensor, FiredPulses
+from lidarsim.simulator.recorded_sweeps import FiredPulses, PulseAugmenter, RecordedSensor
 from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.steps.step import RecordedPulses
 
@@ -24,12 +24,16 @@ from .effects import Effects
 from .inserted_objects import InsertedObjects
 from .intensity_scale import DetectionThreshold, IntensityScale, detection_threshold
 from .scan_pattern import PulseGrid, ScanPattern
+from .sensor_motion import SensorMotion
 
 _DIVERGENCE_MRAD = 3.0  # beam divergence of a sensor whose divergence is unknown
 _REFERENCE_SWEEPS = 5  # number of sweeps from which the sensitivity is estimated
 _SUBRAYS = 7  # sub-rays per beam if objects are inserted
 _RECEIVER = ("detection_range_m", "overlap_m", "saturation", "seed")  # properties of the receiver
 _UNSUPPORTED_FAULTS = ("frozen", "time_jump")
+# Minimum energy of recorded returns relative to the detection threshold. With this energy, 2.3 % of
+# the pulses are detected.
+_WEAKEST = 0.6
 _RANGES = ("range", "distance", "depth")  # columns that contain ranges
 _ROUNDING = 1e-9  # relative differences below this are rounding errors of the simulation
 
@@ -75,11 +79,14 @@ class Augmenter:
                 )
         self.recording = recording
         self.effects = effects
-        self.pattern = ScanPattern.from_recording(recording, model)
+        self.motion = SensorMotion.from_recording(
+            recording, has_objects=bool(effects.actors or effects.insertions)
+        )
+        self.pattern = ScanPattern.from_recording(recording, model, self.motion)
         self.scale = IntensityScale.for_recording(recording, model, reflectance)
         self.model = model
         self._notes: list[str] = [self.pattern.note, self.scale.note]
-        self.objects = InsertedObjects.from_effects(recording, effects)
+        self.objects = InsertedObjects.from_effects(recording, effects, self.motion)
         self._notes += self.objects.notes
         self._simulation = self._build(model)
 
@@ -205,18 +212,17 @@ class Augmenter:
 
         `number` selects the random numbers, the time of the sweep and the poses of actors.
         """
-        grid = self.pattern.grid(sweep)
+        grid = self.pattern.grid(self.motion.as_fired(sweep, number))
         if not len(grid.row):
             return self._without_returns(sweep)
-        motion = self.objects.motion(sweep, number, grid.times_s - self._first_s)
-        if motion.origins is not None:
-            channels = grid.directions.shape[1]
-            origins = np.repeat(motion.origins[:, None], channels, axis=1)
-            grid = grid.with_origins(origins, motion.rotations)
+        motion = self.motion.of_sweep(sweep, number, grid.times_s)
+        if motion.origins is not None and motion.rotations is not None:
+            grid = grid.transform(motion.origins, motion.rotations)
         intensity = self._intensity(sweep)
         recorded = None if intensity is None else intensity[grid.row]
-        # What was detected had at least the energy of the threshold.
-        energy = np.maximum(self.scale.energies(recorded, grid.range_m), self._simulation.threshold)
+        # What was detected had an energy of about the threshold or more.
+        weakest = _WEAKEST * self._simulation.threshold
+        energy = np.maximum(self.scale.energies(recorded, grid.range_m), weakest)
         firing_ns = self._start_ns(number) + 1e9 * (grid.times_s - self._first_s)
         pulses = FiredPulses(
             grid.directions,
