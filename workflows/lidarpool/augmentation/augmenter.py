@@ -12,7 +12,6 @@ from lidarsim.columns.column_names import TIMES
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints, Ints32
-from lidarsim.numerics.even_samples import even_indices
 from lidarsim.sensor import Noise, Returns, Sensor
 from lidarsim.simulator.recorded_sweeps import FiredPulses, PulseAugmenter, RecordedSensor
 from lidarsim.simulator.returns import PulseReturns
@@ -22,12 +21,11 @@ from ..clouds.recording import Recording
 from .augmented_sweep import AugmentedSweep
 from .effects import Effects
 from .inserted_objects import InsertedObjects
-from .intensity_scale import DetectionThreshold, IntensityScale, detection_threshold
 from .scan_pattern import PulseGrid, ScanPattern
 from .sensor_motion import SensorMotion
+from .strength_columns import StrengthColumns
 
 _DIVERGENCE_MRAD = 3.0  # beam divergence of a sensor whose divergence is unknown
-_REFERENCE_SWEEPS = 5  # number of sweeps from which the sensitivity is estimated
 _SUBRAYS = 7  # sub-rays per beam if objects are inserted
 _RECEIVER = ("detection_range_m", "overlap_m", "saturation", "seed")  # properties of the receiver
 _UNSUPPORTED_FAULTS = ("frozen", "time_jump")
@@ -83,9 +81,8 @@ class Augmenter:
             recording, has_objects=bool(effects.actors or effects.insertions)
         )
         self.pattern = ScanPattern.from_recording(recording, model, self.motion)
-        self.scale = IntensityScale.for_recording(recording, model, reflectance)
-        self.model = model
-        self._notes: list[str] = [self.pattern.note, self.scale.note]
+        self.strengths = StrengthColumns.for_recording(recording, model, reflectance)
+        self._notes: list[str] = [self.pattern.note, self.strengths.scale.note]
         self.objects = InsertedObjects.from_effects(recording, effects, self.motion)
         self._notes += self.objects.notes
         self._simulation = self._build(model)
@@ -149,7 +146,7 @@ class Augmenter:
         receiver = {name: changes[name] for name in _RECEIVER if name in changes}
         base = sensor.noise or Noise()
         if "detection_range_m" not in receiver and base.detection_range_m is None:
-            threshold = self._detection_threshold()
+            threshold = self.strengths.threshold
             receiver["detection_range_m"] = threshold.range_m
             self._notes.append(threshold.note)
         base = replace(base, **receiver, seed=self.effects.seed)
@@ -175,18 +172,6 @@ class Augmenter:
             added = replace(added, channel_bias_m=0.0)
         others = {name: value for name, value in changes.items() if name not in _RECEIVER}
         return replace(added, **others), replace(recorded, **others)
-
-    def _detection_threshold(self) -> DetectionThreshold:
-        """Estimate the detection threshold from a few sweeps."""
-        sweeps = [
-            self.recording[number].returns()
-            for number in even_indices(len(self.recording), _REFERENCE_SWEEPS).tolist()
-        ]
-        ranges = np.concatenate([np.linalg.norm(sweep.points, axis=1) for sweep in sweeps])
-        intensity = None
-        if self.scale.column:
-            intensity = np.concatenate([sweep.columns[self.scale.column] for sweep in sweeps])
-        return detection_threshold(self.scale, intensity, ranges, self.model)
 
     def sweep(self, number: int) -> AugmentedSweep:
         """Augment a sweep.
@@ -218,11 +203,10 @@ class Augmenter:
         motion = self.motion.of_sweep(sweep, number, grid.times_s)
         if motion.origins is not None and motion.rotations is not None:
             grid = grid.transform(motion.origins, motion.rotations)
-        intensity = self._intensity(sweep)
-        recorded = None if intensity is None else intensity[grid.row]
+        recorded = {name: np.asarray(v)[grid.row] for name, v in sweep.columns.items()}
         # What was detected had an energy of about the threshold or more.
         weakest = _WEAKEST * self._simulation.threshold
-        energy = np.maximum(self.scale.energies(recorded, grid.range_m), weakest)
+        energy = np.maximum(self.strengths.energies(recorded, grid.range_m), weakest)
         firing_ns = self._start_ns(number) + 1e9 * (grid.times_s - self._first_s)
         pulses = FiredPulses(
             grid.directions,
@@ -246,39 +230,33 @@ class Augmenter:
         boxes, visibility = self.objects.boxes(self._simulation, pulses, motion, returns, number)
         return AugmentedSweep(augmented, points.template, points.is_recorded, boxes, visibility)
 
-    def _intensity(self, sweep: Sweep) -> AnyArray | None:
-        return np.asarray(sweep.columns[self.scale.column]) if self.scale.column else None
-
-    def _intensities(
+    def _set_strengths(
         self,
-        sweep: Sweep,
+        columns: dict[str, AnyArray],
         points: _AugmentedPoints,
         grid: PulseGrid,
         recorded: RecordedPulses,
         returns: PulseReturns,
-    ) -> AnyArray:
-        """Return the intensities of the augmented points on the scale of the recording."""
+    ) -> None:
+        """Set the strength columns of points whose energy or range has changed."""
         assert returns.energy is not None
         energy = returns.energy[points.order]
-        old = self._intensity(sweep)
-        assert old is not None
-        values = old[points.template]
+        source = points.source
+        old_energy = recorded.energy[source]
+        changed = points.is_moved | (np.abs(energy - old_energy) > _ROUNDING * energy)
         added = np.flatnonzero(~points.is_recorded)
-        values[added] = self.scale.intensities(energy[added], points.range_m[added])
-        kept = np.flatnonzero(points.is_recorded)
-        source = points.source[kept]
-        unchanged = np.abs(energy[kept] - recorded.energy[source]) < _ROUNDING * energy[kept]
-        energy[kept] = np.where(unchanged, recorded.energy[source], energy[kept])
-        old_m = grid.range_m[source]
-        new_m = np.where(points.is_moved[kept], points.range_m[kept], old_m)
-        values[kept] = self.scale.scale_intensities(
-            values[kept],
-            recorded.energy[source],
+        kept = np.flatnonzero(points.is_recorded & changed)
+        new_values = self.strengths.intensities(energy[added], points.range_m[added])
+        scaled = self.strengths.scale_intensities(
+            {name: values[kept] for name, values in columns.items()},
+            old_energy[kept],
             energy[kept],
-            old_m,
-            new_m,
+            grid.range_m[source[kept]],
+            points.range_m[kept],
         )
-        return values
+        for name, values in scaled.items():
+            columns[name][kept] = values
+            columns[name][added] = new_values[name]
 
     def _without_returns(self, sweep: Sweep) -> AugmentedSweep:
         """Return a sweep that has no returns, whose pulses are therefore unknown."""
@@ -310,8 +288,7 @@ class Augmenter:
     ) -> dict[str, AnyArray]:
         """Return the columns of the augmented points."""
         columns = {name: np.asarray(v)[points.template] for name, v in sweep.columns.items()}
-        if self.scale.column:
-            columns[self.scale.column] = self._intensities(sweep, points, grid, recorded, returns)
+        self._set_strengths(columns, points, grid, recorded, returns)
         added = np.flatnonzero(~points.is_recorded)
         ranges = np.linalg.norm(np.asarray(sweep.points, np.float64), axis=1)
         for name in columns.keys() & {*_RANGES}:

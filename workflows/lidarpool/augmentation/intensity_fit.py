@@ -24,13 +24,17 @@ _MAX_RETURNS = 400_000  # maximum number of returns that are used
 _MIN_RETURNS = 50  # minimum number of returns in a range interval
 # Numbers of steps per unit that are tested. 8-bit codes are often divided by 255 or 256.
 _STEPS_PER_UNIT = (1, 2, 10, 100, 255, 256, 1000, 4095, 10_000, 65_535, 100_000, 1_000_000)
+# Largest values on scales from 0 to 1, by the number of steps. KITTI has steps of 0.01 up to 0.99.
+_UNIT_LIMITS = {100.0: 0.99, 255.0: 1.0, 256.0: 255 / 256}
 _MAX_ROUNDING = 0.02  # maximum distance of a value from a multiple of the step, in steps
 _SATURATED_SHARE = 0.05  # minimum share of returns at the largest value in a saturated interval
 _CLIPPED_SHARE = 1e-3  # minimum share of returns with the same largest value if they are clipped
 # Returns above this height in the sensor frame are not from the ground, whose incidence angle
 # increases with the range.
 _ABOVE_GROUND_M = -0.5
-_LAW_RANGES_M = (2.0, 5.0, 80.0)  # minimum, preferred minimum and maximum for `is_compensated`
+# Minimum, preferred minimum and maximum range for `is_compensated`. At long range, fog and the
+# detection threshold change intensities more than the distance does.
+_LAW_RANGES_M = (2.0, 5.0, 40.0)
 # Typical intensities decrease with a power of the range between 0 and -1 if they are compensated,
 # and between -2 and -3 if they are energies. The second values apply to level ground, for which the
 # cosine of the angle of incidence is inversely proportional to the range.
@@ -101,6 +105,12 @@ def is_valid(values: AnyArray) -> Bools:
     return np.asarray(np.isfinite(values) & (values >= 0))
 
 
+def smallest_positive(values: AnyArray) -> float:
+    """Return the smallest positive value, or 0 if no value is 0. The values must be valid."""
+    positive = values[values > 0]
+    return float(positive.min()) if 0 < len(positive) < len(values) else 0.0
+
+
 class Quantization(NamedTuple):
     """Steps and limits of recorded values.
 
@@ -157,9 +167,9 @@ def _max_value(distinct: Floats, counts: AnyArray, steps_per_unit: float) -> flo
     if 0 < steps_per_unit <= 1:
         unit = 1 / steps_per_unit
         return next((m * unit for m in (255, 65_535) if largest <= m * unit), np.inf)
-    if steps_per_unit in (100, 255, 256) and largest <= 1:
-        # KITTI stores at most 0.99.
-        return 1.0 if steps_per_unit == 255 or largest > 0.996 else largest
+    if steps_per_unit in _UNIT_LIMITS and largest <= 1:
+        limit = _UNIT_LIMITS[steps_per_unit]
+        return limit if largest < limit + 0.5 / steps_per_unit else 1.0
     clipped = largest.is_integer() and counts[-1] >= max(5, _CLIPPED_SHARE * counts.sum())
     return largest if clipped else np.inf
 
@@ -205,7 +215,7 @@ def _levels_by_range(
 ) -> list[tuple[float, float]]:
     """Return the logarithms of range and mean intensity for unsaturated range intervals."""
     levels = []
-    edges = _LAW_RANGES_M[0] * 1.25 ** np.arange(18)
+    edges = _LAW_RANGES_M[0] * 1.25 ** np.arange(15)
     for lower, upper in pairwise(edges):
         inside = (range_m >= lower) & (range_m < upper)
         if inside.sum() < _MIN_RETURNS:

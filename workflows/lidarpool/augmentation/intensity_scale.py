@@ -8,7 +8,7 @@ compensate them for the range, so that a white surface has the same intensity at
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -16,8 +16,7 @@ from lidarsim.columns.column_names import STRENGTHS
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import AnyArray, AnyFloats, Floats
 from lidarsim.schema.checks import check_number
-from lidarsim.sensor.noise import TARGET_REFLECTANCE
-from lidarsim.sensor.reflectivity import COUNTS, SCALES, ByteScale
+from lidarsim.sensor.reflectivity import SCALES, ByteScale
 from lidarsim.sensor.sensor import Sensor
 from lidarsim.words import format_rounded
 
@@ -29,15 +28,16 @@ from .intensity_fit import (
     is_compensated,
     is_valid,
     range_factors,
-    range_of_energy,
+    smallest_positive,
     typical_level,
-    weakest_energy,
     white_level,
 )
 
-# Typical values of the reflectance multiplied by the cosine of the angle of incidence. An assumed
-# scale must result in a median between these limits.
-_PLAUSIBLE = (0.03, 0.6)
+# An assumed scale must result in plausible reflectances, multiplied by the cosine of the angle of
+# incidence. The median of codes has no lower limit, because fog reduces typical codes of real
+# sensors to 1 or 2. The other limits apply to the 99th percentile.
+_MAX_MEDIAN = 0.6
+_BRIGHTEST = (0.25, 1.3)
 _ZERO_STEPS = 0.25  # value that represents a recorded 0, in steps
 _TYPICAL_REFLECTANCE = 0.2  # reflectance times cosine of the incidence, if it cannot be estimated
 _RESOLVED_STEPS = 3  # smallest value, in steps, that is used to estimate the detection threshold
@@ -81,8 +81,8 @@ class IntensityScale:
         Share of the energy that is recorded at close range.
     typical
         Median of the reflectance multiplied by the cosine of the angle of incidence.
-    zero_value
-        Value that represents a recorded 0, which is a weak return that was rounded down.
+    smallest
+        Smallest positive value, if values are not quantized and some of them are 0.
     is_known
         Whether the scale is known, rather than assumed or fitted.
     note
@@ -107,7 +107,7 @@ class IntensityScale:
     codes_per_unit: float = 1.0
     near: NearFactors = _NO_DROP
     typical: float = _TYPICAL_REFLECTANCE
-    zero_value: float = 0.0
+    smallest: float = 0.0
     is_known: bool = True
     note: str = ""
 
@@ -117,7 +117,7 @@ class IntensityScale:
         recording: Recording,
         model: Sensor | None = None,
         assumed_reflectance: float | None = None,
-    ) -> Self:
+    ) -> IntensityScale:
         """Determine the intensity scale of a recording from at most five sweeps.
 
         The scale is known for results, for packet captures, and for 8-bit codes if the sensor model
@@ -172,7 +172,7 @@ class IntensityScale:
     @classmethod
     def from_returns(
         cls, recording: Recording, returns: RecordedReturns, model: Sensor | None
-    ) -> Self:
+    ) -> IntensityScale:
         """Determine the scale of a recording, some of whose returns have already been read.
 
         Raises LidarError in the same cases as `for_recording`.
@@ -183,8 +183,23 @@ class IntensityScale:
         if not valid.any() or (recorded[valid] == recorded[valid][0]).all():
             raise LidarError(_missing_text(recording, column, recorded[valid]))
         fit = _Fit(recording, column, returns.select(valid), model)
-        scale = fit.scale()
-        return cls(**scale.__dict__)
+        return fit.scale()
+
+    @property
+    def zero_value(self) -> float:
+        """Value that represents a recorded 0, which is a weak return that was rounded down."""
+        steps = self.quantization.steps_per_unit
+        return _ZERO_STEPS / steps if steps else self.smallest / 2
+
+    def with_codes(self, codes: ByteScale) -> Self:
+        """Return a copy whose values are codes on a scale, one for each step of the values."""
+        codes_per_unit = self.quantization.steps_per_unit
+        return replace(
+            self,
+            codes=codes,
+            codes_per_unit=codes_per_unit,
+            white=codes.code / codes.reflectance / codes_per_unit,
+        )
 
     def energies(self, intensity: AnyArray | None, range_m: AnyFloats) -> Floats:
         """Convert recorded intensities to received energies.
@@ -234,8 +249,7 @@ class IntensityScale:
         positive = np.where(energy > 0, energy, 0.0)
         values = self._values(positive / self._factors(range_m))
         steps, max_value = self.quantization
-        if self.zero_value:
-            values[values <= self.zero_value * (1 + 1e-9)] = 0
+        values[values <= self.zero_value * (1 + 1e-9)] = 0
         if steps:
             values = np.rint(values * steps) / steps
         values = np.minimum(values, max_value)
@@ -390,15 +404,6 @@ def _missing_text(recording: Recording, column: str, values: AnyArray | None) ->
     )
 
 
-class _Convention(NamedTuple):
-    """A common intensity scale, and how it is described to the user."""
-
-    white: float
-    text: str
-    codes: ByteScale | None = None
-    codes_per_unit: float = 1.0
-
-
 @dataclass(frozen=True, eq=False)
 class _Fit:
     """Returns with valid intensities, from which a scale is determined."""
@@ -413,15 +418,13 @@ class _Fit:
         recorded = self.returns.columns[self.column]
         quantization = Quantization.from_values(recorded)
         values = recorded.astype(np.float64)
-        smallest = float(values[values > 0].min())
-        steps = quantization.steps_per_unit
         common = IntensityScale(
             column=self.column,
             dtype=recorded.dtype,
             quantization=quantization,
             white=1.0,
             compensated=True,
-            zero_value=_ZERO_STEPS / steps if steps else smallest / 2,
+            smallest=smallest_positive(values),
         )
         scale = self._known(common, values)
         if scale is None:
@@ -442,15 +445,14 @@ class _Fit:
         maker = "velodyne" if self.model is None else self.model.optics.reflectivity
         codes = SCALES[maker]
         if recording.white is not None:
-            if quantization.is_byte and codes.code / codes.reflectance == recording.white:
-                return _with_codes(common, codes, 1.0)
+            scale = common.with_codes(codes)
+            if quantization.is_byte and scale.white == recording.white:
+                return scale
             return replace(common, white=recording.white)
         if self.model is None or self._law(values, quantization) is False:
             return None
-        if quantization.is_byte:
-            return _with_codes(common, codes, quantization.steps_per_unit)
-        if quantization.is_unit_byte:
-            return _with_codes(common, codes, 255.0)
+        if quantization.is_byte or quantization.is_unit_byte:
+            return common.with_codes(codes)
         return None
 
     def _law(self, values: Floats, quantization: Quantization) -> bool | None:
@@ -462,25 +464,18 @@ class _Fit:
         compensated = True if law is None else law
         scale = replace(common, compensated=compensated, is_known=False)
         range_m = self.returns.range_m
-        lowest, highest = _PLAUSIBLE
-        for convention in self._conventions(scale.quantization, compensated):
-            assumed = replace(
-                scale,
-                white=convention.white,
-                codes=convention.codes,
-                codes_per_unit=convention.codes_per_unit,
-            )
+        for assumed, text in self._conventions(scale):
             levels = _levels(assumed, values, range_m)
-            if lowest <= typical_level(levels, range_m) <= highest:
-                return self._with_near(assumed, values, convention.text)
+            if assumed.codes is not None:
+                is_plausible = typical_level(levels, range_m) <= _MAX_MEDIAN
+            else:
+                is_plausible = _BRIGHTEST[0] <= white_level(levels, range_m) <= _BRIGHTEST[1]
+            if is_plausible:
+                return self._with_near(assumed, values, text)
         levels = _levels(scale, values, range_m)
         white = white_level(levels, range_m)
-        at_reference = "" if compensated else " at 10 m"
-        text = (
-            f"A white surface{at_reference} was assumed to have the intensity "
-            f"{format_rounded(white)}, the 99th percentile."
-        )
-        return self._with_near(replace(scale, white=white), values, text)
+        fitted = replace(scale, white=white)
+        return self._with_near(fitted, values, f"{_white_text(fitted)}, the 99th percentile.")
 
     def _with_near(self, scale: IntensityScale, values: Floats, text: str) -> IntensityScale:
         """Add factors at close range and a note to an assumed scale."""
@@ -503,23 +498,22 @@ class _Fit:
             )
         return replace(scale, near=near, note=" ".join(sentences))
 
-    def _conventions(self, quantization: Quantization, compensated: bool) -> list[_Convention]:
-        """Return common scales that are consistent with the recorded values."""
-        if not compensated:
-            return _energy_conventions(quantization)
+    def _conventions(self, scale: IntensityScale) -> list[tuple[IntensityScale, str]]:
+        """Return common scales that are consistent with the values, and their descriptions."""
+        quantization = scale.quantization
         if quantization.is_byte or quantization.is_unit_byte:
-            is_byte = quantization.is_byte
-            codes_per_unit = quantization.steps_per_unit if is_byte else 255.0
-            name, codes = self._maker()
-            white = codes.code / codes.reflectance / codes_per_unit
-            text = (
-                f"A white surface was assumed to have the intensity {format_rounded(white)}, as "
-                f"on the scale of {name}."
-            )
-            return [_Convention(white, text, codes, codes_per_unit)]
-        if quantization.steps_per_unit == 0:
-            return [_Convention(1.0, "Its intensities were assumed to be reflectances.")]
-        return []
+            if scale.compensated:
+                name, codes = self._maker()
+                assumed = scale.with_codes(codes)
+                text = f"{_white_text(assumed)}, as on the scale of {name}."
+                return [(assumed, text)]
+            whites = [quantization.max_value]
+        elif quantization.steps_per_unit:
+            whites = []  # counts, whose unit depends on the sensor
+        else:
+            whites = [1.0] if scale.compensated else [1.0, 255.0]
+        candidates = [replace(scale, white=white) for white in whites]
+        return [(assumed, f"{_white_text(assumed)}, as in simulations.") for assumed in candidates]
 
     def _maker(self) -> tuple[str, ByteScale]:
         """Return the manufacturer that the columns indicate, and its scale."""
@@ -531,91 +525,17 @@ class _Fit:
         return "Velodyne, Ouster and RoboSense", SCALES["velodyne"]
 
 
-def _energy_conventions(quantization: Quantization) -> list[_Convention]:
-    """Return common scales of energies that are consistent with the recorded values."""
-    if quantization.steps_per_unit and not quantization.is_byte:
-        text = f"A white surface at 10 m was assumed to have the intensity {COUNTS:,}."
-        return [_Convention(float(COUNTS), text)]
-    whites = [255.0] if quantization.max_value == 255 else [1.0, 255.0]
-    text = "A white surface at 10 m was assumed to have the intensity {:g}, as in simulations."
-    return [_Convention(white, text.format(white)) for white in whites]
+def _white_text(scale: IntensityScale) -> str:
+    """Describe the intensity of a white surface, in a sentence without a period."""
+    distance = "" if scale.compensated else " at 10 m"
+    return f"A white surface{distance} was assumed to have the intensity {_rounded(scale.white)}"
 
 
-def _with_codes(scale: IntensityScale, codes: ByteScale, codes_per_unit: float) -> IntensityScale:
-    white = codes.code / codes.reflectance / codes_per_unit
-    return replace(scale, codes=codes, codes_per_unit=codes_per_unit, white=white)
+def _rounded(value: float) -> str:
+    return format_rounded(value) if value < 1000 else f"{value:,.0f}"
 
 
 def _levels(scale: IntensityScale, values: Floats, range_m: Floats) -> Floats:
     """Return the reflectances of surfaces multiplied by the cosine of the angle of incidence."""
     reflectances = scale._reflectances(values)
     return reflectances if scale.compensated else reflectances / range_factors(range_m)
-
-
-@dataclass(frozen=True)
-class DetectionThreshold:
-    """Energy at which half of the returns are detected.
-
-    Attributes
-    ----------
-    energy
-        Threshold on the scale of the simulator. It is 0 if all returns are detected.
-    range_m
-        Range in meters at which half of the pulses are detected on a perpendicular surface with
-        10 % reflectance.
-    is_known
-        Whether the threshold is from the data sheet of the sensor.
-    note
-        Sentence for the user.
-    """
-
-    energy: float
-    range_m: float
-    is_known: bool
-    note: str
-
-
-def detection_threshold(
-    scale: IntensityScale,
-    intensity: AnyArray | None,
-    range_m: Floats,
-    model: Sensor | None = None,
-) -> DetectionThreshold:
-    """Determine the detection threshold of the sensor of a recording.
-
-    The threshold is that of the sensor model, if the model was loaded with
-    ``performance="datasheet"``. Otherwise it is estimated from the weakest returns.
-
-    Parameters
-    ----------
-    scale
-        Intensity scale of the recording.
-    intensity
-        Recorded intensities of some sweeps, or None if there are none. Shape (n,).
-    range_m
-        Ranges in meters. Shape (n,).
-    model
-        Sensor model of the recording, or None if it is unknown.
-
-    Notes
-    -----
-    The estimate is too high if no surface in the recording is so dark or so distant that its
-    returns are lost.
-    """
-    if model is not None and model.noise is not None and model.noise.threshold > 0:
-        energy = model.noise.threshold
-        source = "from the data sheet"
-    elif len(range_m):
-        energies = scale.energies(intensity, range_m)
-        energy = weakest_energy(energies, range_m, scale.step_energies(range_m))
-        source = "estimated from the weakest returns"
-    else:
-        return DetectionThreshold(0.0, np.inf, False, "There are no returns, so none are lost.")
-    distance = range_of_energy(energy, TARGET_REFLECTANCE)
-    return DetectionThreshold(
-        energy,
-        distance,
-        source == "from the data sheet",
-        f"Half of the returns from a surface with 10 % reflectance are detected at "
-        f"{format_rounded(distance)} m ({source}).",
-    )

@@ -1,0 +1,465 @@
+"""Intensities of all kinds of sensors, converted to energies and back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.street_recordings import COUNT, record, reflectances, street
+
+from lidarpool import load_sensor
+from lidarpool.augmentation.intensity_fit import NearFactors, Quantization
+from lidarpool.augmentation.intensity_scale import IntensityScale
+from lidarpool.clouds.recording import Recording
+from lidarsim.columns.sweep import Sweep
+from lidarsim.errors import LidarError
+from lidarsim.media.materials import normal_incidence_energy
+from lidarsim.sensor.reflectivity import SCALES
+
+VELODYNE = SCALES["velodyne"]
+# 99th percentile of the reflectance multiplied by the cosine of the angle of incidence
+BRIGHTEST = 0.638
+
+
+def codes_of(maker="velodyne", dtype=np.uint8, unit=1):
+    """Return a function that computes an intensity column of 8-bit codes."""
+
+    def columns(energy, range_m):
+        codes = SCALES[maker].encode(reflectances(energy, range_m))
+        return {"intensity": (codes / dtype(unit)).astype(dtype)}
+
+    return columns
+
+
+def energies_times(factor, dtype=np.float32, max_value=np.inf):
+    """Return a function that computes an intensity column proportional to the energy."""
+
+    def columns(energy, range_m):
+        values = np.minimum(energy * factor, max_value)
+        if np.dtype(dtype).kind == "u":
+            values = np.rint(values)
+        return {"intensity": values.astype(dtype)}
+
+    return columns
+
+
+def errors_of(recording, scale, **options):
+    """Return the ratios of converted to true energies in the first sweep."""
+    points, energy = street(0, **options)
+    columns = recording[0].columns
+    return scale.energies(columns[scale.column], np.linalg.norm(points, axis=1)) / energy
+
+
+def byte_scale(**fields):
+    """Return the known scale of a sensor by Velodyne."""
+    common = {
+        "column": "intensity",
+        "dtype": np.dtype(np.uint8),
+        "quantization": Quantization(1, 255),
+        "white": 1.0,
+        "compensated": True,
+    }
+    return IntensityScale(**common | fields).with_codes(VELODYNE)
+
+
+# -- known scales ----------------------------------------------------------------------------
+
+
+def test_a_white_surface_at_20_m_has_a_quarter_of_the_energy():
+    scale = byte_scale()
+    codes = np.array([100, 50, 100], np.uint8)
+    range_m = np.array([20.0, 10.0, 5.0])
+    np.testing.assert_allclose(scale.energies(codes, range_m), [0.25, 0.5, 4.0])
+    np.testing.assert_array_equal(scale.intensities(np.array([0.25, 0.5, 4.0]), range_m), codes)
+
+
+def test_codes_above_white_are_logarithmic():
+    scale = byte_scale()
+    range_m = np.full(2, 10.0)
+    energy = scale.energies(np.array([200, 255], np.uint8), range_m)
+    np.testing.assert_allclose(energy, VELODYNE.decode(np.array([200, 255], np.uint8)))
+    assert energy[1] == pytest.approx(VELODYNE.max_reflectance)
+    # Halving the energy of a retroreflector changes its code by a few steps only.
+    codes = np.array([200, 80], np.uint8)
+    halved = scale.scale_intensities(
+        codes, scale.energies(codes, range_m), scale.energies(codes, range_m) / 2, range_m, range_m
+    )
+    step = np.log(VELODYNE.max_reflectance) / 155
+    np.testing.assert_array_equal(halved, [round(200 - np.log(2) / step), 40])
+
+
+@pytest.mark.parametrize("maker", SCALES)
+@pytest.mark.parametrize(("dtype", "unit"), [(np.uint8, 1), (np.float32, 1), (np.float32, 255)])
+def test_all_codes_survive_a_round_trip(maker, dtype, unit):
+    codes = (np.arange(256) / dtype(unit)).astype(dtype)
+    scale = byte_scale(dtype=np.dtype(dtype), quantization=Quantization(unit, 255 / unit))
+    scale = scale.with_codes(SCALES[maker])
+    for distance in (0.5, 10.0, 77.7):
+        range_m = np.full(256, distance)
+        again = scale.intensities(scale.energies(codes, range_m), range_m)
+        assert again.dtype == dtype
+        np.testing.assert_array_equal(again, codes)
+
+
+def test_results_contain_energies():
+    recording = record(energies_times(1.0), energies=True)
+    scale = IntensityScale.for_recording(recording)
+    assert scale.is_known
+    assert not scale.note
+    assert not scale.compensated
+    np.testing.assert_allclose(errors_of(recording, scale), 1, rtol=1e-6)
+
+
+def test_a_reflectivity_reveals_simulated_energies():
+    def columns(energy, range_m):
+        codes = VELODYNE.encode(reflectances(energy, range_m))
+        return {"intensity": energy.astype(np.float32), "reflectivity": codes}
+
+    recording = record(columns)
+    scale = IntensityScale.for_recording(recording)
+    assert (scale.column, scale.is_known, scale.note) == ("intensity", True, "")
+    np.testing.assert_allclose(errors_of(recording, scale), 1, rtol=1e-6)
+
+
+def test_packet_captures_state_the_intensity_of_white():
+    scale = IntensityScale.for_recording(record(codes_of(), white=100.0))
+    assert (scale.is_known, scale.codes, scale.note) == (True, VELODYNE, "")
+    halves = record(codes_of(dtype=np.float32, unit=2), white=50.0)
+    scale = IntensityScale.for_recording(halves)
+    assert (scale.is_known, scale.white) == (True, 50.0)
+
+
+@pytest.mark.parametrize("model", ["velodyne/vlp16", "hesai/pandar64", "livox/mid360"])
+@pytest.mark.parametrize(("dtype", "unit"), [(np.uint8, 1), (np.float32, 1), (np.float32, 255)])
+def test_the_model_determines_the_scale_of_codes(model, dtype, unit):
+    sensor = load_sensor(model)
+    maker = sensor.optics.reflectivity
+    recording = record(codes_of(maker, dtype, unit))
+    scale = IntensityScale.for_recording(recording, sensor)
+    assert (scale.is_known, scale.codes, scale.note) == (True, SCALES[maker], "")
+    errors = errors_of(recording, scale)
+    assert np.median(errors) == pytest.approx(1, abs=0.01)
+    assert np.quantile(np.abs(errors - 1), 0.9) < 0.5  # weakest codes are rounded
+
+
+def test_codes_are_recognized_in_16_bit_integers():
+    def columns(energy, range_m):
+        codes = VELODYNE.encode(reflectances(energy, range_m)).astype(np.uint16)
+        return {"intensity": codes * np.uint16(257)}
+
+    recording = record(columns)
+    scale = IntensityScale.for_recording(recording, load_sensor("velodyne/vlp16"))
+    assert scale.is_known
+    assert np.median(errors_of(recording, scale)) == pytest.approx(1, abs=0.01)
+    codes = recording[0].columns["intensity"]
+    range_m = np.linalg.norm(recording[0].points, axis=1)
+    again = scale.intensities(scale.energies(codes, range_m), range_m)
+    np.testing.assert_array_equal(again, codes)
+    assert again.dtype == np.uint16
+
+
+def test_the_reflectivity_of_a_known_sensor_is_preferred():
+    def columns(energy, range_m):
+        codes = SCALES["ouster"].encode(reflectances(energy, range_m)).astype(np.uint16)
+        counts = np.rint(3000 * energy).astype(np.float32)
+        return {"intensity": counts, "reflectivity": codes, "ambient": codes}
+
+    recording = record(columns)
+    scale = IntensityScale.for_recording(recording, load_sensor("ouster/os1-64"))
+    assert (scale.column, scale.is_known, scale.note) == ("reflectivity", True, "")
+    scale = IntensityScale.for_recording(recording)
+    assert (scale.column, scale.is_known) == ("reflectivity", False)
+    assert "on the scale of Ouster" in scale.note
+    chosen = replace(recording, intensity_column="intensity")
+    assert IntensityScale.for_recording(chosen).column == "intensity"
+
+
+# -- assumed and fitted scales ---------------------------------------------------------------
+
+
+def test_codes_of_an_unknown_sensor_are_assumed_to_be_calibrated():
+    recording = record(codes_of(dtype=np.float32))
+    scale = IntensityScale.for_recording(recording)
+    assert not scale.is_known
+    assert scale.note == (
+        "The intensity scale of drive.mcap is unknown. A white surface was assumed to have the "
+        "intensity 100, as on the scale of Velodyne, Ouster and RoboSense. Pass `--model` to use "
+        "the scale of a sensor."
+    )
+    assert np.median(errors_of(recording, scale)) == pytest.approx(1, abs=0.01)
+
+
+def test_codes_recorded_in_fog_are_assumed_to_be_calibrated():
+    def columns(energy, range_m):
+        attenuated = reflectances(energy, range_m) * np.exp(-0.05 * range_m)
+        return {"intensity": VELODYNE.encode(attenuated)}
+
+    scale = IntensityScale.for_recording(record(columns))
+    assert (scale.white, scale.codes) == (100, VELODYNE)
+
+
+def test_livox_columns_are_recognized():
+    def columns(energy, range_m):
+        codes = SCALES["livox"].encode(reflectances(energy, range_m))
+        return {"reflectivity": codes, "tag": np.zeros(len(codes), np.uint8)}
+
+    recording = record(columns)
+    scale = IntensityScale.for_recording(recording)
+    assert "on the scale of Livox" in scale.note
+    assert np.median(errors_of(recording, scale)) == pytest.approx(1, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("columns", "white"),
+    [
+        (energies_times(1.0), 1),  # messages with the layout of velodyne_pointcloud
+        (energies_times(255.0, max_value=255.0), 255),  # nuScenes
+        (energies_times(255.0, np.uint8, 255), 255),  # messages of Autoware
+    ],
+)
+def test_energies_are_recognized(columns, white):
+    recording = record(columns)
+    scale = IntensityScale.for_recording(recording)
+    assert (scale.white, scale.compensated, scale.is_known) == (white, False, False)
+    assert "as in simulations" in scale.note
+    _, energy = street(0)
+    clear = (energy > 0.05) & (energy < 0.99)
+    np.testing.assert_allclose(errors_of(recording, scale)[clear], 1, rtol=0.05)
+
+
+@pytest.mark.parametrize("compensated", [True, False])
+def test_the_white_of_an_unknown_scale_is_a_high_percentile(compensated):
+    def columns(energy, range_m):
+        level = reflectances(energy, range_m) if compensated else energy
+        return {"intensity": np.rint(200_000 * level).clip(0, 4e9).astype(np.uint32)}
+
+    recording = record(columns)
+    scale = IntensityScale.for_recording(recording, load_sensor("velodyne/vlp16"))
+    assert scale.compensated == compensated
+    assert scale.white == pytest.approx(200_000 * BRIGHTEST, rel=0.02)
+    distance = "" if compensated else " at 10 m"
+    assert f"A white surface{distance} was assumed to have the intensity 1" in scale.note
+    assert "99th percentile" in scale.note
+    assert "The scale of Velodyne VLP-16 was not used" in scale.note
+    errors = errors_of(recording, scale)
+    assert np.median(errors) == pytest.approx(1 / BRIGHTEST, rel=0.02)
+    assert np.quantile(errors, 0.9) < 1.1 * np.quantile(errors, 0.1)
+
+
+def test_retroreflectors_do_not_determine_white():
+    def columns(energy, range_m):
+        values = 5000 * reflectances(energy, range_m)
+        values[::40] = 60_000
+        return {"intensity": np.rint(values).astype(np.uint16)}
+
+    scale = IntensityScale.for_recording(record(columns))
+    assert scale.white == pytest.approx(5000 * BRIGHTEST, rel=0.02)
+
+
+def test_scales_on_which_surfaces_would_be_too_bright_are_fitted():
+    # As in KITTI, values have steps of 0.01, and typical surfaces would be almost white.
+    def columns(energy, range_m):
+        values = np.floor(100 * np.minimum(reflectances(energy, range_m), 0.99)) / 100
+        return {"intensity": values.astype(np.float32)}
+
+    scale = IntensityScale.for_recording(record(columns))
+    assert scale.quantization == Quantization(100, 0.99)
+    assert scale.white == pytest.approx(BRIGHTEST, abs=0.01)
+    implausible = record(codes_of(), brightness=20.0)
+    assert "99th percentile" in IntensityScale.for_recording(implausible).note
+
+
+def test_a_clear_drop_at_close_range_is_fitted_in_both_directions():
+    def drop(range_m):
+        return np.minimum(1, (range_m / 10) ** 2)
+
+    def columns(energy, range_m):
+        return {"intensity": (energy * drop(range_m)).astype(np.float32)}
+
+    recording = record(columns)
+    scale = IntensityScale.for_recording(recording)
+    assert "below 10 m" in scale.note
+    points, _ = street(0)
+    range_m = np.linalg.norm(points, axis=1)
+    errors = errors_of(recording, scale)
+    close = range_m < 4
+    assert np.median(errors[close]) > 2 * np.median(drop(range_m[close]))
+    assert np.median(errors[close]) < 1.2
+    values = recording[0].columns["intensity"]
+    again = scale.intensities(scale.energies(values, range_m), range_m)
+    np.testing.assert_array_equal(again, values)
+    without_drop = IntensityScale.for_recording(record(energies_times(1.0)))
+    assert without_drop.near == NearFactors()
+
+
+# -- recorded values -------------------------------------------------------------------------
+
+
+def test_unchanged_returns_keep_their_exact_value():
+    values = np.array([0.123456789, 0.3, 0.25])  # not on the scale
+    scale = byte_scale(dtype=np.dtype(np.float64), quantization=Quantization(255, 1.0))
+    energy = np.array([1.0, 2.0, 3.0])
+    range_m = np.full(3, 8.0)
+    same = scale.scale_intensities(values, energy, energy, range_m, range_m)
+    np.testing.assert_array_equal(same, values)
+    weaker = scale.scale_intensities(values, energy, [1.0, 1.0, 3.0], range_m, range_m)
+    np.testing.assert_array_equal(weaker[[0, 2]], values[[0, 2]])
+    assert weaker[1] == 38 / 255
+
+
+def test_compensated_values_depend_on_the_new_range():
+    scale = byte_scale()
+    near = np.array([10.0])
+    far = np.array([20.0])
+    moved = scale.scale_intensities(np.array([20], np.uint8), [0.2], [0.2], near, far)
+    assert moved.tolist() == [80]
+
+
+def test_values_are_quantized_and_clipped():
+    scale = byte_scale(dtype=np.dtype(np.float32), quantization=Quantization(1, 255))
+    range_m = np.full(5, 10.0)
+    values = scale.intensities(np.array([-1, 0, 0.104, 1e9, np.nan]), range_m)
+    np.testing.assert_array_equal(values, [0, 0, 10, 255, 0])
+    assert values.dtype == np.float32
+    continuous = IntensityScale(
+        "intensity", np.dtype(np.float64), Quantization(0, np.inf), 7.0, compensated=False
+    )
+    assert continuous.intensities(np.array([0.1]), np.array([30.0])) == pytest.approx(0.7)
+
+
+def test_a_recorded_zero_is_a_weak_return():
+    scale = byte_scale()
+    range_m = np.array([10.0, 10.0])
+    codes = np.array([0, 1], np.uint8)
+    zero, one = scale.energies(codes, range_m)
+    assert 0 < zero < one
+    np.testing.assert_array_equal(scale.intensities(np.array([zero, one]), range_m), codes)
+
+    def columns(energy, range_m):
+        values = energy.astype(np.float32)
+        values[::50] = 0
+        return {"intensity": values}
+
+    fitted = IntensityScale.for_recording(record(columns))
+    values = np.zeros(1, np.float32)
+    energy = fitted.energies(values, np.array([30.0]))
+    assert energy > 0
+    assert fitted.intensities(energy, np.array([30.0])) == 0
+
+
+@pytest.mark.parametrize("invalid", [np.nan, -1.0, np.inf, -np.inf])
+def test_invalid_intensities_have_a_typical_energy_and_are_not_changed(invalid):
+    def columns(energy, range_m):
+        values = VELODYNE.encode(reflectances(energy, range_m)).astype(np.float32)
+        values[::2] = invalid
+        return {"intensity": values}
+
+    recording = record(columns)
+    scale = IntensityScale.for_recording(recording, load_sensor("velodyne/vlp16"))
+    assert scale.is_known
+    range_m = np.array([20.0, 20.0])
+    values = np.array([invalid, 40], np.float32)
+    energy = scale.energies(values, range_m)
+    np.testing.assert_allclose(energy, [scale.typical / 4, 0.1])
+    weaker = scale.scale_intensities(values, energy, energy / 2, range_m, range_m)
+    np.testing.assert_array_equal(weaker, np.array([invalid, 20], np.float32))
+
+
+def test_saturated_energies_are_at_least_typical():
+    recording = record(energies_times(255.0, np.uint8, 255))
+    scale = IntensityScale.for_recording(recording)
+    range_m = np.array([2.0, 9.0])
+    energy = scale.energies(np.array([255, 255], np.uint8), range_m)
+    np.testing.assert_allclose(energy, [scale.typical * 25, 1])
+    np.testing.assert_array_equal(scale.intensities(energy, range_m), [255, 255])
+
+
+@given(
+    st.floats(2**-20, 2**20, width=32),
+    st.floats(0.1, 300),
+    st.sampled_from([np.float32, np.float64]),
+    st.booleans(),
+)
+def test_continuous_values_survive_a_round_trip(value, distance, dtype, compensated):
+    near = NearFactors((2.0, 10.0), (0.1, 1.0))
+    scale = IntensityScale(
+        "intensity", np.dtype(dtype), Quantization(0, np.inf), 61.0, compensated, near=near
+    )
+    values = np.array([value], dtype)
+    range_m = np.array([distance])
+    again = scale.intensities(scale.energies(values, range_m), range_m)
+    # float64 values may differ in the last bits.
+    np.testing.assert_allclose(again, values, rtol=0 if dtype is np.float32 else 1e-14)
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        (np.arange(200, dtype=np.uint8), (1, 255)),
+        (np.arange(0, 3000, 7, dtype=np.uint16), (1, 65_535)),
+        (np.arange(200, dtype=np.float32), (1, 255)),
+        (np.arange(200, dtype=np.uint16) * np.uint16(256), (1 / 256, 65_280)),
+        (np.arange(200, dtype=np.float32) / np.float32(255), (255, 1)),
+        (np.arange(200, dtype=np.float32) / np.float32(256), (256, 255 / 256)),
+        (np.arange(100, dtype=np.float32) / np.float32(100), (100, 0.99)),
+        (np.round(np.linspace(0, 3, 999), 3), (1000, np.inf)),
+        (np.linspace(0, 1, 999) ** 2.1, (0, np.inf)),
+        (np.minimum(np.linspace(0, 1.2, 999) ** 2.1, 1), (0, 1)),
+    ],
+)
+def test_quantization(values, expected):
+    assert Quantization.from_values(values) == pytest.approx(expected)
+
+
+# -- without intensities ---------------------------------------------------------------------
+
+ADVICE = (
+    "so the energies of its returns are unknown. Pass `--intensity COLUMN` to use another column, "
+    "or `--reflectance 0.3` to assume the same reflectance for all returns."
+)
+
+
+@pytest.mark.parametrize(
+    ("values", "problem"),
+    [
+        (None, "drive.mcap has no intensity column, "),
+        (0.0, "All intensities of drive.mcap are 0, "),
+        (255.0, "All intensities of drive.mcap are 255, "),
+        (np.nan, "The column 'intensity' of drive.mcap has no valid intensities, "),
+    ],
+)
+def test_recordings_without_intensities_are_rejected(values, problem):
+    columns = {} if values is None else {"intensity": np.full(COUNT, values)}
+    recording = record(lambda energy, _: columns)
+    with pytest.raises(LidarError) as error:
+        IntensityScale.for_recording(recording)
+    assert str(error.value) == problem + ADVICE
+
+
+def test_recordings_without_returns_or_sweeps_are_rejected():
+    empty = Recording("empty.mcap", 2, lambda _: Sweep(np.zeros((5, 3))))
+    with pytest.raises(LidarError, match=r"empty\.mcap has no returns in the sweeps"):
+        IntensityScale.for_recording(empty)
+    cloud = record(codes_of(), is_cloud=True, name="cloud.las")
+    with pytest.raises(LidarError, match=r"cloud\.las is a cloud without sweeps"):
+        IntensityScale.for_recording(cloud)
+
+
+def test_a_reflectance_can_be_assumed():
+    recording = record(lambda energy, range_m: {})
+    scale = IntensityScale.for_recording(recording, assumed_reflectance=0.3)
+    assert (scale.column, scale.is_known) == ("", False)
+    assert scale.note == "All returns are assumed to have a reflectance of 0.3."
+    range_m = np.array([5.0, 20.0])
+    expected = 0.3 * normal_incidence_energy(range_m)
+    np.testing.assert_allclose(scale.energies(None, range_m), expected)
+    np.testing.assert_allclose(scale.energies(np.array([1, 200]), range_m), expected)
+
+
+@pytest.mark.parametrize("reflectance", [0, -0.1, 1.5, np.nan])
+def test_assumed_reflectances_have_limits(reflectance):
+    with pytest.raises(LidarError, match="assumed_reflectance"):
+        IntensityScale.with_reflectance(reflectance)
