@@ -120,7 +120,7 @@ class Drive:
         noise = replace(self.sensor.noise or Noise(), **condition.noise, seed=seed)
         duration_s = self.sweeps * SWEEP_S
         start = np.array([-10.0, 0, HEIGHT_M])
-        end = start + [SPEED_M_S * duration_s, 0, 0]
+        end = [start[0] + SPEED_M_S * duration_s, 0, HEIGHT_M]
         return Survey(
             self.sensor,
             trajectory=Track([0, duration_s], [start, end]),

@@ -243,16 +243,19 @@ class Augmenter:
         energy = returns.energy[points.order]
         source = points.source
         old_energy = recorded.energy[source]
+        full = self._simulation.saturation
         changed = points.is_moved | (np.abs(energy - old_energy) > _ROUNDING * energy)
+        changed |= energy > full
         added = np.flatnonzero(~points.is_recorded)
         kept = np.flatnonzero(points.is_recorded & changed)
-        new_values = self.strengths.intensities(energy[added], points.range_m[added])
+        new_values = self.strengths.intensities(energy[added], points.range_m[added], full)
         scaled = self.strengths.scale_intensities(
             {name: values[kept] for name, values in columns.items()},
             old_energy[kept],
             energy[kept],
             grid.range_m[source[kept]],
             points.range_m[kept],
+            full,
         )
         for name, values in scaled.items():
             columns[name][kept] = values
@@ -290,13 +293,12 @@ class Augmenter:
         columns = {name: np.asarray(v)[points.template] for name, v in sweep.columns.items()}
         self._set_strengths(columns, points, grid, recorded, returns)
         added = np.flatnonzero(~points.is_recorded)
-        ranges = np.linalg.norm(np.asarray(sweep.points, np.float64), axis=1)
         for name in columns.keys() & {*_RANGES}:
-            stored = np.asarray(sweep.columns[name], np.float64)
-            valid = np.isfinite(ranges) & (ranges > 0) & (stored > 0)
+            stored = np.asarray(sweep.columns[name], np.float64)[grid.row]
+            valid = np.isfinite(stored) & (stored > 0)
             if not valid.any():
                 continue
-            unit = float(np.median(stored[valid] / ranges[valid]))
+            unit = float(np.median(stored[valid] / grid.range_m[valid]))
             changed = np.flatnonzero(points.is_moved)
             values = unit * points.range_m[changed]
             columns[name][changed] = _as_type(values, columns[name].dtype)
