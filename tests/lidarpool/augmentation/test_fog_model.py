@@ -10,6 +10,7 @@ the wavelength. Both models are therefore compared at the same extinction.
 """
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -78,7 +79,7 @@ def recording(sensor):
     corners = [(40, -15), (40, 15), (-8, 15), (-8, -15), (40, -15)]
     walls = [
         SceneMesh(f"wall {k}", np.array([[*a, -50], [*b, -50], [*b, 50], [*a, 50]], float), faces)
-        for k, (a, b) in enumerate(zip(corners[:-1], corners[1:], strict=True))
+        for k, (a, b) in enumerate(pairwise(corners))
     ]
     scanner = Scanner(
         Scene.from_meshes(walls),
