@@ -19,11 +19,12 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidarpool import Sensor, save_cloud
+from lidarpool import Noise, Sensor, Sweep, save_cloud
+from lidarpool.augmentation.augmented_sweep import AugmentedSweep
 from lidarpool.augmentation.augmenter import Augmenter
 from lidarpool.augmentation.effects import Effects, Insertion
 from lidarpool.recordings.opening import open_recording
@@ -37,10 +38,10 @@ from .augmentation_drives import (
     CONDITIONS,
     Drive,
     detecting_sensor,
-    ranges,
     street,
 )
 from .augmentation_equivalence import (
+    PULSE_KEY_NS,
     Comparison,
     augmented,
     compare,
@@ -65,6 +66,7 @@ FORMATS: dict[str, dict[str, Any]] = {
 }
 FORMAT_CONDITIONS = ("rain, 25 mm/h", "fog, visibility 100 m", "snow, 2 mm/h", "saturation")
 SUBRAY_CONDITIONS = ("rain, 25 mm/h", "fog, visibility 100 m", "snow, 2 mm/h", "dirt")
+SAME_M = 0.05  # maximum distance of points that are the same
 KITTI_SWEEPS = 7_481
 SPEED_EFFECTS = {
     "no effects": Effects(),
@@ -164,54 +166,68 @@ def _compared_formats(quick: bool) -> dict[str, Any]:
     return results
 
 
+class CarPoints(NamedTuple):
+    """Numbers of points on cars, which were simulated or inserted.
+
+    Points are the same if they are less than `SAME_M` apart.
+    """
+
+    simulated: int
+    same: int
+    without_pulse: int  # missing points whose pulse has no return in the recording without cars
+    missing: int  # other missing points
+    added: int  # inserted points without a simulated point
+    outline: int  # recorded points of pulses at an outline that return from the car if simulated
+    behind: int  # other recorded points of pulses that return from a car if simulated
+
+
 def insertion(quick: bool) -> dict[str, Any]:
     """Insert cars that were removed from a drive, and compare it with the drive with the cars."""
     results: dict[str, Any] = {}
-    print_row("sub-rays", "points of cars", "recovered", "added", "median distance, mm", "behind")
-    print_row(*["---"] * 6)
+    print_row("sub-rays", *CarPoints._fields)
+    print_row(*["---"] * (1 + len(CarPoints._fields)))
     for subrays in (1, 7):
         sensor = detecting_sensor("ouster/os1-64", None, subrays)
-        with_cars = Drive(_scene(quick), sensor, 2 if quick else 6)
+        noise = Noise(detection_range_m=sensor.noise.detection_range_m)
+        with_cars = Drive(_scene(quick), replace(sensor, noise=noise), 2 if quick else 6)
         scene = with_cars.scene
         without = replace(with_cars, scene=scene.with_actors(()))
         truth = with_cars.recording()
         recording = without.recording()
-        augmenter = Augmenter(recording, Effects(actors=scene.actors), sensor)
-        results[str(subrays)] = _inserted(truth, recording, augmenter, len(scene.names))
-        print_row(subrays, *results[str(subrays)].values())
+        augmenter = Augmenter(recording, Effects(actors=scene.actors), with_cars.sensor)
+        counts = [
+            _car_points(truth[n], recording[n], augmenter.sweep(n), len(scene.names))
+            for n in range(len(truth))
+        ]
+        total = CarPoints(*np.sum(counts, axis=0).tolist())
+        results[str(subrays)] = total._asdict()
+        print_row(subrays, *total)
     return results
 
 
-def _inserted(truth: Any, recording: Any, augmenter: Augmenter, first: int) -> dict[str, Any]:
-    """Count the points of cars that are the same in both drives, by pulse."""
-    expected = 0
-    recovered = 0
-    added = 0
-    behind = 0
-    distances = []
-    for number in range(len(truth)):
-        sweep = truth[number]
-        on_car = np.asarray(sweep.columns["object"]) >= first
-        result = augmenter.sweep(number)
-        new = result.sweep.points[~result.is_recorded]
-        apart, row = _nearest(sweep.points[on_car], new)
-        expected += int(on_car.sum())
-        recovered += int((apart < 0.1).sum())
-        added += len(new) - len(np.unique(row[apart < 0.1]))
-        distances.append(apart[apart < 0.1])
-        # A pulse that returns from a car must not also return from the recording behind it.
-        keys = pulse_keys(recording[number])[result.template[result.is_recorded]]
-        kept_m = ranges(result.sweep)[result.is_recorded]
-        car_keys = pulse_keys(sweep)[on_car]
-        same, kept, rows = np.intersect1d(keys, car_keys, return_indices=True)
-        behind += int((kept_m[kept] > ranges(sweep)[on_car][rows] + 0.5).sum())
-    return {
-        "points": expected,
-        "recovered": recovered,
-        "added": added,
-        "median_mm": round(1e3 * float(np.median(np.concatenate(distances))), 2),
-        "behind": behind,
-    }
+def _car_points(truth: Sweep, recorded: Sweep, result: AugmentedSweep, first_car: int) -> CarPoints:
+    """Compare the points on cars in a simulated and in an augmented sweep."""
+    on_car = truth.select(np.asarray(truth.columns["object"]) >= first_car)
+    inserted = result.sweep.points[~result.is_recorded]
+    apart_m, _ = _nearest(on_car.points, inserted)
+    extra_m, _ = _nearest(inserted, on_car.points)
+    is_missing = apart_m >= SAME_M
+    keys = pulse_keys(on_car)
+    has_pulse = np.isin(keys, pulse_keys(recorded))
+    # Pulses whose four neighbors also return from a car. Every other channel has the same azimuth.
+    step = PULSE_KEY_NS * int(np.diff(np.unique(truth.columns["time"])).min())
+    neighbors = (step, -step, 2, -2)
+    inside = keys[np.all([np.isin(keys + offset, keys) for offset in neighbors], axis=0)]
+    kept = pulse_keys(recorded)[result.template[result.is_recorded]]
+    return CarPoints(
+        len(keys),
+        int((~is_missing).sum()),
+        int((is_missing & ~has_pulse).sum()),
+        int((is_missing & has_pulse).sum()),
+        int((extra_m >= SAME_M).sum()),
+        int((np.isin(kept, keys) & ~np.isin(kept, inside)).sum()),
+        int(np.isin(kept, inside).sum()),
+    )
 
 
 def _nearest(points: Floats, others: Floats) -> tuple[Floats, Any]:

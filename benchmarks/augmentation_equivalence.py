@@ -25,6 +25,7 @@ from .harness import print_row
 
 CLUSTERS = 16  # clusters of pulses per sweep, which fail together if packets are dropped
 _RESOLUTION = 0.01  # relative resolution of the compared intensities
+PULSE_KEY_NS = 1000  # difference of the keys of pulses that are fired a nanosecond apart
 MIN_COUNT = 50  # smallest samples that are compared
 
 
@@ -86,7 +87,7 @@ class DriveReturns(NamedTuple):
 def pulse_keys(sweep: Sweep) -> Ints:
     """Return numbers that identify pulses by time and channel, for points as simulated."""
     time_ns = np.asarray(sweep.columns["time"], np.int64)
-    return time_ns * 1000 + np.asarray(sweep.columns["channel"], np.int64)
+    return time_ns * PULSE_KEY_NS + np.asarray(sweep.columns["channel"], np.int64)
 
 
 def returns_of(sweeps: Sequence[Sweep], strength: str, keys: Sequence[Ints]) -> DriveReturns:
