@@ -381,6 +381,22 @@ def test_all_sequences_of_a_data_set_are_augmented(kitti, tmp_path):
     assert [after[name] == files[name] for name in names[2:]] == [True, True]
 
 
+def test_messages_name_one_of_several_sensors(kitti, tmp_path):
+    for path in kitti.glob("sequences/01/velodyne/*.bin"):
+        path.write_bytes(b"")
+    several = Augmentation(RecordingFile(kitti), Variants(Effects.load(options=RAIN)))
+    with pytest.raises(LidarError) as refused:
+        several.run(tmp_path / "wet", workers=1)
+    assert "01" in str(refused.value)
+    assert not (tmp_path / "wet").exists()
+
+
+def test_insertions_into_several_sequences(kitti, tmp_path):
+    crate = Variants(Effects(insertions=(Insertion(box("crate", (1, 1, 1)), 6, -3),)))
+    augmented = Augmentation(RecordingFile(kitti), crate).run(tmp_path / "crate", workers=1)
+    assert augmented.counts.added["surface"] > 50
+
+
 def test_one_of_several_sensors_is_converted(kitti, tmp_path):
     augmentation = Augmentation(
         RecordingFile(kitti), Variants(Effects.load(options=RAIN)), output_format="pcd"

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 
 _WORKER_BYTES = 2 << 30  # memory per process for a sensor with 128 channels
 _WORKER_SWEEPS = 32  # starting a process takes about as long as augmenting this many sweeps
+_CHECKED_SENSORS = 4  # number of sensors that are checked before the first sweep is augmented
 _TASK_SWEEPS = 8  # maximum number of sweeps in a task
 _MIN_TASKS = 64  # so that all workers are busy until the end, if there are enough sweeps
 
@@ -182,10 +183,10 @@ class Augmentation:
             written, or if the unfinished run has other inputs.
         """
         out = Path(out)
-        files = self.file.each_sensor()
-        output = self._output()
-        targets = self._targets(out, output)
         try:
+            files = self.file.each_sensor()
+            output = self._output()
+            targets = self._targets(out, output)
             with ExitStack() as stack:
                 if targets[0] != out:
                     stack.enter_context(result_folder(out))
@@ -313,9 +314,10 @@ class _Run:
                 rewriter.check_target(target, overwrite=self.work.may_replace(variant))
         if len(parts) > 1:
             self._check_several(plan)
-        first = plan.part(0)
-        first.prepare(0)
-        self._add_notes(first.notes())
+        for index in range(min(len(parts), _CHECKED_SENSORS)):
+            part = plan.part(index)
+            part.prepare(0)
+            self._add_notes(part.notes())
 
     def _check_several(self, plan: PlanProcess) -> None:
         """Raise LidarError if several sensors of the recording cannot be augmented together."""

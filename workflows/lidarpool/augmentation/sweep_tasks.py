@@ -11,8 +11,9 @@ import pickle
 import socket
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ import numpy as np
 
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import CAUSES
-from lidarsim.errors import LidarError
+from lidarsim.errors import LidarError, prefix_errors
 from lidarsim.numerics.random_numbers import named_seed
 from lidarsim.sensor import Sensor
 
@@ -36,6 +37,12 @@ from .resampling import SensorResampler
 from .rewriting.opening import open_rewriter
 from .rewriting.rewriter import Rewriter
 from .work_folder import WorkFolder, counts_name, encoded_name
+
+
+@lru_cache(maxsize=4)
+def _opened(path: Path, sensor: str | None, intensity: str | None) -> Recording:
+    """Open a recording. It is cached, because the sweeps of some bags must be counted."""
+    return open_recording(path, sensor, intensity, keep_noise=True)
 
 
 @dataclass(frozen=True)
@@ -66,7 +73,7 @@ class RecordingFile:
 
     def open(self) -> Recording:
         """Open the recording with all points of its file."""
-        return open_recording(self.located, self.sensor, self.intensity, keep_noise=True)
+        return _opened(self.located, self.sensor, self.intensity)
 
     def each_sensor(self) -> tuple[RecordingFile, ...]:
         """Return this file once for each of its sensors, or only for the chosen sensor.
@@ -269,7 +276,8 @@ class PartProcess:
             if len(self.rewriter.sensors()) > 1:  # sensors have different random numbers
                 effects = replace(effects, seed=named_seed(effects.seed, self.rewriter.sensor))
             plan = self.plan
-            augmenter = Augmenter(self.source, effects, plan.model, plan.reflectance)
+            with nullcontext() if len(plan.files) == 1 else prefix_errors(self.file.sensor):
+                augmenter = Augmenter(self.source, effects, plan.model, plan.reflectance)
             self._augmenters[variant] = augmenter
         return self._augmenters[variant]
 
@@ -383,7 +391,8 @@ def open_plan(shared: SharedPlan) -> PlanProcess:
     """Return the state of a plan in this process, which keeps only the most recent plan."""
     states = _processes()
     if shared.key not in states:
-        states.clear()
+        if states:
+            close_plans()
         plan = pickle.loads(shared.content)  # noqa: S301 - from the driver of the command
         states[shared.key] = PlanProcess(plan)
     return states[shared.key]
@@ -392,6 +401,7 @@ def open_plan(shared: SharedPlan) -> PlanProcess:
 def close_plans() -> None:
     """Release the recordings and augmenters that this process keeps."""
     _processes().clear()
+    _opened.cache_clear()
 
 
 def unchanged_sweep(sweep: Sweep) -> AugmentedSweep:
