@@ -359,7 +359,10 @@ def kitti(points, tmp_path):
 
 def test_all_sequences_of_a_data_set_are_augmented(kitti, tmp_path):
     everything = Augmentation(RecordingFile(kitti), Variants(Effects.load(options=RAIN)))
-    assert everything.run(tmp_path / "all", workers=1).sweeps == 4
+    augmented = everything.run(tmp_path / "all", workers=1)
+    assert augmented.sweeps == 4
+    assert any(note.startswith("00: ") for note in augmented.notes)
+    assert any(note.startswith("01: ") for note in augmented.notes)
     files = content(tmp_path / "all")
     before = content(kitti)
     names = [

@@ -26,6 +26,7 @@ from ..identity.fingerprint import fingerprint
 from ..identity.software import software
 from ..run.cluster.worker_map import MapFunction, parallel_map
 from .sweep_tasks import (
+    CHECKED_SENSORS,
     MAX_VARIANTS,
     AugmentationPlan,
     EncodedFiles,
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
 
 _WORKER_BYTES = 2 << 30  # memory per process for a sensor with 128 channels
 _WORKER_SWEEPS = 32  # starting a process takes about as long as augmenting this many sweeps
-_CHECKED_SENSORS = 4  # number of sensors that are checked before the first sweep is augmented
 _TASK_SWEEPS = 8  # maximum number of sweeps in a task
 _MIN_TASKS = 64  # so that all workers are busy until the end, if there are enough sweeps
 
@@ -314,10 +314,17 @@ class _Run:
                 rewriter.check_target(target, overwrite=self.work.may_replace(variant))
         if len(parts) > 1:
             self._check_several(plan)
-        for index in range(min(len(parts), _CHECKED_SENSORS)):
+        for index in range(min(len(parts), CHECKED_SENSORS)):
             part = plan.part(index)
             part.prepare(0)
             self._add_notes(part.notes())
+        if len(parts) > CHECKED_SENSORS:
+            others = plural(
+                len(parts) - CHECKED_SENSORS,
+                "further sensor or sequence",
+                "further sensors or sequences",
+            )
+            self._add_notes([f"The notes of {others} are not shown."])
 
     def _check_several(self, plan: PlanProcess) -> None:
         """Raise LidarError if several sensors of the recording cannot be augmented together."""

@@ -197,7 +197,8 @@ def augment_sweeps(task: SweepTask) -> EncodedFiles:
             else:
                 unwritten |= named
             finished += 1
-        notes |= dict.fromkeys(part.notes())
+        if sweep.part < CHECKED_SENSORS:
+            notes |= dict.fromkeys(part.notes())
     return EncodedFiles(finished, tuple(notes), None if is_accessible else unwritten)
 
 
@@ -286,6 +287,8 @@ class PartProcess:
         notes = [note for augmenter in self._augmenters.values() for note in augmenter.notes]
         if self.resampler is not None:
             notes = [*self.resampler.notes, *notes]
+        if len(self.plan.files) > 1:
+            notes = [f"{self.file.sensor}: {note}" for note in notes]
         return tuple(dict.fromkeys(notes))
 
     def augmented(self, number: int, variant: int) -> AugmentedSweep:
@@ -359,6 +362,8 @@ class Resampler:
         return tuple(self._resampler.notes)
 
 
+# Number of sensors that are checked before the first sweep is augmented, and whose notes are shown.
+CHECKED_SENSORS = 4
 MAX_VARIANTS = 8  # maximum number of variants of a task, whose augmenters are in memory
 
 
