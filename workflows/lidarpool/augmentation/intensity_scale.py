@@ -305,21 +305,30 @@ class IntensityScale:
         new = new_energy[rows]
         known = old > 0
         scaled = np.where(known, recorded * (new / np.where(known, old, 1.0)), new)
+        if self.quantization.steps_per_unit:
+            # A value that is the rounded old energy becomes the rounded new energy.
+            finer = np.flatnonzero(old != recorded)
+            rounded = self.intensities(old[finer], np.asarray(old_range_m)[rows[finer]])
+            finer = finer[rounded == intensity[rows[finer]]]
+            scaled[finer] = new[finer]
         result = intensity.astype(self.dtype)
         result[rows] = self.intensities(scaled, np.asarray(new_range_m)[rows])
         return result
 
-    def step_energies(self, range_m: AnyFloats) -> Floats:
-        """Return the smallest energies that the recorded values resolve reliably.
+    def step_energies(self, range_m: AnyFloats, count: float | None = None) -> Floats:
+        """Return the energies of a number of steps of the recorded values.
 
-        Both arrays have shape (n,).
+        By default, these are the smallest energies that the values resolve reliably. Both arrays
+        have shape (n,).
         """
         steps = self.quantization.steps_per_unit
         if not steps or not self.column:
             return np.zeros(len(range_m))
         # Without compensation, returns close to the threshold have values of a few steps.
-        resolved = (_RESOLVED_STEPS if self.compensated else 0.5) / steps
-        return self._reflectances(np.full(len(range_m), resolved)) * self._factors(range_m)
+        if count is None:
+            count = _RESOLVED_STEPS if self.compensated else 0.5
+        values = np.full(len(range_m), count / steps)
+        return self._reflectances(values) * self._factors(range_m)
 
     def _factors(self, range_m: AnyFloats) -> Floats:
         """Return the energy of a return divided by the result of `_reflectances`."""
