@@ -209,7 +209,7 @@ class IntensityScale:
         energy = np.asarray(energy, np.float64)
         if not self.compensated and np.isinf(self.quantization.max_value):
             return energy
-        return np.minimum(energy, saturation)
+        return np.asarray(np.minimum(energy, saturation), np.float64)
 
     def energies(self, intensity: AnyArray | None, range_m: AnyFloats) -> Floats:
         """Convert recorded intensities to received energies.
