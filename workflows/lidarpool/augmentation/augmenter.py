@@ -195,7 +195,7 @@ class Augmenter:
             return self._without_returns(sweep)
         motion = self.objects.motion(sweep, number, grid.times_s - self._first_s)
         if motion.origins is not None:
-            channels = grid.directions.shape[1]
+            channels = grid.fired.shape[1]
             origins = np.repeat(motion.origins[:, None], channels, axis=1)
             grid = grid.with_origins(origins, motion.rotations)
         recorded = {name: np.asarray(v)[grid.row] for name, v in sweep.columns.items()}
@@ -205,7 +205,7 @@ class Augmenter:
         )
         firing_ns = self._start_ns(number) + 1e9 * (grid.times_s - self._first_s)
         pulses = FiredPulses(
-            grid.directions,
+            lambda: grid.directions,
             firing_ns,
             RecordedPulses(grid.cell, grid.range_m, energy, grid.fired.reshape(-1)),
             grid.origins,
@@ -335,7 +335,7 @@ class _AugmentedPoints:
     @classmethod
     def from_returns(cls, sweep: Sweep, grid: PulseGrid, returns: PulseReturns) -> _AugmentedPoints:
         """Compute the points of reported returns."""
-        channels = grid.directions.shape[1]
+        channels = grid.fired.shape[1]
         assert returns.reported is not None
         assert returns.source is not None
         nearest = returns.source.astype(np.int64)

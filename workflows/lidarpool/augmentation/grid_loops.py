@@ -118,15 +118,12 @@ def locate_returns(returns, tables, rotation, has_several, output):  # noqa: PLR
 
 
 @compiled()
-def fill_pulses(  # noqa: PLR0914, PLR0917 - a compiled loop
-    returns, tables, rotation, min_rings, grid, firing_sines, directions, fired
-):
-    """Write the directions of pulses, and whether they were fired.
+def mark_fired(returns, tables, rotation, min_rings, grid, fired):
+    """Mark the pulses that were fired.
 
     A pulse was fired if it has a return, or if its channel can receive returns from its sector of
-    azimuth, and at least `min_rings` channels have returns in this sector of the sweep.
-    `firing_sines` (2, f) are the sines and cosines of the azimuths of firings. `directions` (f, c,
-    3) and `fired` (f, c) are written.
+    azimuth, and at least `min_rings` channels have returns in this sector of the sweep. `fired` (f,
+    c) is written.
     """
     channels = len(tables.stride)
     returned = np.zeros((channels, SECTORS), np.bool_)
@@ -134,39 +131,58 @@ def fill_pulses(  # noqa: PLR0914, PLR0917 - a compiled loop
         if returns.channel[k] >= 0:
             sector = int(np.floor(returns.azimuth[k] * (SECTORS / _TURN))) % SECTORS
             returned[returns.channel[k], sector] = True
-    received = np.zeros(SECTORS, np.bool_)
     for sector in range(SECTORS):
         rings = 0
         for ring in range(channels):
             rings += returned[ring, sector]
-        received[sector] = rings >= min_rings
+        for ring in range(channels):
+            is_in_view = tables.in_view[ring, sector] or returned[ring, sector]
+            returned[ring, sector] = is_in_view and rings >= min_rings
+    for firing in range(len(fired)):
+        azimuth = rotation.sign * (firing * rotation.step_rad + rotation.phase_rad)
+        for ring in range(channels):
+            pulse_azimuth = azimuth + tables.offset_rad[ring]
+            sector = int(np.floor(pulse_azimuth * (SECTORS / _TURN))) % SECTORS
+            stride = tables.stride[ring]
+            fired[firing, ring] = (
+                returned[ring, sector]
+                and firing < rotation.firings
+                and (stride == 1 or (firing - tables.residue[ring]) % stride == 0)
+            )
+    for k in range(len(grid.cell)):
+        firing = grid.cell[k] // channels
+        fired[firing, grid.cell[k] - firing * channels] = True
+
+
+@compiled()
+def aim_pulses(ray, returns, tables, grid, firing_sines, directions):
+    """Write the directions of pulses.
+
+    A pulse with returns points to the farthest one. `ray` (k,) are the cells of the pulses,
+    `firing_sines` (2, f) the sines and cosines of the azimuths of firings, and `directions` (k, 3)
+    is written.
+    """
+    channels = len(tables.stride)
+    last = np.full(firing_sines.shape[1] * channels, -1, np.int64)
+    for k in range(len(grid.cell)):
+        last[grid.cell[k]] = grid.order[k]
     offset_sines = np.empty((2, channels))
     for ring in range(channels):
         offset_sines[0, ring] = np.sin(tables.offset_rad[ring])
         offset_sines[1, ring] = np.cos(tables.offset_rad[ring])
-    for firing in range(len(fired)):
-        sine = firing_sines[0, firing]
-        cosine = firing_sines[1, firing]
-        azimuth = rotation.sign * (firing * rotation.step_rad + rotation.phase_rad)
-        for ring in range(channels):
+    for k in range(len(ray)):
+        row = last[ray[k]]
+        if row >= 0:
+            for axis in range(3):
+                directions[k, axis] = returns.points[row, axis] / returns.range_m[row]
+        else:
+            firing = ray[k] // channels
+            ring = ray[k] - firing * channels
+            sine = firing_sines[0, firing]
+            cosine = firing_sines[1, firing]
             level = tables.cos_elevation[ring]
             sine_of = offset_sines[0, ring]
             cosine_of = offset_sines[1, ring]
-            directions[firing, ring, 0] = level * (cosine * cosine_of - sine * sine_of)
-            directions[firing, ring, 1] = level * (sine * cosine_of + cosine * sine_of)
-            directions[firing, ring, 2] = tables.sin_elevation[ring]
-            pulse_azimuth = azimuth + tables.offset_rad[ring]
-            sector = int(np.floor(pulse_azimuth * (SECTORS / _TURN))) % SECTORS
-            fired[firing, ring] = (
-                firing < rotation.firings
-                and received[sector]
-                and (tables.in_view[ring, sector] or returned[ring, sector])
-                and (firing - tables.residue[ring]) % tables.stride[ring] == 0
-            )
-    for k in range(len(grid.cell)):
-        firing = grid.cell[k] // channels
-        ring = grid.cell[k] - firing * channels
-        row = grid.order[k]
-        for axis in range(3):
-            directions[firing, ring, axis] = returns.points[row, axis] / returns.range_m[row]
-        fired[firing, ring] = True
+            directions[k, 0] = level * (cosine * cosine_of - sine * sine_of)
+            directions[k, 1] = level * (sine * cosine_of + cosine * sine_of)
+            directions[k, 2] = tables.sin_elevation[ring]

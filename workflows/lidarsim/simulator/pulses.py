@@ -27,6 +27,7 @@ device without steps, `DeviceColumns` replaces 3 to 6.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
 from typing import NamedTuple
@@ -35,7 +36,7 @@ import numpy as np
 
 from raybeam import Pattern
 
-from ..numerics.arrays import Ints, to_writable
+from ..numerics.arrays import Floats, Ints, to_writable
 from ..scene.scene import Scene
 from ..sensor.noise import Noise
 from ..survey.survey import Survey
@@ -90,7 +91,7 @@ class PulseCaster:
     def scan(
         self,
         scan: int,
-        pattern: Pattern,
+        pattern: Pattern | Callable[[], Pattern],
         poses: CastPoses,
         window: tuple[int, int],
         scan_starts: Ints,
@@ -107,7 +108,7 @@ class PulseCaster:
             Number of the first scan, which is a key of the random numbers. For a frozen sensor, the
             number of the older scan that is sent again.
         pattern
-            Rays of the beams.
+            Rays of the beams, or a function that returns them. It is called if a step needs them.
         poses
             Poses of the beams.
         window
@@ -168,10 +169,10 @@ class PulseCaster:
         sensor = self.setup.sensor
         if returns.reported is returns.distance or returns.reported is None:  # without noise
             return scanned
+        if _are_within(returns.reported, sensor.min_range_m, sensor.max_range_m):
+            return scanned
         in_range = returns.reported >= sensor.min_range_m
         in_range &= returns.reported <= sensor.max_range_m
-        if in_range.all():
-            return scanned
         removed = np.flatnonzero(~in_range)
         removed_scan = np.searchsorted(scan_starts, returns.ray[removed], "right") - 1
         hit_counts = scanned.hit_counts - np.bincount(removed_scan, minlength=len(scan_starts))
@@ -294,3 +295,8 @@ class PulseCaster:
             return ScannedReturns(thinned, hit_counts, None)
         triangle = returns.triangle[returns.triangle != NO_SURFACE]
         return ScannedReturns(thinned, hit_counts, self._surfaces.triangles.count(triangle))
+
+
+def _are_within(values: Floats, lowest: float, highest: float) -> bool:
+    """Return whether all values are within limits."""
+    return bool(values.min(initial=np.inf) >= lowest and values.max(initial=-np.inf) <= highest)

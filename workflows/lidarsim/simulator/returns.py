@@ -89,6 +89,8 @@ class PulseReturns(NamedTuple):
         """Return the selected rows of all columns."""
         if row_selection.dtype == np.bool_:  # convert a mask once instead of once per column
             row_selection = np.flatnonzero(row_selection)
+            if len(row_selection) == len(self.ray):
+                return self
         return PulseReturns(*select_rows(self, row_selection))
 
     @property

@@ -36,19 +36,32 @@ class DetectionStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Keep the detected returns of a batch."""
-        setup = self.setup
-        scan, ray = batch.keys.scan_and_number(returns.ray)
-        number = number_within_ray(returns.ray)
-        earlier = None
-        dropout: Floats | float = setup.noise.dropout
-        if batch.recorded is not None and setup.recorded_noise is not None:
-            source = require_column(returns.source)
-            rows = np.flatnonzero(source >= 0)
-            earlier = np.full(len(source), np.inf)
-            earlier[rows] = batch.recorded.energy[source[rows]]
-            dropout = np.where(source >= 0, setup.recorded_noise.dropout, dropout)
-        detected_mask = is_detected(
-            setup.noise, returns.height, scan, ray, number, dropout=dropout, earlier=earlier
+        noise = self.setup.noise
+        earlier_noise = self.setup.recorded_noise
+        if batch.recorded is None or earlier_noise is None:
+            scan, ray = batch.keys.scan_and_number(returns.ray)
+            number = number_within_ray(returns.ray)
+            return returns.take(is_detected(noise, returns.height, scan, ray, number))
+        # Most signals exceed the threshold with any noise, so they need no random numbers.
+        uncertain = returns.height <= (1 - quantiles()[0] / THRESHOLD_SIGMAS) * noise.threshold
+        if noise.dropout or earlier_noise.dropout:
+            uncertain[:] = True
+        rows = np.flatnonzero(uncertain)
+        if not len(rows):
+            return returns
+        scan, ray = batch.keys.scan_and_number(returns.ray[rows])
+        number = rows - np.searchsorted(returns.ray, returns.ray[rows])
+        source = require_column(returns.source)[rows]
+        recorded = source >= 0
+        detected_mask = ~uncertain
+        detected_mask[rows] = is_detected(
+            noise,
+            returns.height[rows],
+            scan,
+            ray,
+            number,
+            dropout=np.where(recorded, earlier_noise.dropout, noise.dropout),
+            earlier=np.where(recorded, batch.recorded.energy[source], np.inf),
         )
         return returns.take(detected_mask)
 
@@ -98,18 +111,12 @@ def _is_detected_again(
 
     `earlier` (n,) are the energies with which the returns were detected, or inf for other returns.
     """
-    # Signals that exceed the threshold for all quantiles need no random numbers.
-    largest = -float(quantiles()[0]) / THRESHOLD_SIGMAS + 1
-    result = energy > largest * noise.threshold
-    rows = np.flatnonzero(~result)
-    limit = -THRESHOLD_SIGMAS * (earlier[rows] / noise.threshold - 1)
+    limit = -THRESHOLD_SIGMAS * (earlier / noise.threshold - 1)
     lowest = np.searchsorted(quantiles(), limit, side="right")  # quantiles that were not detected
-    row_keys = (np.broadcast_to(key, result.shape)[rows] for key in (scan, ray, number))
-    index = (raw(noise.seed, DETECTION, *row_keys) >> np.uint64(48)).astype(np.int64)
+    index = (raw(noise.seed, DETECTION, scan, ray, number) >> np.uint64(48)).astype(np.int64)
     index = lowest + index * (len(quantiles()) - lowest) // len(quantiles())
-    signal = THRESHOLD_SIGMAS * (energy[rows] / noise.threshold - 1)
-    result[rows] = signal + quantiles()[index] > 0
-    return result
+    signal = THRESHOLD_SIGMAS * (energy / noise.threshold - 1)
+    return np.asarray(signal + quantiles()[index] > 0)
 
 
 def exceeds_threshold(
