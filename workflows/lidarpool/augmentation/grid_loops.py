@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsim.numerics.arrays import Bools, Floats, Ints
-from raybeam.compiled import compiled
+from raybeam.compiled import compiled, inlined
 
 SECTORS = 360  # azimuth sectors, in which all rings may be empty
 _SAME_PULSE_RAD = 1e-4  # maximum angle between the returns of a pulse
@@ -186,3 +186,86 @@ def aim_pulses(ray, returns, tables, grid, firing_sines, directions):
             directions[k, 0] = level * (cosine * cosine_of - sine * sine_of)
             directions[k, 1] = level * (sine * cosine_of + cosine * sine_of)
             directions[k, 2] = tables.sin_elevation[ring]
+
+
+@inlined
+def _return_of_other_channel(ray, firsts, lasts, cell, shape):
+    """Return the closest return of the closest channels, if the channel of a ray has no returns.
+
+    `firsts` and `lasts` (c,) are the first and last return of each channel, or -1.
+    """
+    firings, channels = shape
+    lower = ray % channels
+    upper = lower
+    while lower >= 0 and lasts[lower] < 0:
+        lower -= 1
+    while upper < channels and firsts[upper] < 0:
+        upper += 1
+    if lower < 0 or upper == channels:
+        return firsts[upper] if lower < 0 else lasts[lower]
+    # A channel is farther away than any return of the next channel.
+    after = (upper - ray % channels) * 3 * firings + cell[firsts[upper]] // channels
+    before = (ray % channels - lower) * 3 * firings - cell[lasts[lower]] // channels
+    firing = ray // channels
+    return lasts[lower] if before + firing <= after - firing else firsts[upper]
+
+
+@compiled()
+def sort_points(ray, source, cell, row, shape, nearest, order):  # noqa: C901 - a compiled loop
+    """Sort points by the row of a recorded return that serves as their template.
+
+    The template of a recorded return is itself. That of an added return is the recorded return of
+    the same channel that is closest in time. Added returns follow their template.
+
+    Parameters
+    ----------
+    ray, source
+        (m,): rays of the returns in ascending order, and recorded return of each, or -1.
+    cell, row
+        (n,): cells of the recorded returns in ascending order, and their rows in the sweep.
+    shape
+        Number of firings and channels.
+    nearest, order
+        (m,): recorded return that is the template of each point, and return of each point.
+    """
+    channels = shape[1]
+    count = len(ray)
+    template = np.empty(count, np.int64)
+    lasts = np.full(channels, -1, np.int64)  # last return of each channel before a ray
+    k = 0
+    for index in range(count):
+        template[index] = source[index]
+        if source[index] < 0:
+            while k < len(cell) and cell[k] < ray[index]:
+                lasts[cell[k] % channels] = k
+                k += 1
+            template[index] = lasts[ray[index] % channels]
+    while k < len(cell):
+        lasts[cell[k] % channels] = k
+        k += 1
+    firsts = np.full(channels, -1, np.int64)  # first return of each channel from a ray on
+    k = len(cell) - 1
+    for index in range(count - 1, -1, -1):
+        if source[index] < 0:
+            while k >= 0 and cell[k] >= ray[index]:
+                firsts[cell[k] % channels] = k
+                k -= 1
+            before = template[index]
+            after = firsts[ray[index] % channels]
+            if before < 0 or (after >= 0 and cell[after] - ray[index] < ray[index] - cell[before]):
+                template[index] = after
+    while k >= 0:
+        firsts[cell[k] % channels] = k
+        k -= 1
+    starts = np.zeros(2 * row.max() + 4, np.int64)
+    for index in range(count):
+        if template[index] < 0:
+            template[index] = _return_of_other_channel(ray[index], firsts, lasts, cell, shape)
+        starts[2 * row[template[index]] + int(source[index] < 0) + 1] += 1
+    for key in range(1, len(starts)):
+        starts[key] += starts[key - 1]
+    for index in range(count):
+        key = 2 * row[template[index]] + int(source[index] < 0)
+        order[starts[key]] = index
+        nearest[starts[key]] = template[index]
+        starts[key] += 1
