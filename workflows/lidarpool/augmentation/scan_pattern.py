@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from lidarsim.columns.sweep import Sweep
-from lidarsim.numerics.arrays import Bools, Floats, Ints, to_writable
+from lidarsim.numerics.arrays import Bools, Floats, Integers, Ints, to_writable
 from lidarsim.numerics.elementary import arctan2, sin_cos
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.sensor import Sensor
@@ -68,7 +68,7 @@ class PulseGrid:
         (f, c, 3): origins of the pulses in meters, or None if all pulses start at the origin.
     """
 
-    aim: Callable[[Ints], Floats]
+    aim: Callable[[Integers], Floats]
     times_s: Floats
     fired: Bools
     cell: Ints
@@ -81,7 +81,7 @@ class PulseGrid:
         """Unit directions of all pulses in the frame of the sweep, of shape (f, c, 3)."""
         return self.aim(np.arange(self.fired.size)).reshape(*self.fired.shape, 3)
 
-    def ends(self, ray: Ints, range_m: Floats) -> Floats:
+    def ends(self, ray: Integers, range_m: Floats) -> Floats:
         """Return the points at the given ranges along pulses, of shape (k, 3)."""
         points = self.aim(ray) * range_m[:, None]
         if self.origins is not None:
@@ -266,7 +266,7 @@ class ChannelPattern:
         min_rings = max(_MIN_RINGS * len(self.channels.rings), 1)
         grid_loops.mark_fired(returns, tables, rotation, min_rings, located, fired)
 
-        def aim(ray: Ints) -> Floats:
+        def aim(ray: Integers) -> Floats:
             directions = np.empty((len(ray), 3))
             grid_loops.aim_pulses(
                 to_writable(ray, np.int64), returns, tables, located, sines, directions

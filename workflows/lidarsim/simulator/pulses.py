@@ -27,7 +27,7 @@ device without steps, `DeviceColumns` replaces 3 to 6.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from typing import NamedTuple
@@ -58,6 +58,14 @@ class ScannedReturns(NamedTuple):
     hit_counts: Ints  # (scans,): returns of each scan, including those that are not kept
     # (counters,): all hits per hit counter (`StoredTriangles.counter`); None if not requested
     tally: Ints | None
+
+
+class BeamRange(NamedTuple):
+    """Consecutive beams that are cast by the same caster."""
+
+    caster: PulseCaster
+    start: int  # number of the first beam, counted from the first beam of the scans
+    stop: int  # one past the last beam
 
 
 class PulseCaster:
@@ -99,6 +107,7 @@ class PulseCaster:
         *,
         tally: bool = True,
         recorded: RecordedPulses | None = None,
+        ranges: Sequence[BeamRange] = (),
     ) -> ScannedReturns:
         """Cast consecutive scans, count their returns, and keep every n-th return.
 
@@ -122,11 +131,14 @@ class PulseCaster:
             Whether to count the hits on surfaces by `StoredTriangles.counter`.
         recorded
             Recorded pulses of the beams, which are required if `Setup.is_recorded` is true.
+        ranges
+            Ranges of all beams, if other casters cast some of them. Steps that act on reported
+            returns are those of this caster.
         """
         first_row = window[0]
         beam_count = window[1] - window[0]
 
-        def batch(start: int, stop: int) -> PulseBatch:
+        def batch(emitter: Emitter, start: int, stop: int) -> PulseBatch:
             keys = Keys(scan, scan_starts)
             return PulseBatch(
                 keys=keys,
@@ -136,18 +148,21 @@ class PulseCaster:
                 first=first_row,
                 poses=poses,
                 firings=firings,
-                emitter=self.emitter,
+                emitter=emitter,
                 recorded=recorded,
             )
 
-        all_beams = batch(0, beam_count)
+        all_beams = batch(self.emitter, 0, beam_count)
         if self._return_count_varies:
             pose_beams = poses.rays_per_pose or self.setup.sensor.channels
-            chunk_beams = max(1, CHUNK_RAYS // (len(self.emitter) * pose_beams)) * pose_beams
-            chunk_starts = range(0, beam_count, chunk_beams)
-            chunks = [
-                self._pulses(batch(k, min(k + chunk_beams, beam_count))) for k in chunk_starts
-            ]
+            chunks = []
+            for caster, start, stop in ranges or [BeamRange(self, 0, beam_count)]:
+                emitter = caster.emitter
+                chunk_beams = max(1, CHUNK_RAYS // (len(emitter) * pose_beams)) * pose_beams
+                chunks += [
+                    caster._pulses(batch(emitter, k, min(k + chunk_beams, stop)))
+                    for k in range(start, stop, chunk_beams)
+                ]
             scanned = self._thin_out(concatenate_returns(chunks), scan_starts, tally)
         else:
             scanned = self._cast_once(all_beams, scan_starts, tally)

@@ -20,12 +20,14 @@ from ..scene.scene_mesh import SceneMesh
 from ..sensor import Noise, Returns, Sensor, Spin
 from ..sensor.beams import Beams
 from ..survey.survey import Mounted, ScanSpec, Survey
+from .body_spheres import firings_near_bodies, ranges_of_firings
 from .casting.actor_trajectories import ActorTrajectories
 from .casting.motion import CastPoses, FiringClock, Firings
 from .casting.scene_caster import casters_of_sensors
 from .casting.surfaces import SceneSurfaces
-from .pulses import PulseCaster
+from .pulses import BeamRange, PulseCaster
 from .returns import PulseReturns
+from .steps.cast import has_bodies
 from .steps.step import RecordedPulses
 
 RECORDING = "recording"  # name of the invisible object that stands for recorded surfaces
@@ -181,6 +183,15 @@ class PulseAugmenter:
         (caster,) = casters_of_sensors(scene, self.survey, self.surfaces)
         self._caster = caster
         self._pulses = PulseCaster(0, caster, scene, self.survey, self.surfaces, recorded_noise)
+        # Most pulses cannot hit an object. They are not cast, and need no sub-rays.
+        without_objects = replace(
+            self.survey,
+            sensors=[replace(mounted, unseen=("*",))],
+            returns=replace(returns, subrays=1),
+        )
+        self._distant_pulses = PulseCaster(
+            0, caster, scene, without_objects, self.surfaces, recorded_noise
+        )
         self._actor_trajectories = ActorTrajectories.from_actors(scene.actors)
 
     @property
@@ -222,6 +233,7 @@ class PulseAugmenter:
             Firings.from_scans(self.sensor.with_pulses(pulses), [spec]),
             tally=False,
             recorded=pulses.recorded,
+            ranges=self._ranges(pulses, poses),
         )
         returns = scanned.returns
         return returns.take(pulses.recorded.fired[returns.ray])
@@ -235,16 +247,41 @@ class PulseAugmenter:
         """
         poses = self._poses(pulses, pose)
         sensor = self.sensor
-        hits = self._caster.scan(
-            pulses.pattern,
+        counts = np.zeros(count, np.int64)
+        for caster, start, stop in self._ranges(pulses, poses):
+            if caster is self._distant_pulses:
+                continue
+            hits = self._caster.scan(
+                pulses.pattern,
+                poses.for_subrays(start, stop, 1),
+                window=(start, stop),
+                t_min=sensor.min_range_m,
+                t_max=sensor.max_range_m,
+            )
+            fired = pulses.recorded.fired[start + hits.ray]
+            _, objects, _ = self.surfaces.triangles.locate(hits.triangle[fired])
+            counts += np.bincount(objects - 1, minlength=count)
+        return counts
+
+    def _ranges(self, pulses: FiredPulses, poses: CastPoses) -> list[BeamRange]:
+        """Divide the pulses of a sweep into those that can hit an object, and those that cannot."""
+        channels = pulses.channels
+        if not has_bodies(self._pulses.setup):
+            return []
+        near = firings_near_bodies(
+            self.scene,
+            self._pulses.emitter.beam,
             poses,
-            window=(0, len(pulses.recorded.fired)),
-            t_min=sensor.min_range_m,
-            t_max=sensor.max_range_m,
+            pulses.firing_ns,
+            pulses.directions,
+            pulses.origins,
         )
-        fired = pulses.recorded.fired[hits.ray]
-        _, objects, _ = self.surfaces.triangles.locate(hits.triangle[fired])
-        return np.bincount(objects - 1, minlength=count)
+        return [
+            BeamRange(
+                self._pulses if is_near else self._distant_pulses, start * channels, stop * channels
+            )
+            for start, stop, is_near in ranges_of_firings(near, channels)
+        ]
 
     def _poses(self, pulses: FiredPulses, pose: tuple[Floats, Floats] | None) -> CastPoses:
         """Return the poses of the rays of a sweep in the scene frame, with the clock of actors."""

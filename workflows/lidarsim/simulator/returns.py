@@ -112,6 +112,7 @@ def require_column(column: T | None) -> T:
 
 # Fill values for tables that lack a column that other tables have.
 _LACKING: dict[str, Any] = {
+    "color": pack_colors(GRAY[0])[0],
     "cause": np.uint8(SURFACE),
     "velocity": np.nan,
     "width": 0.0,
