@@ -80,7 +80,11 @@ def locate_returns(returns, tables, rotation, has_several, output):  # noqa: PLR
             side = 1 if exact >= nearest else -1
             for attempt in range(3):
                 shift = 0 if attempt == 0 else (side if attempt == 1 else -side)
-                firing = (tables.residue[ring] + (nearest + shift) * step) % firings
+                firing = tables.residue[ring] + (nearest + shift) * step
+                while firing < 0:  # faster than the modulo
+                    firing += firings
+                while firing >= firings:
+                    firing -= firings
                 other = occupied[firing * channels + ring]
                 if other < 0 or (
                     has_several
@@ -149,9 +153,9 @@ def mark_fired(returns, tables, rotation, min_rings, grid, fired):
                 and firing < rotation.firings
                 and (stride == 1 or (firing - tables.residue[ring]) % stride == 0)
             )
+    pulses = fired.reshape(-1)
     for k in range(len(grid.cell)):
-        firing = grid.cell[k] // channels
-        fired[firing, grid.cell[k] - firing * channels] = True
+        pulses[grid.cell[k]] = True
 
 
 @compiled()
@@ -230,6 +234,12 @@ def sort_points(ray, source, cell, row, shape, nearest, order):  # noqa: C901 - 
     """
     channels = shape[1]
     count = len(ray)
+    channel = np.empty(len(cell), np.int64)
+    begin = 0  # first cell of the firing, which saves divisions
+    for k in range(len(cell)):
+        while cell[k] >= begin + channels:
+            begin += channels
+        channel[k] = cell[k] - begin
     template = np.empty(count, np.int64)
     lasts = np.full(channels, -1, np.int64)  # last return of each channel before a ray
     k = 0
@@ -237,25 +247,25 @@ def sort_points(ray, source, cell, row, shape, nearest, order):  # noqa: C901 - 
         template[index] = source[index]
         if source[index] < 0:
             while k < len(cell) and cell[k] < ray[index]:
-                lasts[cell[k] % channels] = k
+                lasts[channel[k]] = k
                 k += 1
             template[index] = lasts[ray[index] % channels]
     while k < len(cell):
-        lasts[cell[k] % channels] = k
+        lasts[channel[k]] = k
         k += 1
     firsts = np.full(channels, -1, np.int64)  # first return of each channel from a ray on
     k = len(cell) - 1
     for index in range(count - 1, -1, -1):
         if source[index] < 0:
             while k >= 0 and cell[k] >= ray[index]:
-                firsts[cell[k] % channels] = k
+                firsts[channel[k]] = k
                 k -= 1
             before = template[index]
             after = firsts[ray[index] % channels]
             if before < 0 or (after >= 0 and cell[after] - ray[index] < ray[index] - cell[before]):
                 template[index] = after
     while k >= 0:
-        firsts[cell[k] % channels] = k
+        firsts[channel[k]] = k
         k -= 1
     starts = np.zeros(2 * row.max() + 4, np.int64)
     for index in range(count):

@@ -300,19 +300,19 @@ class IntensityScale:
         intensity = np.asarray(intensity)
         old_range_m = np.asarray(old_range_m, np.float64)
         new_range_m = np.asarray(new_range_m, np.float64)
+        old = np.asarray(old_energy, np.float64)
+        new = np.asarray(new_energy, np.float64)
+        factors = self._factors(old_range_m)
+        scaled = self._energies(intensity, old_range_m, factors)
+        scaled *= new / np.where(old > 0, old, 1.0)
+        unknown = np.flatnonzero(~(old > 0))
+        scaled[unknown] = new[unknown]
         moved = old_range_m != new_range_m
-        changed = moved | (np.asarray(old_energy) != np.asarray(new_energy))
-        rows = np.flatnonzero(changed & is_valid(intensity))
-        factors = self._factors(old_range_m[rows])
-        recorded = self._energies(intensity[rows], old_range_m[rows], factors)
-        old = np.asarray(old_energy, np.float64)[rows]
-        new = np.asarray(new_energy, np.float64)[rows]
-        known = old > 0
-        scaled = np.where(known, recorded * (new / np.where(known, old, 1.0)), new)
-        moved_rows = np.flatnonzero(moved[rows])
-        factors[moved_rows] = self._factors(new_range_m[rows[moved_rows]])
-        result = intensity.astype(self.dtype)
-        result[rows] = self._intensities(scaled, factors)
+        rows = np.flatnonzero(moved)
+        factors[rows] = self._factors(new_range_m[rows])
+        result = self._intensities(scaled, factors)
+        kept = np.flatnonzero(~(is_valid(intensity) & (moved | (old != new))))
+        result[kept] = intensity[kept]
         return result
 
     def step_energies(self, range_m: AnyFloats) -> Floats:
