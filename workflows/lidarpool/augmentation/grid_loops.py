@@ -54,7 +54,7 @@ class GridReturns(NamedTuple):
 
 
 @compiled()
-def locate_returns(returns, tables, rotation, has_several, output):  # noqa: PLR0914, PLR0915 - a compiled loop
+def locate_returns(returns, tables, rotation, has_several, output):  # noqa: C901, PLR0914, PLR0915 - a compiled loop
     """Assign returns to firings, and sort them by cell and range.
 
     A channel fires every `stride` firings. Each return gets a pulse of its own, unless
@@ -215,7 +215,7 @@ def _return_of_other_channel(ray, firsts, lasts, cell, shape):
 
 
 @compiled()
-def sort_points(ray, source, cell, row, shape, nearest, order):  # noqa: C901 - a compiled loop
+def sort_points(ray, source, cell, row, shape, nearest, order):  # noqa: C901, PLR0915 - a compiled loop
     """Sort points by the row of a recorded return that serves as their template.
 
     The template of a recorded return is itself. That of an added return is the recorded return of

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...numerics.arrays import Bools, Floats, Integers
-from ...numerics.random_numbers import Purpose, normal, quantiles, raw, uniform
+from ...numerics.arrays import Bools, Floats, Integers, to_writable
+from ...numerics.random_numbers import Purpose, initial_states, normal, quantiles, uniform
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise
 from ..returns import PulseReturns, number_within_ray, require_column
 from .step import PulseBatch, PulseStep, Role, Setup
@@ -36,34 +36,42 @@ class DetectionStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Keep the detected returns of a batch."""
+        if batch.recorded is not None:
+            return self._detected_again(returns, batch)
+        scan, ray = batch.keys.scan_and_number(returns.ray)
+        number = number_within_ray(returns.ray)
+        return returns.take(is_detected(self.setup.noise, returns.height, scan, ray, number))
+
+    def _detected_again(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Keep the detected returns of a batch of recorded pulses."""
+        from . import detection_loops  # imported here because numba takes half a second to import
+        from .random_loops import RandomKeys
+
         noise = self.setup.noise
-        earlier_noise = self.setup.recorded_noise
-        if batch.recorded is None or earlier_noise is None:
-            scan, ray = batch.keys.scan_and_number(returns.ray)
-            number = number_within_ray(returns.ray)
-            return returns.take(is_detected(noise, returns.height, scan, ray, number))
-        # Most signals exceed the threshold with any noise, so they need no random numbers.
-        uncertain = returns.height <= (1 - quantiles()[0] / THRESHOLD_SIGMAS) * noise.threshold
-        if noise.dropout or earlier_noise.dropout:
-            uncertain[:] = True
-        rows = np.flatnonzero(uncertain)
-        if not len(rows):
-            return returns
-        scan, ray = batch.keys.scan_and_number(returns.ray[rows])
-        number = rows - np.searchsorted(returns.ray, returns.ray[rows])
-        source = require_column(returns.source)[rows]
-        recorded = source >= 0
-        detected_mask = ~uncertain
-        detected_mask[rows] = is_detected(
-            noise,
-            returns.height[rows],
-            scan,
-            ray,
-            number,
-            dropout=np.where(recorded, earlier_noise.dropout, noise.dropout),
-            earlier=np.where(recorded, batch.recorded.energy[source], np.inf),
+        recorded_noise = require_column(self.setup.recorded_noise)
+        recorded = require_column(batch.recorded)
+        row_indices = np.empty(len(returns.ray), np.int64)
+        count = detection_loops.find_detected(
+            to_writable(returns.ray, np.int64),
+            to_writable(returns.height),
+            to_writable(require_column(returns.source), np.int32),
+            to_writable(recorded.energy),
+            detection_loops.DetectionLimits(
+                float(noise.dropout),
+                float(recorded_noise.dropout),
+                float(noise.threshold),
+                THRESHOLD_SIGMAS,
+                quantiles(),
+            ),
+            RandomKeys(
+                initial_states(noise.seed, LOSS, DETECTION),
+                batch.keys.scan,
+                to_writable(batch.keys.scan_starts, np.int64),
+                0,
+            ),
+            row_indices,
         )
-        return returns.take(detected_mask)
+        return returns if count == len(row_indices) else returns.take(row_indices[:count])
 
 
 def is_detected(
@@ -72,51 +80,23 @@ def is_detected(
     scan: Integers,
     ray: Integers,
     number: Integers,
-    *,
-    dropout: Floats | float | None = None,
-    earlier: Floats | None = None,
 ) -> Bools:
     """Return whether returns with the given energies are detected.
 
     `energy` is the energy of a return, or its height in the waveform. `scan`, `ray` (the ray's
     number in its scan) and `number` (the return's number in its ray, from 0) are the keys of the
-    random numbers. `dropout` (n,) overrides `Noise.dropout`. `earlier` (n,) are the energies with
-    which returns were detected before, or inf for returns that were not.
+    random numbers.
 
     The signal with normally distributed noise must exceed a threshold. If the energy equals the
     threshold, half of the returns are detected. At 1.4 times this energy, 97.7 % are detected, and
     at a fifth of it, 3 in 100,000.
     """
-    if dropout is None:
-        dropout = noise.dropout
     detected_mask = np.ones(len(energy), np.bool_)
-    if np.any(dropout):
-        detected_mask &= uniform(noise.seed, LOSS, scan, ray, number) >= dropout
-    if noise.detection_range_m is not None and earlier is None:
+    if noise.dropout:
+        detected_mask &= uniform(noise.seed, LOSS, scan, ray, number) >= noise.dropout
+    if noise.detection_range_m is not None:
         detected_mask &= exceeds_threshold(noise, DETECTION, energy, scan, ray, number)
-    elif noise.detection_range_m is not None and earlier is not None:
-        detected_mask &= _is_detected_again(noise, energy, earlier, scan, ray, number)
     return detected_mask
-
-
-def _is_detected_again(
-    noise: Noise,
-    energy: Floats,
-    earlier: Floats,
-    scan: Integers,
-    ray: Integers,
-    number: Integers,
-) -> Bools:
-    """Return whether returns are detected that were already detected with another energy.
-
-    `earlier` (n,) are the energies with which the returns were detected, or inf for other returns.
-    """
-    limit = -THRESHOLD_SIGMAS * (earlier / noise.threshold - 1)
-    lowest = np.searchsorted(quantiles(), limit, side="right")  # quantiles that were not detected
-    index = (raw(noise.seed, DETECTION, scan, ray, number) >> np.uint64(48)).astype(np.int64)
-    index = lowest + index * (len(quantiles()) - lowest) // len(quantiles())
-    signal = THRESHOLD_SIGMAS * (energy / noise.threshold - 1)
-    return np.asarray(signal + quantiles()[index] > 0)
 
 
 def exceeds_threshold(

@@ -1,0 +1,74 @@
+"""Compiled loop that detects the returns of recorded pulses (detection.py)."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from raybeam.compiled import compiled
+
+from ...numerics.arrays import Floats
+from .pulse_loops import scan_row
+from .random_loops import SHIFT_TO_INDEX, bits, uniform
+
+
+class DetectionLimits(NamedTuple):
+    """Properties of a receiver and of the random numbers of its noise."""
+
+    dropout: float  # fraction of added returns that are lost
+    recorded_dropout: float  # fraction of recorded returns that are lost
+    threshold: float  # energy at which half of the returns are detected; 0 without detection
+    threshold_sigmas: float  # threshold in standard deviations of the noise
+    quantiles: Floats  # quantiles of the normal distribution
+
+
+@compiled()
+def find_detected(ray, energy, source, recorded_energy, limits, keys, row_indices):
+    """Write the rows of the returns that are detected, and return their number.
+
+    Parameters
+    ----------
+    ray, energy, source
+        (n,): returns, sorted by ray. `source` is -1 for added returns.
+    recorded_energy
+        Energies with which recorded returns were detected.
+    limits
+        A `DetectionLimits`.
+    keys
+        A `RandomKeys` with the starts for losses and for the noise of the energy.
+    row_indices
+        (n,): output.
+    """
+    quantiles = limits.quantiles
+    levels = len(quantiles)
+    count = 0
+    number = 0
+    scan = 0
+    for k in range(len(ray)):
+        number = number + 1 if k > 0 and ray[k] == ray[k - 1] else 0
+        scan = scan_row(keys.scan_starts, ray[k], scan)
+        beam = ray[k] - keys.scan_starts[scan]
+        dropout = limits.recorded_dropout if source[k] >= 0 else limits.dropout
+        if dropout > 0 and uniform(keys.starts[0], keys.scan + scan, beam, number) < dropout:
+            continue
+        if limits.threshold > 0:
+            signal = limits.threshold_sigmas * (energy[k] / limits.threshold - 1)
+            if not signal + quantiles[0] > 0:  # not detected with some random numbers
+                index = np.int64(
+                    bits(keys.starts[1], keys.scan + scan, beam, number) >> SHIFT_TO_INDEX
+                )
+                if source[k] >= 0:
+                    earlier = recorded_energy[source[k]] / limits.threshold - 1
+                    # number of quantiles with which the return was not detected before
+                    lowest = np.searchsorted(
+                        quantiles, -limits.threshold_sigmas * earlier, side="right"
+                    )
+                    index = lowest + index * (levels - lowest) // levels
+                if not signal + quantiles[index] > 0:
+                    continue
+        row_indices[count] = k
+        count += 1
+    return count
