@@ -43,31 +43,36 @@ def find_detected(ray, energy, source, recorded_energy, limits, keys, row_indice
         (n,): output.
     """
     quantiles = limits.quantiles
+    scan_starts = keys.scan_starts
+    loss_start = keys.starts[0]
+    noise_start = keys.starts[1]
+    threshold = limits.threshold
     levels = len(quantiles)
     count = 0
     number = 0
     scan = 0
     for k in range(len(ray)):
         number = number + 1 if k > 0 and ray[k] == ray[k - 1] else 0
-        scan = scan_row(keys.scan_starts, ray[k], scan)
-        beam = ray[k] - keys.scan_starts[scan]
-        dropout = limits.recorded_dropout if source[k] >= 0 else limits.dropout
-        if dropout > 0 and uniform(keys.starts[0], keys.scan + scan, beam, number) < dropout:
+        scan = scan_row(scan_starts, ray[k], scan)
+        beam = ray[k] - scan_starts[scan]
+        is_recorded = source[k] >= 0
+        dropout = limits.recorded_dropout if is_recorded else limits.dropout
+        if dropout > 0 and uniform(loss_start, keys.scan + scan, beam, number) < dropout:
             continue
-        if limits.threshold > 0:
-            signal = limits.threshold_sigmas * (energy[k] / limits.threshold - 1)
-            if not signal + quantiles[0] > 0:  # not detected with some random numbers
-                index = np.int64(
-                    bits(keys.starts[1], keys.scan + scan, beam, number) >> SHIFT_TO_INDEX
-                )
-                if source[k] >= 0:
-                    earlier = recorded_energy[source[k]] / limits.threshold - 1
+        if threshold > 0:
+            signal = limits.threshold_sigmas * (energy[k] / threshold - 1)
+            if signal + quantiles[levels - 1] <= 0:  # never detected
+                continue
+            if signal + quantiles[0] <= 0:  # not detected with some random numbers
+                index = np.int64(bits(noise_start, keys.scan + scan, beam, number) >> SHIFT_TO_INDEX)
+                if is_recorded:
+                    earlier = recorded_energy[source[k]] / threshold - 1
                     # number of quantiles with which the return was not detected before
                     lowest = np.searchsorted(
                         quantiles, -limits.threshold_sigmas * earlier, side="right"
                     )
                     index = lowest + index * (levels - lowest) // levels
-                if not signal + quantiles[index] > 0:
+                if signal + quantiles[index] <= 0:
                     continue
         row_indices[count] = k
         count += 1
