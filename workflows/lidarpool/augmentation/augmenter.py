@@ -22,12 +22,16 @@ from .augmented_sweep import AugmentedSweep
 from .effects import Effects
 from .inserted_objects import InsertedObjects
 from .scan_pattern import PulseGrid, ScanPattern
+from .sensor_motion import SensorMotion
 from .strength_columns import StrengthColumns
 
 _DIVERGENCE_MRAD = 3.0  # beam divergence of a sensor whose divergence is unknown
 _SUBRAYS = 7  # sub-rays per beam if objects are inserted
 _RECEIVER = ("detection_range_m", "overlap_m", "saturation", "seed")  # properties of the receiver
 _UNSUPPORTED_FAULTS = ("frozen", "time_jump")
+# Minimum energy of recorded returns relative to the detection threshold. With this energy, 2.3 % of
+# the pulses are detected.
+_WEAKEST = 0.6
 _RANGES = ("range", "distance", "depth")  # columns that contain ranges
 _ROUNDING = 1e-9  # relative differences below this are rounding errors of the simulation
 
@@ -73,10 +77,13 @@ class Augmenter:
                 )
         self.recording = recording
         self.effects = effects
-        self.pattern = ScanPattern.from_recording(recording, model)
+        self.motion = SensorMotion.from_recording(
+            recording, has_objects=bool(effects.actors or effects.insertions)
+        )
+        self.pattern = ScanPattern.from_recording(recording, model, self.motion)
         self.strengths = StrengthColumns.for_recording(recording, model, reflectance)
         self._notes: list[str] = [self.pattern.note, self.strengths.scale.note]
-        self.objects = InsertedObjects.from_effects(recording, effects)
+        self.objects = InsertedObjects.from_effects(recording, effects, self.motion)
         self._notes += self.objects.notes
         self._simulation = self._build(model)
 
@@ -190,20 +197,17 @@ class Augmenter:
 
         `number` selects the random numbers, the time of the sweep and the poses of actors.
         """
-        grid = self.pattern.grid(sweep)
+        grid = self.pattern.grid(self.motion.as_fired(sweep, number))
         if not len(grid.row):
             return self._without_returns(sweep)
-        motion = self.objects.motion(sweep, number, grid.times_s - self._first_s)
-        if motion.origins is not None:
-            channels = grid.fired.shape[1]
-            origins = np.repeat(motion.origins[:, None], channels, axis=1)
-            grid = grid.with_origins(origins, motion.rotations)
+        motion = self.motion.of_sweep(sweep, number, grid.times_s)
+        if motion.origins is not None and motion.rotations is not None:
+            grid = grid.transform(motion.origins, motion.rotations)
         names = self.strengths.names[:1]  # the column that defines the energies
         recorded = {name: np.asarray(sweep.columns[name])[grid.row] for name in names}
-        # What was detected had at least the energy of the threshold.
-        energy = np.maximum(
-            self.strengths.energies(recorded, grid.range_m), self._simulation.threshold
-        )
+        # What was detected had an energy of about the threshold or more.
+        weakest = _WEAKEST * self._simulation.threshold
+        energy = np.maximum(self.strengths.energies(recorded, grid.range_m), weakest)
         firing_ns = self._start_ns(number) + 1e9 * (grid.times_s - self._first_s)
         pulses = FiredPulses(
             lambda: grid.directions,
@@ -239,18 +243,21 @@ class Augmenter:
         assert returns.energy is not None
         energy = returns.energy[points.order]
         old_energy = recorded.energy[points.nearest]
+        full = self._simulation.saturation
         changed = points.is_moved | (np.abs(energy - old_energy) > _ROUNDING * energy)
+        changed |= energy > full
         added = points.added
         changed[added] = False
         kept = np.flatnonzero(changed)
         old_m = grid.range_m[points.nearest[kept]]
-        new_values = self.strengths.intensities(energy[added], points.range_m[added])
+        new_values = self.strengths.intensities(energy[added], points.range_m[added], full)
         scaled = self.strengths.scale_intensities(
             {name: columns[name][kept] for name in self.strengths.names if name in columns},
             old_energy[kept],
             energy[kept],
             old_m,
             np.where(points.is_moved[kept], points.range_m[kept], old_m),
+            full,
         )
         for name, values in scaled.items():
             columns[name][kept] = values
@@ -289,12 +296,11 @@ class Augmenter:
         self._set_strengths(columns, points, grid, recorded, returns)
         added = points.added
         for name in columns.keys() & {*_RANGES}:
-            ranges = np.linalg.norm(np.asarray(sweep.points, np.float64), axis=1)
-            stored = np.asarray(sweep.columns[name], np.float64)
-            valid = np.isfinite(ranges) & (ranges > 0) & (stored > 0)
+            stored = np.asarray(sweep.columns[name], np.float64)[grid.row]
+            valid = np.isfinite(stored) & (stored > 0)
             if not valid.any():
                 continue
-            unit = float(np.median(stored[valid] / ranges[valid]))
+            unit = float(np.median(stored[valid] / grid.range_m[valid]))
             changed = np.flatnonzero(points.is_moved)
             values = unit * points.range_m[changed]
             columns[name][changed] = _as_type(values, columns[name].dtype)

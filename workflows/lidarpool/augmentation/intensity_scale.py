@@ -201,6 +201,16 @@ class IntensityScale:
             white=codes.code / codes.reflectance / codes_per_unit,
         )
 
+    def clip(self, energy: AnyFloats, saturation: float) -> Floats:
+        """Limit energies to the energy at which the receiver saturates.
+
+        Unlimited energies, as in results, are those before saturation and are not limited.
+        """
+        energies = np.asarray(energy, np.float64)
+        if not self.compensated and np.isinf(self.quantization.max_value):
+            return energies
+        return np.minimum(energies, saturation)
+
     def energies(self, intensity: AnyArray | None, range_m: AnyFloats) -> Floats:
         """Convert recorded intensities to received energies.
 

@@ -111,7 +111,9 @@ class StrengthColumns:
         """
         return self.scale.energies(columns.get(self.scale.column), range_m)
 
-    def intensities(self, energy: AnyFloats, range_m: AnyFloats) -> dict[str, AnyArray]:
+    def intensities(
+        self, energy: AnyFloats, range_m: AnyFloats, saturation: float = np.inf
+    ) -> dict[str, AnyArray]:
         """Return the values of all strength columns for new returns.
 
         Parameters
@@ -120,13 +122,18 @@ class StrengthColumns:
             Received energies. Shape (n,).
         range_m
             Ranges in meters. Shape (n,).
+        saturation
+            Energy at which the receiver saturates.
 
         Returns
         -------
         dict
             Arrays of shape (n,), keyed by column name. Empty without an intensity column.
         """
-        return {scale.column: scale.intensities(energy, range_m) for scale in self._scales}
+        return {
+            scale.column: scale.intensities(scale.clip(energy, saturation), range_m)
+            for scale in self._scales
+        }
 
     def scale_intensities(
         self,
@@ -135,6 +142,7 @@ class StrengthColumns:
         new_energy: AnyFloats,
         old_range_m: AnyFloats,
         new_range_m: AnyFloats,
+        saturation: float = np.inf,
     ) -> dict[str, AnyArray]:
         """Return the values of all strength columns after energies or ranges have changed.
 
@@ -145,6 +153,8 @@ class StrengthColumns:
         ----------
         columns
             Columns of a sweep. Arrays of shape (n,).
+        saturation
+            Energy at which the receiver saturates.
 
         Returns
         -------
@@ -153,7 +163,11 @@ class StrengthColumns:
         """
         return {
             scale.column: scale.scale_intensities(
-                columns[scale.column], old_energy, new_energy, old_range_m, new_range_m
+                columns[scale.column],
+                old_energy,
+                scale.clip(new_energy, saturation),
+                old_range_m,
+                new_range_m,
             )
             for scale in self._scales
             if scale.column in columns

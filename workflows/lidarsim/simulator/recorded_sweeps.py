@@ -199,6 +199,11 @@ class PulseAugmenter:
         """Energy at which half of the returns are detected, or 0 without a detection range."""
         return self.survey.noise_each[0].threshold
 
+    @property
+    def saturation(self) -> float:
+        """Energy at which the receiver saturates, or infinity if it never saturates."""
+        return self.survey.noise_each[0].saturation_energy
+
     def apply(
         self, number: int, pulses: FiredPulses, pose: tuple[Floats, Floats] | None = None
     ) -> PulseReturns:

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...numerics.arrays import Bools, Floats, Integers, to_writable
-from ...numerics.random_numbers import Purpose, initial_states, normal, quantiles, uniform
+from ...numerics.random_numbers import Purpose, normal, quantiles, uniform
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise
 from ..returns import PulseReturns, number_within_ray, require_column
+from .particles import random_keys
 from .step import PulseBatch, PulseStep, Role, Setup
 
 DETECTION = Purpose(4, "energy noise of a return")
@@ -45,7 +46,6 @@ class DetectionStep(PulseStep):
     def _detected_again(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Keep the detected returns of a batch of recorded pulses."""
         from . import detection_loops  # imported here because numba takes half a second to import
-        from .random_loops import RandomKeys
 
         noise = self.setup.noise
         recorded_noise = require_column(self.setup.recorded_noise)
@@ -63,12 +63,7 @@ class DetectionStep(PulseStep):
                 THRESHOLD_SIGMAS,
                 quantiles(),
             ),
-            RandomKeys(
-                initial_states(noise.seed, LOSS, DETECTION),
-                batch.keys.scan,
-                to_writable(batch.keys.scan_starts, np.int64),
-                0,
-            ),
+            random_keys(noise.seed, (LOSS, DETECTION), batch.keys, 0),
             row_indices,
         )
         return returns if count == len(row_indices) else returns.take(row_indices[:count])

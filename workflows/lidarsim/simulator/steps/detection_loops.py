@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raybeam.compiled import compiled
+from raybeam.compiled import compiled, inlined
 
 from ...numerics.arrays import Floats
 from .pulse_loops import scan_row
@@ -25,6 +25,14 @@ class DetectionLimits(NamedTuple):
     quantiles: Floats  # quantiles of the normal distribution
 
 
+@inlined
+def _index_above(quantiles, limit, index):
+    """Map a random index of a quantile to the quantiles above a limit."""
+    levels = len(quantiles)
+    lowest = min(np.searchsorted(quantiles, limit, side="right"), levels - 1)
+    return lowest + index * (levels - lowest) // levels
+
+
 @compiled()
 def find_detected(ray, energy, source, recorded_energy, limits, keys, row_indices):
     """Write the rows of the returns that are detected, and return their number.
@@ -38,16 +46,14 @@ def find_detected(ray, energy, source, recorded_energy, limits, keys, row_indice
     limits
         A `DetectionLimits`.
     keys
-        A `RandomKeys` with the starts for losses and for the noise of the energy.
+        A `RandomKeys` with the states for losses and for the noise of the energy.
     row_indices
         (n,): output.
     """
     quantiles = limits.quantiles
+    states = keys.states
     scan_starts = keys.scan_starts
-    loss_start = keys.starts[0]
-    noise_start = keys.starts[1]
     threshold = limits.threshold
-    levels = len(quantiles)
     count = 0
     number = 0
     scan = 0
@@ -55,23 +61,18 @@ def find_detected(ray, energy, source, recorded_energy, limits, keys, row_indice
         number = number + 1 if k > 0 and ray[k] == ray[k - 1] else 0
         scan = scan_row(scan_starts, ray[k], scan)
         beam = ray[k] - scan_starts[scan]
-        is_recorded = source[k] >= 0
-        dropout = limits.recorded_dropout if is_recorded else limits.dropout
-        if dropout > 0 and uniform(loss_start, keys.scan + scan, beam, number) < dropout:
+        dropout = limits.recorded_dropout if source[k] >= 0 else limits.dropout
+        if dropout > 0 and uniform(states[scan, 0], beam, number) < dropout:
             continue
         if threshold > 0:
             signal = limits.threshold_sigmas * (energy[k] / threshold - 1)
-            if signal + quantiles[levels - 1] <= 0:  # never detected
+            if signal + quantiles[len(quantiles) - 1] <= 0:  # never detected
                 continue
             if signal + quantiles[0] <= 0:  # not detected with some random numbers
-                index = np.int64(bits(noise_start, keys.scan + scan, beam, number) >> SHIFT_TO_INDEX)
-                if is_recorded:
+                index = np.int64(bits(states[scan, 1], beam, number) >> SHIFT_TO_INDEX)
+                if source[k] >= 0:
                     earlier = recorded_energy[source[k]] / threshold - 1
-                    # number of quantiles with which the return was not detected before
-                    lowest = np.searchsorted(
-                        quantiles, -limits.threshold_sigmas * earlier, side="right"
-                    )
-                    index = lowest + index * (levels - lowest) // levels
+                    index = _index_above(quantiles, -limits.threshold_sigmas * earlier, index)
                 if signal + quantiles[index] <= 0:
                     continue
         row_indices[count] = k

@@ -186,8 +186,8 @@ class RecordedPulses:
     distance
         (n,): ranges of the returns in meters, in ascending order for each ray.
     energy
-        (n,): energies of the returns on the scale of `SceneSurfaces.energy`. They are at least the
-        detection threshold of the sensor, because the returns were detected.
+        (n,): energies of the returns on the scale of `SceneSurfaces.energy`. They must not be far
+        below the detection threshold of the sensor, because the returns were detected.
     fired
         (rays,): whether each ray of the sweep was fired. Rays that were not fired fill gaps in the
         grid of firings and channels.
