@@ -98,9 +98,16 @@ class PulseGrid:
         """
         path = self.ends(self.cell, self.range_m) - origins.reshape(-1, 3)[self.cell]
         range_m = _ranges(path)
-        directions = self.directions.reshape(-1, 3).copy()
-        directions[self.cell] = path / range_m[:, None]
-        return replace(self, aim=directions.__getitem__, range_m=range_m, origins=origins)
+        towards = path / range_m[:, None]
+
+        def aim(ray: Integers) -> Floats:
+            directions = self.aim(ray)
+            last = np.searchsorted(self.cell, ray, side="right") - 1  # farthest return of a pulse
+            returned = np.flatnonzero(self.cell[last] == ray)
+            directions[returned] = towards[last[returned]]
+            return directions
+
+        return replace(self, aim=aim, range_m=range_m, origins=origins)
 
     def transform(self, positions: Floats, rotations: Floats) -> PulseGrid:
         """Transform the pulses of each firing to the frame of the sweep.
@@ -112,11 +119,15 @@ class PulseGrid:
         rotations
             (f, 3, 3): rotations from the sensor frame at the firings to the frame of the sweep.
         """
-        directions = np.einsum("fij,fcj->fci", rotations, self.directions)
-        origins = np.repeat(positions[:, None], directions.shape[1], axis=1)
+        channels = self.fired.shape[1]
+        origins = np.repeat(positions[:, None], channels, axis=1)
         if self.origins is not None:
             origins += np.einsum("fij,fcj->fci", rotations, self.origins)
-        return replace(self, aim=directions.reshape(-1, 3).__getitem__, origins=origins)
+
+        def aim(ray: Integers) -> Floats:
+            return np.asarray(np.einsum("kij,kj->ki", rotations[ray // channels], self.aim(ray)))
+
+        return replace(self, aim=aim, origins=origins)
 
 
 @dataclass(frozen=True, eq=False)

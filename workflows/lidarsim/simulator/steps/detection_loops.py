@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raybeam.compiled import compiled
+from raybeam.compiled import compiled, inlined
 
 from ...numerics.arrays import Floats
 from .pulse_loops import scan_row
@@ -23,6 +23,14 @@ class DetectionLimits(NamedTuple):
     threshold: float  # energy at which half of the returns are detected; 0 without detection
     threshold_sigmas: float  # threshold in standard deviations of the noise
     quantiles: Floats  # quantiles of the normal distribution
+
+
+@inlined
+def _index_above(quantiles, limit, index):
+    """Map a random index of a quantile to the quantiles above a limit."""
+    levels = len(quantiles)
+    lowest = min(np.searchsorted(quantiles, limit, side="right"), levels - 1)
+    return lowest + index * (levels - lowest) // levels
 
 
 @compiled()
@@ -43,9 +51,9 @@ def find_detected(ray, energy, source, recorded_energy, limits, keys, row_indice
         (n,): output.
     """
     quantiles = limits.quantiles
+    states = keys.states
     scan_starts = keys.scan_starts
     threshold = limits.threshold
-    levels = len(quantiles)
     count = 0
     number = 0
     scan = 0
@@ -53,23 +61,18 @@ def find_detected(ray, energy, source, recorded_energy, limits, keys, row_indice
         number = number + 1 if k > 0 and ray[k] == ray[k - 1] else 0
         scan = scan_row(scan_starts, ray[k], scan)
         beam = ray[k] - scan_starts[scan]
-        is_recorded = source[k] >= 0
-        dropout = limits.recorded_dropout if is_recorded else limits.dropout
-        if dropout > 0 and uniform(keys.states[scan, 0], beam, number) < dropout:
+        dropout = limits.recorded_dropout if source[k] >= 0 else limits.dropout
+        if dropout > 0 and uniform(states[scan, 0], beam, number) < dropout:
             continue
         if threshold > 0:
             signal = limits.threshold_sigmas * (energy[k] / threshold - 1)
-            if signal + quantiles[levels - 1] <= 0:  # never detected
+            if signal + quantiles[len(quantiles) - 1] <= 0:  # never detected
                 continue
             if signal + quantiles[0] <= 0:  # not detected with some random numbers
-                index = np.int64(bits(keys.states[scan, 1], beam, number) >> SHIFT_TO_INDEX)
-                if is_recorded:
+                index = np.int64(bits(states[scan, 1], beam, number) >> SHIFT_TO_INDEX)
+                if source[k] >= 0:
                     earlier = recorded_energy[source[k]] / threshold - 1
-                    # number of quantiles with which the return was not detected before
-                    lowest = np.searchsorted(
-                        quantiles, -limits.threshold_sigmas * earlier, side="right"
-                    )
-                    index = lowest + index * (levels - lowest) // levels
+                    index = _index_above(quantiles, -limits.threshold_sigmas * earlier, index)
                 if signal + quantiles[index] <= 0:
                     continue
         row_indices[count] = k
