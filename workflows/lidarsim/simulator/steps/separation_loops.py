@@ -568,7 +568,10 @@ def mark_reported(ray, energy, mode, shown):
         stop = begin + 1
         while stop < len(ray) and ray[stop] == ray[begin]:
             stop += 1
-        _mark(energy, begin, stop, mode, shown)
+        if stop == begin + 1:  # the call would take most of the time
+            shown[begin] = True
+        else:
+            _mark(energy, begin, stop, mode, shown)
         begin = stop
 
 
