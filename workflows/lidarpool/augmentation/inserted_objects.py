@@ -134,17 +134,16 @@ class InsertedObjects:
         added
             Rows of the added points.
         numbers
-            (n,): inserted object of each point, or -1.
+            Inserted object of each added point, or -1.
         named_objects
             Number of objects that are named in the recording.
         """
-        inserted = numbers[added]
         if "class" in columns:
             classes = np.array([*self.classes, 0])
-            columns["class"][added] = classes[inserted]
+            columns["class"][added] = classes[numbers]
         if "object" in columns:
             first = named_objects or _FIRST_OBJECT
-            columns["object"][added] = np.where(inserted >= 0, first + inserted, -1)
+            columns["object"][added] = np.where(numbers >= 0, first + numbers, -1)
 
     def boxes(
         self,
@@ -164,8 +163,10 @@ class InsertedObjects:
                 0
             )
         objects = simulation.objects(returns)
-        rays = np.unique(np.stack([objects, returns.ray]), axis=1)[0]
-        visible = np.bincount(rays[rays >= 0], minlength=count)
+        hits = np.flatnonzero(objects >= 0)
+        rays = len(pulses.recorded.fired)
+        visible = np.unique(objects[hits] * rays + returns.ray[hits]) // rays
+        visible = np.bincount(visible, minlength=count)
         points = np.bincount(objects[objects >= 0], minlength=count)
         alone = simulation.pulses_on_objects(pulses, motion.poses, count)
         back = np.linalg.inv(motion.stamp_pose)

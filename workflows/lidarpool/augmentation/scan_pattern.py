@@ -7,15 +7,16 @@ which each ring returns, and cells of the grid without a return are pulses witho
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from lidarsim.columns.sweep import Sweep
-from lidarsim.numerics.arrays import Bools, Floats, Ints, to_writable
+from lidarsim.numerics.arrays import Bools, Floats, Integers, Ints, to_writable
 from lidarsim.numerics.elementary import arctan2, sin_cos
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.numerics.vectors import hypot
@@ -47,13 +48,15 @@ _DIGITS = 9  # decimals of fitted angles, so that rounding errors do not affect 
 _TURN = 2 * np.pi
 
 
-class PulseGrid(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class PulseGrid:
     """Pulses of a sweep in a grid of f firings and c channels, and the returns of the pulses.
 
     Attributes
     ----------
-    directions
-        (f, c, 3): unit directions in the frame of the sweep.
+    aim
+        Function that returns the unit directions (k, 3) of the pulses in k cells, in the frame of
+        the sweep.
     times_s
         (f,): firing times in seconds relative to the timestamp of the sweep.
     fired
@@ -68,7 +71,7 @@ class PulseGrid(NamedTuple):
         (f, c, 3): origins of the pulses in meters, or None if all pulses start at the origin.
     """
 
-    directions: Floats
+    aim: Callable[[Integers], Floats]
     times_s: Floats
     fired: Bools
     cell: Ints
@@ -76,9 +79,14 @@ class PulseGrid(NamedTuple):
     row: Ints
     origins: Floats | None = None
 
-    def ends(self, ray: Ints, range_m: Floats) -> Floats:
+    @cached_property
+    def directions(self) -> Floats:
+        """Unit directions of all pulses in the frame of the sweep, of shape (f, c, 3)."""
+        return self.aim(np.arange(self.fired.size)).reshape(*self.fired.shape, 3)
+
+    def ends(self, ray: Integers, range_m: Floats) -> Floats:
         """Return the points at the given ranges along pulses, of shape (k, 3)."""
-        points = self.directions.reshape(-1, 3)[ray] * range_m[:, None]
+        points = self.aim(ray) * range_m[:, None]
         if self.origins is not None:
             points += self.origins.reshape(-1, 3)[ray]
         return points
@@ -90,9 +98,9 @@ class PulseGrid(NamedTuple):
         """
         path = self.ends(self.cell, self.range_m) - origins.reshape(-1, 3)[self.cell]
         range_m = _ranges(path)
-        directions = self.directions.copy()
-        directions.reshape(-1, 3)[self.cell] = path / range_m[:, None]
-        return self._replace(directions=directions, range_m=range_m, origins=origins)
+        directions = self.directions.reshape(-1, 3).copy()
+        directions[self.cell] = path / range_m[:, None]
+        return replace(self, aim=directions.__getitem__, range_m=range_m, origins=origins)
 
     def transform(self, positions: Floats, rotations: Floats) -> PulseGrid:
         """Transform the pulses of each firing to the frame of the sweep.
@@ -108,7 +116,7 @@ class PulseGrid(NamedTuple):
         origins = np.repeat(positions[:, None], directions.shape[1], axis=1)
         if self.origins is not None:
             origins += np.einsum("fij,fcj->fci", rotations, self.origins)
-        return self._replace(directions=directions, origins=origins)
+        return replace(self, aim=directions.reshape(-1, 3).__getitem__, origins=origins)
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,18 +277,23 @@ class ChannelPattern:
         shape = rotation.firings + extra, len(self.channels)
         turns = np.arange(shape[0]) * rotation.step_rad + rotation.phase_rad
         sines = np.stack(sin_cos(rotation.sign * turns))
-        directions = np.empty((*shape, 3))
         fired = np.empty(shape, np.bool_)
         min_rings = max(_MIN_RINGS * len(self.channels.rings), 1)
-        grid_loops.fill_pulses(
-            returns, tables, rotation, min_rings, located, sines, directions, fired
-        )
+        grid_loops.mark_fired(returns, tables, rotation, min_rings, located, fired)
+
+        def aim(ray: Integers) -> Floats:
+            directions = np.empty((len(ray), 3))
+            grid_loops.aim_pulses(
+                to_writable(ray, np.int64), returns, tables, located, sines, directions
+            )
+            return directions
+
         if times_s is None:
             times = period_s * (np.arange(shape[0]) % rotation.firings) / rotation.firings
         else:
             times = _firing_times(located.firing, times_s, shape[0])
         range_m = returns.range_m[located.order]
-        grid = PulseGrid(directions, times, fired, located.cell, range_m, rows[located.order])
+        grid = PulseGrid(aim, times, fired, located.cell, range_m, rows[located.order])
         return self._from_beam_origins(grid, sines)
 
     def _from_beam_origins(self, grid: PulseGrid, sines: Floats) -> PulseGrid:
@@ -292,7 +305,7 @@ class ChannelPattern:
             return grid
         x, y, z = self.channels.origin.T
         sine, cosine = sines[:, :, None]
-        origins = np.empty_like(grid.directions)
+        origins = np.empty((*grid.fired.shape, 3))
         origins[..., 0] = cosine * x - sine * y
         origins[..., 1] = sine * x + cosine * y
         origins[..., 2] = z
@@ -415,11 +428,13 @@ class ScanPattern:
             times_s = self.period_s * np.arange(count) / max(count, 1)
         range_m = _ranges(points)
         channels = self.channel_count
-        directions = np.repeat((points / range_m[:, None])[:, None, :], channels, axis=1)
+        directions = points / range_m[:, None]
         fired = np.zeros((count, channels), np.bool_)
         fired[:, 0] = True
         cell = np.arange(count) * channels
-        return PulseGrid(directions, times_s, fired, cell, range_m, rows)
+        return PulseGrid(
+            lambda ray: directions[ray // channels], times_s, fired, cell, range_m, rows
+        )
 
 
 def _elevations_from(origin: Floats, rings: Rings, sweeps: Sequence[Sweep]) -> Floats:

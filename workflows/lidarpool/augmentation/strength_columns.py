@@ -191,6 +191,11 @@ class StrengthColumns:
         }
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the strength columns."""
+        return tuple(scale.column for scale in self._scales)
+
+    @property
     def _scales(self) -> tuple[IntensityScale, ...]:
         return (self.scale, *self.others) if self.scale.column else ()
 
