@@ -29,7 +29,7 @@ from .harness import print_row
 
 MODEL = "velodyne/hdl32e"
 VISIBILITIES_KM = (0.03, 0.05, 0.07, 0.1, 0.125, 0.15, 0.2, 0.3)
-DETECTION_RANGES_M = (None, 90.0)  # None for the range that is estimated
+DETECTION_RANGES_M = (None, 60.0, 90.0)  # None for the range that is estimated
 NEAREST_M = 2.0  # closer returns come from the vehicle
 FITTED_M = 10.0  # minimum range of the distributions from which the visibility is fitted
 SWEEPS = 10

@@ -118,7 +118,9 @@ class InsertedObjects:
     @property
     def surface_materials(self) -> tuple[Material, ...]:
         """Materials of all objects, including those without a material of the user."""
-        return (*self.materials, Material("*")) if self.materials else ()
+        if not self.materials or self.materials[-1].applies_to_all:
+            return self.materials
+        return (*self.materials, Material("*"))
 
     def label(
         self, columns: dict[str, AnyArray], added: Ints, numbers: Ints, named_objects: int

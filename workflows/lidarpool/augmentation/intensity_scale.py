@@ -206,10 +206,9 @@ class IntensityScale:
 
         Unlimited energies, as in results, are those before saturation and are not limited.
         """
-        energies = np.asarray(energy, np.float64)
         if not self.compensated and np.isinf(self.quantization.max_value):
-            return energies
-        return np.minimum(energies, saturation)
+            return np.asarray(energy, np.float64)
+        return np.asarray(np.minimum(energy, saturation), np.float64)
 
     def energies(self, intensity: AnyArray | None, range_m: AnyFloats) -> Floats:
         """Convert recorded intensities to received energies.
@@ -308,23 +307,26 @@ class IntensityScale:
             Values on the scale of the recording, as from `intensities`. Shape (n,).
         """
         intensity = np.asarray(intensity)
-        old_energy = np.asarray(old_energy, np.float64)
-        new_energy = np.asarray(new_energy, np.float64)
-        changed = (old_energy != new_energy) | (np.asarray(old_range_m) != np.asarray(new_range_m))
-        rows = np.flatnonzero(changed & is_valid(intensity))
-        recorded = self.energies(intensity[rows], np.asarray(old_range_m)[rows])
-        old = old_energy[rows]
-        new = new_energy[rows]
-        known = old > 0
-        scaled = np.where(known, recorded * (new / np.where(known, old, 1.0)), new)
+        old_range_m = np.asarray(old_range_m, np.float64)
+        new_range_m = np.asarray(new_range_m, np.float64)
+        old = np.asarray(old_energy, np.float64)
+        new = np.asarray(new_energy, np.float64)
+        factors = self._factors(old_range_m)
+        scaled = self._energies(intensity, old_range_m, factors)
+        replaced = np.flatnonzero(~(old > 0))
         if self.quantization.steps_per_unit:
             # A value that is the rounded old energy becomes the rounded new energy.
-            finer = np.flatnonzero(old != recorded)
-            rounded = self.intensities(old[finer], np.asarray(old_range_m)[rows[finer]])
-            finer = finer[rounded == intensity[rows[finer]]]
-            scaled[finer] = new[finer]
-        result = intensity.astype(self.dtype)
-        result[rows] = self.intensities(scaled, np.asarray(new_range_m)[rows])
+            finer = np.flatnonzero(scaled != old)
+            rounded = self._intensities(old[finer], factors[finer])
+            replaced = np.append(replaced, finer[rounded == intensity[finer]])
+        scaled *= new / np.where(old > 0, old, 1.0)
+        scaled[replaced] = new[replaced]
+        moved = old_range_m != new_range_m
+        rows = np.flatnonzero(moved)
+        factors[rows] = self._factors(new_range_m[rows])
+        result = self._intensities(scaled, factors)
+        kept = np.flatnonzero(~(is_valid(intensity) & (moved | (old != new))))
+        result[kept] = intensity[kept]
         return result
 
     def step_energies(self, range_m: AnyFloats, count: float | None = None) -> Floats:
