@@ -206,10 +206,9 @@ class IntensityScale:
 
         Unlimited energies, as in results, are those before saturation and are not limited.
         """
-        energies = np.asarray(energy, np.float64)
         if not self.compensated and np.isinf(self.quantization.max_value):
-            return energies
-        return np.minimum(energies, saturation)
+            return np.asarray(energy, np.float64)
+        return np.asarray(np.minimum(energy, saturation), np.float64)
 
     def energies(self, intensity: AnyArray | None, range_m: AnyFloats) -> Floats:
         """Convert recorded intensities to received energies.
