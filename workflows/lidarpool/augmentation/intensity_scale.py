@@ -312,10 +312,14 @@ class IntensityScale:
         old = np.asarray(old_energy, np.float64)
         new = np.asarray(new_energy, np.float64)
         factors = self._factors(old_range_m)
-        scaled = self._energies(intensity, old_range_m, factors)
-        scaled *= new / np.where(old > 0, old, 1.0)
-        unknown = np.flatnonzero(~(old > 0))
-        scaled[unknown] = new[unknown]
+        recorded = self._energies(intensity, old_range_m, factors)
+        scaled = np.where(old > 0, recorded * (new / np.where(old > 0, old, 1.0)), new)
+        if self.quantization.steps_per_unit:
+            # A value that is the rounded old energy becomes the rounded new energy.
+            finer = np.flatnonzero(old != recorded)
+            rounded = self._intensities(old[finer], factors[finer])
+            finer = finer[rounded == intensity[finer]]
+            scaled[finer] = new[finer]
         moved = old_range_m != new_range_m
         rows = np.flatnonzero(moved)
         factors[rows] = self._factors(new_range_m[rows])
@@ -324,17 +328,20 @@ class IntensityScale:
         result[kept] = intensity[kept]
         return result
 
-    def step_energies(self, range_m: AnyFloats) -> Floats:
-        """Return the smallest energies that the recorded values resolve reliably.
+    def step_energies(self, range_m: AnyFloats, count: float | None = None) -> Floats:
+        """Return the energies of a number of steps of the recorded values.
 
-        Both arrays have shape (n,).
+        By default, these are the smallest energies that the values resolve reliably. Both arrays
+        have shape (n,).
         """
         steps = self.quantization.steps_per_unit
         if not steps or not self.column:
             return np.zeros(len(range_m))
         # Without compensation, returns close to the threshold have values of a few steps.
-        resolved = (_RESOLVED_STEPS if self.compensated else 0.5) / steps
-        return self._reflectances(np.full(len(range_m), resolved)) * self._factors(range_m)
+        if count is None:
+            count = _RESOLVED_STEPS if self.compensated else 0.5
+        values = np.full(len(range_m), count / steps)
+        return self._reflectances(values) * self._factors(range_m)
 
     def _factors(self, range_m: AnyFloats) -> Floats:
         """Return the energy of a return divided by the result of `_reflectances`."""

@@ -34,6 +34,7 @@ from .intensity_scale import IntensityScale
 _NAMES = (*STRENGTHS, "signal", "reflectance", "amplitude")
 _MIN_STEPS = 5  # smallest value, in steps, that is used to fit a factor
 _MIN_RETURNS = 20
+_COARSE_STEPS = 10  # values below this, in steps, are resolved poorly
 _MAX_CODE_ERROR = 0.03  # maximum relative error of the factor of 8-bit codes on a known scale
 
 
@@ -94,8 +95,11 @@ class StrengthColumns:
         threshold = "" if self.threshold.is_known else self.threshold.note
         return " ".join(filter(None, (self.scale.note, threshold)))
 
-    def energies(self, columns: Columns, range_m: AnyFloats) -> Floats:
+    def energies(self, columns: Columns, range_m: Floats) -> Floats:
         """Return the received energies of recorded returns.
+
+        The main column may be a coarse code. If it resolves a weak return poorly, the energy comes
+        from a column with a finer resolution.
 
         Parameters
         ----------
@@ -109,7 +113,20 @@ class StrengthColumns:
         array
             Energies. Shape (n,).
         """
-        return self.scale.energies(columns.get(self.scale.column), range_m)
+        energies = self.scale.energies(columns.get(self.scale.column), range_m)
+        if not self.scale.column or not self.scale.quantization.steps_per_unit:
+            return energies
+        step = self.scale.step_energies(range_m, 1)
+        for scale in self.others:
+            values = columns.get(scale.column)
+            if values is None:
+                continue
+            finer_step = scale.step_energies(range_m, 1)
+            is_coarse = (energies < _COARSE_STEPS * step) & (finer_step < step / 2)
+            rows = np.flatnonzero(is_coarse & is_valid(np.asarray(values)))
+            energies[rows] = scale.energies(np.asarray(values)[rows], range_m[rows])
+            step = np.where(is_coarse, finer_step, step)
+        return energies
 
     def intensities(
         self, energy: AnyFloats, range_m: AnyFloats, saturation: float = np.inf

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -20,10 +20,11 @@ from lidarsim.errors import LidarError, explain_os_errors
 
 from ..identity.fingerprint import fingerprint
 
+if TYPE_CHECKING:
+    from ..run.cluster.worker_map import MapFunction
+
 STEPS_FOLDER = ".lidarpool-twin"
 _OF_FILE = "of.json"  # identifies the inputs of the steps
-
-MapFunction = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
 class TwinStep(NamedTuple):

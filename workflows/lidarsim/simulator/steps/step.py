@@ -352,6 +352,9 @@ class PulseStep(ABC):
     writes: ClassVar[tuple[str, ...]] = ()  # fields that the step adds or changes
     causes: ClassVar[tuple[int, ...]] = ()  # values of `cause` for returns that the step adds
     purposes: ClassVar[tuple[Purpose, ...]] = ()  # purposes of the step's random numbers
+    # Sentences that state why the step cannot act on recorded pulses, and what to do instead. Empty
+    # if the step can act on recorded pulses.
+    on_recordings: ClassVar[str] = ""
 
     def __init_subclass__(cls) -> None:
         if not getattr(cls, "role", None):

@@ -32,6 +32,11 @@ class WaveformStep(PulseStep):
     effects = ("Waveforms",)
     reads = "ray", "distance", "triangle", "energy", "velocity"
     writes = *RETURN_COLUMNS, "velocity", "width", "amplitude"
+    on_recordings = (
+        "`returns.waveform` cannot be simulated on a recording, because a recording contains "
+        "returns instead of waveforms. Reconstruct the scene with `lidarpool twin`, and simulate "
+        "the sensor in it."
+    )
 
     @staticmethod
     def applies(setup: Setup) -> bool:
