@@ -373,3 +373,12 @@ def test_points_are_sorted_by_the_closest_return_of_their_channel(seed):
         apart = apart + np.abs(cell // channels - ray_k // channels)
         chosen = apart[nearest_k]
         assert chosen == apart.min() if ray_k % channels != 3 else chosen < 8 * firings
+
+
+def test_a_recording_in_snow_is_noted(scene, sensor):
+    """In clear air, there is no such note."""
+    effects = Effects(weather=Weather(visibility_km=0.5))
+    snowy = recording_of(scan(scene, sensor, snow_mm_h=1.0))
+    assert any("are isolated, as in rain" in n for n in Augmenter(snowy, effects, sensor).notes)
+    clear = recording_of(scan(scene, sensor))
+    assert not any("isolated" in note for note in Augmenter(clear, effects, sensor).notes)

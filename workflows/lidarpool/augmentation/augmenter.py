@@ -21,6 +21,7 @@ from ..clouds.recording import Recording
 from .augmented_sweep import AugmentedSweep
 from .effects import Effects
 from .inserted_objects import InsertedObjects
+from .recorded_weather import weather_note
 from .scan_pattern import PulseGrid, ScanPattern
 from .sensor_motion import SensorMotion
 from .strength_columns import StrengthColumns
@@ -83,6 +84,8 @@ class Augmenter:
         self.pattern = ScanPattern.from_recording(recording, model, self.motion)
         self.strengths = StrengthColumns.for_recording(recording, model, reflectance)
         self._notes: list[str] = [self.pattern.note, self.strengths.scale.note]
+        if effects.weather.attenuates:
+            self._notes.append(weather_note(recording, self.pattern, self.motion))
         self.objects = InsertedObjects.from_effects(recording, effects, self.motion)
         self._notes += self.objects.notes
         self._simulation = self._build(model)

@@ -177,7 +177,7 @@ class Effects:
     def is_empty(self) -> bool:
         """Whether there are no effects."""
         weather = self.weather
-        has_air = weather.visibility_km is not None or weather.returns_light or weather.spray_g_m3
+        has_air = weather.attenuates or weather.spray_g_m3
         has_noise = any(value != getattr(Noise, name) for name, value in self.noise.items())
         changes = (has_air, has_noise, self.faults, self.mode, self.actors, self.insertions)
         return not any(changes)

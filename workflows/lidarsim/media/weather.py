@@ -121,6 +121,13 @@ class Weather(FileSection):
         check_fields(self)
 
     @property
+    def attenuates(self) -> bool:
+        """Whether there is rain, snow, dust or fog."""
+        return self.visibility_km is not None or bool(
+            self.rain_mm_h or self.snow_mm_h or self.dust_mg_m3
+        )
+
+    @property
     def returns_light(self) -> bool:
         """Whether rain, snow, dust or fog may return light."""
         return bool(self.rain_mm_h or self.snow_mm_h or self.dust_mg_m3) or self.fog_returns_light
