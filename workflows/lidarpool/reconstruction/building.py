@@ -55,7 +55,7 @@ from .labels import split_by_object
 from .lost_pulses import SensorCoverage, firings_per_turn
 from .motion import Motion
 from .odometry import RecordedPoses, find_poses
-from .processes import parallel_map
+from .processes import LostWorkersError, parallel_map
 from .recorded_sweeps import RecordedSweeps, Rotation
 from .reflectances import IntensityModel, Reflectances, Response, fit_response
 from .submap_tasks import BuildTask, SubmapSurfels, SubmapTask, align_submap, build_submap
@@ -151,12 +151,16 @@ class Twin:
             If the folder cannot be written to.
         """
         path = Path(folder)
+        with result_folder(path):
+            return self.write(path)
+
+    def write(self, folder: Path) -> list[Path]:
+        """Write the files of `save` to a folder that the caller has locked."""
         with (
-            result_folder(path),
             explain_os_errors(
-                f"The reconstruction cannot be written to {path}", "free some disk space"
+                f"The reconstruction cannot be written to {folder}", "free some disk space"
             ),
-            staging(path) as staged,
+            staging(folder) as staged,
         ):
             write_scene(staged / SCENE_FILE, self.scene)
             pictures = {name: page.svg() for name, page in self.pictures.items()}
@@ -173,7 +177,7 @@ class Twin:
             }
             for name, text in texts.items():
                 (staged / name).write_text(text, encoding="utf-8", newline="\n")
-            return [(staged / name).replace(path / name) for name in (SCENE_FILE, *texts)]
+            return [(staged / name).replace(folder / name) for name in (SCENE_FILE, *texts)]
 
     def _classes(self) -> dict[int, str]:
         """Return the material names of surfels with a recorded class, keyed by class number."""
@@ -289,8 +293,8 @@ def twin(
     ------
     LidarError
         If the recording cannot be read, has fewer than four sweeps, has no planes, or has no rings
-        and `model` is not set; if an extra is missing; or if the folder contains the steps of a
-        different twin.
+        and `model` is not set; if an extra is missing; if the folder contains the steps of a
+        different twin, or if another reconstruction is using it; or if the cluster is lost.
     """
     check_number("voxel_m", voxel_m, gt=0, le=10)
     require_package("scipy", "twin", "Reconstructing a recording")
@@ -312,12 +316,21 @@ def twin(
         raise LidarError(f"{reason} Specify its sensor, for example `--model livox/mid360`.")
     track = None if trajectory is None else Path(trajectory)
     report = report or (lambda line: None)
+    made_of = (_fingerprint_inputs(recorded, track), voxel_m)
     with ExitStack() as stack:
         if folder is None:
-            folder = stack.enter_context(TemporaryDirectory(prefix="lidarpool-"))
-        made_of = (_fingerprint_inputs(recorded, track), voxel_m)
-        steps = FinishedSteps.create_or_resume(Path(folder), made_of, resume=resume)
-        built = _Building(recorded, base, voxel_m, steps, client, report).twin(track)
+            steps_folder = Path(stack.enter_context(TemporaryDirectory(prefix="lidarpool-")))
+        else:
+            steps_folder = stack.enter_context(result_folder(Path(folder)))
+        steps = FinishedSteps.create_or_resume(steps_folder, made_of, resume=resume)
+        try:
+            built = _Building(recorded, base, voxel_m, steps, client, report).twin(track)
+        except (KeyboardInterrupt, LostWorkersError) as error:
+            if folder is not None:
+                error.add_note(
+                    f"The finished steps are stored in {folder}. Continue with `--resume`."
+                )
+            raise
         steps.remove()
     return built
 

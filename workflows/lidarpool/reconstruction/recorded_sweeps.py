@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -106,6 +106,14 @@ class RecordedSweeps:
                 f"{recording.name} contains no points, so there is nothing to reconstruct."
             )
         return cls(recording, rings, recording.point_times, _stamps_s(recording))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state to send to another process, whose working directory may differ."""
+        state = dict(vars(self))
+        if not isinstance(self.source, Recording):
+            path, *selection = self.source
+            state["source"] = (path.absolute(), *selection)
+        return state
 
     @property
     def recording(self) -> Recording:
