@@ -174,6 +174,21 @@ def test_a_twin_has_the_points_and_the_lost_pulses_of_held_out_sweeps(place):
     assert "points    " in repr(place)
 
 
+def test_a_twin_has_the_metrics_of_lidar4d(place):
+    found = place.figures["lidar4d"]
+    held = place.figures["held_out"]
+    assert [one["sweep"] for one in found["by_frame"]] == [one["sweep"] for one in held["by_sweep"]]
+    assert found["frames"] == len(found["by_frame"])
+    assert found["chamfer_m2"] < 0.5
+    assert found["f_score"] > 0.9
+    assert found["depth"]["rmse_m"] < 3
+    assert found["ray_drop"]["f1"] > 0.97
+    assert found["intensity"]["factor"] == 1
+    assert found["intensity"]["rmse"] < 0.1
+    assert place.figures["lidar4d_window"] is None
+    assert "lidar4d  " in repr(place)
+
+
 def test_lost_pulses_are_steps_of_a_ring_without_a_return():
     elevation = np.radians(np.linspace(15, -15, 16))
     azimuth = np.radians(np.arange(-179.9, 180, 0.4))

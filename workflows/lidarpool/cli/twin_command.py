@@ -44,6 +44,13 @@ if TYPE_CHECKING:
     "--sensor", metavar="NAME", help="Sensor or topic of the recording, if it contains several."
 )
 @click.option("--intensity", metavar="COLUMN", help="Column that contains the intensity.")
+@click.option(
+    "--lidar4d-window",
+    type=int,
+    metavar="FRAME",
+    help="First frame of a window of KITTI-360 in which LiDAR4D was evaluated, such as 4950. Only "
+    "this window is used, and the same frames are held out.",
+)
 @options.scheduler
 @options.flag("--resume", help="Resume an unfinished reconstruction, if there is one.")
 @overwrite
