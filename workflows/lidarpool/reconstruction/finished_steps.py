@@ -28,7 +28,6 @@ _OF_FILE = "of.json"  # identifies the inputs of the steps
 # Errors that NumPy and zipfile raise for damaged files.
 _DAMAGED = (
     EOFError,
-    MemoryError,  # the size of an array is damaged
     NotImplementedError,
     OSError,
     RuntimeError,
