@@ -13,6 +13,7 @@ import pytest
 
 from lidarpool import (
     Actor,
+    Augment,
     Beams,
     Campaign,
     Cloud,
@@ -43,6 +44,7 @@ from lidarpool import (
     Spin,
     Survey,
     Track,
+    augment,
     box,
     compare,
     fit,
@@ -176,6 +178,11 @@ WRONG = {
     remove_run: [(3, "location must be a str or a Path, but is 3")],
     sweeps: [("nowhere", "nowhere does not exist. Specify the output folder of a campaign")],
     twin: [("nowhere", "nowhere does not exist")],
+    augment: [
+        ("nowhere", "nowhere does not exist"),
+        ("nowhere", {"scene": "seed"}, "`scene` cannot be applied to a recording"),
+    ],
+    Augment: [("nowhere.yaml", "nowhere.yaml"), ({"steps": 3}, "`steps` cannot be applied")],
 }
 
 

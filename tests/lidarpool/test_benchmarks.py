@@ -6,7 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
-from benchmarks import live, odometry, raycast, realism, scanner, trees
+from benchmarks import augmentation, live, odometry, raycast, realism, scanner, trees
 from benchmarks.harness import read_results
 
 from lidarscenes.procedural.city import city
@@ -70,6 +70,19 @@ def test_what_is_real_is_measured_beside_what_is_bare(capsys):
     assert "x bare" in capsys.readouterr().out
     assert rows["bare"]["times"] == 1 and all(row["points"] > 500 for row in rows.values())
     assert {"3 boxes, moving", "19 sub-rays", "rain", "fog", "snow", "all"} <= rows.keys()
+
+
+@pytest.mark.slow
+def test_augmented_drives_agree_with_simulated_drives(capsys):
+    results = augmentation.main(["--quick", "--repeat", "1"])
+    assert "two seeds" in capsys.readouterr().out
+    drives = results["equivalence"]
+    for name in ("OS1-64", "VLP-16", "HDL-64E", "MCAP", "PCD", "compensated"):
+        for comparison in drives[name].values():
+            assert abs(comparison["surfaces_z"]) < 5 and abs(comparison["air_z"]) < 5
+    for counts in results["insertion"].values():
+        assert counts["same"] > 0.95 * counts["simulated"] and counts["behind"] == 0
+    assert results["speed"]["OS1-64"]["fog"]["ms"] > 0
 
 
 @pytest.mark.slow

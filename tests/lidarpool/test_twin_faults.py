@@ -22,8 +22,8 @@ from lidarpool import LidarError, Mounted, Pose, Sensor, Survey, Track, save_clo
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.folder import result_folder
 from lidarpool.reconstruction.finished_steps import STEPS_FOLDER, FinishedSteps, TwinStep
-from lidarpool.reconstruction.processes import LostWorkersError, parallel_map
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarpool.run.cluster.worker_map import LostWorkersError, parallel_map
 from lidarscenes.procedural.city import city
 from lidarsim.columns.table import SCAN
 from lidarsim.simulator.points.batch_columns import columns_of
@@ -161,7 +161,7 @@ def wait_for_loss(number):
 def test_a_lost_scheduler_is_one_sentence():
     with thread_cluster({"OTHER": 1}) as cluster, Client(cluster, set_as_default=False) as client:
         address = cluster.scheduler_address
-        with parallel_map(client, 3) as run:
+        with parallel_map(client, 3, 1) as run:
             results = iter(run(wait_for_loss, [0, 1, 2]))
             assert next(results) == 0
             cluster.sync(cluster.scheduler.close)
@@ -178,18 +178,16 @@ def test_an_error_of_a_worker_is_no_lost_cluster():
     with (
         thread_cluster({"OTHER": 1}) as cluster,
         Client(cluster, set_as_default=False) as client,
-        parallel_map(client, 1) as run,
+        parallel_map(client, 1, 1) as run,
         pytest.raises(OSError, match="no such file"),
     ):
         list(run(fail, [2]))
 
 
 @pytest.mark.slow
-def test_a_submap_that_kills_its_workers_is_one_sentence(monkeypatch):
-    monkeypatch.setattr("lidarpool.reconstruction.processes.CPU_COUNT", 2)
-    monkeypatch.setattr("lidarpool.reconstruction.processes.memory", lambda: 1 << 40)
+def test_a_submap_that_kills_its_workers_is_one_sentence():
     with (
-        parallel_map(None, 2) as run,
+        parallel_map(None, 2, 1, workers=2) as run,
         pytest.raises(LostWorkersError, match="Several workers ended while they processed the"),
     ):
         list(run(os._exit, [1, 1]))

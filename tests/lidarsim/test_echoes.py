@@ -42,11 +42,11 @@ from lidarsim import box as cuboid
 from lidarsim.media.materials import extinction, fresnel
 from lidarsim.numerics.random_numbers import raw
 from lidarsim.scene.shapes import seed_objects
-from lidarsim.simulator.returns import PulseReturns
+from lidarsim.simulator.returns import Keys, PulseReturns
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps.angle_noise import ACROSS
 from lidarsim.simulator.steps.range_noise import RANGE
-from lidarsim.simulator.steps.separation import reported_mask, separate_hits
+from lidarsim.simulator.steps.separation import Reporting, reported_mask, separate_hits
 
 # -- random numbers ------------------------------------------------------------------------------
 
@@ -156,6 +156,35 @@ def test_modes(mode):
     assert dual.distance.tolist() == [2.0, 7.0, 9.0]
 
 
+@pytest.mark.parametrize("subrays", [1, 3])
+@pytest.mark.parametrize("dropout", [0.0, 0.3])
+def test_the_strongest_return_is_that_of_all_detected_returns(subrays, dropout):
+    """Also for beams whose surface outshines the air, which take a shorter way."""
+    rng = np.random.default_rng(4)
+    noise = Noise(detection_range_m=100.0, dropout=dropout)
+
+    def hits_of(ray, triangle, farthest_m):
+        distance = rng.uniform(1, farthest_m, len(ray))
+        energy = noise.threshold * rng.exponential(2.0, len(ray)) ** 2
+        return PulseReturns(ray, distance, triangle, energy)
+
+    beams = 3000
+    surface_rays = np.flatnonzero(rng.random(beams * subrays) < 0.8)
+    surface = hits_of(surface_rays, np.zeros(len(surface_rays), np.int32), 12.0)
+    air_rays = np.sort(rng.integers(0, beams * subrays, 2 * beams))
+    air = hits_of(air_rays, np.full(2 * beams, -1, np.int32), 10.0)
+    air = air._replace(cause=np.ones(2 * beams, np.uint8))
+    keys = Keys(3, np.array([0, 1000]))
+    every, strongest = (
+        separate_hits(surface, 0.5, subrays, air=air, reporting=Reporting(mode, noise, keys))
+        for mode in ("all", "strongest")
+    )
+    expected = every.take(reported_mask(every, "strongest"))
+    assert beams / 2 < len(strongest.ray) < len(every.ray)
+    for column in ("ray", "distance", "triangle", "energy", "cause"):
+        assert np.array_equal(getattr(strongest, column), getattr(expected, column)), column
+
+
 def test_a_surface_that_continues_takes_hits_between_its_hits():
     """The example of `continue_surfaces`: a drop, ground at three sub-rays, and a post."""
     from lidarsim.simulator.steps.pulse_loops import SubrayNeighbors
@@ -183,7 +212,7 @@ def test_a_surface_that_continues_takes_hits_between_its_hits():
         ),
         neighbors=SubrayNeighbors(4, pairs, normals.T.copy(), directions.T.copy()),
         receiver=Receiver(4, 0.3, ALL, False, 0.0, 0.0, 0.0, np.zeros(0)),
-        keys=RandomKeys(np.zeros(0, np.uint64), 0, np.zeros(1, np.int64), 0),
+        keys=RandomKeys(np.zeros((1, 0), np.uint64), np.zeros(1, np.int64), 0),
         output=found,
     )
     assert count == 2 and found.row[:count].tolist() == [-1, 3]

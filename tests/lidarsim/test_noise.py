@@ -28,7 +28,7 @@ from lidarpool import (
 )
 from lidarsim.media.weather import Weather, raindrops, snowflakes
 from lidarsim.motion.navigation import gnss_fixes, imu_samples
-from lidarsim.numerics.random_numbers import Purpose, initial_states, named_seed, raw
+from lidarsim.numerics.random_numbers import Purpose, named_seed, raw, scan_states
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps import particle_loops, pulse_loops, random_loops, spray_loops
 from lidarsim.simulator.steps.losses import PACKET
@@ -86,7 +86,7 @@ class Draws:
 
     def __init__(self):
         self.bits = {}  # {purpose: arrays}
-        self._purposes = {}  # {start: purpose}
+        self._purposes = {}  # {hash state: purpose}
         self._compiled_bits = compiled()(random_loops.bits.py_func)
 
     def raw(self, seed, purpose, *key):
@@ -94,14 +94,15 @@ class Draws:
         self.bits.setdefault(purpose, []).append(np.ravel(bits))
         return bits
 
-    def starts(self, seed, *which):
-        made = initial_states(seed, *which)
-        self._purposes.update(zip(made.tolist(), which, strict=True))
-        return made
+    def states(self, seed, purposes, scans):
+        states = scan_states(seed, purposes, scans)
+        for row in states.tolist():
+            self._purposes.update(zip(row, purposes, strict=True))
+        return states
 
-    def hashed(self, start, *key):
-        bits = self._compiled_bits(start, *key)
-        purpose = self._purposes[int(start)]
+    def hashed(self, state, *key):
+        bits = self._compiled_bits(state, *key)
+        purpose = self._purposes[int(state)]
         self.bits.setdefault(purpose, []).append(np.array([bits], np.uint64))
         return bits
 
@@ -110,7 +111,7 @@ def watch_arrays(monkeypatch, draws):
     """Have all modules draw arrays of random numbers by `draws`."""
     for name, module in [*sys.modules.items()]:
         if name.startswith(("lidarpool", "lidarscenes", "lidarsim")):
-            for known, watched in ((raw, draws.raw), (initial_states, draws.starts)):
+            for known, watched in ((raw, draws.raw), (scan_states, draws.states)):
                 if getattr(module, known.__name__, None) is known:
                     monkeypatch.setattr(module, known.__name__, watched)
 
@@ -119,8 +120,8 @@ def watch_loops(monkeypatch, draws):
     """Have the loops that draw random numbers run in plain Python, and draw by `draws`."""
     # Some are private: every function is replaced by which a random number reaches a loop.
     sampling = {
-        particle_loops: ["write_particle", "sample_particles", "sample_fog"],
-        spray_loops: ["write_particle", "_column", "_guide", "sample_clumps"],
+        particle_loops: ["particle_energy", "sample_particles", "sample_fog"],
+        spray_loops: ["particle_energy", "_column", "_guide", "sample_clumps"],
     }
     for loops, names in sampling.items():
         # Others are compiled without these.

@@ -12,7 +12,7 @@ from tests.shapes import quad
 
 from lidarpool import Beams, Material, Noise, Optics, Returns, Scene, Sensor, Spin, Survey
 from lidarsim.media.weather import Air, spray_clumps
-from lidarsim.numerics.random_numbers import Purpose, initial_states, named_seed, raw
+from lidarsim.numerics.random_numbers import Purpose, named_seed, raw, scan_states
 from lidarsim.sensor.disc import Beam
 from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
 from lidarsim.simulator.casting.surfaces import SceneSurfaces, SensorLight
@@ -303,7 +303,7 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
         ):
             precipitation = reference.Precipitation(kind, air, noise.threshold)
             seed = named_seed(9, "kind 1" if number else "")
-            tables = seen.counts, seen.by_range[0]
+            tables = seen.counts, seen.by_range[:, 0].astype(float)
             drawn += reference.particles(precipitation, seed, key, own, tables)
         if cloud is not None:
             table = cloud.peaks.reshape(-1, len(cloud.energy))
@@ -337,8 +337,9 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
     light = np.ones(len(hits))
     crossings = spray_loops.BoxCrossings(beam, crossed)
     spray_loops.attenuate(crossings, each, 0.1, far, SampledHits(hits, place, light))
-    begun = initial_states(9, SPRAY_DEPTH, SPRAY_SUBRAY, SPRAY_DIAMETER)
-    keys = RandomKeys(begun, KEYS.scan, KEYS.scan_starts, FIRST)
+    purposes = SPRAY_DEPTH, SPRAY_SUBRAY, SPRAY_DIAMETER
+    states = scan_states(9, purposes, KEYS.scan + np.arange(len(KEYS.scan_starts)))
+    keys = RandomKeys(states, KEYS.scan_starts, FIRST)
     out = SampledHits(np.empty(4000, np.int64), *np.empty((2, 4000)))
     clumps = []
     left = []
@@ -350,7 +351,9 @@ def test_clumps_of_spray_are_those_of_the_twin(each):
         boxes = [tuple(one) for one in crossed[:, beam == pulse].T.tolist()]
         own = far[pulse * each : (pulse + 1) * each].tolist()
         key = key_of(FIRST + pulse)
-        seen = reference.clumps(precipitation, 9, key, own, boxes, (mean, tables[0]))
+        seen = reference.clumps(
+            precipitation, 9, key, own, boxes, (mean, tables[:, 0].astype(float))
+        )
         clumps += [(pulse * each + one.subray, one.distance, one.energy) for one in seen]
         left += [reference.veiled(end, boxes, 0.1) for end in own if end < np.inf]
     ray, distance, energy = map(np.array, zip(*clumps, strict=True))

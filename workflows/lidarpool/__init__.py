@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from .api.dask_frames import to_dask
     from .api.result import Result
     from .api.simulation import Campaign, simulate
+    from .augmentation.effects import Effects, Insertion
+    from .augmentation.transform import Augment, augment
     from .clouds.open3d_cloud import to_open3d
     from .clouds.ply import read_cloud
     from .clouds.recording import Recording
@@ -55,18 +57,21 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Actor",
+    "Augment",
     "Beams",
     "Campaign",
     "CampaignRun",
     "Cloud",
     "Column",
     "Comparison",
+    "Effects",
     "Fault",
     "Fit",
     "Follower",
     "Foxglove",
     "Gnss",
     "Imu",
+    "Insertion",
     "Job",
     "LidarError",
     "Material",
@@ -97,6 +102,7 @@ __all__ = [
     "Track",
     "Twin",
     "__version__",
+    "augment",
     "box",
     "compare",
     "fit",
@@ -124,6 +130,8 @@ _MODULES = {
     ".api.dask_frames": ("to_dask",),
     ".api.result": ("Result",),
     ".api.simulation": ("Campaign", "simulate"),
+    ".augmentation.effects": ("Effects", "Insertion"),
+    ".augmentation.transform": ("Augment", "augment"),
     ".datasets.loader": ("sweeps",),
     ".clouds.writing": ("save_cloud",),
     ".clouds.open3d_cloud": ("to_open3d",),

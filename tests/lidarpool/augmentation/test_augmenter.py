@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from lidarpool import Fault, Pose, Scanner, Scene, load_sensor
+from lidarpool import Fault, Pose, Scanner, Scene, Track, load_sensor
 from lidarpool.augmentation.augmenter import Augmenter
 from lidarpool.augmentation.effects import Effects, Insertion
 from lidarpool.clouds.recording import Recording
@@ -266,8 +266,6 @@ def test_a_stationary_car_keeps_its_place_while_the_sensor_moves(scene, sensor):
 
 
 def test_cars_move_during_a_sweep(clear, sensor):
-    from lidarpool import Track
-
     speed = 20.0
     track = Track([0.0, 1.0], [[10, -3, -HEIGHT_M], [10 + speed, -3, -HEIGHT_M]], yaw_deg=0.0)
     augmenter = Augmenter(clear, Effects(actors=(Actor(CAR, track),)), sensor)
@@ -315,3 +313,47 @@ def test_a_sweep_without_points_stays_empty(scene, sensor):
     result = Augmenter(recording, Effects(weather=Weather(snow_mm_h=2.0)), sensor).sweep(0)
     assert len(result.sweep) == 0
     assert result.sweep.columns["cause"].shape == (0,)
+
+
+def test_results_do_not_depend_on_how_pulses_are_divided(clear, sensor, monkeypatch):
+    track = Track([0, 1], [[-10, 3, 0.7], [10, 3, 0.7]])
+    effects = {
+        "weather": Weather(snow_mm_h=2.0),
+        "insertions": (Insertion(CAR, 8, -3),),
+        "actors": (Actor(replace(CAR, name="Moving"), track),),
+    }
+    whole = augmented(clear, sensor, **effects)
+    monkeypatch.setattr("lidarsim.simulator.pulses.CHUNK_RAYS", 1 << 11)
+    for one, other in zip(whole, augmented(clear, sensor, **effects), strict=True):
+        assert np.array_equal(one.sweep.points, other.sweep.points)
+        assert one.sweep.columns.keys() == other.sweep.columns.keys()
+        for name, values in one.sweep.columns.items():
+            assert np.array_equal(values, other.sweep.columns[name])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_points_are_sorted_by_the_closest_return_of_their_channel(seed):
+    from lidarpool.augmentation.grid_loops import sort_points
+
+    rng = np.random.default_rng(seed)
+    firings, channels = 40, 8
+    cell = np.sort(rng.choice(firings * channels, 60, replace=False))
+    cell = cell[cell % channels != 3]  # a channel without returns
+    row = rng.permutation(len(cell))
+    added = rng.choice(firings * channels, 50, replace=False)
+    ray = np.concatenate([cell, added])
+    source = np.concatenate([np.arange(len(cell)), np.full(len(added), -1)]).astype(np.int32)
+    by_ray = np.argsort(ray, kind="stable")
+    ray, source = ray[by_ray], source[by_ray]
+    nearest, order = np.empty((2, len(ray)), np.int64)
+    sort_points(ray, source, cell, row, (firings, channels), nearest, order)
+    assert np.array_equal(np.sort(order), np.arange(len(ray)))
+    is_added = source[order] < 0
+    assert np.array_equal(nearest[~is_added], source[order][~is_added])
+    keys = 2 * row[nearest] + is_added
+    assert (np.diff(keys) >= 0).all()
+    for ray_k, nearest_k in zip(ray[order][is_added], nearest[is_added], strict=True):
+        apart = np.abs(cell % channels - ray_k % channels) * 3 * firings
+        apart = apart + np.abs(cell // channels - ray_k // channels)
+        chosen = apart[nearest_k]
+        assert chosen == apart.min() if ray_k % channels != 3 else chosen < 8 * firings

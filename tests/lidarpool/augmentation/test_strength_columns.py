@@ -12,6 +12,8 @@ from lidarpool import load_sensor
 from lidarpool.augmentation.detection_threshold import detection_threshold
 from lidarpool.augmentation.intensity_scale import IntensityScale
 from lidarpool.augmentation.strength_columns import StrengthColumns
+from lidarpool.clouds.recording import Recording
+from lidarsim.columns.sweep import Sweep
 from lidarsim.sensor.reflectivity import SCALES
 
 OUSTER = SCALES["ouster"]
@@ -154,3 +156,42 @@ def test_nothing_is_lost_without_returns():
 def test_scales_can_be_sent_to_workers():
     strengths = StrengthColumns.for_recording(record(ouster))
     assert pickle.loads(pickle.dumps(strengths)) == strengths
+
+
+def test_weak_returns_have_the_energies_of_the_column_with_the_finest_steps():
+    """The reflectivity of an Ouster is a byte, but the signal has thousands of steps."""
+    random = np.random.default_rng(0)
+    range_m = random.uniform(5, 60, 20_000)
+    energy = random.uniform(0.005, 0.6, len(range_m)) * (10 / range_m) ** 2
+    signal = np.rint(10_000 * energy).astype(np.uint16)
+    reflectivity = OUSTER.encode(energy / (10 / range_m) ** 2)
+    columns = {"intensity": signal, "reflectivity": reflectivity}
+    points = np.outer(range_m, [1.0, 0, 0])
+    recording = Recording("drive", 1, lambda _: Sweep(points, columns))
+    strengths = StrengthColumns.for_recording(recording, load_sensor("ouster/os1-64"))
+    assert strengths.scale.column == "reflectivity"
+    weak = (reflectivity < 8) & (signal > 30)
+    errors = strengths.energies(columns, range_m)[weak] / energy[weak] - 1
+    assert weak.sum() > 1000
+    assert np.abs(errors).max() < 0.05
+    halved = strengths.scale_intensities(columns, energy, energy / 2, range_m, range_m)
+    expected = OUSTER.encode(energy / 2 / (10 / range_m) ** 2)
+    np.testing.assert_array_equal(halved["reflectivity"], expected)
+
+
+def test_saturated_returns_are_clipped():
+    random = np.random.default_rng(0)
+    range_m = random.uniform(5, 60, 5_000)
+    reflectivity = random.integers(5, 90, len(range_m)).astype(np.uint8)
+    points = np.outer(range_m, [1.0, 0, 0])
+    columns = {"reflectivity": reflectivity}
+    recording = Recording("drive", 1, lambda _: Sweep(points, columns))
+    strengths = StrengthColumns.for_recording(recording, load_sensor("ouster/os1-64"))
+    energy = strengths.energies(columns, range_m)
+    full = float(np.median(energy))
+    clipped = strengths.scale_intensities(columns, energy, energy, range_m, range_m, full)
+    after = strengths.energies(clipped, range_m)
+    step = 0.01 * (10 / range_m) ** 2
+    assert (after <= full + step).all()
+    weak = energy <= full
+    np.testing.assert_array_equal(clipped["reflectivity"][weak], reflectivity[weak])

@@ -11,7 +11,7 @@ import numpy as np
 from lidarsim.columns.column_names import TIMES
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
-from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints, Ints32
+from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Integers, Ints, to_writable
 from lidarsim.sensor import Noise, Returns, Sensor
 from lidarsim.simulator.recorded_sweeps import FiredPulses, PulseAugmenter, RecordedSensor
 from lidarsim.simulator.returns import PulseReturns
@@ -22,12 +22,16 @@ from .augmented_sweep import AugmentedSweep
 from .effects import Effects
 from .inserted_objects import InsertedObjects
 from .scan_pattern import PulseGrid, ScanPattern
+from .sensor_motion import SensorMotion
 from .strength_columns import StrengthColumns
 
 _DIVERGENCE_MRAD = 3.0  # beam divergence of a sensor whose divergence is unknown
 _SUBRAYS = 7  # sub-rays per beam if objects are inserted
 _RECEIVER = ("detection_range_m", "overlap_m", "saturation", "seed")  # properties of the receiver
 _UNSUPPORTED_FAULTS = ("frozen", "time_jump")
+# Minimum energy of recorded returns relative to the detection threshold. With this energy, 2.3 % of
+# the pulses are detected.
+_WEAKEST = 0.6
 _RANGES = ("range", "distance", "depth")  # columns that contain ranges
 _ROUNDING = 1e-9  # relative differences below this are rounding errors of the simulation
 
@@ -73,10 +77,13 @@ class Augmenter:
                 )
         self.recording = recording
         self.effects = effects
-        self.pattern = ScanPattern.from_recording(recording, model)
+        self.motion = SensorMotion.from_recording(
+            recording, has_objects=bool(effects.actors or effects.insertions)
+        )
+        self.pattern = ScanPattern.from_recording(recording, model, self.motion)
         self.strengths = StrengthColumns.for_recording(recording, model, reflectance)
         self._notes: list[str] = [self.pattern.note, self.strengths.scale.note]
-        self.objects = InsertedObjects.from_effects(recording, effects)
+        self.objects = InsertedObjects.from_effects(recording, effects, self.motion)
         self._notes += self.objects.notes
         self._simulation = self._build(model)
 
@@ -190,22 +197,20 @@ class Augmenter:
 
         `number` selects the random numbers, the time of the sweep and the poses of actors.
         """
-        grid = self.pattern.grid(sweep)
+        grid = self.pattern.grid(self.motion.as_fired(sweep, number))
         if not len(grid.row):
             return self._without_returns(sweep)
-        motion = self.objects.motion(sweep, number, grid.times_s - self._first_s)
-        if motion.origins is not None:
-            channels = grid.directions.shape[1]
-            origins = np.repeat(motion.origins[:, None], channels, axis=1)
-            grid = grid.with_origins(origins, motion.rotations)
-        recorded = {name: np.asarray(v)[grid.row] for name, v in sweep.columns.items()}
-        # What was detected had at least the energy of the threshold.
-        energy = np.maximum(
-            self.strengths.energies(recorded, grid.range_m), self._simulation.threshold
-        )
+        motion = self.motion.of_sweep(sweep, number, grid.times_s)
+        if motion.origins is not None and motion.rotations is not None:
+            grid = grid.transform(motion.origins, motion.rotations)
+        names = self.strengths.names[:1]  # the column that defines the energies
+        recorded = {name: np.asarray(sweep.columns[name])[grid.row] for name in names}
+        # What was detected had an energy of about the threshold or more.
+        weakest = _WEAKEST * self._simulation.threshold
+        energy = np.maximum(self.strengths.energies(recorded, grid.range_m), weakest)
         firing_ns = self._start_ns(number) + 1e9 * (grid.times_s - self._first_s)
         pulses = FiredPulses(
-            grid.directions,
+            lambda: grid.directions,
             firing_ns,
             RecordedPulses(grid.cell, grid.range_m, energy, grid.fired.reshape(-1)),
             grid.origins,
@@ -237,18 +242,22 @@ class Augmenter:
         """Set the strength columns of points whose energy or range has changed."""
         assert returns.energy is not None
         energy = returns.energy[points.order]
-        source = points.source
-        old_energy = recorded.energy[source]
+        old_energy = recorded.energy[points.nearest]
+        full = self._simulation.saturation
         changed = points.is_moved | (np.abs(energy - old_energy) > _ROUNDING * energy)
-        added = np.flatnonzero(~points.is_recorded)
-        kept = np.flatnonzero(points.is_recorded & changed)
-        new_values = self.strengths.intensities(energy[added], points.range_m[added])
+        changed |= energy > full
+        added = points.added
+        changed[added] = False
+        kept = np.flatnonzero(changed)
+        old_m = grid.range_m[points.nearest[kept]]
+        new_values = self.strengths.intensities(energy[added], points.range_m[added], full)
         scaled = self.strengths.scale_intensities(
-            {name: values[kept] for name, values in columns.items()},
+            {name: columns[name][kept] for name in self.strengths.names if name in columns},
             old_energy[kept],
             energy[kept],
-            grid.range_m[source[kept]],
-            points.range_m[kept],
+            old_m,
+            np.where(points.is_moved[kept], points.range_m[kept], old_m),
+            full,
         )
         for name, values in scaled.items():
             columns[name][kept] = values
@@ -285,23 +294,24 @@ class Augmenter:
         """Return the columns of the augmented points."""
         columns = {name: np.asarray(v)[points.template] for name, v in sweep.columns.items()}
         self._set_strengths(columns, points, grid, recorded, returns)
-        added = np.flatnonzero(~points.is_recorded)
-        ranges = np.linalg.norm(np.asarray(sweep.points, np.float64), axis=1)
+        added = points.added
         for name in columns.keys() & {*_RANGES}:
-            stored = np.asarray(sweep.columns[name], np.float64)
-            valid = np.isfinite(ranges) & (ranges > 0) & (stored > 0)
+            stored = np.asarray(sweep.columns[name], np.float64)[grid.row]
+            valid = np.isfinite(stored) & (stored > 0)
             if not valid.any():
                 continue
-            unit = float(np.median(stored[valid] / ranges[valid]))
+            unit = float(np.median(stored[valid] / grid.range_m[valid]))
             changed = np.flatnonzero(points.is_moved)
             values = unit * points.range_m[changed]
             columns[name][changed] = _as_type(values, columns[name].dtype)
         times = self.recording.point_times
         if times is not None and len(added):
-            late_s = grid.times_s[points.firing] - grid.times_s[points.template_firing]
+            channels = grid.fired.shape[1]
+            template_firing = grid.cell[points.nearest[added]] // channels
+            late_s = grid.times_s[points.ray[added] // channels] - grid.times_s[template_firing]
             for name in TIMES:
                 if name in columns:
-                    values = columns[name][added] + late_s[added] / times.unit_s
+                    values = columns[name][added] + late_s / times.unit_s
                     columns[name][added] = _as_type(values, columns[name].dtype)
                     break
         order = points.order
@@ -311,8 +321,9 @@ class Augmenter:
             columns["returns"] = returns.return_counts[order].astype(columns["returns"].dtype)
         cause = np.zeros(len(order), np.uint8) if returns.cause is None else returns.cause[order]
         columns["cause"] = cause
-        numbers = self._simulation.objects(returns)[order]
-        self.objects.label(columns, added, numbers, len(sweep.object_names))
+        if columns.keys() & {"class", "object"}:
+            numbers = self._simulation.objects(returns.take(order[added]))
+            self.objects.label(columns, added, numbers, len(sweep.object_names))
         return columns
 
 
@@ -328,70 +339,45 @@ class _AugmentedPoints:
     range_m: Floats
     template: Ints
     is_moved: Bools  # whether a point is new or has another range
-    source: Ints32  # row among the recorded returns, or -1
-    firing: Ints
-    template_firing: Ints
+    ray: Integers
+    nearest: Ints  # row of the template among the recorded returns
+    added: Ints  # rows of the points that are not recorded returns
 
     @classmethod
     def from_returns(cls, sweep: Sweep, grid: PulseGrid, returns: PulseReturns) -> _AugmentedPoints:
         """Compute the points of reported returns."""
-        channels = grid.directions.shape[1]
+        from . import grid_loops  # imported here because numba takes half a second to import
+
         assert returns.reported is not None
         assert returns.source is not None
-        nearest = returns.source.astype(np.int64)
-        added = np.flatnonzero(nearest < 0)
-        nearest[added] = _nearest_returns(grid.cell, returns.ray[added].astype(np.int64), channels)
+        order, nearest = np.empty((2, len(returns.ray)), np.int64)
+        grid_loops.sort_points(
+            to_writable(returns.ray, np.int64),
+            returns.source,
+            grid.cell,
+            grid.row,
+            grid.fired.shape,
+            nearest,
+            order,
+        )
         template = grid.row[nearest]
-        order = np.lexsort((returns.source < 0, template))
-        ray = returns.ray[order].astype(np.int64)
+        added = np.flatnonzero(returns.source[order] < 0)
+        ray = returns.ray[order]
         range_m = returns.reported[order]
-        source = returns.source[order]
-        template = template[order]
-        old_m = grid.range_m[source]
-        is_moved = (source < 0) | (np.abs(range_m - old_m) > _ROUNDING * old_m)
-        positions = np.asarray(sweep.points, np.float64)[template]
+        old_m = grid.range_m[nearest]
+        is_moved = np.abs(range_m - old_m) > _ROUNDING * old_m
+        is_moved[added] = True
+        positions = np.asarray(sweep.points.take(template, axis=0), np.float64)
         rows = np.flatnonzero(is_moved)
         positions[rows] = grid.ends(ray[rows], range_m[rows])
-        return cls(
-            order,
-            positions,
-            range_m,
-            template,
-            is_moved,
-            source,
-            ray // channels,
-            grid.cell[nearest[order]] // channels,
-        )
+        return cls(order, positions, range_m, template, is_moved, ray, nearest, added)
 
     @property
     def is_recorded(self) -> Bools:
         """Whether each point is a recorded return."""
-        return np.asarray(self.source >= 0)
-
-
-def _nearest_returns(cells: Ints, rays: Ints, channels: int) -> Ints:
-    """Return the recorded return that is nearest to each ray, in the same channel if possible.
-
-    `cells` (n,) are the cells of the recorded returns.
-    """
-    if not len(rays):
-        return np.zeros(0, np.int64)
-    firings = int(max(cells.max(initial=0), rays.max())) // channels + 1
-    keys = (cells % channels) * firings + cells // channels
-    by_channel = np.argsort(keys, kind="stable")
-    keys = keys[by_channel]
-    wanted = (rays % channels) * firings + rays // channels
-    after = np.searchsorted(keys, wanted).clip(0, len(keys) - 1)
-    before = (after - 1).clip(0)
-    # A return of another channel is farther away than any return of the same channel.
-    far = 2 * firings
-
-    def distance(row: Ints) -> Ints:
-        gap = np.abs(keys[row] - wanted)
-        return np.asarray(gap + far * (keys[row] // firings != wanted // firings))
-
-    closer = np.where(distance(before) <= distance(after), before, after)
-    return by_channel[closer]
+        mask = np.ones(len(self.order), np.bool_)
+        mask[self.added] = False
+        return mask
 
 
 def _as_type(values: Floats, dtype: np.dtype[Any]) -> AnyArray:

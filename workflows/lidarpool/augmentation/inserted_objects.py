@@ -1,15 +1,14 @@
-"""Objects that are inserted into recorded sweeps, and the motion of the sensor among them."""
+"""Objects that are inserted into recorded sweeps."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.media.materials import Material
 from lidarsim.motion.rotations import quaternions_of
@@ -26,33 +25,9 @@ from ..clouds.boxes import SweepBoxes
 from ..clouds.recording import Recording
 from .effects import Effects, Insertion
 from .ground_plane import GroundPlane
+from .sensor_motion import SensorMotion, SweepMotion
 
-_MAX_LOCAL_M = 1e4  # distance from the origin beyond which the world frame is shifted
 _FIRST_OBJECT = 60_000  # number of the first inserted object if the objects have no names
-
-
-class SweepMotion(NamedTuple):
-    """Motion of the sensor during a sweep.
-
-    Attributes
-    ----------
-    poses
-        Positions (3,) or (f, 3) and rotations (3, 3) or (f, 3, 3) of the frame of the rays in the
-        world frame, or None if they are not needed.
-    origins
-        (f, 3): sensor positions at the firings in the frame of the sweep in meters, or None if the
-        points are not compensated for motion.
-    rotations
-        (f, 3, 3): rotations from the sensor frame at the firings to the frame of the sweep, or
-        None.
-    stamp_pose
-        (4, 4): transformation from the frame of the sweep to the world frame.
-    """
-
-    poses: tuple[Floats, Floats] | None = None
-    origins: Floats | None = None
-    rotations: Floats | None = None
-    stamp_pose: Floats = np.eye(4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,30 +36,23 @@ class InsertedObjects:
 
     Attributes
     ----------
-    recording
-        The recording.
     scene
-        Scene of the objects in the world frame of the recording, minus `shift`.
+        Scene of the objects in the world frame of the recording, minus `SensorMotion.shift`.
     names, types
         (k,): names of the objects, and names of their classes.
     classes
         (k,): semantic class numbers of the objects.
     materials
         Materials of the objects.
-    poses
-        (s, 4, 4): poses of the recording in the world frame, minus `shift`, or None if they are
-        unknown.
     notes
         Notes for the user.
     """
 
-    recording: Recording
     scene: Scene
     names: tuple[str, ...] = ()
     types: tuple[str, ...] = ()
     classes: tuple[int, ...] = ()
     materials: tuple[Material, ...] = ()
-    poses: Floats | None = None
     # (k, 2, 3): bounds of the objects in their own frames, meters
     bounds: Floats = field(default_factory=lambda: np.zeros((0, 2, 3)))
     # {number of a stationary object: pose in the world frame (4, 4)}
@@ -92,8 +60,10 @@ class InsertedObjects:
     notes: tuple[str, ...] = ()
 
     @classmethod
-    def from_effects(cls, recording: Recording, effects: Effects) -> InsertedObjects:
-        """Place the objects of effects in a recording.
+    def from_effects(
+        cls, recording: Recording, effects: Effects, motion: SensorMotion
+    ) -> InsertedObjects:
+        """Place the objects of effects in a recording, whose sensor motion is known.
 
         Raises
         ------
@@ -101,19 +71,14 @@ class InsertedObjects:
             If two objects have the same name, or the recorded ground below an object is unknown.
         """
         if not effects.actors and not effects.insertions:
-            return cls(recording, scene_of_bodies(), materials=effects.materials)
+            return cls(scene_of_bodies(), materials=effects.materials)
         notes = []
-        poses = recording.poses(range(len(recording)))
-        if poses is None:
+        if motion.poses is None:
             notes.append(
                 f"The poses of {recording.name} are unknown, so inserted objects move with the "
                 "sensor."
             )
-        shift = np.zeros(3)
-        if poses is not None and np.abs(poses[0, :3, 3]).max() > _MAX_LOCAL_M:
-            shift = np.floor(poses[0, :3, 3])
-            poses[:, :3, 3] -= shift
-        first_pose = np.eye(4) if poses is None else poses[0]
+        first_pose = np.eye(4) if motion.poses is None else motion.poses[0]
         ground = GroundPlane.from_sweep(recording[0]) if effects.insertions else None
         meshes: list[SceneMesh] = []
         placed: dict[int, Floats] = {}
@@ -123,7 +88,7 @@ class InsertedObjects:
             placed[number] = pose
             vertices = insertion.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
             meshes.append(replace(insertion.mesh, vertices=vertices, animation=None))
-        actors = tuple(_shifted(actor, shift) for actor in effects.actors)
+        actors = tuple(_shifted(actor, motion.shift) for actor in effects.actors)
         names = [mesh.name for mesh in meshes] + [actor.name for actor in actors]
         for name in names:
             if names.count(name) > 1:
@@ -135,13 +100,11 @@ class InsertedObjects:
         bounds = [_bounds(insertion.mesh) for insertion in effects.insertions]
         bounds += [_bounds(actor.mesh) for actor in actors]
         return cls(
-            recording,
             scene_of_bodies(tuple(meshes), actors),
             tuple(names),
             tuple(types),
             _classes(effects, types, names),
             effects.materials,
-            poses,
             np.array(bounds),
             placed,
             tuple(notes),
@@ -155,59 +118,9 @@ class InsertedObjects:
     @property
     def surface_materials(self) -> tuple[Material, ...]:
         """Materials of all objects, including those without a material of the user."""
-        return (*self.materials, Material("*")) if self.materials else ()
-
-    def motion(self, sweep: Sweep, number: int, times_s: Floats) -> SweepMotion:
-        """Return the motion of the sensor during a sweep.
-
-        `times_s` (f,) are the firing times in seconds after the first point of the sweep.
-        """
-        if not self.has_objects or self.poses is None:
-            return SweepMotion()
-        pose = self.poses[number]
-        single = (pose[:3, 3], np.ascontiguousarray(pose[:3, :3]))
-        path = self._path(number)
-        if path is None or sweep.compensated is None:
-            return SweepMotion(single, stamp_pose=pose)
-        positions, rotations = full_poses(path, 0, 1e9 * (times_s - path.times_s[0]))
-        if not sweep.compensated:
-            return SweepMotion((positions, rotations), stamp_pose=pose)
-        back = np.linalg.inv(pose)
-        origins = positions @ back[:3, :3].T + back[:3, 3]
-        return SweepMotion(single, origins, back[:3, :3] @ rotations, pose)
-
-    def _path(self, number: int) -> Track | None:
-        """Return the trajectory of the sensor around a sweep, or None if it is unknown.
-
-        Time 0 of the trajectory is the timestamp of the previous sweep.
-        """
-        stamps_ns = self.recording.stamps_ns
-        if stamps_ns is None or self.poses is None or len(self.poses) < 2:
-            return None
-        count = len(self.poses)
-        pose = self.poses[number]
-        step_s = 1e-9 * float(np.median(np.diff(stamps_ns)))
-        after, after_s = None, step_s
-        before, before_s = None, step_s
-        if number + 1 < count:
-            after = self.poses[number + 1]
-            after_s = 1e-9 * float(stamps_ns[number + 1] - stamps_ns[number])
-        if number:
-            before = self.poses[number - 1]
-            before_s = 1e-9 * float(stamps_ns[number] - stamps_ns[number - 1])
-        if after is None and before is not None:
-            after, after_s = pose @ np.linalg.inv(before) @ pose, before_s
-        if before is None and after is not None:
-            before, before_s = pose @ np.linalg.inv(after) @ pose, after_s
-        if before is None or after is None or before_s <= 0 or after_s <= 0:
-            return None
-        samples = np.stack([before, pose, after])
-        return Track(
-            np.array([-before_s, 0.0, after_s]),
-            samples[:, :3, 3],
-            quaternions_of(samples[:, :3, :3]),
-            beyond="hold",
-        )
+        if not self.materials or self.materials[-1].applies_to_all:
+            return self.materials
+        return (*self.materials, Material("*"))
 
     def label(
         self, columns: dict[str, AnyArray], added: Ints, numbers: Ints, named_objects: int
@@ -223,17 +136,16 @@ class InsertedObjects:
         added
             Rows of the added points.
         numbers
-            (n,): inserted object of each point, or -1.
+            Inserted object of each added point, or -1.
         named_objects
             Number of objects that are named in the recording.
         """
-        inserted = numbers[added]
         if "class" in columns:
             classes = np.array([*self.classes, 0])
-            columns["class"][added] = classes[inserted]
+            columns["class"][added] = classes[numbers]
         if "object" in columns:
             first = named_objects or _FIRST_OBJECT
-            columns["object"][added] = np.where(inserted >= 0, first + inserted, -1)
+            columns["object"][added] = np.where(numbers >= 0, first + numbers, -1)
 
     def boxes(
         self,
@@ -253,8 +165,10 @@ class InsertedObjects:
                 0
             )
         objects = simulation.objects(returns)
-        rays = np.unique(np.stack([objects, returns.ray]), axis=1)[0]
-        visible = np.bincount(rays[rays >= 0], minlength=count)
+        hits = np.flatnonzero(objects >= 0)
+        rays = len(pulses.recorded.fired)
+        visible = np.unique(objects[hits] * rays + returns.ray[hits]) // rays
+        visible = np.bincount(visible, minlength=count)
         points = np.bincount(objects[objects >= 0], minlength=count)
         alone = simulation.pulses_on_objects(pulses, motion.poses, count)
         back = np.linalg.inv(motion.stamp_pose)

@@ -201,6 +201,15 @@ class IntensityScale:
             white=codes.code / codes.reflectance / codes_per_unit,
         )
 
+    def clip(self, energy: AnyFloats, saturation: float) -> Floats:
+        """Limit energies to the energy at which the receiver saturates.
+
+        Unlimited energies, as in results, are those before saturation and are not limited.
+        """
+        if not self.compensated and np.isinf(self.quantization.max_value):
+            return np.asarray(energy, np.float64)
+        return np.asarray(np.minimum(energy, saturation), np.float64)
+
     def energies(self, intensity: AnyArray | None, range_m: AnyFloats) -> Floats:
         """Convert recorded intensities to received energies.
 
@@ -216,18 +225,27 @@ class IntensityScale:
         array
             Energies. Shape (n,).
         """
-        typical = self.typical * range_factors(range_m)
+        range_m = np.asarray(range_m)
         if intensity is None or not self.column:
-            return typical
-        intensity = np.asarray(intensity)
-        valid = is_valid(intensity)
-        values = np.where(valid, intensity, 0).astype(np.float64)
-        energies = self._reflectances(values) * self._factors(range_m)
+            return self._typical_energies(range_m)
+        return self._energies(np.asarray(intensity), range_m, self._factors(range_m))
+
+    def _energies(self, intensity: AnyArray, range_m: AnyFloats, factors: Floats) -> Floats:
+        """Convert recorded intensities, given the result of `_factors`."""
+        values = intensity.astype(np.float64)
+        invalid = np.flatnonzero(~is_valid(intensity))
+        values[invalid] = 0
+        energies = self._reflectances(values) * factors
         if not self.compensated and np.isfinite(self.quantization.max_value):
-            saturated = values >= self.quantization.max_value
-            energies[saturated] = np.maximum(energies[saturated], typical[saturated])
-        energies[~valid] = typical[~valid]
+            saturated = np.flatnonzero(values >= self.quantization.max_value)
+            typical = self._typical_energies(range_m[saturated])
+            energies[saturated] = np.maximum(energies[saturated], typical)
+        energies[invalid] = self._typical_energies(range_m[invalid])
         return energies
+
+    def _typical_energies(self, range_m: AnyFloats) -> Floats:
+        """Return the energies of typical surfaces at normal incidence."""
+        return self.typical * range_factors(range_m)
 
     def intensities(self, energy: AnyFloats, range_m: AnyFloats) -> AnyArray:
         """Convert received energies to the values that the sensor would record.
@@ -245,9 +263,12 @@ class IntensityScale:
             Values on the scale of the recording, which are quantized, clipped, and have the dtype
             of the recording. Energies that are not positive have the value 0. Shape (n,).
         """
-        energy = np.asarray(energy, np.float64)
+        return self._intensities(np.asarray(energy, np.float64), self._factors(range_m))
+
+    def _intensities(self, energy: Floats, factors: Floats) -> AnyArray:
+        """Convert received energies, given the result of `_factors`."""
         positive = np.where(energy > 0, energy, 0.0)
-        values = self._values(positive / self._factors(range_m))
+        values = self._values(positive / factors)
         steps, max_value = self.quantization
         values[values <= self.zero_value * (1 + 1e-9)] = 0
         if steps:
@@ -286,30 +307,42 @@ class IntensityScale:
             Values on the scale of the recording, as from `intensities`. Shape (n,).
         """
         intensity = np.asarray(intensity)
-        old_energy = np.asarray(old_energy, np.float64)
-        new_energy = np.asarray(new_energy, np.float64)
-        changed = (old_energy != new_energy) | (np.asarray(old_range_m) != np.asarray(new_range_m))
-        rows = np.flatnonzero(changed & is_valid(intensity))
-        recorded = self.energies(intensity[rows], np.asarray(old_range_m)[rows])
-        old = old_energy[rows]
-        new = new_energy[rows]
-        known = old > 0
-        scaled = np.where(known, recorded * (new / np.where(known, old, 1.0)), new)
-        result = intensity.astype(self.dtype)
-        result[rows] = self.intensities(scaled, np.asarray(new_range_m)[rows])
+        old_range_m = np.asarray(old_range_m, np.float64)
+        new_range_m = np.asarray(new_range_m, np.float64)
+        old = np.asarray(old_energy, np.float64)
+        new = np.asarray(new_energy, np.float64)
+        factors = self._factors(old_range_m)
+        scaled = self._energies(intensity, old_range_m, factors)
+        replaced = np.flatnonzero(~(old > 0))
+        if self.quantization.steps_per_unit:
+            # A value that is the rounded old energy becomes the rounded new energy.
+            finer = np.flatnonzero(scaled != old)
+            rounded = self._intensities(old[finer], factors[finer])
+            replaced = np.append(replaced, finer[rounded == intensity[finer]])
+        scaled *= new / np.where(old > 0, old, 1.0)
+        scaled[replaced] = new[replaced]
+        moved = old_range_m != new_range_m
+        rows = np.flatnonzero(moved)
+        factors[rows] = self._factors(new_range_m[rows])
+        result = self._intensities(scaled, factors)
+        kept = np.flatnonzero(~(is_valid(intensity) & (moved | (old != new))))
+        result[kept] = intensity[kept]
         return result
 
-    def step_energies(self, range_m: AnyFloats) -> Floats:
-        """Return the smallest energies that the recorded values resolve reliably.
+    def step_energies(self, range_m: AnyFloats, count: float | None = None) -> Floats:
+        """Return the energies of a number of steps of the recorded values.
 
-        Both arrays have shape (n,).
+        By default, these are the smallest energies that the values resolve reliably. Both arrays
+        have shape (n,).
         """
         steps = self.quantization.steps_per_unit
         if not steps or not self.column:
             return np.zeros(len(range_m))
         # Without compensation, returns close to the threshold have values of a few steps.
-        resolved = (_RESOLVED_STEPS if self.compensated else 0.5) / steps
-        return self._reflectances(np.full(len(range_m), resolved)) * self._factors(range_m)
+        if count is None:
+            count = _RESOLVED_STEPS if self.compensated else 0.5
+        values = np.full(len(range_m), count / steps)
+        return self._reflectances(values) * self._factors(range_m)
 
     def _factors(self, range_m: AnyFloats) -> Floats:
         """Return the energy of a return divided by the result of `_reflectances`."""

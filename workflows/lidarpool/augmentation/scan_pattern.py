@@ -7,21 +7,24 @@ which each ring returns, and cells of the grid without a return are pulses witho
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from lidarsim.columns.sweep import Sweep
-from lidarsim.numerics.arrays import Bools, Floats, Ints, to_writable
+from lidarsim.numerics.arrays import Bools, Floats, Integers, Ints, to_writable
 from lidarsim.numerics.elementary import arctan2, sin_cos
 from lidarsim.numerics.even_samples import even_indices
+from lidarsim.numerics.vectors import hypot
 from lidarsim.sensor import Sensor
 
 from ..clouds.recording import Recording
 from ..clouds.rings import Rings
+from .sensor_motion import SensorMotion
 
 if TYPE_CHECKING:
     from .grid_loops import ChannelTables, SweepReturns, SweepRotation
@@ -34,6 +37,7 @@ _MIN_STEPS = 8  # minimum number of steps of a ring from which its step is deter
 _MAX_STEPS = 3  # maximum number of steps in a gap from which the step is determined
 _MAX_OFF_STEP = 0.3  # maximum deviation of such a gap from whole steps
 _MAX_STRIDE = 4  # maximum ratio of the step of a ring to the smallest step
+_MIN_MULTIPLES = 0.9  # minimum fraction of gaps that are multiples of the step of a ring
 _MAX_STEP_CHANGE = 0.1  # maximum relative deviation of the step of a sweep
 _PHASE_SAMPLE = 8  # one in this many returns determines the phase of a sweep
 _MIN_RESULTANT = 0.5  # minimum resultant length of azimuths minus the rotation
@@ -44,13 +48,15 @@ _DIGITS = 9  # decimals of fitted angles, so that rounding errors do not affect 
 _TURN = 2 * np.pi
 
 
-class PulseGrid(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class PulseGrid:
     """Pulses of a sweep in a grid of f firings and c channels, and the returns of the pulses.
 
     Attributes
     ----------
-    directions
-        (f, c, 3): unit directions in the frame of the sweep.
+    aim
+        Function that returns the unit directions (k, 3) of the pulses in k cells, in the frame of
+        the sweep.
     times_s
         (f,): firing times in seconds relative to the timestamp of the sweep.
     fired
@@ -65,7 +71,7 @@ class PulseGrid(NamedTuple):
         (f, c, 3): origins of the pulses in meters, or None if all pulses start at the origin.
     """
 
-    directions: Floats
+    aim: Callable[[Integers], Floats]
     times_s: Floats
     fired: Bools
     cell: Ints
@@ -73,31 +79,55 @@ class PulseGrid(NamedTuple):
     row: Ints
     origins: Floats | None = None
 
-    def ends(self, ray: Ints, range_m: Floats) -> Floats:
+    @cached_property
+    def directions(self) -> Floats:
+        """Unit directions of all pulses in the frame of the sweep, of shape (f, c, 3)."""
+        return self.aim(np.arange(self.fired.size)).reshape(*self.fired.shape, 3)
+
+    def ends(self, ray: Integers, range_m: Floats) -> Floats:
         """Return the points at the given ranges along pulses, of shape (k, 3)."""
-        points = self.directions.reshape(-1, 3)[ray] * range_m[:, None]
+        points = self.aim(ray) * range_m[:, None]
         if self.origins is not None:
             points += self.origins.reshape(-1, 3)[ray]
         return points
 
-    def with_origins(self, origins: Floats, rotations: Floats | None = None) -> PulseGrid:
+    def with_origins(self, origins: Floats) -> PulseGrid:
         """Return a grid whose pulses start at other origins but end at the same returns.
+
+        `origins` (f, c, 3) are the new origins in meters.
+        """
+        path = self.ends(self.cell, self.range_m) - origins.reshape(-1, 3)[self.cell]
+        range_m = _ranges(path)
+        towards = path / range_m[:, None]
+
+        def aim(ray: Integers) -> Floats:
+            directions = self.aim(ray)
+            last = np.searchsorted(self.cell, ray, side="right") - 1  # farthest return of a pulse
+            returned = np.flatnonzero(self.cell[last] == ray)
+            directions[returned] = towards[last[returned]]
+            return directions
+
+        return replace(self, aim=aim, range_m=range_m, origins=origins)
+
+    def transform(self, positions: Floats, rotations: Floats) -> PulseGrid:
+        """Transform the pulses of each firing to the frame of the sweep.
 
         Parameters
         ----------
-        origins
-            (f, c, 3): new origins in meters.
+        positions
+            (f, 3): positions of the sensor at the firings in meters.
         rotations
-            (f, 3, 3): rotations of the pulses without a return, or None.
+            (f, 3, 3): rotations from the sensor frame at the firings to the frame of the sweep.
         """
-        ends = self.ends(self.cell, self.range_m)
-        directions = self.directions.copy()
-        if rotations is not None:
-            directions = np.einsum("fij,fcj->fci", rotations, directions)
-        path = ends - origins.reshape(-1, 3)[self.cell]
-        range_m = _ranges(path)
-        directions.reshape(-1, 3)[self.cell] = path / range_m[:, None]
-        return self._replace(directions=directions, range_m=range_m, origins=origins)
+        channels = self.fired.shape[1]
+        origins = np.repeat(positions[:, None], channels, axis=1)
+        if self.origins is not None:
+            origins += np.einsum("fij,fcj->fci", rotations, self.origins)
+
+        def aim(ray: Integers) -> Floats:
+            return np.asarray(np.einsum("kij,kj->ki", rotations[ray // channels], self.aim(ray)))
+
+        return replace(self, aim=aim, origins=origins)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,23 +155,28 @@ class Channels:
     origin: Floats | None = None
 
     @classmethod
-    def from_rings(cls, rings: Rings, model: Sensor | None) -> Channels:
+    def from_rings(cls, rings: Rings, model: Sensor | None, sweeps: Sequence[Sweep]) -> Channels:
         """Match the rings of a recording with the channels of a sensor model, if possible.
 
-        A recording has no ring for a channel that never returns.
+        A recording has no ring for a channel that never returns. Elevations are compared as seen
+        from the origins of the beams. Seen from the sensor origin, returns at close range may be
+        closer to the elevation of the next channel.
         """
+        from scipy.optimize import linear_sum_assignment
+
         recorded = cls(rings, rings.elevation_rad[::-1], np.arange(len(rings))[::-1])
-        if model is None or model.channels < len(rings):
+        if model is None or not 0 < len(rings) <= model.channels:
             return recorded
         order = np.argsort(model.beams.elevation, kind="stable")
         elevation = model.beams.elevation[order]
-        apart = np.abs(rings.elevation_rad[:, None] - elevation)
-        nearest = apart.argmin(axis=1)
+        seen = _elevations_from(model.beams.origin.mean(axis=0), rings, sweeps)
+        apart = np.abs(seen[:, None] - elevation)
+        _, channel = linear_sum_assignment(apart)
         gap_rad = float(np.median(np.diff(elevation))) if len(elevation) > 1 else np.inf
-        if len(np.unique(nearest)) < len(rings) or (apart.min(axis=1) > gap_rad).any():
+        if (apart[np.arange(len(rings)), channel] > gap_rad).any():
             return recorded
         origin = model.beams.origin[order] if model.beams.origin.any() else None
-        return cls(rings, elevation, nearest, model.beams.azimuth[order], origin)
+        return cls(rings, elevation, channel, model.beams.azimuth[order], origin)
 
     def __len__(self) -> int:
         return len(self.elevation_rad)
@@ -200,9 +235,7 @@ class ChannelPattern:
         if not steps:
             return None
         step_rad = round(float(np.median([step.smallest_rad for step in steps])), _DIGITS)
-        ring_rad = np.stack([step.ring_rad for step in steps])
-        ring_rad = np.nanmedian(np.where(np.isnan(ring_rad), step_rad, ring_rad), axis=0)
-        stride = np.rint(ring_rad / step_rad).clip(1, _MAX_STRIDE).astype(np.int64)
+        stride = np.min([step.stride for step in steps], axis=0)
         offset_rad, clockwise = _offsets(sweeps, azimuths, numbers, count, period_s)
         if channels.offset_rad is not None:
             offset_rad = channels.offset_rad
@@ -210,7 +243,9 @@ class ChannelPattern:
         for azimuth, number in zip(azimuths, numbers, strict=True):
             sector = np.floor(azimuth / _TURN * SECTORS).astype(np.int64) % SECTORS
             in_view[number[number >= 0], sector[number >= 0]] = True
-        # A ring above the horizon may observe nothing but the sky.
+        # The vehicle blocks pulses from below, so rings above a ring that returns are in view, too.
+        # They may observe nothing but the sky, or ground that is too far away.
+        in_view = np.logical_or.accumulate(in_view, axis=0)
         in_view[channels.elevation_rad >= _LOW_RAD] = in_view.any(axis=0)
         several = sum(step.several for step in steps)
         return cls(
@@ -253,18 +288,23 @@ class ChannelPattern:
         shape = rotation.firings + extra, len(self.channels)
         turns = np.arange(shape[0]) * rotation.step_rad + rotation.phase_rad
         sines = np.stack(sin_cos(rotation.sign * turns))
-        directions = np.empty((*shape, 3))
         fired = np.empty(shape, np.bool_)
         min_rings = max(_MIN_RINGS * len(self.channels.rings), 1)
-        grid_loops.fill_pulses(
-            returns, tables, rotation, min_rings, located, sines, directions, fired
-        )
+        grid_loops.mark_fired(returns, tables, rotation, min_rings, located, fired)
+
+        def aim(ray: Integers) -> Floats:
+            directions = np.empty((len(ray), 3))
+            grid_loops.aim_pulses(
+                to_writable(ray, np.int64), returns, tables, located, sines, directions
+            )
+            return directions
+
         if times_s is None:
             times = period_s * (np.arange(shape[0]) % rotation.firings) / rotation.firings
         else:
             times = _firing_times(located.firing, times_s, shape[0])
         range_m = returns.range_m[located.order]
-        grid = PulseGrid(directions, times, fired, located.cell, range_m, rows[located.order])
+        grid = PulseGrid(aim, times, fired, located.cell, range_m, rows[located.order])
         return self._from_beam_origins(grid, sines)
 
     def _from_beam_origins(self, grid: PulseGrid, sines: Floats) -> PulseGrid:
@@ -276,7 +316,7 @@ class ChannelPattern:
             return grid
         x, y, z = self.channels.origin.T
         sine, cosine = sines[:, :, None]
-        origins = np.empty_like(grid.directions)
+        origins = np.empty((*grid.fired.shape, 3))
         origins[..., 0] = cosine * x - sine * y
         origins[..., 1] = sine * x + cosine * y
         origins[..., 2] = z
@@ -332,11 +372,16 @@ class ScanPattern:
     note: str = ""
 
     @classmethod
-    def from_recording(cls, recording: Recording, model: Sensor | None = None) -> ScanPattern:
+    def from_recording(
+        cls,
+        recording: Recording,
+        model: Sensor | None = None,
+        motion: SensorMotion | None = None,
+    ) -> ScanPattern:
         """Determine the scan pattern from a few sweeps.
 
         The sensor model, if it is known, adds channels that never return, and the origins of the
-        beams.
+        beams. The motion of the sensor, if it is known, reverses the compensation of sweeps.
 
         Raises
         ------
@@ -344,12 +389,17 @@ class ScanPattern:
             If the recording cannot be read.
         """
         numbers = even_indices(len(recording), _REFERENCE_SWEEPS).tolist()
-        sweeps = [sweep for n in numbers if len(sweep := recording[n].returns())]
+        stored = {number: recording[number].returns() for number in numbers}
+        sweeps = [
+            sweep if motion is None else motion.as_fired(sweep, number)
+            for number, sweep in stored.items()
+            if len(sweep)
+        ]
         max_range_m = max((float(_ranges(sweep.points).max()) for sweep in sweeps), default=1.0)
         period_s = _period_s(recording)
         pattern = None
         if sweeps:
-            channels = Channels.from_rings(recording.rings, model)
+            channels = Channels.from_rings(recording.rings, model, sweeps)
             pattern = ChannelPattern.from_sweeps(channels, sweeps, period_s)
         note = ""
         if pattern is None:
@@ -389,18 +439,34 @@ class ScanPattern:
             times_s = self.period_s * np.arange(count) / max(count, 1)
         range_m = _ranges(points)
         channels = self.channel_count
-        directions = np.repeat((points / range_m[:, None])[:, None, :], channels, axis=1)
+        directions = points / range_m[:, None]
         fired = np.zeros((count, channels), np.bool_)
         fired[:, 0] = True
         cell = np.arange(count) * channels
-        return PulseGrid(directions, times_s, fired, cell, range_m, rows)
+        return PulseGrid(
+            lambda ray: directions[ray // channels], times_s, fired, cell, range_m, rows
+        )
+
+
+def _elevations_from(origin: Floats, rings: Rings, sweeps: Sequence[Sweep]) -> Floats:
+    """Return the median elevation of each ring, as seen from the origin of the beams.
+
+    `origin` (3,) is the origin of a beam at azimuth 0, in meters.
+    """
+    numbers = np.concatenate([rings.ring_indices(sweep) for sweep in sweeps])
+    x, y, z = np.concatenate([np.asarray(sweep.points, np.float64) for sweep in sweeps]).T
+    elevation = arctan2(z - origin[2], hypot(x, y) - origin[0])
+    medians = rings.elevation_rad.copy()
+    for ring in np.unique(numbers[numbers >= 0]).tolist():
+        medians[ring] = np.median(elevation[numbers == ring])
+    return medians
 
 
 class _RingSteps(NamedTuple):
     """Azimuth steps of the rings in a sweep."""
 
     smallest_rad: float  # typical step of the rings with the smallest steps
-    ring_rad: Floats  # (c,): step of each ring; NaN if it is unknown
+    stride: Ints  # (c,): ratio of the step of each ring to the smallest step; 1 if it is unknown
     several: int  # number of returns that share their pulse with another return
 
     @classmethod
@@ -422,7 +488,22 @@ class _RingSteps(NamedTuple):
         if np.isnan(ring_rad).all():
             return None
         several = int((same & (gaps < _SAME_PULSE_RAD)).sum())
-        return cls(float(np.nanquantile(ring_rad, 0.2)), ring_rad, several)
+        smallest_rad = float(np.nanquantile(ring_rad, 0.2))
+        stride = np.array([_stride(part, smallest_rad) for part in parts])
+        return cls(smallest_rad, stride, several)
+
+
+def _stride(gaps: Floats, step_rad: float) -> int:
+    """Return the number of steps of which nearly all gaps of a ring are multiples.
+
+    Most gaps of a ring that rarely returns span several steps, but not a multiple of them.
+    """
+    steps = np.rint(gaps / step_rad)
+    steps = steps[steps <= _MAX_STRIDE * _MAX_STEPS]
+    if len(steps) < _MIN_STEPS:
+        return 1
+    strides = range(_MAX_STRIDE, 1, -1)
+    return next((k for k in strides if (steps % k == 0).mean() > _MIN_MULTIPLES), 1)
 
 
 def _refined_step(gaps: Floats, step_rad: float) -> float:

@@ -34,6 +34,7 @@ from .intensity_scale import IntensityScale
 _NAMES = (*STRENGTHS, "signal", "reflectance", "amplitude")
 _MIN_STEPS = 5  # smallest value, in steps, that is used to fit a factor
 _MIN_RETURNS = 20
+_COARSE_STEPS = 10  # values below this, in steps, are resolved poorly
 _MAX_CODE_ERROR = 0.03  # maximum relative error of the factor of 8-bit codes on a known scale
 
 
@@ -94,8 +95,11 @@ class StrengthColumns:
         threshold = "" if self.threshold.is_known else self.threshold.note
         return " ".join(filter(None, (self.scale.note, threshold)))
 
-    def energies(self, columns: Columns, range_m: AnyFloats) -> Floats:
+    def energies(self, columns: Columns, range_m: Floats) -> Floats:
         """Return the received energies of recorded returns.
+
+        The main column may be a coarse code. If it resolves a weak return poorly, the energy comes
+        from a column with a finer resolution.
 
         Parameters
         ----------
@@ -109,9 +113,24 @@ class StrengthColumns:
         array
             Energies. Shape (n,).
         """
-        return self.scale.energies(columns.get(self.scale.column), range_m)
+        energies = self.scale.energies(columns.get(self.scale.column), range_m)
+        if not self.scale.column or not self.scale.quantization.steps_per_unit:
+            return energies
+        step = self.scale.step_energies(range_m, 1)
+        for scale in self.others:
+            values = columns.get(scale.column)
+            if values is None:
+                continue
+            finer_step = scale.step_energies(range_m, 1)
+            is_coarse = (energies < _COARSE_STEPS * step) & (finer_step < step / 2)
+            rows = np.flatnonzero(is_coarse & is_valid(np.asarray(values)))
+            energies[rows] = scale.energies(np.asarray(values)[rows], range_m[rows])
+            step = np.where(is_coarse, finer_step, step)
+        return energies
 
-    def intensities(self, energy: AnyFloats, range_m: AnyFloats) -> dict[str, AnyArray]:
+    def intensities(
+        self, energy: AnyFloats, range_m: AnyFloats, saturation: float = np.inf
+    ) -> dict[str, AnyArray]:
         """Return the values of all strength columns for new returns.
 
         Parameters
@@ -120,13 +139,18 @@ class StrengthColumns:
             Received energies. Shape (n,).
         range_m
             Ranges in meters. Shape (n,).
+        saturation
+            Energy at which the receiver saturates.
 
         Returns
         -------
         dict
             Arrays of shape (n,), keyed by column name. Empty without an intensity column.
         """
-        return {scale.column: scale.intensities(energy, range_m) for scale in self._scales}
+        return {
+            scale.column: scale.intensities(scale.clip(energy, saturation), range_m)
+            for scale in self._scales
+        }
 
     def scale_intensities(
         self,
@@ -135,6 +159,7 @@ class StrengthColumns:
         new_energy: AnyFloats,
         old_range_m: AnyFloats,
         new_range_m: AnyFloats,
+        saturation: float = np.inf,
     ) -> dict[str, AnyArray]:
         """Return the values of all strength columns after energies or ranges have changed.
 
@@ -145,6 +170,8 @@ class StrengthColumns:
         ----------
         columns
             Columns of a sweep. Arrays of shape (n,).
+        saturation
+            Energy at which the receiver saturates.
 
         Returns
         -------
@@ -153,11 +180,20 @@ class StrengthColumns:
         """
         return {
             scale.column: scale.scale_intensities(
-                columns[scale.column], old_energy, new_energy, old_range_m, new_range_m
+                columns[scale.column],
+                old_energy,
+                scale.clip(new_energy, saturation),
+                old_range_m,
+                new_range_m,
             )
             for scale in self._scales
             if scale.column in columns
         }
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the strength columns."""
+        return tuple(scale.column for scale in self._scales)
 
     @property
     def _scales(self) -> tuple[IntensityScale, ...]:

@@ -35,6 +35,7 @@ from ..processes.rare_collections import no_collections
 from ..viewers.viewer_table import PAGE, VIEWERS
 from . import completion
 from . import shared_options as shared
+from .augment_command import augment
 from .first_step import print_first_step
 from .play_command import play
 from .result_commands import compare, export, fit, plot, view
@@ -228,7 +229,7 @@ class _Commands(click.Group):
     cls=_Commands,
     commands=[
         *(init, import_, check, schema, scene, sensors, stations),
-        *(view, play, plot, export, compare, fit, twin),
+        *(view, play, plot, export, compare, fit, twin, augment),
     ],
     context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]},
 )

@@ -13,7 +13,12 @@ import click
 from click.shell_completion import CompletionItem
 
 from lidarsim.errors import LidarError
-from lidarsim.schema.vocabulary import ALWAYS_COLUMNS, COMPOSED_COLUMNS, OPTIONAL_COLUMNS
+from lidarsim.schema.vocabulary import (
+    ALWAYS_COLUMNS,
+    COMPOSED_COLUMNS,
+    INSERTIONS,
+    OPTIONAL_COLUMNS,
+)
 from lidarsim.sensor_files.format_table import FORMATS
 
 from ..clouds.format_table import EXPORTS, GROUP
@@ -102,6 +107,15 @@ def live(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
     items = starting_with(incomplete, [PAGE, *VIEWERS])
     takes_file = any(isinstance(param, click.Argument) for param in ctx.command.params)
     return [CompletionItem(incomplete, type="file"), *items] if takes_file else items
+
+
+def insertions(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
+    """Complete a file name or the name of a built-in object that can be inserted."""
+    del ctx, param
+    return [
+        CompletionItem(incomplete, type="file"),
+        *starting_with(incomplete, INSERTIONS),
+    ]
 
 
 def _in_list(incomplete: str, names: Iterable[str]) -> Items:

@@ -258,24 +258,42 @@ def _labels(
 # -- reading ---------------------------------------------------------------------------------
 
 
-def _sequences(source: RecordingSource) -> dict[str, Recording]:
-    """Open all sequences in a folder, a single sequence, or a folder of .bin files."""
-    folder = source.path
+def sequence_folders(folder: Path) -> dict[str, tuple[Path, Path]]:
+    """Find the sequences in a folder.
+
+    The folder can also be a single sequence, or contain .bin files.
+
+    Returns
+    -------
+    dict
+        The folder of each sequence and its folder with point files, keyed by the name of the
+        sequence. The name of a single sequence is empty.
+    """
     sequences = sort_by_number(p for p in folder.glob("sequences/*") if (p / "velodyne").is_dir())
     if sequences:
-        return {
-            sequence.name: _sequence(source, sequence, "velodyne", sequence.name)
-            for sequence in sequences
-        }
+        return {sequence.name: (sequence, sequence / "velodyne") for sequence in sequences}
     for inner in ("velodyne", "velodyne_points/data", "."):
         if any((folder / inner).glob("*.bin")):
-            return {"": _sequence(source, folder, inner)}
+            return {"": (folder, folder / inner)}
     return {}
 
 
-def _sequence(source: RecordingSource, folder: Path, inner: str, name: str = "") -> Recording:
+def point_files(folder: Path) -> list[Path]:
+    """Return the point files of a sequence in the order of its sweeps."""
+    return sort_by_number(folder.glob("*.bin"))
+
+
+def _sequences(source: RecordingSource) -> dict[str, Recording]:
+    """Open all sequences in a folder."""
+    return {
+        name: _sequence(source, *folders, name)
+        for name, folders in sequence_folders(source.path).items()
+    }
+
+
+def _sequence(source: RecordingSource, folder: Path, points: Path, name: str = "") -> Recording:
     """Open a folder of sweeps, with labels, poses and times if they exist."""
-    files = sort_by_number((folder / inner).glob("*.bin"))
+    files = point_files(points)
     calibration = folder / CALIBRATION_FILE
     notes = []
 

@@ -519,7 +519,28 @@ class _Tables:
 
 
 def _open_data_set(source: RecordingSource) -> Recording:
-    """Open a lidar in a nuScenes data set, given its root folder or the folder with its tables.
+    """Open a lidar in a nuScenes data set."""
+    folder = tables_folder(source)
+    with reading(source.name):
+        tables = NuScenesTables(folder)
+        lidars = {
+            name: _recording(source, tables, rows) for name, rows in tables.lidar_rows().items()
+        }
+    return source.select_sensor(lidars)
+
+
+def _recording(source: RecordingSource, tables: NuScenesTables, rows: list[_Row]) -> Recording:
+    times_ns = 1e3 * np.array([row["timestamp"] for row in rows])
+    return source.recording(
+        len(rows),
+        lambda number: tables.read(rows[number]),
+        read_stamps=times_ns.tolist,
+        sequence=tables.scene_name(rows[0]) if tables.scene_count > 1 else "",
+    )
+
+
+def tables_folder(source: RecordingSource) -> Path:
+    """Return the folder with the tables of a data set, given this folder or the root folder.
 
     Raises LidarError if the root folder contains several versions of the tables.
     """
@@ -533,61 +554,68 @@ def _open_data_set(source: RecordingSource) -> Recording:
                 f"folder of one version, for example {source.name}/{versions[0].name}."
             )
         (tables,) = versions
-    with reading(source.name):
-        lidars = _DataSet(source, tables.absolute()).lidars()
-    return source.select_sensor(lidars)
+    return tables.absolute()
 
 
-class _DataSet:
-    """Tables of a nuScenes data set with the sweeps of its lidars.
+class NuScenesTables:
+    """Tables of a nuScenes data set, which describe the sweeps of its lidars.
 
     File names in the tables are relative to the parent of the folder that contains the tables.
     """
 
-    def __init__(self, source: RecordingSource, tables: Path) -> None:
-        self._source = source
-        self._tables = tables
-        self._poses = self._table("ego_pose")
-        self._calibrated = self._table("calibrated_sensor")
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._poses = self.table("ego_pose")
+        self._calibrated = self.table("calibrated_sensor")
+        self._scenes = self.table("scene")
+        self._samples = self.table("sample")
         self._labels: dict[str, str] = {}  # {token of a sweep: its label file}
-        if (tables / "lidarseg.json").exists():
-            rows = self._table("lidarseg").values()
-            self._labels = {row["sample_data_token"]: row["filename"] for row in rows}
+        for row in self.table("lidarseg", optional=True).values():
+            self._labels[row["sample_data_token"]] = row["filename"]
         # Class number of each label. Data sets from other sources have no class numbers.
-        self._classes = np.arange(256, dtype=np.uint16)
-        known = self._labels and (tables / "category.json").exists()
-        for row in self._table("category").values() if known else ():
-            if "class" in row:
-                self._classes[row["index"]] = row["class"]
+        self.classes = np.arange(256, dtype=np.uint16)
+        for row in self.table("category", optional=True).values():
+            if self._labels and "class" in row:
+                self.classes[row["index"]] = row["class"]
 
-    def _table(self, name: str) -> dict[str, _Row]:
-        rows = json.loads(read_input(self._tables / f"{name}.json"))
+    def table(self, name: str, *, optional: bool = False) -> dict[str, _Row]:
+        """Read a table, whose rows are keyed by token.
+
+        An optional table is empty if its file does not exist.
+        """
+        if optional and not (self.folder / f"{name}.json").exists():
+            return {}
+        rows = json.loads(read_input(self.folder / f"{name}.json"))
         return {row["token"]: row for row in rows}
 
-    def lidars(self) -> dict[str, Recording]:
-        """Return one recording per lidar channel.
+    @property
+    def scene_count(self) -> int:
+        """Number of scenes."""
+        return len(self._scenes)
 
-        The sweeps of a recording are sorted by time. If there are several scenes, the name of the
-        scene precedes the name of the channel.
+    def scene_name(self, row: _Row) -> str:
+        """Return the name of the scene of a sweep."""
+        scene = self._scenes[self._samples[row["sample_token"]]["scene_token"]]
+        return str(scene["name"])
+
+    def lidar_rows(self) -> dict[str, list[_Row]]:
+        """Return the sweeps of each lidar channel, sorted by time.
+
+        If there are several scenes, the name of the scene precedes the name of the channel.
         """
-        sensors = self._table("sensor")
-        scenes = self._table("scene")
-        samples = self._table("sample")
+        sensors = self.table("sensor")
         rows_of_channel: dict[tuple[str, str], list[_Row]] = {}
-        for row in self._table("sample_data").values():
+        for row in self.table("sample_data").values():
             sensor = sensors[self._calibrated[row["calibrated_sensor_token"]]["sensor_token"]]
             if sensor["modality"] == "lidar":
-                scene = scenes[samples[row["sample_token"]]["scene_token"]]["name"]
-                rows_of_channel.setdefault((scene, sensor["channel"]), []).append(row)
+                channel = self.scene_name(row), sensor["channel"]
+                rows_of_channel.setdefault(channel, []).append(row)
                 for name, entry in self._named_files(row):
                     check_name(name, entry)
-        if len(scenes) == 1:
-            return {
-                channel: self._sweeps(rows)
-                for (_, channel), rows in sorted(rows_of_channel.items())
-            }
         return {
-            f"{scene} {channel}": self._sweeps(rows, scene)
+            f"{scene} {channel}" if self.scene_count > 1 else channel: sorted(
+                rows, key=lambda row: row["timestamp"]
+            )
             for (scene, channel), rows in sorted(rows_of_channel.items())
         }
 
@@ -597,35 +625,37 @@ class _DataSet:
         Each file name is accompanied by a description of the table entry that contains it.
         """
         token = row["token"]
-        folder = self._tables.name
+        folder = self.folder.name
         names = [(row["filename"], f"{folder}/{_SWEEP_TABLE}, token {token},")]
         if token in self._labels:
             entry = f"{folder}/lidarseg.json, sample_data_token {token},"
             names.append((self._labels[token], entry))
         return names
 
-    def _sweeps(self, rows: list[_Row], sequence: str = "") -> Recording:
-        rows.sort(key=lambda row: row["timestamp"])
-        times_ns = 1e3 * np.array([row["timestamp"] for row in rows])
-        return self._source.recording(
-            len(rows),
-            lambda number: self._read(rows[number]),
-            read_stamps=times_ns.tolist,
-            sequence=sequence,
-        )
+    def files(self, row: _Row) -> list[Path]:
+        """Return the paths of the point file of a sweep and, if it exists, of its label file.
 
-    def _read(self, row: _Row) -> Sweep:
-        names = self._named_files(row)
-        file, *label_files = [file_below(self._tables.parent, *named) for named in names]
+        Raises LidarError if a file is outside of the data set.
+        """
+        return [file_below(self.folder.parent, *named) for named in self._named_files(row)]
+
+    def sensor_pose(self, row: _Row) -> Floats:
+        """Return the sensor pose of a sweep in the world frame, with shape (4, 4)."""
+        calibration = _pose_of(self._calibrated[row["calibrated_sensor_token"]])
+        return _pose_of(self._poses[row["ego_pose_token"]]) @ calibration
+
+    def read(self, row: _Row) -> Sweep:
+        """Read a sweep."""
+        file, *label_files = self.files(row)
         columns = read_float_columns(file, NUSCENES)
         for label_file in label_files:
             labels = np.frombuffer(read_input(label_file), "u1")
             if len(labels) != (count := len(columns["x"])):
                 raise ValueError(f"{label_file.name} has {len(labels)} labels for {count} points")
-            columns["class"] = self._classes[labels]
-        calibration = _pose_of(self._calibrated[row["calibrated_sensor_token"]])
-        pose = _pose_of(self._poses[row["ego_pose_token"]]) @ calibration
-        return sweep_from_columns(columns, pose=pose, time_ns=1e3 * row["timestamp"])
+            columns["class"] = self.classes[labels]
+        return sweep_from_columns(
+            columns, pose=self.sensor_pose(row), time_ns=1e3 * row["timestamp"]
+        )
 
 
 def _pose_of(row: _Row) -> Floats:

@@ -86,11 +86,14 @@ class PCD(MultiFileFormat):
 
         The pose of each sweep is the VIEWPOINT in its file.
         """
-        files = [source.path]
-        if source.path.is_dir():
-            inside = source.path.iterdir()
-            files = sort_by_number(file for file in inside if file.suffix.lower() == ".pcd")
-        return _open_files(source, files)
+        return _open_files(source, point_files(source.path))
+
+
+def point_files(path: Path) -> list[Path]:
+    """Return the files of a recording in the order of its sweeps."""
+    if not path.is_dir():
+        return [path]
+    return sort_by_number(file for file in path.iterdir() if file.suffix.lower() == ".pcd")
 
 
 def _open_files(source: RecordingSource, files: list[Path]) -> Recording:

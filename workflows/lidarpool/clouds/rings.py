@@ -132,10 +132,16 @@ class Rings:
             )
         assert self.numbers is not None
         numbers = np.asarray(sweep.columns["channel"]).astype(np.int64)
+        # The values of a column are usually consecutive, and all of them belong to a ring.
+        values = np.arange(int(numbers.min()), int(numbers.max()) + 1)
+        if len(values) > len(numbers):
+            values, numbers = np.unique(numbers, return_inverse=True)
+        else:
+            numbers -= values[0]
         order = np.argsort(self.numbers)
-        place = np.searchsorted(self.numbers, numbers, sorter=order)
+        place = np.searchsorted(self.numbers, values, sorter=order)
         row = order[np.minimum(place, len(order) - 1)]
-        return np.where(self.numbers[row] == numbers, row, -1)
+        return np.where(self.numbers[row] == values, row, -1)[numbers]
 
     def _rows_of_runs(self, medians: Floats, is_ring: Bools) -> Ints:
         """Assign a ring to each run of points, given the median elevations of the runs.

@@ -333,7 +333,7 @@ def _cells(row: JobRow, names: Sequence[str], classes: Sequence[int]) -> Iterato
     for name, kind in (_HEAD | _TAIL).items():
         if name == "error":
             for value in names:
-                yield _written(row.values.get(value))
+                yield format_cell(row.values.get(value))
         entry = getattr(row, name)
         # Before Python 3.13, csv.writer left a bare carriage return unquoted.
         if kind is str:
@@ -397,7 +397,7 @@ def _kind(value: Any) -> type:
     return kind
 
 
-def _written(value: Any) -> str:
+def format_cell(value: Any) -> str:
     """Format a varied value as a table cell from which its value and type can be restored.
 
     The cell is empty for None.

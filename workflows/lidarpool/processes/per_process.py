@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 Value = TypeVar("Value")
 
@@ -14,6 +14,8 @@ class PerProcess(Generic[Value]):
 
     Use it for open files and locks that a forked process must not share with its parent. If two
     processes share an open file, each read moves the file position of both.
+
+    The value is not pickled, so that another process creates its own value.
 
     Parameters
     ----------
@@ -25,6 +27,9 @@ class PerProcess(Generic[Value]):
         self._create = create
         # A fork keeps its parent's value, because closing it could affect the parent.
         self._values: dict[int, Value] = {}  # {process: value}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_create": self._create, "_values": {}}
 
     def __call__(self) -> Value:
         """Return the value that belongs to the current process."""

@@ -40,6 +40,7 @@ from ..comparing.fit import Fit, fit
 from ..comparing.lidar4d import WINDOWS
 from ..recordings.opening import open_recording
 from ..report.page.rendering import render_template
+from ..run.cluster.worker_map import LostWorkersError, MapFunction, parallel_map
 from ..scenario.point_scene import CLASS_MATERIAL
 from .alignment import AlignedSweeps, Alignment, first_alignment
 from .charts import (
@@ -50,13 +51,12 @@ from .charts import (
     draw_sweep,
     draw_top_view,
 )
-from .finished_steps import FinishedSteps, MapFunction, TwinStep
+from .finished_steps import FinishedSteps, TwinStep
 from .held_out import HeldOutRays
 from .labels import split_by_object
 from .lost_pulses import SensorCoverage, firings_per_turn
 from .motion import Motion
 from .odometry import RecordedPoses, find_poses
-from .processes import LostWorkersError, parallel_map
 from .published_metrics import HeldOutFrames
 from .recorded_sweeps import RecordedSweeps, Rotation
 from .reflectances import IntensityModel, Reflectances, Response, fit_response
@@ -66,6 +66,7 @@ from .surface_map import Observations
 from .surfels import merge_surfels, surfel_centers, surfel_mesh
 
 MIN_SWEEPS = 4
+_SUBMAP_BYTES = 3 << 30  # memory per process for a submap of a sensor with 64 rings
 SCENE_FILE = "place.glb"
 TRAJECTORY_FILE = "trajectory.csv"
 SENSOR_FILE = "sensor.yaml"
@@ -413,7 +414,8 @@ class _Building:
             drawn_share=0.0,
         )
         is_shared = not isinstance(recorded.source, Recording)
-        with parallel_map(self.client, len(submaps) if is_shared else 1) as run:
+        count = len(submaps) if is_shared else 1
+        with parallel_map(self.client, count, _SUBMAP_BYTES) as run:
             task = replace(task, alignment=self._align_submaps(run, task, submaps))
             built = self._build_submaps(run, task, submaps)
             sweeps = AlignedSweeps(recorded, task.alignment, task.coverage)

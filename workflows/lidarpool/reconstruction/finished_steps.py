@@ -11,10 +11,10 @@ import pickle
 import shutil
 import struct
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from lidarsim._version import __version__
 from lidarsim.errors import LidarError, explain_os_errors
 
 from ..identity.fingerprint import fingerprint
+
+if TYPE_CHECKING:
+    from ..run.cluster.worker_map import MapFunction
 
 STEPS_FOLDER = ".lidarpool-twin"
 _OF_FILE = "of.json"  # identifies the inputs of the steps
@@ -37,8 +40,6 @@ _DAMAGED = (
     struct.error,
     zipfile.BadZipFile,
 )
-
-MapFunction = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
 class TwinStep(NamedTuple):

@@ -34,7 +34,7 @@ _MAX_START_RAD = np.radians(12)  # maximum angle between the first pulses of rin
 _MIN_AGREEMENT = 0.9  # minimum resultant length of azimuths minus a uniform rotation
 
 
-class RecordingFile(NamedTuple):
+class RecordingSelection(NamedTuple):
     """File or folder of a recording, and the part of it to read."""
 
     path: Path
@@ -44,7 +44,7 @@ class RecordingFile(NamedTuple):
 
 
 @lru_cache(maxsize=1)
-def _opened(file: RecordingFile) -> Recording:
+def _opened(file: RecordingSelection) -> Recording:
     path, sensor, intensity, window = file
     recording = open_recording(path, sensor, intensity, name="the recording")
     return recording if window is None else _select_window(recording, WINDOWS[window])
@@ -94,7 +94,7 @@ class RecordedSweeps:
         Timestamps of the sweeps in seconds, float64 of shape (s,), or None if there are none.
     """
 
-    source: RecordingFile | Recording
+    source: RecordingSelection | Recording
     rings: Rings
     point_times: PointTimes | None
     stamps_s: Floats | None
@@ -115,7 +115,7 @@ class RecordedSweeps:
         LidarError
             If the recording cannot be read, or if it does not contain the window.
         """
-        file = RecordingFile(path, sensor, intensity, window)
+        file = RecordingSelection(path, sensor, intensity, window)
         return replace(cls.from_recording(_opened(file)), source=file)
 
     @classmethod

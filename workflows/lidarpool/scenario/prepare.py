@@ -31,6 +31,7 @@ from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene import Scene
 from lidarsim.schema.declared import declared_values
 from lidarsim.sensor import Noise, Returns, Sensor
+from lidarsim.simulator.recorded_sweeps import scene_of_bodies
 from lidarsim.survey.survey import CloudOptions, Mounted, Survey
 from lidarsim.words import name_hint, plural
 
@@ -175,6 +176,61 @@ def _prepare(
         )
     mistakes.raise_if_any()
     return PreparedScenario(scenario, job, survey_parts.placement, findings)
+
+
+class PreparedActors(NamedTuple):
+    """Actors of a scenario without a static scene.
+
+    Attributes
+    ----------
+    actors
+        Actors and traffic. Coordinates are those of the scenario, and times start at 0 s.
+    materials
+        Materials of the scenario, with entries for the classes of the actors.
+    classes
+        Names of semantic classes by number.
+    notes
+        Notes about the files of the actors.
+    """
+
+    actors: Sequence[Actor]
+    materials: Sequence[Material]
+    classes: Mapping[int, str]
+    notes: Sequence[str]
+
+
+def prepare_actors(scenario: Scenario, duration_s: float = np.inf) -> PreparedActors:
+    """Read the files of a scenario that has actors or traffic, but no static scene.
+
+    Parameters
+    ----------
+    scenario
+        The scenario. Its actors must not follow surfaces.
+    duration_s
+        Duration in seconds of the traffic that is read.
+
+    Raises
+    ------
+    LidarError
+        If a file cannot be read.
+    """
+    findings = FileFindings()
+    shapes = ShapeLoader(scenario, findings)
+    support = SupportSurfaces(None)
+    vehicles: list[tuple[Actor, VehicleSection]] = []
+    with scenario.explain_missing_files():
+        actors = _build_actors(shapes, support, None)
+        if scenario.traffic is not None:
+            with prefix_errors(scenario.source):
+                vehicles = _traffic_actors(scenario.traffic, shapes, support, 0.0, duration_s)
+        actors += [actor for actor, _ in vehicles]
+        materials: Sequence[Material] = scenario.materials
+        if actors:
+            with prefix_errors(scenario.source):
+                scene = scene_of_bodies(actors=tuple(actors))
+                materials = _materials(scenario, findings, scene, vehicles)
+    classes = _class_names(scenario, findings, materials, ())
+    return PreparedActors(actors, materials, classes, [*findings.notes, *findings.remarks])
 
 
 class _SurveyParts(NamedTuple):
@@ -596,7 +652,7 @@ def _build_survey(
         **({"sensor": sensors[0].sensor} if is_plain_sensor else {"sensors": sensors}),
         steps=scenario.steps,
         materials=materials,
-        classes=_class_names(survey_parts, materials, cloud["columns"]),
+        classes=_class_names(scenario, survey_parts.findings, materials, cloud["columns"]),
         returns=Returns(**dict(scenario.returns)),
         noise=Noise() if all_have_noise else Noise(**dict(scenario.noise)),
         navigation=scenario.navigation,
@@ -609,7 +665,10 @@ def _build_survey(
 
 
 def _class_names(
-    survey_parts: _SurveyParts, materials: Sequence[Material], columns: Sequence[str]
+    scenario: Scenario,
+    findings: FileFindings,
+    materials: Sequence[Material],
+    columns: Sequence[str],
 ) -> dict[int, str]:
     """Return the names of a survey's classes, keyed by class number.
 
@@ -617,16 +676,13 @@ def _class_names(
     unless the scenario uses the number or the name for a different class. `columns` are the columns
     of the cloud.
     """
-    scenario = survey_parts.scenario
     entries = (*scenario.object_entries, *(scenario.traffic.vehicles if scenario.traffic else ()))
     scenario_classes = {entry.semantic_class for entry in (*scenario.materials, *entries)}
     file_classes = {material.semantic_class for material in materials} - scenario_classes
     numbers: dict[str, int] = {}  # {class name: number}
     if scenario.classes or "class" in columns:
         numbers = {
-            name: number
-            for number, name in survey_parts.findings.class_names.items()
-            if number in file_classes
+            name: number for number, name in findings.class_names.items() if number in file_classes
         }
     numbers |= {name: number for number, name in scenario.classes.items()}
     return {number: name for name, number in numbers.items()}

@@ -13,7 +13,7 @@ import numpy as np
 from ..environment.extras import reading, require_package
 from ..errors import CutShortError, LidarError
 from ..io.input_files import input_size
-from ..numerics.arrays import AnyArray
+from ..numerics.arrays import AnyArray, Records
 from ..words import make_distinct, printable
 from .mcap_chunks import check_chunks, check_packed
 
@@ -138,7 +138,16 @@ def point_columns(data: bytes) -> dict[str, AnyArray]:
     ValueError
         If the lengths in the message are inconsistent, or if a field has an invalid type or count.
     """
-    message: Any = message_types().deserialize_cdr(data, POINT_CLOUD)
+    rows = point_rows(message_types().deserialize_cdr(data, POINT_CLOUD))
+    return {name: rows[name] for name in rows.dtype.names or ()}
+
+
+def point_rows(message: Any) -> Records:
+    """Return the points of a PointCloud2 message as a structured array of shape (n,).
+
+    Its fields are named like the columns that `point_columns` returns. Unused bytes of a point are
+    part of its row. Raises ValueError like `point_columns`.
+    """
     kinds = {number: kind for kind, number in POINT_FIELDS.items()}
     order = ">" if message.is_bigendian else "<"
     for field in message.fields:
@@ -159,7 +168,7 @@ def point_columns(data: bytes) -> dict[str, AnyArray]:
         for index in range(field.count)
     ]
     if not numbers:
-        return {}
+        return np.zeros(0, [])
     formats = [order + kinds[field.datatype] for _, field, _ in numbers]
     row = np.dtype(
         {
@@ -174,8 +183,7 @@ def point_columns(data: bytes) -> dict[str, AnyArray]:
     )
     lines = message.data.reshape(message.height, message.row_step)
     used = np.ascontiguousarray(lines[:, : message.width * message.point_step])
-    rows = used.reshape(-1).view(row)
-    return {name: rows[name] for name in row.names or ()}
+    return used.reshape(-1).view(row)
 
 
 def livox_columns(data: bytes) -> dict[str, AnyArray]:
@@ -191,6 +199,15 @@ def livox_columns(data: bytes) -> dict[str, AnyArray]:
     ValueError
         If the message is truncated.
     """
+    rows, _ = livox_rows(data)
+    return {name: rows[name] for name in rows.dtype.names or ()}
+
+
+def livox_rows(data: bytes) -> tuple[Records, int]:
+    """Return the points of a serialized Livox CustomMsg, and the position of the first point.
+
+    The points are a structured array of shape (n,). Raises ValueError if the message is truncated.
+    """
     order: Literal["<", ">"] = "<" if data[1] & 1 else ">"
 
     def number(offset: int) -> int:
@@ -205,5 +222,15 @@ def livox_columns(data: bytes) -> dict[str, AnyArray]:
     if len(data) < start + count * row.itemsize - LIVOX_PADDING * bool(count):
         raise CutShortError(f"{count:,} points were expected, but there are fewer")
     content = data[start : start + count * row.itemsize].ljust(count * row.itemsize, b"\0")
-    rows = np.frombuffer(content, row)
-    return {name: rows[name] for name in row.names or ()}
+    return np.frombuffer(content, row), start
+
+
+def livox_message(data: bytes, rows: Records) -> bytes:
+    """Return a serialized Livox CustomMsg in which the points are replaced."""
+    _, start = livox_rows(data)
+    count = np.array(len(rows), "<u4" if data[1] & 1 else ">u4").tobytes()
+    head = bytearray(data[:start])
+    for position in (start - 12, start - 4):  # point_num, and the length of the array
+        head[position : position + 4] = count
+    content = rows.tobytes()
+    return bytes(head) + content[: len(content) - LIVOX_PADDING]

@@ -89,6 +89,15 @@ def initial_states(seed: int, *purposes: Purpose) -> NDArray[np.uint64]:
     return _mixed(start + np.array(steps, np.uint64))
 
 
+def scan_states(seed: int, purposes: tuple[Purpose, ...], scans: ArrayLike) -> NDArray[np.uint64]:
+    """Return the hash state of each scan for each purpose.
+
+    `scans` has shape (s,), and the result has shape (s, purposes).
+    """
+    steps = np.asarray(scans).astype(np.uint64) * np.uint64(_GAMMA)
+    return _mixed(initial_states(seed, *purposes) + steps[:, None])
+
+
 def raw(
     seed: int, purpose: Purpose, scan: ArrayLike, ray: ArrayLike, number: ArrayLike = 0
 ) -> NDArray[np.uint64]:

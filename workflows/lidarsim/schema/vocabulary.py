@@ -6,6 +6,10 @@ This module is quick to import. Command-line help and shell completion import no
 from __future__ import annotations
 
 BACKENDS = ("auto", "cuda", "tiles", "numpy")
+# Objects that `lidarpool augment` can insert without a file.
+INSERTIONS = ("car", "pedestrian")
+# Values of `lidarsim.sensor.optics.Mode`. A test compares them.
+RETURN_MODES = ("strongest", "first", "last", "dual", "two_strongest", "all")
 PICTURES = ("scene", "hits", "intensity", "cloud", "path")
 
 # Names of the columns in `lidarsim.columns.table.TABLE`, in the same order. A test compares them.

@@ -34,7 +34,9 @@ class ByteScale(NamedTuple):
         Both arrays have shape (n,).
         """
         fraction = reflectance / self.reflectance
-        code = self.code * np.minimum(fraction, 1) + log(np.maximum(fraction, 1)) / self._step
+        code = self.code * np.minimum(fraction, 1)
+        bright = np.flatnonzero(fraction > 1)
+        code[bright] += log(fraction[bright]) / self._step
         return np.minimum(code, 255)
 
     def decode(self, codes: Bytes | Floats) -> Floats:
@@ -42,8 +44,10 @@ class ByteScale(NamedTuple):
 
         Both arrays have shape (n,).
         """
-        linear = np.minimum(codes, self.code)
-        return self.reflectance * (linear / self.code) * exp(self._step * (codes - linear))
+        reflectance = self.reflectance * (np.minimum(codes, self.code) / self.code)
+        bright = np.flatnonzero(codes > self.code)
+        reflectance[bright] *= exp(self._step * (codes[bright] - self.code))
+        return reflectance
 
     @property
     def _step(self) -> float:

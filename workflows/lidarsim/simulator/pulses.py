@@ -27,6 +27,7 @@ device without steps, `DeviceColumns` replaces 3 to 6.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from typing import NamedTuple
@@ -35,7 +36,7 @@ import numpy as np
 
 from raybeam import Pattern
 
-from ..numerics.arrays import Ints, to_writable
+from ..numerics.arrays import Floats, Ints, to_writable
 from ..scene.scene import Scene
 from ..sensor.noise import Noise
 from ..survey.survey import Survey
@@ -57,6 +58,14 @@ class ScannedReturns(NamedTuple):
     hit_counts: Ints  # (scans,): returns of each scan, including those that are not kept
     # (counters,): all hits per hit counter (`StoredTriangles.counter`); None if not requested
     tally: Ints | None
+
+
+class BeamRange(NamedTuple):
+    """Consecutive beams that are cast by the same caster."""
+
+    caster: PulseCaster
+    start: int  # number of the first beam, counted from the first beam of the scans
+    stop: int  # one past the last beam
 
 
 class PulseCaster:
@@ -90,7 +99,7 @@ class PulseCaster:
     def scan(
         self,
         scan: int,
-        pattern: Pattern,
+        pattern: Pattern | Callable[[], Pattern],
         poses: CastPoses,
         window: tuple[int, int],
         scan_starts: Ints,
@@ -98,6 +107,7 @@ class PulseCaster:
         *,
         tally: bool = True,
         recorded: RecordedPulses | None = None,
+        ranges: Sequence[BeamRange] = (),
     ) -> ScannedReturns:
         """Cast consecutive scans, count their returns, and keep every n-th return.
 
@@ -107,7 +117,7 @@ class PulseCaster:
             Number of the first scan, which is a key of the random numbers. For a frozen sensor, the
             number of the older scan that is sent again.
         pattern
-            Rays of the beams.
+            Rays of the beams, or a function that returns them. It is called if a step needs them.
         poses
             Poses of the beams.
         window
@@ -121,11 +131,14 @@ class PulseCaster:
             Whether to count the hits on surfaces by `StoredTriangles.counter`.
         recorded
             Recorded pulses of the beams, which are required if `Setup.is_recorded` is true.
+        ranges
+            Ranges of all beams, if other casters cast some of them. Steps that act on reported
+            returns are those of this caster.
         """
         first_row = window[0]
         beam_count = window[1] - window[0]
 
-        def batch(start: int, stop: int) -> PulseBatch:
+        def batch(emitter: Emitter, start: int, stop: int) -> PulseBatch:
             keys = Keys(scan, scan_starts)
             return PulseBatch(
                 keys=keys,
@@ -135,18 +148,21 @@ class PulseCaster:
                 first=first_row,
                 poses=poses,
                 firings=firings,
-                emitter=self.emitter,
+                emitter=emitter,
                 recorded=recorded,
             )
 
-        all_beams = batch(0, beam_count)
+        all_beams = batch(self.emitter, 0, beam_count)
         if self._return_count_varies:
             pose_beams = poses.rays_per_pose or self.setup.sensor.channels
-            chunk_beams = max(1, CHUNK_RAYS // (len(self.emitter) * pose_beams)) * pose_beams
-            chunk_starts = range(0, beam_count, chunk_beams)
-            chunks = [
-                self._pulses(batch(k, min(k + chunk_beams, beam_count))) for k in chunk_starts
-            ]
+            chunks = []
+            for caster, start, stop in ranges or [BeamRange(self, 0, beam_count)]:
+                emitter = caster.emitter
+                chunk_beams = max(1, CHUNK_RAYS // (len(emitter) * pose_beams)) * pose_beams
+                chunks += [
+                    caster._pulses(batch(emitter, k, min(k + chunk_beams, stop)))
+                    for k in range(start, stop, chunk_beams)
+                ]
             scanned = self._thin_out(concatenate_returns(chunks), scan_starts, tally)
         else:
             scanned = self._cast_once(all_beams, scan_starts, tally)
@@ -168,10 +184,10 @@ class PulseCaster:
         sensor = self.setup.sensor
         if returns.reported is returns.distance or returns.reported is None:  # without noise
             return scanned
+        if _are_within(returns.reported, sensor.min_range_m, sensor.max_range_m):
+            return scanned
         in_range = returns.reported >= sensor.min_range_m
         in_range &= returns.reported <= sensor.max_range_m
-        if in_range.all():
-            return scanned
         removed = np.flatnonzero(~in_range)
         removed_scan = np.searchsorted(scan_starts, returns.ray[removed], "right") - 1
         hit_counts = scanned.hit_counts - np.bincount(removed_scan, minlength=len(scan_starts))
@@ -294,3 +310,8 @@ class PulseCaster:
             return ScannedReturns(thinned, hit_counts, None)
         triangle = returns.triangle[returns.triangle != NO_SURFACE]
         return ScannedReturns(thinned, hit_counts, self._surfaces.triangles.count(triangle))
+
+
+def _are_within(values: Floats, lowest: float, highest: float) -> bool:
+    """Return whether all values are within limits."""
+    return bool(values.min(initial=np.inf) >= lowest and values.max(initial=-np.inf) <= highest)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,25 +20,64 @@ from ..scene.scene_mesh import SceneMesh
 from ..sensor import Noise, Returns, Sensor, Spin
 from ..sensor.beams import Beams
 from ..survey.survey import Mounted, ScanSpec, Survey
+from .body_spheres import firings_near_bodies, ranges_of_firings
 from .casting.actor_trajectories import ActorTrajectories
 from .casting.motion import CastPoses, FiringClock, Firings
 from .casting.scene_caster import casters_of_sensors
 from .casting.surfaces import SceneSurfaces
-from .pulses import PulseCaster
+from .pulses import BeamRange, PulseCaster
 from .returns import PulseReturns
+from .steps.cast import has_bodies
 from .steps.step import RecordedPulses
 
 RECORDING = "recording"  # name of the invisible object that stands for recorded surfaces
+
+
+@dataclass(frozen=True, eq=False)
+class FiredPulses:
+    """Pulses of a recorded sweep in a grid of f firings and c channels.
+
+    Attributes
+    ----------
+    aim
+        Function that returns the unit directions (f, c, 3) of the pulses in the sensor frame. It is
+        called at most once, and only if an effect depends on the directions.
+    firing_ns
+        (f,): firing times in nanoseconds since the start of the recording.
+    recorded
+        Returns of the pulses. The ray of a pulse is ``firing * c + channel``.
+    origins
+        (f, c, 3): sensor positions at the firings in the sensor frame of the sweep, in meters, or
+        None if all pulses start at the origin. They differ in motion-compensated sweeps.
+    """
+
+    aim: Callable[[], Floats]
+    firing_ns: Floats
+    recorded: RecordedPulses
+    origins: Floats | None = None
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return len(self.recorded.fired) // max(len(self.firing_ns), 1)
+
+    @cached_property
+    def directions(self) -> Floats:
+        """Unit directions of the pulses in the sensor frame, of shape (f, c, 3)."""
+        return self.aim()
+
+    @cached_property
+    def pattern(self) -> Pattern:
+        """Rays of the pulses."""
+        origins = None if self.origins is None else self.origins.reshape(-1, 3)
+        return Pattern(self.directions.reshape(-1, 3), origins, step=self.channels)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RecordedSensor(Sensor):
     """A sensor whose pulses were recorded. Each sweep has its own directions and times."""
 
-    # (f, c, 3): unit directions of the pulses of a sweep, in the sensor frame
-    pulse_directions: Floats = field(default_factory=lambda: np.zeros((0, 1, 3)))
-    # (f,): firing times in nanoseconds since the start of the recording
-    firing_ns: Floats = field(default_factory=lambda: np.zeros(0))
+    pulses: FiredPulses | None = None  # pulses of a sweep; None before a sweep is known
 
     @classmethod
     def create(cls, channels: int, firings: int, sensor: Sensor, max_range_m: float) -> Any:
@@ -65,36 +107,20 @@ class RecordedSensor(Sensor):
 
     def directions(self, firings: Ints) -> Floats:
         """Return the recorded directions of firings in the sensor frame, of shape (k, c, 3)."""
-        return self.pulse_directions[firings]
+        assert self.pulses is not None
+        return self.pulses.directions[firings]
 
     def begins_ns(self, firings: Ints) -> Floats:
         """Return the firing times in nanoseconds since the start of the recording."""
-        if not len(self.firing_ns):  # before a sweep is known
+        if self.pulses is None:
             return super().begins_ns(firings)
-        return self.firing_ns[firings]
+        return self.pulses.firing_ns[firings]
 
-
-@dataclass(frozen=True, eq=False)
-class FiredPulses:
-    """Pulses of a recorded sweep in a grid of f firings and c channels.
-
-    Attributes
-    ----------
-    directions
-        (f, c, 3): unit directions of the pulses in the sensor frame.
-    firing_ns
-        (f,): firing times in nanoseconds since the start of the recording.
-    recorded
-        Returns of the pulses. The ray of a pulse is ``firing * c + channel``.
-    origins
-        (f, c, 3): sensor positions at the firings in the sensor frame of the sweep, in meters, or
-        None if all pulses start at the origin. They differ in motion-compensated sweeps.
-    """
-
-    directions: Floats
-    firing_ns: Floats
-    recorded: RecordedPulses
-    origins: Floats | None = None
+    def with_pulses(self, pulses: FiredPulses) -> RecordedSensor:
+        """Return a copy with the pulses of a sweep."""
+        sensor = copy(self)  # `replace` would check all fields of the sensor for each sweep
+        object.__setattr__(sensor, "pulses", pulses)
+        return sensor
 
 
 def scene_of_bodies(objects: tuple[SceneMesh, ...] = (), actors: tuple[Actor, ...] = ()) -> Scene:
@@ -157,12 +183,26 @@ class PulseAugmenter:
         (caster,) = casters_of_sensors(scene, self.survey, self.surfaces)
         self._caster = caster
         self._pulses = PulseCaster(0, caster, scene, self.survey, self.surfaces, recorded_noise)
+        # Most pulses cannot hit an object. They are not cast, and need no sub-rays.
+        without_objects = replace(
+            self.survey,
+            sensors=[replace(mounted, unseen=("*",))],
+            returns=replace(returns, subrays=1),
+        )
+        self._distant_pulses = PulseCaster(
+            0, caster, scene, without_objects, self.surfaces, recorded_noise
+        )
         self._actor_trajectories = ActorTrajectories.from_actors(scene.actors)
 
     @property
     def threshold(self) -> float:
         """Energy at which half of the returns are detected, or 0 without a detection range."""
         return self.survey.noise_each[0].threshold
+
+    @property
+    def saturation(self) -> float:
+        """Energy at which the receiver saturates, or infinity if it never saturates."""
+        return self.survey.noise_each[0].saturation_energy
 
     def apply(
         self, number: int, pulses: FiredPulses, pose: tuple[Floats, Floats] | None = None
@@ -185,26 +225,20 @@ class PulseAugmenter:
             Returns of the pulses that were fired. `source` is the row of a recorded return in
             `pulses.recorded`, and `reported` is the range with noise in meters.
         """
-        firings, channels = pulses.directions.shape[:2]
-        rays = firings * channels
-        sensor = replace(
-            self.sensor,
-            pulse_directions=pulses.directions,
-            firing_ns=pulses.firing_ns,
-        )
-        spec = ScanSpec(number, 0, (0, firings), channels=channels)
-        pattern = _pattern(pulses)
+        rays = len(pulses.recorded.fired)
+        spec = ScanSpec(number, 0, (0, len(pulses.firing_ns)), channels=pulses.channels)
         poses = self._poses(pulses, pose)
         self._caster.ensure_trees(np.atleast_2d(poses.positions))
         scanned = self._pulses.scan(
             number,
-            pattern,
+            lambda: pulses.pattern,
             poses,
             (0, rays),
             np.zeros(1, np.int64),
-            Firings.from_scans(sensor, [spec]),
+            Firings.from_scans(self.sensor.with_pulses(pulses), [spec]),
             tally=False,
             recorded=pulses.recorded,
+            ranges=self._ranges(pulses, poses),
         )
         returns = scanned.returns
         return returns.take(pulses.recorded.fired[returns.ray])
@@ -217,18 +251,42 @@ class PulseAugmenter:
         The parameters are those of `apply`. The result has shape (count,).
         """
         poses = self._poses(pulses, pose)
-        rays = pulses.directions.shape[0] * pulses.directions.shape[1]
         sensor = self.sensor
-        hits = self._caster.scan(
-            _pattern(pulses),
+        counts = np.zeros(count, np.int64)
+        for caster, start, stop in self._ranges(pulses, poses):
+            if caster is self._distant_pulses:
+                continue
+            hits = self._caster.scan(
+                pulses.pattern,
+                poses.for_subrays(start, stop, 1),
+                window=(start, stop),
+                t_min=sensor.min_range_m,
+                t_max=sensor.max_range_m,
+            )
+            fired = pulses.recorded.fired[start + hits.ray]
+            _, objects, _ = self.surfaces.triangles.locate(hits.triangle[fired])
+            counts += np.bincount(objects - 1, minlength=count)
+        return counts
+
+    def _ranges(self, pulses: FiredPulses, poses: CastPoses) -> list[BeamRange]:
+        """Divide the pulses of a sweep into those that can hit an object, and those that cannot."""
+        channels = pulses.channels
+        if not has_bodies(self._pulses.setup):
+            return []
+        near = firings_near_bodies(
+            self.scene,
+            self._pulses.emitter.beam,
             poses,
-            window=(0, rays),
-            t_min=sensor.min_range_m,
-            t_max=sensor.max_range_m,
+            pulses.firing_ns,
+            pulses.directions,
+            pulses.origins,
         )
-        fired = pulses.recorded.fired[hits.ray]
-        _, objects, _ = self.surfaces.triangles.locate(hits.triangle[fired])
-        return np.bincount(objects - 1, minlength=count)
+        return [
+            BeamRange(
+                self._pulses if is_near else self._distant_pulses, start * channels, stop * channels
+            )
+            for start, stop, is_near in ranges_of_firings(near, channels)
+        ]
 
     def _poses(self, pulses: FiredPulses, pose: tuple[Floats, Floats] | None) -> CastPoses:
         """Return the poses of the rays of a sweep in the scene frame, with the clock of actors."""
@@ -236,7 +294,7 @@ class PulseAugmenter:
         poses = CastPoses(
             position - self.scene.origin,
             rotation,
-            rays_per_pose=None if position.ndim == 1 else pulses.directions.shape[1],
+            rays_per_pose=None if position.ndim == 1 else pulses.channels,
         )
         if not self.scene.actors:
             return poses
@@ -257,10 +315,3 @@ class PulseAugmenter:
         _, objects, _ = self.surfaces.triangles.locate(returns.triangle[rows])
         numbers[rows] = objects - 1
         return numbers
-
-
-def _pattern(pulses: FiredPulses) -> Pattern:
-    """Return the rays of a sweep."""
-    origins = None if pulses.origins is None else pulses.origins.reshape(-1, 3)
-    channels = pulses.directions.shape[1]
-    return Pattern(pulses.directions.reshape(-1, 3), origins, step=channels)

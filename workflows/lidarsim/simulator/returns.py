@@ -89,6 +89,8 @@ class PulseReturns(NamedTuple):
         """Return the selected rows of all columns."""
         if row_selection.dtype == np.bool_:  # convert a mask once instead of once per column
             row_selection = np.flatnonzero(row_selection)
+            if len(row_selection) == len(self.ray):
+                return self
         return PulseReturns(*select_rows(self, row_selection))
 
     @property
@@ -110,6 +112,7 @@ def require_column(column: T | None) -> T:
 
 # Fill values for tables that lack a column that other tables have.
 _LACKING: dict[str, Any] = {
+    "color": pack_colors(GRAY[0])[0],
     "cause": np.uint8(SURFACE),
     "velocity": np.nan,
     "width": 0.0,

@@ -276,15 +276,12 @@ def _at_start(job: JobReader, sweep: int, points: Floats32, times: AnyArray) -> 
     return fired_in_sensor.compensate_motion(sweep, sensor_cloud).astype(np.float32)
 
 
-def _open_bag(source: RecordingSource) -> Recording:
-    """Open a topic of a bag.
+def point_connection(source: RecordingSource, bag: Any) -> Any:
+    """Return the connection of a bag whose messages are the sweeps of a recording.
 
-    Each message is a sweep in the frame of its header. The topic contains PointCloud2 messages. A
-    topic with Livox CustomMsg messages is read if the user chose it, or if the bag has no
-    PointCloud2 messages.
+    A topic with Livox CustomMsg messages is selected if the user chose it, or if the bag has no
+    PointCloud2 messages. Raises LidarError if the user must choose a topic.
     """
-    bags = PerProcess(partial(open_bag, source.path, source.name))
-    bag = bags()
     clouds = {
         connection.topic: connection
         for connection in bag.connections
@@ -296,24 +293,34 @@ def _open_bag(source: RecordingSource) -> Recording:
         if connection.msgtype in LIVOX_CLOUDS
     }
     topics = livox_clouds if source.sensor in livox_clouds else clouds or livox_clouds
-    connection = topics[source.choose("PointCloud2 topics", topics)]
-    columns_of = livox_columns if topics is livox_clouds else point_columns
+    chosen = topics[source.choose("PointCloud2 topics", topics)]
+    return chosen._replace(owner=None)  # the bag that contains the connection cannot be pickled
+
+
+def _open_bag(source: RecordingSource) -> Recording:
+    """Open a topic of a bag.
+
+    Each message is a sweep in the frame of its header.
+    """
+    bags = PerProcess(partial(open_bag, source.path, source.name))
+    connection = point_connection(source, bags())
+    columns_of = livox_columns if connection.msgtype in LIVOX_CLOUDS else point_columns
 
     def messages() -> Iterator[Any]:
         return bags().messages([connection])
 
     def convert(message: Any) -> Sweep:
         _, recorded_ns, data = message
-        stamp_ns = _header_of(data).stamp_ns if is_stamped else recorded_ns
+        stamp_ns = header_of(data).stamp_ns if is_stamped else recorded_ns
         return sweep_from_columns(columns_of(data), time_ns=float(stamp_ns))
 
     with reading(source.name):
         # The timestamp is zero if the recording program did not set it.
-        is_stamped = any(_header_of(data).stamp_ns for _, _, data in islice(messages(), 2))
+        is_stamped = any(header_of(data).stamp_ns for _, _, data in islice(messages(), 2))
 
-    def headers() -> Iterator[_Header]:
+    def headers() -> Iterator[MessageHeader]:
         for _, recorded_ns, data in messages():
-            header = _header_of(data)
+            header = header_of(data)
             yield header if is_stamped else header._replace(stamp_ns=recorded_ns)
 
     def read_stamps() -> Iterator[float]:
@@ -346,20 +353,22 @@ def _stated_compensation(path: Path) -> bool | None:
     return states_compensation(re.sub(r"[\s\\]+", " ", text))  # YAML breaks long lines
 
 
-class _Header(NamedTuple):
+class MessageHeader(NamedTuple):
+    """Header of a ROS message."""
+
     stamp_ns: int  # time of the measurement, which can be long before the recording time
     frame: str
 
 
-def _header_of(data: bytes) -> _Header:
+def header_of(data: bytes) -> MessageHeader:
     """Decode the header with which a serialized ROS 2 message starts."""
     order = "<u4" if data[1] & 1 else ">u4"
     seconds, nanoseconds, length = np.frombuffer(data, order, 3, 4).tolist()
     frame = bytes(data[16 : 15 + length]).decode(errors="replace")
-    return _Header(seconds * 10**9 + nanoseconds, frame)
+    return MessageHeader(seconds * 10**9 + nanoseconds, frame)
 
 
-def _sweep_poses(path: Path, headers: Sequence[_Header]) -> Floats | None:
+def _sweep_poses(path: Path, headers: Sequence[MessageHeader]) -> Floats | None:
     """Return the poses of sweeps relative to the root of the frame tree.
 
     Parameters

@@ -13,12 +13,12 @@ from rosbags.typesys.store import Typestore
 
 from lidarsim.columns.bags import POINT_FIELDS
 from lidarsim.columns.cloud import Cloud, CloudLike
-from lidarsim.numerics.arrays import Floats32, Ints, Records
+from lidarsim.numerics.arrays import Floats, Floats32, Ints, Records
 from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
 from lidarsim.sweeps.ray_image import RayImage
 from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
 
-from ..boxes import Boxes
+from ..boxes import Boxes, SweepBoxes
 from ..frame_names import INSTRUMENTS, VEHICLE, WORLD, frame_names, points_topic, survey_start_ns
 from ..laser_scan import ScanRays
 from .layouts import MessageLayout, encode_points, message_stamp_ns, sensor_traits, since_stamp_ns
@@ -306,6 +306,15 @@ def _sent(topic: str, content: Any, time_ns: int) -> RosMessage:
     return RosMessage(topic, kind, time_ns, message_store().serialize_cdr(content, kind))
 
 
+class _NamedBox(NamedTuple):
+    """Box that a marker shows."""
+
+    name: str
+    center: Floats  # (3,), meters
+    quaternion: Floats  # (4,), x, y, z, w
+    size: Floats  # (3,), meters
+
+
 class _Messages:
     """Factory for messages and their common parts."""
 
@@ -435,41 +444,71 @@ class _Messages:
 
         It replaces earlier markers.
         """
+        (marker,) = self.types_of("visualization_msgs", "Marker")
+        actions = [marker.ADD if present else marker.DELETE for present in boxes.present]
+        header = self.header(WORLD, time_ns)
+        cubes = [
+            self._cube(header, "actors", number, action, _NamedBox(*box))
+            for number, (action, *box) in enumerate(
+                zip(actions, actors, boxes.centers, boxes.quaternions, boxes.sizes, strict=True)
+            )
+        ]
+        return self._types["visualization_msgs/msg/MarkerArray"](cubes)
+
+    def sweep_markers(self, boxes: SweepBoxes, namespace: str, header: Any) -> Any:
+        """Return a MarkerArray with boxes in the frame of a header. It removes earlier markers."""
+        (marker,) = self.types_of("visualization_msgs", "Marker")
+        nowhere = _NamedBox("", np.zeros(3), np.array([0.0, 0, 0, 1]), np.zeros(3))
+        cubes = [self._cube(header, namespace, 0, marker.DELETEALL, nowhere)]
+        cubes += [
+            self._cube(header, namespace, number, marker.ADD, _NamedBox(*box))
+            for number, *box in zip(
+                boxes.objects.tolist(),
+                boxes.names,
+                boxes.centers,
+                boxes.quaternions,
+                boxes.sizes,
+                strict=True,
+            )
+        ]
+        return self._types["visualization_msgs/msg/MarkerArray"](cubes)
+
+    def _cube(self, header: Any, namespace: str, number: int, action: int, box: _NamedBox) -> Any:
+        """Return a Marker with a box."""
         types = self._types
         names = ("Point", "Quaternion", "Pose", "Vector3")
-        point, quaternion, pose, vector = self.types_of("geometry_msgs", *names)
+        point, rotation, pose, vector = self.types_of("geometry_msgs", *names)
         marker, mesh = self.types_of("visualization_msgs", "Marker", "MeshFile")
         image = types["sensor_msgs/msg/CompressedImage"]
-        header = self.header(WORLD, time_ns)
         none = np.empty(0, np.uint8)
-        orange = types["std_msgs/msg/ColorRGBA"](1, 0.6, 0, 0.4)
-        always = types["builtin_interfaces/msg/Duration"](0, 0)
-        return types["visualization_msgs/msg/MarkerArray"](
-            [
-                marker(
-                    header=header,
-                    ns="actors",
-                    id=number,
-                    type=marker.CUBE,
-                    action=marker.ADD if boxes.present[number] else marker.DELETE,
-                    pose=pose(
-                        point(*boxes.centers[number].tolist()),
-                        quaternion(*boxes.quaternions[number].tolist()),
-                    ),
-                    scale=vector(*boxes.sizes[number].tolist()),
-                    color=orange,
-                    lifetime=always,
-                    frame_locked=False,
-                    points=[],
-                    colors=[],
-                    texture_resource="",
-                    texture=image(header, "", none),
-                    uv_coordinates=[],
-                    text=name,
-                    mesh_resource="",
-                    mesh_file=mesh("", none),
-                    mesh_use_embedded_materials=False,
-                )
-                for number, name in enumerate(actors)
-            ]
+        return marker(
+            header=header,
+            ns=namespace,
+            id=number,
+            type=marker.CUBE,
+            action=action,
+            pose=pose(point(*box.center.tolist()), rotation(*box.quaternion.tolist())),
+            scale=vector(*box.size.tolist()),
+            color=types["std_msgs/msg/ColorRGBA"](1, 0.6, 0, 0.4),  # orange
+            lifetime=types["builtin_interfaces/msg/Duration"](0, 0),
+            frame_locked=False,
+            points=[],
+            colors=[],
+            texture_resource="",
+            texture=image(header, "", none),
+            uv_coordinates=[],
+            text=box.name,
+            mesh_resource="",
+            mesh_file=mesh("", none),
+            mesh_use_embedded_materials=False,
         )
+
+
+def box_markers(boxes: SweepBoxes, namespace: str, frame: str, time_ns: int) -> RosMessage:
+    """Return a MarkerArray with boxes in a frame, which removes the earlier markers of its topic.
+
+    The topic is `/` and the namespace.
+    """
+    make = _Messages(message_store().types)
+    content = make.sweep_markers(boxes, namespace, make.header(frame, time_ns))
+    return _sent(f"/{namespace}", content, time_ns)

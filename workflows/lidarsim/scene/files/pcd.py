@@ -13,7 +13,7 @@ import re
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,10 +25,10 @@ from ...errors import CutShortError
 from ...io.allowance import Allowance
 from ...io.input_files import read_input
 from ...motion.rotations import matrices
-from ...numerics.arrays import AnyArray, Bytes, Floats
-from ...words import printable
+from ...numerics.arrays import AnyArray, Bytes, Floats, Ints, Records
+from ...words import make_distinct, printable
 from ..transform import affine
-from .text_rows import RowReader
+from .text_rows import COMMENT_PREFIXES, RowReader
 
 _KEYWORDS = (
     "VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS",
@@ -65,6 +65,7 @@ class _Field:
 class _Header(NamedTuple):
     fields: list[_Field]
     points: int
+    height: int
     encoding: str
     viewpoint: tuple[float, ...]  # position x, y, z and quaternion w, x, y, z
     lines: int  # number of lines, including DATA
@@ -89,19 +90,8 @@ def read_pcd(path: Path) -> list[Sweep]:
         If the file cannot be read.
     """
     data = read_input(path)
-    end = _DATA.search(data, 0, _HEADER_MAX_BYTES)
-    if end is None:
-        is_header = any(line.startswith(_STARTS) for line in data[:_HEADER_MAX_BYTES].splitlines())
-        failure = CutShortError if is_header else ValueError
-        raise failure("its header has no DATA line")
-    header = _parse_header(data[: end.start()], end[1].decode("latin-1"))
-    body = memoryview(data)[end.end() :]
-    if header.encoding == "ascii":
-        arrays = _read_text(header, body)
-    elif header.encoding == "binary":
-        arrays = _read_binary(header, body)
-    else:
-        arrays = _read_compressed(header, body, len(data))
+    header, start = _find_header(data)
+    arrays = _read_body(header, memoryview(data)[start:], len(data))
     columns = _named_columns(header.fields, arrays)
     if missing := [axis for axis in "xyz" if axis not in columns]:
         names = ", ".join(field.name for field in header.fields)
@@ -155,6 +145,28 @@ def pcd_bytes(
     return "\n".join(header).encode() + rows.tobytes()
 
 
+def _find_header(data: bytes) -> tuple[_Header, int]:
+    """Parse the header of a file, and return it with the position of the body."""
+    end = _DATA.search(data, 0, _HEADER_MAX_BYTES)
+    if end is None:
+        is_header = any(line.startswith(_STARTS) for line in data[:_HEADER_MAX_BYTES].splitlines())
+        failure = CutShortError if is_header else ValueError
+        raise failure("its header has no DATA line")
+    return _parse_header(data[: end.start()], end[1].decode("latin-1")), end.end()
+
+
+def _read_body(header: _Header, body: memoryview, file_size: int) -> list[AnyArray]:
+    """Read the fields of the points.
+
+    Each array has shape (n, count).
+    """
+    if header.encoding == "ascii":
+        return _read_text(header, body)
+    if header.encoding == "binary":
+        return _read_binary(header, body)
+    return _read_compressed(header, body, file_size)
+
+
 # -- the header ----------------------------------------------------------------------------------
 
 
@@ -183,7 +195,12 @@ def _parse_header(data: bytes, encoding: str) -> _Header:
             "binary_compressed"
         )
     return _Header(
-        _fields(entries), _count_of_points(entries), encoding, _viewpoint(entries), len(lines) + 1
+        fields=_fields(entries),
+        points=_count_of_points(entries),
+        height=_whole_numbers(entries, "HEIGHT", [1], 1)[0],
+        encoding=encoding,
+        viewpoint=_viewpoint(entries),
+        lines=len(lines) + 1,
     )
 
 
@@ -432,6 +449,115 @@ def _as_integers(values: Floats, field: _Field) -> AnyArray:
             f"{limits.min} to {limits.max}, according to its TYPE and SIZE"
         )
     return numbers.astype(field.kind)
+
+
+# -- other points in the same format --------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class PCDRecords:
+    """The points of a .pcd file as stored, from which files with other points are created.
+
+    Attributes
+    ----------
+    records
+        (n,): structured array with one field per number, named like the columns of `read_pcd`. In
+        text files, floating-point fields have double precision, since programs write more digits.
+    height
+        Number of rows of an organized cloud, or 1.
+    """
+
+    records: Records
+    height: int
+    _header: _Header
+    _counts: tuple[int, ...]  # stored numbers per point and field; 0 for omitted padding
+    _text: bytes  # header lines, including DATA
+    _body: bytes
+
+    @classmethod
+    def read(cls, path: Path) -> PCDRecords:
+        """Read a .pcd file. Raises the same errors as `read_pcd`."""
+        data = read_input(path)
+        header, start = _find_header(data)
+        body = memoryview(data)[start:]
+        arrays = _read_body(header, body, len(data))
+        columns = [
+            (name, array[:, index])
+            for field, array in zip(header.fields, arrays, strict=True)
+            for index, name in zip(range(array.shape[1]), _column_names(field), strict=False)
+        ]
+        names = make_distinct(name for name, _ in columns)
+        row = [(name, array.dtype) for name, (_, array) in zip(names, columns, strict=True)]
+        records = np.empty(header.points, row)
+        for name, (_, array) in zip(names, columns, strict=True):
+            records[name] = array
+        counts = tuple(array.shape[1] for array in arrays)
+        return cls(records, header.height, header, counts, data[:start], bytes(body))
+
+    def encode(self, rows: Records, template: Ints, height: int = 1) -> bytes:
+        """Return the content of a file with other points, in the same encoding.
+
+        Parameters
+        ----------
+        rows
+            (m,): new points, with the dtype of `records`.
+        template
+            (m,): index of the stored record from which each point was derived. In text files,
+            values that are equal to those of the record keep their digits.
+        height
+            Number of rows of an organized cloud, or 1.
+        """
+        text = self._text
+        sizes = {b"WIDTH": len(rows) // height, b"HEIGHT": height, b"POINTS": len(rows)}
+        for keyword, number in sizes.items():
+            pattern = rb"^(" + keyword + rb"[ \t]+)\d+"
+            text = re.sub(pattern, rb"\g<1>%d" % number, text, count=1, flags=re.M | re.I)
+        if self._header.encoding == "ascii":
+            return text + self._text_rows(rows, template)
+        if self._header.encoding == "binary":
+            return text + rows.tobytes()
+        names = iter(rows.dtype.names or ())
+        fields = [[*islice(names, count)] for count in self._counts]
+        numbers = [np.stack([rows[name] for name in field], axis=1) for field in fields if field]
+        content = b"".join(array.tobytes() for array in numbers)
+        packed = _compress(content)
+        return text + struct.pack("<II", len(packed), len(content)) + packed
+
+    def _text_rows(self, rows: Records, template: Ints) -> bytes:
+        comments = tuple(prefix.encode() for prefix in COMMENT_PREFIXES)
+        lines = [
+            line
+            for line in map(bytes.strip, self._body.splitlines())
+            if line and not line.startswith(comments)
+        ]
+        changed = rows != self.records[template]
+        output = []
+        for row, source, differs in zip(rows, template.tolist(), changed.tolist(), strict=True):
+            output.append(self._text_row(row, source, lines[source]) if differs else lines[source])
+        return b"".join(line + b"\n" for line in output)
+
+    def _text_row(self, row: Any, source: int, line: bytes) -> bytes:
+        words = line.split()
+        if len(words) != len(row):  # the numbers are separated by commas
+            words = line.replace(b",", b" ").split()
+        numbers = zip(row.tolist(), self.records[source].tolist(), self._kinds(), strict=True)
+        for index, (value, before, kind) in enumerate(numbers):
+            if value != before and not (value != value and before != before):
+                number = str(np.dtype(kind).type(value)) if kind[1] == "f" else str(value)
+                words[index] = number.encode()
+        return b" ".join(words)
+
+    def _kinds(self) -> list[str]:
+        return [field.kind for field in self._header.fields for _ in range(field.count)]
+
+
+def _compress(content: bytes) -> bytes:
+    """Compress data with LZF."""
+    from .lzf_loops import pack_lzf, packed_limit  # importing numba is slow
+
+    packed = np.zeros(packed_limit(len(content)), np.uint8)
+    size = pack_lzf(np.frombuffer(bytearray(content), np.uint8), packed)
+    return packed[:size].tobytes()
 
 
 # -- columns -------------------------------------------------------------------------------------

@@ -21,6 +21,11 @@ class AngleNoiseStep(PulseStep):
 
     role = Role.AIMS
     purposes = ACROSS, UP
+    on_recordings = (
+        "`noise.angle_deg` cannot be simulated on a recording, because it changes where a beam "
+        "hits the scene. Reconstruct the scene with `lidarpool twin`, and simulate the sensor in "
+        "it."
+    )
 
     @staticmethod
     def applies(setup: Setup) -> bool:
@@ -46,6 +51,11 @@ class RippleStep(PulseStep):
 
     role = Role.AIMS | Role.ABOUT_AXIS
     effects = ("Systematic errors",)
+    on_recordings = (
+        "`noise.ripple_deg` cannot be simulated on a recording, because it changes where a beam "
+        "hits the scene. Reconstruct the scene with `lidarpool twin`, and simulate the sensor in "
+        "it."
+    )
 
     @staticmethod
     def applies(setup: Setup) -> bool:

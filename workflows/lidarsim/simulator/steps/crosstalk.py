@@ -105,6 +105,11 @@ class CrosstalkStep(PulseStep):
     writes = RETURN_COLUMNS
     causes = (CROSSTALK,)
     purposes = (FOREIGN_PULSE,)
+    on_recordings = (
+        "`noise.crosstalk` cannot be simulated on a recording, because the pulses of other sensors "
+        "illuminate surfaces that the recording does not contain. Reconstruct the scene with "
+        "`lidarpool twin`, and simulate all sensors in it."
+    )
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: SceneSurfaces) -> None:
         super().__init__(setup, caster, surfaces)

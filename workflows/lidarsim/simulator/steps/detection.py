@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...numerics.arrays import Bools, Floats, Integers
-from ...numerics.random_numbers import Purpose, normal, quantiles, raw, uniform
+from ...numerics.arrays import Bools, Floats, Integers, to_writable
+from ...numerics.random_numbers import Purpose, normal, quantiles, uniform
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise
 from ..returns import PulseReturns, number_within_ray, require_column
+from .particles import random_keys
 from .step import PulseBatch, PulseStep, Role, Setup
 
 DETECTION = Purpose(4, "energy noise of a return")
@@ -36,21 +37,36 @@ class DetectionStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Keep the detected returns of a batch."""
-        setup = self.setup
+        if batch.recorded is not None:
+            return self._detected_again(returns, batch)
         scan, ray = batch.keys.scan_and_number(returns.ray)
         number = number_within_ray(returns.ray)
-        earlier = None
-        dropout: Floats | float = setup.noise.dropout
-        if batch.recorded is not None and setup.recorded_noise is not None:
-            source = require_column(returns.source)
-            rows = np.flatnonzero(source >= 0)
-            earlier = np.full(len(source), np.inf)
-            earlier[rows] = batch.recorded.energy[source[rows]]
-            dropout = np.where(source >= 0, setup.recorded_noise.dropout, dropout)
-        detected_mask = is_detected(
-            setup.noise, returns.height, scan, ray, number, dropout=dropout, earlier=earlier
+        return returns.take(is_detected(self.setup.noise, returns.height, scan, ray, number))
+
+    def _detected_again(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Keep the detected returns of a batch of recorded pulses."""
+        from . import detection_loops  # imported here because numba takes half a second to import
+
+        noise = self.setup.noise
+        recorded_noise = require_column(self.setup.recorded_noise)
+        recorded = require_column(batch.recorded)
+        row_indices = np.empty(len(returns.ray), np.int64)
+        count = detection_loops.find_detected(
+            to_writable(returns.ray, np.int64),
+            to_writable(returns.height),
+            to_writable(require_column(returns.source), np.int32),
+            to_writable(recorded.energy),
+            detection_loops.DetectionLimits(
+                float(noise.dropout),
+                float(recorded_noise.dropout),
+                float(noise.threshold),
+                THRESHOLD_SIGMAS,
+                quantiles(),
+            ),
+            random_keys(noise.seed, (LOSS, DETECTION), batch.keys, 0),
+            row_indices,
         )
-        return returns.take(detected_mask)
+        return returns if count == len(row_indices) else returns.take(row_indices[:count])
 
 
 def is_detected(
@@ -59,57 +75,23 @@ def is_detected(
     scan: Integers,
     ray: Integers,
     number: Integers,
-    *,
-    dropout: Floats | float | None = None,
-    earlier: Floats | None = None,
 ) -> Bools:
     """Return whether returns with the given energies are detected.
 
     `energy` is the energy of a return, or its height in the waveform. `scan`, `ray` (the ray's
     number in its scan) and `number` (the return's number in its ray, from 0) are the keys of the
-    random numbers. `dropout` (n,) overrides `Noise.dropout`. `earlier` (n,) are the energies with
-    which returns were detected before, or inf for returns that were not.
+    random numbers.
 
     The signal with normally distributed noise must exceed a threshold. If the energy equals the
     threshold, half of the returns are detected. At 1.4 times this energy, 97.7 % are detected, and
     at a fifth of it, 3 in 100,000.
     """
-    if dropout is None:
-        dropout = noise.dropout
     detected_mask = np.ones(len(energy), np.bool_)
-    if np.any(dropout):
-        detected_mask &= uniform(noise.seed, LOSS, scan, ray, number) >= dropout
-    if noise.detection_range_m is not None and earlier is None:
+    if noise.dropout:
+        detected_mask &= uniform(noise.seed, LOSS, scan, ray, number) >= noise.dropout
+    if noise.detection_range_m is not None:
         detected_mask &= exceeds_threshold(noise, DETECTION, energy, scan, ray, number)
-    elif noise.detection_range_m is not None and earlier is not None:
-        detected_mask &= _is_detected_again(noise, energy, earlier, scan, ray, number)
     return detected_mask
-
-
-def _is_detected_again(
-    noise: Noise,
-    energy: Floats,
-    earlier: Floats,
-    scan: Integers,
-    ray: Integers,
-    number: Integers,
-) -> Bools:
-    """Return whether returns are detected that were already detected with another energy.
-
-    `earlier` (n,) are the energies with which the returns were detected, or inf for other returns.
-    """
-    # Signals that exceed the threshold for all quantiles need no random numbers.
-    largest = -float(quantiles()[0]) / THRESHOLD_SIGMAS + 1
-    result = energy > largest * noise.threshold
-    rows = np.flatnonzero(~result)
-    limit = -THRESHOLD_SIGMAS * (earlier[rows] / noise.threshold - 1)
-    lowest = np.searchsorted(quantiles(), limit, side="right")  # quantiles that were not detected
-    row_keys = (np.broadcast_to(key, result.shape)[rows] for key in (scan, ray, number))
-    index = (raw(noise.seed, DETECTION, *row_keys) >> np.uint64(48)).astype(np.int64)
-    index = lowest + index * (len(quantiles()) - lowest) // len(quantiles())
-    signal = THRESHOLD_SIGMAS * (energy[rows] / noise.threshold - 1)
-    result[rows] = signal + quantiles()[index] > 0
-    return result
 
 
 def exceeds_threshold(

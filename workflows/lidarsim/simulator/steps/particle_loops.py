@@ -10,7 +10,7 @@ import numpy as np
 
 from raybeam.compiled import compiled, inlined
 
-from ...numerics.arrays import Floats
+from ...numerics.arrays import Bytes, Floats, Floats32
 from .pulse_loops import scan_row
 from .random_loops import SHIFT_TO_INDEX, bits, uniform
 
@@ -19,9 +19,9 @@ class ParticleTables(NamedTuple):
     """Tables for one kind of detectable particle (`particles.DetectableParticles`)."""
 
     counts: Floats  # (k,): cumulative probabilities of 0, 1, … particles in a beam; the last is 1
-    by_range: Floats  # (5, shares): rows as in `particles.DetectableParticles.by_range`
+    by_range: Floats32  # (quantiles, 5), as in `particles.DetectableParticles.by_range`
     step_mm: float  # diameter that a fraction exp(-1) of the particles exceeds
-    exponential: Floats  # quantiles of the exponential distribution
+    exponential: Floats32  # quantiles of the exponential distribution
 
 
 class FogTables(NamedTuple):
@@ -32,54 +32,61 @@ class FogTables(NamedTuple):
     cell_m: float  # length of a cell
     energies: Floats  # (cells,): energy received from the fog in each cell
     peaks: Floats  # ((cells + 1) * cells,): cumulative probabilities (`particles.FogCells.peaks`)
+    guide: Bytes  # (cells + 1, parts): where to search `peaks` (`particles.FogCells.guide`)
 
 
 @inlined
-def write_particle(ray, column, quantile, subrays, tables, hits, row):
-    """Write a sub-ray's hit on a particle to a row of `hits`, which is a `SampledHits`.
+def particle_energy(by_range, index, quantile, step_mm, exponential):
+    """Return the energy that a sensor receives from a particle, if a beam has a single sub-ray.
 
-    `column` is the particle's column in `tables.by_range`. `quantile`, in [0, 1), is the quantile
-    of its diameter among the particles that can be detected at this range.
+    `index` is the particle's row in `ParticleTables.by_range`. `quantile`, in [0, 1), is the
+    quantile of its diameter among the particles that can be detected at this range.
     """
-    by_range = tables.by_range
-    exponential = tables.exponential
-    rank = quantile * by_range[2, column]
-    excess_mm = tables.step_mm * exponential[np.int64(rank * len(exponential))]
-    diameter = by_range[1, column] + excess_mm
-    light = by_range[3, column] * diameter * diameter
-    hits.ray[row] = ray
-    hits.distance[row] = by_range[0, column]
-    hits.energy[row] = subrays * min(light, by_range[4, column])
+    rank = quantile * by_range[index, 2]
+    diameter = by_range[index, 1] + step_mm * exponential[np.int64(rank * len(exponential))]
+    return min(by_range[index, 3] * diameter * diameter, by_range[index, 4])
 
 
 @compiled()
-def sample_particles(beam, stop, subrays, tables, keys, reach, hits):
+def sample_particles(beam, stop, subrays, tables, keys, reach, hits):  # noqa: PLR0914 - a compiled loop
     """Sample particles of one kind along beams `beam` to `stop` until `hits` is full.
 
     `tables` is a `ParticleTables`, `keys` a `RandomKeys`, and `reach` (beams * subrays,) is the
     range that the light of each sub-ray reaches, in meters. The function writes `SampledHits`, and
     returns the first beam that has not been sampled and the number of hits.
     """
-    starts = keys.starts
+    # Inside the loop, numba would count references to the arrays of tuples.
+    counts = tables.counts
+    by_range = tables.by_range
+    exponential = tables.exponential
+    states = keys.states
+    scan_starts = keys.scan_starts
+    hit_ray = hits.ray
+    hit_distance = hits.distance
+    hit_energy = hits.energy
     count = 0
     scan_index = 0
-    while beam < stop and count + len(tables.counts) <= len(hits.ray):
-        scan_index = scan_row(keys.scan_starts, keys.first + beam, scan_index)
-        scan = keys.scan + scan_index
-        number_in_scan = keys.first + beam - keys.scan_starts[scan_index]
-        probability = uniform(starts[0], scan, number_in_scan, 0)
+    while beam < stop and count + len(counts) <= len(hit_ray):
+        scan_index = scan_row(scan_starts, keys.first + beam, scan_index)
+        number_in_scan = keys.first + beam - scan_starts[scan_index]
+        probability = uniform(states[scan_index, 0], number_in_scan, 0)
         particle = 0
-        while tables.counts[particle] <= probability:
-            index = np.int64(bits(starts[1], scan, number_in_scan, particle) >> SHIFT_TO_INDEX)
+        while counts[particle] <= probability:
+            index = np.int64(
+                bits(states[scan_index, 1], number_in_scan, particle) >> SHIFT_TO_INDEX
+            )
             ray = beam * subrays
             if subrays > 1:
                 ray += np.int64(
-                    bits(starts[2], scan, number_in_scan, particle) % np.uint64(subrays)
+                    bits(states[scan_index, 2], number_in_scan, particle) % np.uint64(subrays)
                 )
-            if tables.by_range[0, index] < reach[ray]:
-                quantile = uniform(starts[3], scan, number_in_scan, particle)
-                write_particle(ray, index, quantile, subrays, tables, hits=hits, row=count)
-                count += 1
+            quantile = uniform(states[scan_index, 3], number_in_scan, particle)
+            energy = particle_energy(by_range, index, quantile, tables.step_mm, exponential)
+            hit_ray[count] = ray
+            hit_distance[count] = by_range[index, 0]
+            hit_energy[count] = subrays * energy
+            # The next particle overwrites a particle behind the surface. A branch would be slower.
+            count += int(by_range[index, 0] < reach[ray])
             particle += 1
         beam += 1
     return beam, count
@@ -93,7 +100,9 @@ def sample_fog(subrays, tables, keys, reach, hits):
     light from the cell with the highest peak in front of its surface, which is the surface hit by
     its first, central sub-ray. A beam whose surface is within the first cell returns nothing.
     """
+    states = keys.states
     cells = len(tables.energies)
+    parts = tables.guide.shape[1]
     count = 0
     scan_index = 0
     for beam in range(len(reach) // subrays):
@@ -102,19 +111,15 @@ def sample_fog(subrays, tables, keys, reach, hits):
             continue
         fog_cells = cells if free_cells >= cells else np.int64(free_cells)
         scan_index = scan_row(keys.scan_starts, keys.first + beam, scan_index)
-        scan = keys.scan + scan_index
         number_in_scan = keys.first + beam - keys.scan_starts[scan_index]
+        fraction = uniform(states[scan_index, 0], number_in_scan, 0)
         # Row n of the table is n plus the probabilities (`particles.FogCells.peaks`).
-        probability = fog_cells + uniform(keys.starts[0], scan, number_in_scan, 0)
-        cell = 0  # the cell with the highest peak, found by binary search
-        upper = cells
-        while cell < upper:
-            middle = (cell + upper) // 2
-            if tables.peaks[fog_cells * cells + middle] <= probability:
-                cell = middle + 1
-            else:
-                upper = middle
-        position_in_cell = uniform(keys.starts[1], scan, number_in_scan, 0)
+        probability = fog_cells + fraction
+        cell = np.int64(tables.guide[fog_cells, np.int64(fraction * parts)])
+        # The sum may be rounded up to the last probability, which belongs to the last cell.
+        while cell < fog_cells - 1 and tables.peaks[fog_cells * cells + cell] <= probability:
+            cell += 1
+        position_in_cell = uniform(states[scan_index, 1], number_in_scan, 0)
         hits.ray[count] = beam * subrays
         hits.distance[count] = tables.begin_m + (cell + position_in_cell) * tables.cell_m
         hits.energy[count] = subrays * tables.energies[cell]

@@ -7,7 +7,7 @@ ranges and diameters are drawn as quantiles.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
 from functools import cache, lru_cache
 from statistics import NormalDist
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,10 +17,10 @@ import numpy as np
 from ...columns.table import CAUSES
 from ...media.materials import MaterialTable
 from ...media.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles, particle_range
-from ...numerics.arrays import Bools, Floats, Indices, Ints, to_writable
+from ...numerics.arrays import Bools, Bytes, Floats, Floats32, Indices, Ints, to_writable
 from ...numerics.elementary import exp, expm1, geomspace, interp, log1p
 from ...numerics.elementary_scalars import exp_of
-from ...numerics.random_numbers import Purpose, initial_states, named_seed
+from ...numerics.random_numbers import Purpose, named_seed, scan_states
 from ...sensor.noise import THRESHOLD_SIGMAS
 from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import SceneSurfaces
@@ -51,6 +51,7 @@ AIR = CAUSES.index("air")
 QUANTILES = 1 << 16  # number of equal parts of a distribution in tables
 CACHED_TABLES = 32  # cached because a scanner rebuilds its casters whenever an object is moved
 MAX_FOG_CELLS = 255  # cells of half a pulse length
+PEAK_PARTS = 256  # number of equal parts of [0, 1) in `FogCells.guide`
 # Probabilities are summed up to this many standard deviations below and above the highest signal.
 TAIL_SIGMAS = 6.0
 
@@ -59,10 +60,10 @@ class DetectableParticles(NamedTuple):
     """Distribution of the detectable particles of one kind."""
 
     counts: Floats  # (k,): cumulative probabilities of 0, 1, … particles in a beam
-    # (5, QUANTILES), with a column for each equal fraction of the particles by range: ascending
+    # (QUANTILES, 5), with a row for each equal fraction of the particles by range: ascending
     # distances in meters, smallest detectable diameters in mm, 1 - exp(-slope * (largest -
     # smallest)), energies of a particle of 1 mm, and energies of a particle that fills the beam.
-    by_range: Floats
+    by_range: Floats32
     step_mm: float  # 1 / slope, the diameter that a fraction exp(-1) of the particles exceeds
 
 
@@ -75,6 +76,9 @@ class FogCells(NamedTuple):
     # ((cells + 1) * cells,): row n is n plus the cumulative probabilities that each cell has the
     # highest peak among the first n cells.
     peaks: Floats
+    # (cells + 1, PEAK_PARTS): column k of row n is the first cell whose probability in row n of
+    # `peaks` exceeds k / PEAK_PARTS.
+    guide: Bytes
 
 
 class WeatherStep(PulseStep):
@@ -167,21 +171,21 @@ class WeatherStep(PulseStep):
         reach = light_reach(
             self.surfaces.at_wavelength(self._wavelength_nm), self.surfaces, hits, count
         )
-        samples: list[SampledHits] = []
+        sources: list[SampledHits] = []
         for kind, seed in zip(self.detectable_kinds, self._seeds, strict=True):
             if kind is not None:
                 random = random_keys(seed, self.purposes[2:], keys, first)
-                samples += _particles(kind, random, subrays, reach)
+                sources.append(_particles(kind, random, subrays, reach))
         if self.fog_cells is not None:
             random = random_keys(self._seed, self.purposes[:2], keys, first)
-            samples.append(_fog_hits(self.fog_cells, random, subrays, self._fog_ends(hits, reach)))
-        if not samples:
+            sources.append(_fog_hits(self.fog_cells, random, subrays, self._fog_ends(hits, reach)))
+        if not sources:
             return None
-        ray, distance, energy = map(np.concatenate, zip(*samples, strict=True))
+        ray, distance, energy = _concatenate(sources)
         air_hits = returns_without_surface(hits, ray, distance, energy, AIR)
         if len(self._refracting(hits)):
             air_hits = air_hits.take(~self._in_refracting_bodies(hits, ray, distance))
-        if samples[1:] or subrays > 1:
+        if sources[1:] or subrays > 1:
             air_hits = air_hits.take(np.argsort(air_hits.ray, kind="stable"))
         return air_hits
 
@@ -283,9 +287,9 @@ def random_keys(seed: int, purposes: tuple[Purpose, ...], keys: Keys, first: int
     """Return the keys of random numbers for beams, starting with beam number `first`."""
     from .random_loops import RandomKeys
 
-    return RandomKeys(
-        initial_states(seed, *purposes), keys.scan, to_writable(keys.scan_starts, np.int64), first
-    )
+    scans = keys.scan + np.arange(len(keys.scan_starts))
+    states = scan_states(seed, purposes, scans)
+    return RandomKeys(states, to_writable(keys.scan_starts, np.int64), first)
 
 
 def empty_hits(size: int) -> SampledHits:
@@ -295,10 +299,17 @@ def empty_hits(size: int) -> SampledHits:
     return SampledHits(np.empty(size, np.int64), np.empty(size), np.empty(size))
 
 
+def _concatenate(tables: list[SampledHits]) -> SampledHits:
+    """Concatenate tables of hits. A single table is not copied."""
+    if len(tables) == 1:
+        return tables[0]
+    return type(tables[0])(*map(np.concatenate, zip(*tables, strict=True)))
+
+
 def _particles(
     detectable: DetectableParticles, random: RandomKeys, subrays: int, reach: Floats
-) -> Iterator[SampledHits]:
-    """Yield hits on particles of one kind, in front of the ends of sub-rays.
+) -> SampledHits:
+    """Return hits on particles of one kind, in front of the ends of sub-rays, sorted by beam.
 
     `reach` (rays,) are the ranges of these ends in meters.
     """
@@ -308,13 +319,18 @@ def _particles(
     tables = particle_loops.ParticleTables(
         detectable.counts, detectable.by_range, detectable.step_mm, exponential_quantiles()
     )
+    # Five standard deviations above the mean, so that a single pass usually suffices
+    particles = beams * float(np.sum(1 - detectable.counts))
+    size = int(particles + 5 * math.sqrt(particles)) + len(detectable.counts)
+    parts: list[SampledHits] = []
     beam = 0
     while beam < beams:
-        hits = empty_hits(2 * beams + len(detectable.counts))
+        hits = empty_hits(size)
         beam, count = particle_loops.sample_particles(
             beam, beams, subrays=subrays, tables=tables, keys=random, reach=reach, hits=hits
         )
-        yield hits.first(count)
+        parts.append(hits.first(count))
+    return _concatenate(parts)
 
 
 def _fog_hits(fog: FogCells, random: RandomKeys, subrays: int, reach: Floats) -> SampledHits:
@@ -325,7 +341,9 @@ def _fog_hits(fog: FogCells, random: RandomKeys, subrays: int, reach: Floats) ->
     from . import particle_loops
 
     hits = empty_hits(len(reach) // subrays)
-    tables = particle_loops.FogTables(fog.begin_m, FARTHEST_M, fog.cell_m, fog.energy, fog.peaks)
+    tables = particle_loops.FogTables(
+        fog.begin_m, FARTHEST_M, fog.cell_m, fog.energy, fog.peaks, fog.guide
+    )
     count = particle_loops.sample_fog(subrays, tables, random, reach, hits)
     return hits.first(count)
 
@@ -364,7 +382,7 @@ def _detectable(
 @lru_cache(CACHED_TABLES)
 def seen_by_range(
     air: Air, kind: Particles, min_energy: float, min_range_m: float, max_range_m: float
-) -> tuple[float, Floats] | None:
+) -> tuple[float, Floats32] | None:
     """Return the mean number of detectable particles in a beam, and their table by range.
 
     A particle is detectable if it returns at least `min_energy`. The table is
@@ -386,7 +404,7 @@ def seen_by_range(
     full_beam_energy = kind.reflectance * air.white_energy(distance)
     energy_of_1_mm = full_beam_energy / (1000 * air.beam_diameter(distance)) ** 2
     quantities = [smallest, larger, energy_of_1_mm, full_beam_energy]
-    return float(sums[-1]), np.stack([distance, *(round_to_single(row) for row in quantities)])
+    return float(sums[-1]), np.stack([distance, *quantities], axis=1, dtype=np.float32)
 
 
 def _poisson(mean: float) -> Floats:
@@ -422,9 +440,16 @@ def _fog_cells(
     energy = energy[: int(np.sum(np.cumprod(energy >= FAINTEST * threshold)))]
     if not len(energy):
         return None
-    peaks = highest_probabilities(THRESHOLD_SIGMAS * energy / threshold)
-    peak_rows = np.arange(len(energy) + 1)[:, None] + round_to_single(peaks)
-    return FogCells(min_range_m, cell_m, round_to_single(energy), peak_rows.reshape(-1))
+    peaks = round_to_single(highest_probabilities(THRESHOLD_SIGMAS * energy / threshold))
+    guide = [np.searchsorted(row, np.arange(PEAK_PARTS) / PEAK_PARTS, "right") for row in peaks]
+    peak_rows = np.arange(len(energy) + 1)[:, None] + peaks
+    return FogCells(
+        begin_m=min_range_m,
+        cell_m=cell_m,
+        energy=round_to_single(energy),
+        peaks=peak_rows.reshape(-1),
+        guide=np.array(guide, np.uint8),
+    )
 
 
 def highest_probabilities(signals: Floats) -> Floats:
@@ -458,7 +483,7 @@ def round_to_single(table: Floats) -> Floats:
 
 
 @cache
-def exponential_quantiles() -> Floats:
+def exponential_quantiles() -> Floats32:
     """Return the exponential distribution's quantiles at the centers of equal intervals."""
     fractions = (np.arange(QUANTILES) + 0.5) / QUANTILES
-    return round_to_single(-log1p(-fractions))
+    return (-log1p(-fractions)).astype(np.float32)

@@ -62,7 +62,8 @@ class PulseHits(NamedTuple):
 
     subray: Ints  # number among the sub-rays of all beams
     distance: Floats  # meters
-    row: Ints  # (n, 2): row among the hits of `SubrayNeighbors`, and scratch memory
+    row: Ints  # row among the hits of `SubrayNeighbors`
+    return_begin: Ints  # scratch memory: first hit of the return that each hit belongs to
     subray_hits: Ints  # scratch memory (n * sub-rays per beam,)
     changes: Ints  # scratch memory (n + 1,)
 
@@ -171,6 +172,7 @@ def continue_surfaces(begin, stop, marks, hits, gap_m, neighbors):  # noqa: C901
     starts_surface = marks.starts_surface
     distance = hits.distance
     row = hits.row
+    return_begin = hits.return_begin
     subray_hits = hits.subray_hits
     changes = hits.changes
     count = stop - begin
@@ -189,18 +191,18 @@ def continue_surfaces(begin, stop, marks, hits, gap_m, neighbors):  # noqa: C901
             panes = max(panes, pane + 1)
     changes[count] = 0  # changes[k]: change in the number of surfaces that continue at hit k
     first_hit = begin
-    for k in range(begin, stop):  # row[k, 1]: first hit of the return that hit k belongs to
+    for k in range(begin, stop):
         if starts_return[k]:
             first_hit = k
-        row[k, 1] = first_hit
+        return_begin[k] = first_hit
     for pane in range(panes):
         for pair in range(len(neighbors.pairs)):
             hit = subray_hits[pane * subrays + neighbors.pairs[pair, 0]]
             neighbor = subray_hits[pane * subrays + neighbors.pairs[pair, 1]]
-            if hit < 0 or neighbor < 0 or row[hit, 1] == row[neighbor, 1]:
+            if hit < 0 or neighbor < 0 or return_begin[hit] == return_begin[neighbor]:
                 continue
-            hit_m = _half_way(row[hit, 0], row[neighbor, 0], 1 / distance[hit], neighbors)
-            neighbor_m = _half_way(row[neighbor, 0], row[hit, 0], 1 / distance[neighbor], neighbors)
+            hit_m = _half_way(row[hit], row[neighbor], 1 / distance[hit], neighbors)
+            neighbor_m = _half_way(row[neighbor], row[hit], 1 / distance[neighbor], neighbors)
             between_m = abs(distance[hit] - distance[neighbor])
             if abs(hit_m - neighbor_m) <= max(gap_m, SLOPE * between_m):
                 changes[min(hit, neighbor) + 1 - begin] += 1

@@ -10,7 +10,7 @@ import numpy as np
 
 from raybeam.compiled import inlined
 
-from ...numerics.arrays import AnyArray, Ints
+from ...numerics.arrays import Ints, UInts64
 
 SHIFT_TO_INDEX = np.uint64(48)  # keeps the upper 16 of 64 bits as an index below 65,536
 
@@ -28,8 +28,8 @@ _NEXT = np.uint64(1)
 class RandomKeys(NamedTuple):
     """Keys for the random numbers of consecutive beams."""
 
-    starts: AnyArray  # uint64 (purposes,), from `random_numbers.starts`; empty if none are needed
-    scan: int  # number of the first scan
+    # (scans, purposes), from `random_numbers.scan_states`; no purposes if none are needed
+    states: UInts64
     scan_starts: Ints  # (scans,): number of the first beam of each scan
     first: int  # number of the first beam
 
@@ -43,16 +43,16 @@ def _mixed(x):
 
 
 @inlined
-def bits(start, scan, ray, number):
-    """Return 64 random bits for a purpose, a ray and a number.
+def bits(state, ray, number):
+    """Return 64 random bits for a ray and a number.
 
-    `start` is the initial hash state of the purpose.
+    `state` is the hash state of the ray's scan for a purpose (`RandomKeys.states`). `ray` is the
+    number of the ray in its scan.
     """
-    scan_state = _mixed(start + np.uint64(scan) * _GAMMA)
-    return _mixed(scan_state + (np.uint64(ray) * _NUMBERS + np.uint64(number) + _NEXT) * _GAMMA)
+    return _mixed(state + (np.uint64(ray) * _NUMBERS + np.uint64(number) + _NEXT) * _GAMMA)
 
 
 @inlined
-def uniform(start, scan, ray, number):
+def uniform(state, ray, number):
     """Return a uniform random number in [0, 1) that is a multiple of 2**-53."""
-    return np.float64(bits(start, scan, ray, number) >> _11) * 2.0**-53
+    return np.float64(bits(state, ray, number) >> _11) * 2.0**-53

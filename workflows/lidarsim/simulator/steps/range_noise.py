@@ -35,10 +35,15 @@ class RangeNoiseStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Add reported ranges to the returns of a batch."""
-        reported = self._reported(self.setup.noise, returns, batch)
-        if self.setup.recorded_noise is not None:  # the other noise is already in the recording
-            on_recorded = self._reported(self.setup.recorded_noise, returns, batch)
-            reported = np.where(require_column(returns.source) >= 0, on_recorded, reported)
+        earlier = self.setup.recorded_noise
+        if earlier is None:
+            return returns._replace(reported=self._reported(self.setup.noise, returns, batch))
+        # The other noise is already in the recording.
+        is_added = require_column(returns.source) < 0
+        reported = returns.distance.copy()
+        for noise, rows in ((self.setup.noise, is_added), (earlier, ~is_added)):
+            if noise.has_range_errors and rows.any():
+                reported[rows] = self._reported(noise, returns.take(rows), batch)
         return returns._replace(reported=reported)
 
     def _reported(self, noise: Noise, returns: PulseReturns, batch: PulseBatch) -> Floats:

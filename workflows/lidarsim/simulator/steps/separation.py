@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ...numerics.arrays import Bools, to_writable
-from ...numerics.random_numbers import initial_states, quantiles
+from ...numerics.random_numbers import quantiles, scan_states
 from ...scene.colors import GRAY, pack_colors
 from ...sensor.disc import neighboring_subrays
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise
@@ -104,9 +104,12 @@ def separate_hits(
     )
     output = output.first(count)
     returns = _columns(hits, air_hits, output)
+    # Copies, because the output arrays are as long as the table of hits.
     return returns._replace(
         ray=output.beam + reporting.first,
-        velocity=output.velocity if with_velocity else None,
+        distance=output.distance.copy(),
+        energy=output.energy.copy(),
+        velocity=output.velocity.copy() if with_velocity else None,
     )
 
 
@@ -131,23 +134,17 @@ def _receiver(subrays: int, gap_m: float, reporting: Reporting, *, with_velocity
 def _detection_keys(reporting: Reporting) -> RandomKeys:
     """Return the keys of the random numbers for detection.
 
-    Without loss of returns, the array `starts` is empty.
+    Without loss of returns, the keys have no purposes.
     """
     from .random_loops import RandomKeys
 
     noise = reporting.noise
-    keys = reporting.keys
-    detects = noise is not None and noise.loses_returns
-    return RandomKeys(
-        starts=initial_states(noise.seed, LOSS, DETECTION)
-        if noise is not None and detects
-        else np.zeros(0, np.uint64),
-        scan=0 if keys is None else keys.scan,
-        scan_starts=np.zeros(1, np.int64)
-        if keys is None
-        else to_writable(keys.scan_starts, np.int64),
-        first=reporting.first,
-    )
+    keys = reporting.keys or Keys(0, np.zeros(1, np.int64))
+    states = np.zeros((len(keys.scan_starts), 0), np.uint64)
+    if noise is not None and noise.loses_returns:
+        scans = keys.scan + np.arange(len(keys.scan_starts))
+        states = scan_states(noise.seed, (LOSS, DETECTION), scans)
+    return RandomKeys(states, to_writable(keys.scan_starts, np.int64), reporting.first)
 
 
 def _columns(hits: PulseReturns, air_hits: PulseReturns, output: ReturnArrays) -> PulseReturns:

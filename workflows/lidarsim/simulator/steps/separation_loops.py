@@ -46,7 +46,7 @@ class Receiver(NamedTuple):
 
 
 class _Detection(NamedTuple):
-    """Detection settings of a `Receiver`, and the hash starts of its random numbers."""
+    """Detection settings of a `Receiver`."""
 
     dropout: float  # fraction of returns that are lost
     threshold: float  # energy at which half of the returns are detected; 0 without detection
@@ -54,8 +54,14 @@ class _Detection(NamedTuple):
     quantiles: Floats  # pointer to the quantiles of the normal distribution
     lowest: float  # first quantile
     highest: float  # last quantile
-    loss_start: np.uint64  # hash starts (`random_numbers.starts`)
-    detection_start: np.uint64
+
+
+class _BeamKeys(NamedTuple):
+    """Keys of the random numbers of a beam."""
+
+    loss_state: np.uint64  # hash states of the beam's scan (`random_numbers.scan_states`)
+    detection_state: np.uint64
+    number_in_scan: int
 
 
 class ReturnArrays(NamedTuple):
@@ -71,13 +77,13 @@ class ReturnArrays(NamedTuple):
     velocity: Floats  # radial, m/s
 
     def first(self, count: int) -> ReturnArrays:
-        """Return copies of the first `count` returns."""
+        """Return the first `count` returns, without copying them."""
         return ReturnArrays(
-            self.beam[:count].copy(),
-            self.row[:count].copy(),
-            self.distance[:count].copy(),
-            self.energy[:count].copy(),
-            self.velocity[:count].copy(),
+            self.beam[:count],
+            self.row[:count],
+            self.distance[:count],
+            self.energy[:count],
+            self.velocity[:count],
         )
 
 
@@ -90,13 +96,20 @@ class _BeamRows(NamedTuple):
     air_stop: int
 
 
+class _AirInBeam(NamedTuple):
+    """Hits of a beam in the air."""
+
+    stop: int  # first row of the next beam
+    farthest_m: float  # distance of the farthest hit
+    energy: float  # sum of the energies, as if each sub-ray carried the whole beam
+
+
 class _BeamScratch(NamedTuple):
     """Scratch memory for the hits and returns of one beam."""
 
-    hits: PulseHits  # row[k, 0] is the row on surfaces, or -1, -2, … in the air
+    hits: PulseHits  # row[k] is the row on surfaces, or -1, -2, … in the air
     marks: SurfaceMarks
     energy: Floats
-    velocity: Floats
     shown: Bools  # whether the mode reports a return
 
 
@@ -126,9 +139,47 @@ def _pointers_to_returns(output):
     )
 
 
+@inlined
+def _pointers_to_receiver(receiver):
+    """Return a `Receiver` with a pointer to the quantiles of `receiver`, which must stay alive."""
+    return Receiver(
+        receiver.subrays,
+        receiver.gap_m,
+        receiver.mode,
+        receiver.with_velocity,
+        receiver.dropout,
+        receiver.threshold,
+        receiver.threshold_sigmas,
+        float64s(receiver.quantiles.ctypes.data),
+    )
+
+
+@inlined
+def _pointers_to_scratch(scratch):
+    """Return a `_BeamScratch` with pointers to the arrays of `scratch`, which must stay alive."""
+    hits = scratch.hits
+    starts_return = uint8s(scratch.marks.starts_return.ctypes.data)
+    return _BeamScratch(
+        PulseHits(
+            int64s(hits.subray.ctypes.data),
+            float64s(hits.distance.ctypes.data),
+            int64s(hits.row.ctypes.data),
+            int64s(hits.return_begin.ctypes.data),
+            int64s(hits.subray_hits.ctypes.data),
+            int64s(hits.changes.ctypes.data),
+        ),
+        SurfaceMarks(uint8s(scratch.marks.solid.ctypes.data), starts_return, starts_return),
+        float64s(scratch.energy.ctypes.data),
+        uint8s(scratch.shown.ctypes.data),
+    )
+
+
 @noinline
 def _max_hits(ray, subrays):
-    """Return the maximum number of hits in a beam."""
+    """Return the maximum number of hits in `subrays` consecutive sub-rays.
+
+    This is at least the maximum number of hits in a beam.
+    """
     max_count = 0
     begin = 0
     end = -1
@@ -145,7 +196,8 @@ def _room_for_hits(size, subrays):
     pulse_hits = PulseHits(
         np.empty(size, np.int64),
         np.empty(size),
-        np.empty((size, 2), np.int64),
+        np.empty(size, np.int64),
+        np.empty(size, np.int64),
         np.empty(size * subrays, np.int64),
         np.empty(size + 1, np.int64),
     )
@@ -153,7 +205,6 @@ def _room_for_hits(size, subrays):
     return _BeamScratch(
         pulse_hits,
         SurfaceMarks(np.empty(size, np.bool_), starts_return, starts_return),
-        np.empty(size),
         np.empty(size),
         np.empty(size, np.bool_),
     )
@@ -165,6 +216,18 @@ def _end_of_beam(ray, size, row, end_ray):
     while row < size and ray[row] < end_ray:
         row += 1
     return row
+
+
+@inlined
+def _air_in_beam(air, size, row, end_ray):
+    """Return the hits in the air, starting at `row`, whose sub-rays are less than `end_ray`."""
+    farthest_m = -np.inf
+    energy = 0.0
+    while row < size and air.ray[row] < end_ray:
+        farthest_m = max(farthest_m, air.distance[row])
+        energy += air.energy[row]
+        row += 1
+    return _AirInBeam(row, farthest_m, energy)
 
 
 @inlined
@@ -205,6 +268,29 @@ def _single_return(hits, beam_rows, beam, receiver, count, output):
 
 
 @inlined
+def _surely_detected(energy, detection):
+    """Return whether a return is detected whatever the random numbers are."""
+    return detection.dropout == 0 and (
+        detection.threshold == 0
+        or detection.threshold_sigmas * (energy / detection.threshold - 1) + detection.lowest > 0
+    )
+
+
+@inlined
+def _outshines_air(distance, energy, air_in_beam, receiver, detection):
+    """Return whether the only surface hit of a beam surely becomes the strongest return.
+
+    Its return must be detected, be brighter than all hits in the air together, and be behind them.
+    """
+    return (
+        # The margin allows for sums that are rounded differently.
+        energy > 1.001 * air_in_beam.energy
+        and distance - air_in_beam.farthest_m > receiver.gap_m
+        and _surely_detected(energy / receiver.subrays, detection)
+    )
+
+
+@inlined
 def _collect_hits(hits, air, beam_rows, scratch):
     """Write the hits of a beam that have energy to `scratch`, sorted by sub-ray.
 
@@ -222,12 +308,12 @@ def _collect_hits(hits, air, beam_rows, scratch):
     while surface_row < beam_rows.stop or air_row < beam_rows.air_stop:
         in_air = air_row < beam_rows.air_stop
         if in_air and (surface_row == beam_rows.stop or air.ray[air_row] <= hits.ray[surface_row]):
-            row[count, 0] = -1 - air_row
+            row[count] = -1 - air_row
             distance[count] = air.distance[air_row]
             energy[count] = air.energy[air_row]
             air_row += 1
         else:
-            row[count, 0] = surface_row
+            row[count] = surface_row
             distance[count] = hits.distance[surface_row]
             energy[count] = hits.energy[surface_row]
             surface_row += 1
@@ -239,68 +325,77 @@ def _collect_hits(hits, air, beam_rows, scratch):
 
 
 @inlined
-def _sort_by_distance(pulse_hits, count):
+def _sort_by_distance(scratch, count):
     """Sort the first `count` hits by distance, keeping the order of equal distances."""
-    row = pulse_hits.row
-    distance = pulse_hits.distance
+    row = scratch.hits.row
+    distance = scratch.hits.distance
+    energy = scratch.energy
     for k in range(1, count):
-        row_k = row[k, 0]
+        row_k = row[k]
         distance_k = distance[k]
+        energy_k = energy[k]
         index = k
         while index > 0 and distance[index - 1] > distance_k:
-            row[index, 0] = row[index - 1, 0]
+            row[index] = row[index - 1]
             distance[index] = distance[index - 1]
+            energy[index] = energy[index - 1]
             index -= 1
-        row[index, 0] = row_k
+        row[index] = row_k
         distance[index] = distance_k
+        energy[index] = energy_k
 
 
 @inlined
-def _mark_returns(hits, air, count, exceeds_gap, receiver, neighbors, scratch):
-    """Mark the hits in `scratch` at which returns start, and fill in the columns of the hits.
+def _mark_returns(count, exceeds_gap, receiver, scratch):
+    """Mark the hits in `scratch` at which returns start.
 
     `count` is the number of hits. `exceeds_gap` is False if all hits of the beam are within the
-    receiver's gap of each other. A surface that continues from sub-ray to sub-ray belongs to a
-    single return.
+    receiver's gap of each other. If beams have several sub-rays, `_in_several_returns` then
+    finds the beams for which `continue_surfaces` must be called, because a surface that continues
+    from sub-ray to sub-ray belongs to a single return.
 
     In the example of `continue_surfaces` with a gap of 0.3 m, `_collect_hits` has written the drop
     and then the hits of sub-rays 0 to 3, and `_sort_by_distance` has moved the post before the
-    ground hits of sub-rays 1 and 2. `row[k, 0]` is -1, 0, 3, 1 and 2, because the drop is row 0 of
-    the table of hits in the air. Each hit is farther than the gap from the previous one, so
+    ground hits of sub-rays 1 and 2. `row` is -1, 0, 3, 1 and 2, because the drop is row 0 of the
+    table of hits in the air. Each hit is farther than the gap from the previous one, so
     `starts_return` is True for all five. Because surface hits are in several returns,
     `continue_surfaces` looks for surfaces that continue, and clears `starts_return` of hits 2, 3
     and 4. `_write_returns` then writes two returns: the drop at 8.0 m, and hits 1 to 4 at their
     mean distance, weighted by energy. If the post returns twice the energy of a ground hit, the
     mean is 10.88 m, and the return has row 3, the row of the post.
     """
-    row = scratch.hits.row
     distance = scratch.hits.distance
-    solid = scratch.marks.solid
     starts_return = scratch.marks.starts_return
+    for k in range(count):
+        starts_return[k] = k == 0 or (
+            exceeds_gap and distance[k] - distance[k - 1] > receiver.gap_m
+        )
+
+
+@inlined
+def _in_several_returns(hits, air, count, scratch):
+    """Return whether hits on surfaces are in several returns. Only then can a surface continue.
+
+    Fills in the sub-rays of the first `count` hits in `scratch`, and whether they are solid.
+    """
+    row = scratch.hits.row
+    solid = scratch.marks.solid
     several = False
     surface_number = -1
     number = 0
     for k in range(count):
-        row_k = row[k, 0]
+        row_k = row[k]
         solid[k] = row_k >= 0 and hits.solid[row_k] != 0
         scratch.hits.subray[k] = hits.ray[row_k] if row_k >= 0 else air.ray[-1 - row_k]
-        scratch.energy[k] = hits.energy[row_k] if row_k >= 0 else air.energy[-1 - row_k]
-        if receiver.with_velocity:
-            velocity_k = hits.velocity[row_k] if row_k >= 0 else air.velocity[-1 - row_k]
-            scratch.velocity[k] = velocity_k
-        starts_return[k] = k == 0 or (
-            exceeds_gap and distance[k] - distance[k - 1] > receiver.gap_m
-        )
-        number += int(starts_return[k])
-        if solid[k]:  # a surface can continue only if its hits are in several returns
+        number += int(scratch.marks.starts_return[k])
+        if solid[k]:
             several |= surface_number >= 0 and surface_number != number
             surface_number = number
-    if several and len(neighbors.pairs):
-        continue_surfaces(0, count, scratch.marks, scratch.hits, receiver.gap_m, neighbors)
+    return several
 
 
 @inlined
-def _write_returns(hit_count, beam, receiver, scratch, count, output):
+def _write_returns(hits, air, hit_count, beam, receiver, scratch, count, output):  # noqa: PLR0917 - a compiled loop
     """Write the returns of the first `hit_count` hits in `scratch`.
 
     Return the number of returns.
@@ -309,7 +404,6 @@ def _write_returns(hit_count, beam, receiver, scratch, count, output):
     distance = scratch.hits.distance
     starts_return = scratch.marks.starts_return
     energy = scratch.energy
-    velocity = scratch.velocity
     k = 0
     while k < hit_count:
         strongest = k
@@ -320,14 +414,15 @@ def _write_returns(hit_count, beam, receiver, scratch, count, output):
             sum_energy += energy[k]
             sum_distance += energy[k] * distance[k]
             if receiver.with_velocity:
-                sum_velocity += energy[k] * velocity[k]
+                velocity = hits.velocity[row[k]] if row[k] >= 0 else air.velocity[-1 - row[k]]
+                sum_velocity += energy[k] * velocity
             if energy[k] > energy[strongest]:
                 strongest = k
             k += 1
             if k == hit_count or starts_return[k]:
                 break
         output.beam[count] = beam
-        output.row[count] = row[strongest, 0]
+        output.row[count] = row[strongest]
         output.distance[count] = sum_distance / sum_energy
         output.energy[count] = sum_energy / receiver.subrays
         if receiver.with_velocity:
@@ -339,6 +434,8 @@ def _write_returns(hit_count, beam, receiver, scratch, count, output):
 @inlined
 def _keep(output, k, count):
     """Move return `k` behind the `count` kept returns, and return the new count."""
+    if k == count:
+        return count + 1
     output.beam[count] = output.beam[k]
     output.row[count] = output.row[k]
     output.distance[count] = output.distance[k]
@@ -348,12 +445,8 @@ def _keep(output, k, count):
 
 
 @inlined
-def _detection_of(receiver, starts):
-    """Return the detection settings of a receiver.
-
-    `starts` is empty if no returns are lost.
-    """
-    loses = len(starts) > 0
+def _detection_of(receiver):
+    """Return the detection settings of a receiver."""
     count = len(receiver.quantiles)
     return _Detection(
         dropout=receiver.dropout,
@@ -362,28 +455,26 @@ def _detection_of(receiver, starts):
         quantiles=float64s(receiver.quantiles.ctypes.data),
         lowest=receiver.quantiles[0] if count else 0.0,
         highest=receiver.quantiles[count - 1] if count else 0.0,
-        loss_start=starts[0] if loses else np.uint64(0),
-        detection_start=starts[1] if loses else np.uint64(0),
     )
 
 
 @inlined
-def _detected(energy, scan, number_in_scan, return_index, detection):
-    """Return whether a return is detected, with the same result as `detection.detected`.
+def _detected(energy, beam_keys, return_index, detection):
+    """Return whether a return is detected, with the same result as `detection.is_detected`.
 
-    The keys of the random number are `scan`, the beam's `number_in_scan`, and the `return_index`
-    within the beam, from 0.
+    The keys of the random number are `beam_keys`, and the `return_index` within the beam, from 0.
     """
     detected = (
         detection.dropout == 0
-        or uniform(detection.loss_start, scan, number_in_scan, return_index) >= detection.dropout
+        or uniform(beam_keys.loss_state, beam_keys.number_in_scan, return_index)
+        >= detection.dropout
     )
     if detected and detection.threshold > 0:
         signal = detection.threshold_sigmas * (energy / detection.threshold - 1)
         detected = signal + detection.lowest > 0  # detected with any random number
         if not detected and signal + detection.highest > 0:
             index = np.int64(
-                bits(detection.detection_start, scan, number_in_scan, return_index)
+                bits(beam_keys.detection_state, beam_keys.number_in_scan, return_index)
                 >> SHIFT_TO_INDEX
             )
             detected = signal + detection.quantiles[index] > 0
@@ -391,16 +482,35 @@ def _detected(energy, scan, number_in_scan, return_index, detection):
 
 
 @inlined
-def _keep_detected(begin, stop, scan, number_in_scan, detection, output):
-    """Keep the detected returns among rows `begin` to `stop`. Return the next free row.
-
-    `scan` and the beam's `number_in_scan` are keys of the random numbers (`_detected`).
-    """
+def _keep_detected(begin, stop, beam_keys, detection, output):
+    """Keep the detected returns among rows `begin` to `stop`. Return the next free row."""
     count = begin
     for k in range(begin, stop):
-        if _detected(output.energy[k], scan, number_in_scan, k - begin, detection):
+        if _detected(output.energy[k], beam_keys, k - begin, detection):
             count = _keep(output, k, count)
     return count
+
+
+@inlined
+def _keep_strongest_detected(begin, stop, beam_keys, detection, lost, output):
+    """Keep the strongest detected return among rows `begin` to `stop`. Return the next free row.
+
+    Returns are tried in the order of their energy, which mostly takes a single random number.
+    `lost` is scratch memory.
+    """
+    for k in range(begin, stop):
+        lost[k - begin] = False
+    for _ in range(begin, stop):
+        strongest = -1
+        for k in range(begin, stop):
+            if not lost[k - begin] and (
+                strongest < 0 or output.energy[k] > output.energy[strongest]
+            ):
+                strongest = k
+        if _detected(output.energy[strongest], beam_keys, strongest - begin, detection):
+            return _keep(output, strongest, begin)
+        lost[strongest - begin] = True
+    return begin
 
 
 @noinline
@@ -458,29 +568,29 @@ def mark_reported(ray, energy, mode, shown):
         stop = begin + 1
         while stop < len(ray) and ray[stop] == ray[begin]:
             stop += 1
-        _mark(energy, begin, stop, mode, shown)
+        if stop == begin + 1:  # the call would take most of the time
+            shown[begin] = True
+        else:
+            _mark(energy, begin, stop, mode, shown)
         begin = stop
 
 
-@compiled()
-def separate(hits, air, neighbors, receiver, keys, output):  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Combine the hits of beams into returns, and write these to `output`.
-
-    `hits` and `air` are `SubrayHits` on surfaces and in the air, `neighbors` is a
-    `SubrayNeighbors`, `receiver` a `Receiver`, and `output` a `ReturnArrays`. `keys` is a
-    `RandomKeys`, which has starts if returns can be lost. Beams are numbered from 0 at sub-ray 0,
-    and beam 0 is beam `keys.first` of the scans in `keys`. Returns the number of returns.
-    """
+@inlined
+def _separate_beams(hits, air, neighbors, receiver, keys, scratch, output):  # noqa: C901, PLR0914, PLR0915 - a compiled loop
+    """Separate the hits of all beams, as in `separate`, with the scratch memory of one beam."""
     subrays = receiver.subrays
-    size = _max_hits(hits.ray, subrays) + _max_hits(air.ray, subrays)
-    scratch = _room_for_hits(size, subrays)
     hit_count = len(hits.ray)
     air_count = len(air.ray)
     hits = _pointers_to_hits(hits)
     air = _pointers_to_hits(air)
+    scratch = _pointers_to_scratch(scratch)
     output = _pointers_to_returns(output)
-    loses = len(keys.starts) > 0
-    detection = _detection_of(receiver, keys.starts)
+    loses = keys.states.shape[1] > 0
+    detection = _detection_of(receiver)
+    receiver = _pointers_to_receiver(receiver)
+    has_neighbors = len(neighbors.pairs) > 0
+    loss_state = np.uint64(0)
+    detection_state = np.uint64(0)
     row = 0
     air_row = 0
     count = 0
@@ -493,40 +603,63 @@ def separate(hits, air, neighbors, receiver, keys, output):  # noqa: PLR0914, PL
             beam = min(beam, beam_of(air.ray[air_row], subrays))
         end_ray = (beam + 1) * subrays
         stop = _end_of_beam(hits.ray, hit_count, row, end_ray)
-        air_stop = _end_of_beam(air.ray, air_count, air_row, end_ray)
-        beam_rows = _BeamRows(row, stop, air_row, air_stop)
+        air_in_beam = _air_in_beam(air, air_count, air_row, end_ray)
+        beam_rows = _BeamRows(row, stop, air_row, air_in_beam.stop)
         row = stop
-        air_row = air_stop
+        air_row = air_in_beam.stop
         begin = count
         single = False
-        if (
-            beam_rows.air_start == beam_rows.air_stop
-        ):  # mostly, there is one surface, and no hit in the air
+        # Mostly, there is one surface, and hits in the air are faint.
+        outshines_air = (
+            receiver.mode == STRONGEST
+            and stop == beam_rows.start + 1
+            and _outshines_air(
+                hits.distance[stop - 1], hits.energy[stop - 1], air_in_beam, receiver, detection
+            )
+        )
+        if outshines_air or air_row == beam_rows.air_start:
             single, count = _single_return(hits, beam_rows, beam, receiver, count, output)
         if not single:
             collected, extent_m = _collect_hits(hits, air, beam_rows, scratch)
             exceeds_gap = extent_m > receiver.gap_m
             if exceeds_gap:  # only few beams hit an edge or graze a surface
-                _sort_by_distance(scratch.hits, collected)
-            _mark_returns(
-                hits,
-                air,
-                count=collected,
-                exceeds_gap=exceeds_gap,
-                receiver=receiver,
-                neighbors=neighbors,
-                scratch=scratch,
-            )
-            count = _write_returns(collected, beam, receiver, scratch, count, output)
-        if loses and count > begin:
+                _sort_by_distance(scratch, collected)
+            _mark_returns(collected, exceeds_gap, receiver, scratch)
+            if has_neighbors and _in_several_returns(hits, air, collected, scratch):
+                continue_surfaces(
+                    0, collected, scratch.marks, scratch.hits, receiver.gap_m, neighbors
+                )
+            count = _write_returns(hits, air, collected, beam, receiver, scratch, count, output)
+        if loses and count > begin and not outshines_air:
             number = keys.first + beam
             if number >= scan_stop:
                 scan_index = scan_row(keys.scan_starts, number, scan_index)
                 scan_start = keys.scan_starts[scan_index]
                 scan_stop = _start_of_scan(keys.scan_starts, scan_index + 1)
-            count = _keep_detected(
-                begin, count, keys.scan + scan_index, number - scan_start, detection, output
-            )
+                loss_state = keys.states[scan_index, 0]
+                detection_state = keys.states[scan_index, 1]
+            beam_keys = _BeamKeys(loss_state, detection_state, number - scan_start)
+            if receiver.mode == STRONGEST and count - begin > 1:
+                count = _keep_strongest_detected(
+                    begin, count, beam_keys, detection, scratch.shown, output
+                )
+            else:
+                count = _keep_detected(begin, count, beam_keys, detection, output)
         if receiver.mode != ALL and count - begin > 1:
             count = _keep_reported(begin, count, receiver.mode, scratch, output)
     return count
+
+
+@compiled()
+def separate(hits, air, neighbors, receiver, keys, output):
+    """Combine the hits of beams into returns, and write these to `output`.
+
+    `hits` and `air` are `SubrayHits` on surfaces and in the air, `neighbors` is a
+    `SubrayNeighbors`, `receiver` a `Receiver`, and `output` a `ReturnArrays`. `keys` is a
+    `RandomKeys`, which has purposes if returns can be lost. Beams are numbered from 0 at sub-ray 0,
+    and beam 0 is beam `keys.first` of the scans in `keys`. Returns the number of returns.
+    """
+    subrays = receiver.subrays
+    size = _max_hits(hits.ray, subrays) + _max_hits(air.ray, subrays)
+    scratch = _room_for_hits(size, subrays)
+    return _separate_beams(hits, air, neighbors, receiver, keys, scratch, output)

@@ -182,7 +182,7 @@ class SprayStep(PulseStep):
         rays = np.concatenate(
             [vectors.T.take(ring_order, axis=1) for vectors in batch.central_rays]
         )
-        reach_m = np.minimum(reach_m[ring_order], self._clump_distribution[1][0, -1])
+        reach_m = np.minimum(reach_m[ring_order], self._clump_distribution[1][-1, 0])
         cell, box, cell_rays = pair_cells_with_boxes(
             rays, times, spray_boxes.boxes, spray_boxes.presence_ns, float(reach_m.max())
         )

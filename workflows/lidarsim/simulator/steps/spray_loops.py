@@ -10,9 +10,9 @@ import numpy as np
 
 from raybeam.compiled import compiled, inlined, noinline
 
-from ...numerics.arrays import Floats, Ints
+from ...numerics.arrays import Floats, Floats32, Ints
 from ...numerics.elementary_loops import exp
-from .particle_loops import write_particle
+from .particle_loops import particle_energy
 from .pulse_loops import beam_of, scan_row
 from .random_loops import SHIFT_TO_INDEX, bits, uniform
 
@@ -60,9 +60,9 @@ class ClumpTables(NamedTuple):
     """Tables of detectable clumps of spray (`particles.DetectableParticles`)."""
 
     mean: float  # detectable clumps per beam in air of density `Survey.spray_g_m3`
-    by_range: Floats  # (5, shares): columns of ascending range that hold equal fractions of `mean`
+    by_range: Floats32  # (columns, 5): columns of air, each with an equal fraction of `mean`
     step_mm: float  # diameter that a fraction exp(-1) of the drops exceeds
-    exponential: Floats  # quantiles of the exponential distribution
+    exponential: Floats32  # quantiles of the exponential distribution
 
 
 @noinline
@@ -203,8 +203,8 @@ def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PL
     beam = crossings.beam
     spans = crossings.spans
     exponential = tables.exponential
-    starts = keys.starts
-    ranges = tables.by_range[0]
+    states = keys.states
+    ranges = tables.by_range[:, 0]
     part_m = ranges[-1] / _GUIDE_PARTS
     clumps_per_column = tables.mean / len(ranges)
     guide = _guide(ranges, part_m)
@@ -216,10 +216,11 @@ def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PL
         scan_index = scan_row(
             keys.scan_starts, key, scan_index if keys.scan_starts[scan_index] <= key else 0
         )
-        scan = keys.scan + scan_index
         number_in_scan = key - keys.scan_starts[scan_index]
         clump = 0
-        depth = exponential[np.int64(bits(starts[0], scan, number_in_scan, 0) >> SHIFT_TO_INDEX)]
+        depth = exponential[
+            np.int64(bits(states[scan_index, 0], number_in_scan, 0) >> SHIFT_TO_INDEX)
+        ]
         begin = k
         max_depth = 0.0  # number of columns
         while k < len(beam) and beam[k] == this_beam:
@@ -241,14 +242,21 @@ def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PL
                 ray = this_beam * subrays
                 if subrays > 1:
                     ray += np.int64(
-                        bits(starts[1], scan, number_in_scan, clump) % np.uint64(subrays)
+                        bits(states[scan_index, 1], number_in_scan, clump) % np.uint64(subrays)
                     )
                 if ranges[column] < reach[ray]:
-                    quantile = uniform(starts[2], scan, number_in_scan, clump)
-                    write_particle(ray, column, quantile, subrays, tables, hits=hits, row=count)
+                    quantile = uniform(states[scan_index, 2], number_in_scan, clump)
+                    energy = particle_energy(
+                        tables.by_range, column, quantile, tables.step_mm, exponential
+                    )
+                    hits.ray[count] = ray
+                    hits.distance[count] = ranges[column]
+                    hits.energy[count] = subrays * energy
                     count += 1
                 clump += 1
-                index = np.int64(bits(starts[0], scan, number_in_scan, clump) >> SHIFT_TO_INDEX)
+                index = np.int64(
+                    bits(states[scan_index, 0], number_in_scan, clump) >> SHIFT_TO_INDEX
+                )
                 depth = exponential[index]
             depth -= (end - position) * rate
             k += 1

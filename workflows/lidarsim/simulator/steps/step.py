@@ -8,6 +8,7 @@ decides whether a step acts, and how rays are cast follows from the roles of the
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 from enum import Flag, auto
@@ -185,8 +186,8 @@ class RecordedPulses:
     distance
         (n,): ranges of the returns in meters, in ascending order for each ray.
     energy
-        (n,): energies of the returns on the scale of `SceneSurfaces.energy`. They are at least the
-        detection threshold of the sensor, because the returns were detected.
+        (n,): energies of the returns on the scale of `SceneSurfaces.energy`. They must not be far
+        below the detection threshold of the sensor, because the returns were detected.
     fired
         (rays,): whether each ray of the sweep was fired. Rays that were not fired fill gaps in the
         grid of firings and channels.
@@ -254,7 +255,8 @@ class PulseBatch:
     keys: Keys  # scan and ray numbers of all beams of the scans, for random numbers
     start: int  # number of the batch's first beam
     stop: int  # one past the batch's last beam
-    pattern: Pattern  # rays of beams, in the head or platform frame
+    # rays of beams in the head or platform frame, or a function that returns them
+    pattern: Pattern | Callable[[], Pattern]
     first: int  # row of beam 0 in the pattern, which repeats
     poses: CastPoses  # poses of all beams of the scans
     firings: Firings  # firings of all beams of the scans
@@ -300,8 +302,9 @@ class PulseBatch:
         """
         beam_indices = np.arange(self.first + self.start, self.first + self.stop)
         pattern_rows = None if self.offsets is None else beam_indices
+        pattern = self.pattern() if callable(self.pattern) else self.pattern
         return self.emitter.subrays_of(
-            self.pattern, self.offsets, pattern_rows, by_head=self.poses.by_head
+            pattern, self.offsets, pattern_rows, by_head=self.poses.by_head
         )
 
     @property
@@ -349,6 +352,9 @@ class PulseStep(ABC):
     writes: ClassVar[tuple[str, ...]] = ()  # fields that the step adds or changes
     causes: ClassVar[tuple[int, ...]] = ()  # values of `cause` for returns that the step adds
     purposes: ClassVar[tuple[Purpose, ...]] = ()  # purposes of the step's random numbers
+    # Sentences that state why the step cannot act on recorded pulses, and what to do instead. Empty
+    # if the step can act on recorded pulses.
+    on_recordings: ClassVar[str] = ""
 
     def __init_subclass__(cls) -> None:
         if not getattr(cls, "role", None):

@@ -41,6 +41,11 @@ class StrayLightStep(PulseStep):
     writes = RETURN_COLUMNS
     causes = (BLOOMING,)
     purposes = (STRAY,)
+    on_recordings = (
+        "`noise.stray_light` cannot be simulated on a recording, because a recording does not "
+        "state which surfaces are retroreflectors. Reconstruct the scene with `lidarpool twin`, "
+        "and simulate the sensor in it."
+    )
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: SceneSurfaces) -> None:
         super().__init__(setup, caster, surfaces)

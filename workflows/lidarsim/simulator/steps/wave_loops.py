@@ -540,11 +540,10 @@ def _gaussians(wave, scratch, stops, peaks):
 
 @compiled()
 def order_hits(subrays, ray, distance, energy, row):
-    """Write the rows of hits with energy to `row[:, 0]`, sorted by beam and distance.
+    """Write the rows of hits with energy to `row`, sorted by beam and distance.
 
-    Hits are in the order of rays, which are sub-rays, with `subrays` per beam. `row` is
-    `PulseHits.row`, whose other column is scratch memory of `continue_surfaces`. Returns the number
-    of hits that have energy, and the maximum number of hits in a beam.
+    Hits are in the order of rays, which are sub-rays, with `subrays` per beam. Returns the
+    number of hits that have energy, and the maximum number of hits in a beam.
     """
     count = 0
     begin = 0
@@ -557,10 +556,10 @@ def order_hits(subrays, ray, distance, energy, row):
             begin = count
             beam = ray[k] // subrays
         index = count
-        while index > begin and distance[row[index - 1, 0]] > distance[k]:
-            row[index, 0] = row[index - 1, 0]
+        while index > begin and distance[row[index - 1]] > distance[k]:
+            row[index] = row[index - 1]
             index -= 1
-        row[index, 0] = k
+        row[index] = k
         count += 1
         max_hits = max(max_hits, count - begin)
     return count, max_hits
@@ -760,7 +759,7 @@ def make_returns(hits, sigma_m, samples_per_m, neighbors, peaks, output):  # noq
                 offset = (distance[hit] - mean_m) / sigma_m
                 spread += energy[hit] * (offset * offset)
             output.beam[count] = beam[begin]
-            output.row[count] = hits.pulses.row[best, 0]
+            output.row[count] = hits.pulses.row[best]
             output.distance[count] = mean_m
             output.energy[count] = sum_energy / neighbors.subrays
             output.velocity[count] = sum_velocity / sum_energy

@@ -32,6 +32,11 @@ class WaveformStep(PulseStep):
     effects = ("Waveforms",)
     reads = "ray", "distance", "triangle", "energy", "velocity"
     writes = *RETURN_COLUMNS, "velocity", "width", "amplitude"
+    on_recordings = (
+        "`returns.waveform` cannot be simulated on a recording, because a recording contains "
+        "returns instead of waveforms. Reconstruct the scene with `lidarpool twin`, and simulate "
+        "the sensor in it."
+    )
 
     @staticmethod
     def applies(setup: Setup) -> bool:
@@ -160,15 +165,15 @@ def _wave_hits(hits: PulseReturns, subrays: int) -> WaveHits:
     ray = to_writable(hits.ray, np.int64)
     distance = to_writable(hits.distance)
     energy = to_writable(require_column(hits.energy))
-    row = np.empty((len(ray), 2), np.int64)
+    row = np.empty(len(ray), np.int64)
     count, max_hits = wave_loops.order_hits(subrays, ray, distance, energy, row)
-    row = row[:count]
-    order = row[:, 0]
+    order = row[:count]
     pulse_hits = pulse_loops.PulseHits(
         subray=ray[order],
         distance=distance[order],
-        row=row,
+        row=order,
         # Scratch memory of `continue_surfaces`.
+        return_begin=np.empty(count, np.int64),
         subray_hits=np.empty(max_hits * subrays, np.int64),
         changes=np.empty(max_hits + 1, np.int64),
     )

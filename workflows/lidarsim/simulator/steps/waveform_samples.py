@@ -46,6 +46,10 @@ class RecordingStep(PulseStep):
     reads = "ray", "distance"
     writes = ("waveform",)
     purposes = SAMPLES, SAMPLE
+    on_recordings = (
+        "Waveforms cannot be recorded for recorded pulses, because a recording contains returns "
+        "instead of waveforms."
+    )
 
     @staticmethod
     def applies(setup: Setup) -> bool:

@@ -1,4 +1,4 @@
-"""Worker processes that reconstruct submaps, either in a cluster or on this machine."""
+"""Map functions over items in worker processes, either in a cluster or on this machine."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from lidarsim.io.allowance import memory
 from poolpart import Partition
 from poolpart.deploy import forked_workers
 
-from ..processes.fork_server import start_fork_server
-from ..run.cluster.cluster import is_connection_lost
-from ..run.cluster.connection import check_starts_workers, client_of
-from ..run.pipeline.stage_names import OTHER
-from .finished_steps import MapFunction
+from ...processes.fork_server import start_fork_server
+from ..pipeline.stage_names import OTHER
+from .cluster import is_connection_lost
+from .connection import check_starts_workers, client_of
 
-_SUBMAP_BYTES = 3 << 30  # memory per process for a submap of a sensor with 64 rings
+MapFunction = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+
 # Dask would terminate workers that exceed their share of the memory, and lose their tasks.
 _UNLIMITED = dict.fromkeys(
     (f"distributed.worker.memory.{limit}" for limit in ("target", "spill", "pause", "terminate")),
@@ -32,14 +32,17 @@ _UNLIMITED = dict.fromkeys(
 
 
 class LostWorkersError(LidarError):
-    """Raised if the cluster is lost, or if its workers die while they process a submap."""
+    """Raised if the cluster is lost, or if an item repeatedly kills its workers."""
 
 
 @contextmanager
-def parallel_map(client: Client | None, count: int) -> Iterator[MapFunction]:
+def parallel_map(
+    client: Client | None, count: int, worker_bytes: int, workers: int | None = None
+) -> Iterator[MapFunction]:
     """Yield a `map` function that runs in worker processes and preserves the order of items.
 
-    The function raises LostWorkersError if the scheduler is lost or if an item kills its workers.
+    Items may come from a generator, because the number of items in flight is limited. The
+    function raises LostWorkersError if the scheduler is lost or if an item kills its workers.
 
     Parameters
     ----------
@@ -48,16 +51,23 @@ def parallel_map(client: Client | None, count: int) -> Iterator[MapFunction]:
         machine.
     count
         Maximum number of items. A single item is processed in this process.
+    worker_bytes
+        Memory that a process on this machine requires, in bytes.
+    workers
+        Number of processes on this machine. By default, it depends on the number of cores and the
+        memory.
 
     Raises
     ------
     LidarError
         If this process cannot start worker processes.
     """
-    workers = min(count, CPU_COUNT, max(1, memory() // _SUBMAP_BYTES))
+    if workers is None:
+        workers = min(CPU_COUNT, max(1, memory() // worker_bytes))
+    workers = min(count, workers)
     if client is not None:
         yield partial(_map, client)
-    elif workers == 1:
+    elif workers <= 1:
         yield map
     else:
         check_starts_workers()
@@ -85,13 +95,13 @@ def _map(client: Client, function: Callable[[Any], Any], items: Iterable[Any]) -
         raise
     except KilledWorker as error:
         raise LostWorkersError(
-            "Several workers ended while they processed the same submap, probably because they "
-            "ran out of memory. Use fewer workers per machine, or increase `--voxel-m`."
+            "Several workers ended while they processed the same part of the recording, probably "
+            "because they ran out of memory. Use fewer workers per machine."
         ) from error
     except Exception as error:  # a client without a scheduler may raise any error
         if not is_connection_lost(client, error):
             raise
         raise LostWorkersError(
             f"The cluster at {address} is no longer reachable, or the tasks of this "
-            "reconstruction were canceled by a different client."
+            "command were canceled by a different client."
         ) from error

@@ -1,0 +1,303 @@
+"""Base class of the formats in which an augmented copy of a recording can be written.
+
+Sweeps are encoded independently of each other by any number of processes, and their files are
+collected in a work folder. The files of a sweep do not depend on other sweeps, so an interrupted
+run can be resumed. The driver assembles the data set from the work folder.
+"""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from lidarsim.errors import LidarError, explain_os_errors, unreadable_message
+from lidarsim.io.storage import Storage
+from lidarsim.words import list_names, plural
+
+from ...clouds.recording import Recording, RecordingSource
+from ..augmented_sweep import AugmentedSweep
+from .data_set_copy import check_target, new_target
+from .stored_records import StoredRecords
+
+_LONG_ENDINGS = (".pcd.bin",)  # endings of files whose format the suffix does not determine
+DETAILS_FOLDER = ".details"  # folder in the work folder, with one JSON file per sweep
+
+
+@dataclass(frozen=True)
+class EncodedSweeps:
+    """Encoded sweeps in a work folder.
+
+    Attributes
+    ----------
+    folder
+        Folder that contains the files that `Rewriter.sweep_files` returned.
+    count
+        Number of sweeps in the recording.
+    """
+
+    folder: Path
+    count: int
+
+    def missing(self) -> list[int]:
+        """Return the numbers of the sweeps that are not encoded yet."""
+        details = (self.folder / details_name(number) for number in range(self.count))
+        return [number for number, path in enumerate(details) if not path.exists()]
+
+    def details(self) -> Iterator[dict[str, Any]]:
+        """Yield the details of all sweeps in order."""
+        for number in range(self.count):
+            yield json.loads((self.folder / details_name(number)).read_bytes())
+
+    def names(self) -> set[str]:
+        """Return the names of all encoded files of the data set."""
+        return {name for details in self.details() for name in details["files"]}
+
+    def check_complete(self) -> None:
+        """Raise LidarError if a sweep is missing."""
+        if missing := self.missing():
+            raise LidarError(
+                f"{len(missing):,} of {plural(self.count, 'sweep')} have not been augmented yet, "
+                f"starting with sweep {missing[0]}. Continue with `--resume`."
+            )
+
+
+def details_name(number: int) -> str:
+    """Return the name of the file with the details of a sweep."""
+    return f"{DETAILS_FOLDER}/{number:08}.json"
+
+
+class Rewriter(ABC):
+    """Writer of an augmented copy of a recording in the format of the recording.
+
+    Use `open_rewriter` to create the rewriter for a recording.
+
+    Parameters
+    ----------
+    source
+        File or folder of the recording.
+    recording
+        The recording, opened with `keep_noise=True`.
+    """
+
+    title: ClassVar[str] = ""  # proper name of the format
+
+    def __init__(self, source: RecordingSource, recording: Recording) -> None:
+        self.source = source
+        self.path = source.path
+        self.recording = recording
+
+    @abstractmethod
+    def encode(
+        self, number: int, augmented: AugmentedSweep
+    ) -> tuple[dict[str, bytes], dict[str, Any]]:
+        """Return the files of a sweep, and JSON-serializable details for `assemble`.
+
+        The names of the files are relative to the work folder.
+        """
+
+    @abstractmethod
+    def assemble(self, target: Path, encoded: EncodedSweeps, base: Path) -> list[str]:
+        """Write the augmented copy, and return notes for the user.
+
+        Parameters
+        ----------
+        target
+            File or folder to write.
+        encoded
+            Encoded sweeps.
+        base
+            File or folder that contains everything else. This is the recording, or the target if
+            the sweeps of another sensor have already been written there.
+        """
+
+    def sensors(self) -> Sequence[str]:
+        """Return the names of all sensors, topics or sequences in the file or folder."""
+        return [self.sensor]
+
+    @property
+    def sensor(self) -> str:
+        """Name of the sensor, topic or sequence that is augmented."""
+        return ""
+
+    def sweep_files(self, number: int, augmented: AugmentedSweep) -> dict[str, bytes]:
+        """Return the encoded files of an augmented sweep, keyed by name.
+
+        The files depend only on the recording and on this sweep, and are the same in all processes.
+        The last file contains the details of the sweep. If files are written in this order, the
+        sweep is complete when its last file exists.
+
+        Parameters
+        ----------
+        number
+            Number of the sweep in the recording.
+        augmented
+            The augmented sweep.
+
+        Raises
+        ------
+        LidarError
+            If the sweep cannot be read, or if the format cannot store its points.
+        """
+        try:
+            files, details = self.encode(number, augmented)
+        except (OSError, ValueError) as error:
+            raise LidarError(unreadable_message(self.recording.name, error)) from error
+        details |= {"number": number, "files": sorted(files), "points": len(augmented.sweep)}
+        return files | {details_name(number): json.dumps(details).encode()}
+
+    def write_sweep(self, encoded: Path, number: int, augmented: AugmentedSweep) -> None:
+        """Write the encoded files of a sweep to a work folder.
+
+        Raises LidarError like `sweep_files`, or if a file cannot be written.
+        """
+        files = self.sweep_files(number, augmented)
+        storage = Storage(str(encoded), durable=False)
+        with explain_os_errors(f"{encoded} cannot be written"):
+            for name, content in files.items():
+                storage.prepare(Path(name).parent)
+                storage.write(name, content)
+
+    def is_written(self, encoded: Path, number: int) -> bool:
+        """Return whether a work folder contains all files of a sweep."""
+        return (encoded / details_name(number)).exists()
+
+    @property
+    def ending(self) -> str:
+        """End of the name of the file that is written, or an empty string for a folder."""
+        if self.path.is_dir():
+            return ""
+        return next(
+            (ending for ending in _LONG_ENDINGS if self.path.name.lower().endswith(ending)),
+            self.path.suffix.lower(),
+        )
+
+    def check_target(self, target: Path, *, overwrite: bool = False) -> None:
+        """Raise LidarError unless the augmented copy can be written to a path."""
+        check_target(target, self.path, overwrite=overwrite)
+        if not target.name.lower().endswith(self.ending):
+            raise LidarError(
+                f"{target} does not end in {self.ending}, but a {self.ending} file is written. "
+                f"Specify a path that ends in {self.ending}."
+            )
+
+    def finish(
+        self,
+        target: Path,
+        encoded: Path,
+        *,
+        overwrite: bool = False,
+        others: Sequence[tuple[Rewriter, Path]] = (),
+    ) -> list[str]:
+        """Write the augmented copy of the recording from the encoded sweeps.
+
+        The copy is written completely or not at all. Sweeps are read one after the other. The work
+        folder is not modified, so the caller can remove it afterwards.
+
+        Parameters
+        ----------
+        target
+            File or folder to write, depending on the kind of the recording.
+        encoded
+            Work folder with the encoded files of all sweeps.
+        overwrite
+            Whether to replace a file, or a folder that was written by this method.
+        others
+            Rewriters of other sensors in the same recording, with their work folders. Their sweeps
+            are written to the same target.
+
+        Returns
+        -------
+        Sentences for the user about files and values that were linked, kept or lost.
+
+        Raises
+        ------
+        LidarError
+            If a sweep is missing, or if the target exists or cannot be written.
+        """
+        parts = [
+            (rewriter, EncodedSweeps(folder, len(rewriter.recording)))
+            for rewriter, folder in ((self, encoded), *others)
+        ]
+        for _, sweeps in parts:
+            sweeps.check_complete()
+        self.check_target(target, overwrite=overwrite)
+        chosen = [rewriter.sensor for rewriter, _ in parts]
+        notes = self._sensor_notes(chosen)
+        with new_target(target) as staged:
+            base = self.path
+            for rewriter, sweeps in parts:
+                notes += rewriter.assemble(staged, sweeps, base)
+                base = staged
+        return list(dict.fromkeys(notes))
+
+    def _sensor_notes(self, chosen: Sequence[str]) -> list[str]:
+        """Return a note if the sweeps of some sensors are unchanged."""
+        unchanged = [name for name in self.sensors() if name not in chosen]
+        if not unchanged:
+            return []
+        verb = "is" if len(unchanged) == 1 else "are"
+        return [
+            (
+                f"Only the sweeps of {list_names(chosen)} were augmented. {list_names(unchanged)} "
+                f"in {self.source.name} {verb} unchanged."
+            )
+        ]
+
+    def stored_records(self, number: int, records: Any) -> StoredRecords:
+        """Combine the records of a file with the points of the recording."""
+        recording = self.recording
+        return StoredRecords(
+            records, recording[number], recording.meters, recording.intensity_column
+        )
+
+
+def box_details(augmented: AugmentedSweep) -> list[dict[str, Any]]:
+    """Return JSON-serializable descriptions of the boxes of inserted objects.
+
+    The visibility is None if it is unknown.
+    """
+    boxes = augmented.boxes
+    visibility = np.asarray(augmented.visibility, np.float64)
+    shares = visibility.tolist() if len(visibility) == len(boxes) else [None] * len(boxes)
+    return [
+        {
+            "name": name,
+            "type": kind,
+            "object": int(number),
+            "center": center,
+            "quaternion": quaternion,
+            "size": size,
+            "points": int(points),
+            "visibility": share,
+        }
+        for name, kind, number, center, quaternion, size, points, share in zip(
+            boxes.names,
+            boxes.types,
+            boxes.objects,
+            boxes.centers.tolist(),
+            boxes.quaternions.tolist(),
+            boxes.sizes.tolist(),
+            boxes.points,
+            shares,
+            strict=True,
+        )
+    ]
+
+
+def organization_notes(details: Iterator[Mapping[str, Any]]) -> list[str]:
+    """Return a note if clouds are not organized any more."""
+    lost = sum(bool(sweep.get("unorganized")) for sweep in details)
+    if not lost:
+        return []
+    return [
+        (
+            f"{plural(lost, 'sweep')} cannot stay organized, because not every added return has a "
+            "free cell. Their height is 1, and they contain no points for pulses without a return."
+        )
+    ]

@@ -1,0 +1,471 @@
+"""Tasks of worker processes, which augment and encode sweeps.
+
+The files of a sweep depend only on the recording and the effects, so they are the same in all
+processes.
+"""
+
+from __future__ import annotations
+
+import json
+import pickle
+import socket
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidarsim.columns.sweep import Sweep
+from lidarsim.columns.table import CAUSES
+from lidarsim.errors import LidarError, prefix_errors
+from lidarsim.numerics.random_numbers import named_seed
+from lidarsim.sensor import Sensor
+
+from ..clouds.recording import METERS, Recording, RecordingSource, SeveralSensorsError
+from ..clouds.writing import ExportSpec
+from ..processes.per_process import PerProcess
+from ..recordings.opening import open_recording
+from .augmented_sweep import AugmentedSweep
+from .augmenter import Augmenter
+from .conversion import FormatConverter
+from .effects import Effects
+from .resampling import SensorResampler
+from .rewriting.opening import open_rewriter
+from .rewriting.rewriter import Rewriter
+from .work_folder import WorkFolder, counts_name, encoded_name
+
+
+@lru_cache(maxsize=4)
+def _opened(path: Path, sensor: str | None, intensity: str | None) -> Recording:
+    """Open a recording. It is cached, because the sweeps of some bags must be counted."""
+    return open_recording(path, sensor, intensity, keep_noise=True)
+
+
+@dataclass(frozen=True)
+class RecordingFile:
+    """File or folder of a recording, with the sensor and the column that the user chose.
+
+    Attributes
+    ----------
+    path
+        Path, which may be relative to `folder`.
+    sensor
+        Sensor or topic, if there are several.
+    intensity
+        Column that contains the intensities, if it is not ``intensity``.
+    folder
+        Working directory of the process that created this object.
+    """
+
+    path: Path
+    sensor: str | None = None
+    intensity: str | None = None
+    folder: Path = field(default_factory=Path.cwd)
+
+    @property
+    def located(self) -> Path:
+        """Path that is valid in this process. It is the given path if possible, for messages."""
+        return self.path if Path.cwd() == self.folder else self.folder / self.path
+
+    def open(self) -> Recording:
+        """Open the recording with all points of its file."""
+        return _opened(self.located, self.sensor, self.intensity)
+
+    def each_sensor(self) -> tuple[RecordingFile, ...]:
+        """Return this file once for each of its sensors, or only for the chosen sensor.
+
+        The sequences of a KITTI data set count as sensors.
+
+        Raises
+        ------
+        LidarError
+            If the recording cannot be read.
+        """
+        try:
+            self.open()
+        except SeveralSensorsError as error:
+            return tuple(replace(self, sensor=name) for name in error.names)
+        return (self,)
+
+
+@dataclass(frozen=True, eq=False)
+class AugmentationPlan:
+    """Augmentation of a recording with one or several variants of effects.
+
+    Attributes
+    ----------
+    files
+        File of the recording, once for each of its sensors.
+    variants
+        Effects by the number of their variant.
+    model
+        Model of the recording's sensor, or None if it is unknown.
+    numbers
+        Numbers of the sweeps to augment. Other sweeps are not changed.
+    output
+        Format of the output, or None for the format of the recording.
+    resampled
+        Sensor to which the sweeps are resampled, or None.
+    reflectance
+        Reflectance of all recorded surfaces if the recording has no intensities.
+    """
+
+    files: Sequence[RecordingFile]
+    variants: Mapping[int, Effects]
+    model: Sensor | None = None
+    numbers: range | None = None
+    output: ExportSpec | None = None
+    resampled: Sensor | None = None
+    reflectance: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SharedPlan:
+    """A plan as bytes, which each process unpickles once.
+
+    Attributes
+    ----------
+    key
+        Identifies the plan.
+    work
+        Work folder for the encoded sweeps.
+    content
+        The pickled plan.
+    """
+
+    key: str
+    work: WorkFolder
+    content: bytes
+
+    @classmethod
+    def from_plan(cls, key: str, work: WorkFolder, plan: AugmentationPlan) -> SharedPlan:
+        """Pickle a plan."""
+        return cls(key, work, pickle.dumps(plan))
+
+
+class PlannedSweep(NamedTuple):
+    """A sweep to augment."""
+
+    part: int  # index of the sensor in `AugmentationPlan.files`
+    number: int
+    variants: tuple[int, ...]
+
+
+class SweepTask(NamedTuple):
+    """Task of augmenting sweeps."""
+
+    shared: SharedPlan
+    sweeps: tuple[PlannedSweep, ...]
+
+
+class EncodedFiles(NamedTuple):
+    """Files of the sweeps of a task."""
+
+    finished: int  # number of sweeps, which are counted once for each variant
+    notes: tuple[str, ...]
+    # {name: content} of the files in the order in which they must be written, unless the worker has
+    # written them
+    files: dict[str, bytes] | None
+
+
+def augment_sweeps(task: SweepTask) -> EncodedFiles:
+    """Augment and encode sweeps, and write their files if the work folder is accessible.
+
+    Raises
+    ------
+    LidarError
+        If the recording cannot be read, or if the format cannot store the points.
+    """
+    plan = open_plan(task.shared)
+    work = task.shared.work
+    is_accessible = work.is_accessible()
+    unwritten: dict[str, bytes] = {}
+    notes: dict[str, None] = {}
+    finished = 0
+    for sweep in task.sweeps:
+        part = plan.part(sweep.part)
+        for variant in sweep.variants:
+            folder = encoded_name(variant, sweep.part)
+            files = part.files(sweep.number, variant)
+            named = {f"{folder}/{name}": content for name, content in files.items()}
+            if is_accessible:
+                work.write(named)
+            else:
+                unwritten |= named
+            finished += 1
+        if sweep.part < CHECKED_SENSORS:
+            notes |= dict.fromkeys(part.notes())
+    return EncodedFiles(finished, tuple(notes), None if is_accessible else unwritten)
+
+
+@dataclass(eq=False)
+class PartProcess:
+    """Recording of one sensor with its rewriter and augmenters, which are opened on first use."""
+
+    plan: AugmentationPlan
+    file: RecordingFile
+    _augmenters: dict[int, Augmenter] = field(default_factory=dict)  # {variant: augmenter}
+
+    @cached_property
+    def _read(self) -> _LastSweep:
+        path = self.file.located
+        if path.is_absolute() and not path.exists():
+            raise LidarError(
+                f"{path} does not exist on {socket.gethostname()}. Use a path that all workers "
+                "can access."
+            )
+        return _LastSweep(self.file.open())
+
+    @cached_property
+    def recording(self) -> Recording:
+        """Recording whose last sweep stays in memory.
+
+        Variants and rewriters therefore do not read it again. A bag would even be read from its
+        start.
+        """
+        return replace(self._read.recording, read=self._read)
+
+    @cached_property
+    def rewriter(self) -> Rewriter:
+        """Rewriter for the output format."""
+        path = self.file.located
+        spec = self.plan.output
+        if spec is None:
+            return open_rewriter(path, self.recording, self.file.sensor)
+        source = RecordingSource(path, str(path), self.file.sensor, self.file.intensity)
+        return FormatConverter(source, self.recording, spec)
+
+    @cached_property
+    def resampler(self) -> Resampler | None:
+        """Resampler of the sweeps, or None if they keep the rays of the recorded sensor."""
+        sensor = self.plan.resampled
+        if sensor is None:
+            return None
+        model = self.plan.model
+        return Resampler(SensorResampler(self.recording, sensor, recorded_sensor=model))
+
+    @cached_property
+    def source(self) -> Recording:
+        """The resampled recording, which is the recording itself without a resampler."""
+        resampler = self.resampler
+        if resampler is None:
+            return self.recording
+        # The resampled sweeps have standard names and units.
+        return replace(
+            self.recording,
+            read=lambda number: resampler(number).sweep,
+            fired=None,
+            meters=METERS,
+            intensity_column=None,
+        )
+
+    def prepare(self, variant: int) -> None:
+        """Raise LidarError if the recording cannot be augmented."""
+        if self.resampler is None or not self.plan.variants[variant].is_empty:
+            self.augmenter(variant)
+
+    def augmenter(self, variant: int) -> Augmenter:
+        """Return the augmenter of a variant. Up to `MAX_VARIANTS` augmenters are kept."""
+        if variant not in self._augmenters:
+            while len(self._augmenters) >= MAX_VARIANTS:
+                del self._augmenters[next(iter(self._augmenters))]
+            effects = self.plan.variants[variant]
+            if len(self.rewriter.sensors()) > 1:  # sensors have different random numbers
+                effects = replace(effects, seed=named_seed(effects.seed, self.rewriter.sensor))
+            plan = self.plan
+            with nullcontext() if len(plan.files) == 1 else prefix_errors(self.file.sensor):
+                augmenter = Augmenter(self.source, effects, plan.model, plan.reflectance)
+            self._augmenters[variant] = augmenter
+        return self._augmenters[variant]
+
+    def notes(self) -> tuple[str, ...]:
+        """Return the notes of the resampler and of all augmenters."""
+        notes = [note for augmenter in self._augmenters.values() for note in augmenter.notes]
+        if self.resampler is not None:
+            notes = [*self.resampler.notes, *notes]
+        if len(self.plan.files) > 1:
+            notes = [f"{self.file.sensor}: {note}" for note in notes]
+        return tuple(dict.fromkeys(notes))
+
+    def augmented(self, number: int, variant: int) -> AugmentedSweep:
+        """Return an augmented sweep, whose templates are rows of the recorded sweep."""
+        if not self._is_chosen(number):
+            return unchanged_sweep(self.recording[number])
+        if self.resampler is None:
+            return self.augmenter(variant).sweep(number)
+        resampled = self.resampler(number)
+        if self.plan.variants[variant].is_empty:
+            return resampled
+        augmented = self.augmenter(variant).sweep(number)
+        return replace(augmented, template=resampled.template[augmented.template])
+
+    def _is_chosen(self, number: int) -> bool:
+        return self.plan.numbers is None or number in self.plan.numbers
+
+    def files(self, number: int, variant: int) -> dict[str, bytes]:
+        """Return the files of a sweep in the order in which they must be written."""
+        augmented = self.augmented(number, variant)
+        counts = PointCounts()
+        if self._is_chosen(number):
+            counts = PointCounts.from_sweep(self.recording[number], augmented)
+        return {
+            counts_name(number): json.dumps(counts.to_json()).encode(),
+            **self.rewriter.sweep_files(number, augmented),
+        }
+
+    def release(self) -> None:
+        """Release the augmenters and the last sweep."""
+        self._augmenters.clear()
+        self._read.clear()
+        self.__dict__.pop("resampler", None)
+        self.__dict__.pop("source", None)
+
+
+class _LastSweep:
+    """Function that reads a sweep of a recording, and keeps the last one in memory."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.recording = recording
+        self._last: tuple[int, Sweep] | None = None
+
+    def __call__(self, number: int) -> Sweep:
+        if self._last is None or self._last[0] != number:
+            self._last = None  # frees its memory before the next sweep is read
+            self._last = number, self.recording.read(number)
+        return self._last[1]
+
+    def clear(self) -> None:
+        self._last = None
+
+
+class Resampler:
+    """Function that resamples a sweep to another sensor, and keeps the last one in memory."""
+
+    def __init__(self, resampler: SensorResampler) -> None:
+        self._resampler = resampler
+        self._last: tuple[int, AugmentedSweep] | None = None
+
+    def __call__(self, number: int) -> AugmentedSweep:
+        """Return a resampled sweep."""
+        if self._last is None or self._last[0] != number:
+            self._last = None
+            self._last = number, self._resampler.sweep(number)
+        return self._last[1]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes for the user."""
+        return tuple(self._resampler.notes)
+
+
+# Number of sensors that are checked before the first sweep is augmented, and whose notes are shown.
+CHECKED_SENSORS = 4
+MAX_VARIANTS = 8  # maximum number of variants of a task, whose augmenters are in memory
+
+
+class PlanProcess:
+    """Recordings of a plan in one process. Only the sweeps of one recording are in memory."""
+
+    def __init__(self, plan: AugmentationPlan) -> None:
+        self.plan = plan
+        self._parts: dict[int, PartProcess] = {}
+        self._current = -1
+
+    def part(self, index: int) -> PartProcess:
+        """Return the recording of a sensor."""
+        if index not in self._parts:
+            self._parts[index] = PartProcess(self.plan, self.plan.files[index])
+        if index != self._current and self._current in self._parts:
+            self._parts[self._current].release()
+        self._current = index
+        return self._parts[index]
+
+    def all_parts(self) -> list[PartProcess]:
+        """Return the recordings of all sensors."""
+        return [self.part(index) for index in range(len(self.plan.files))]
+
+
+_processes = PerProcess[dict[str, PlanProcess]](dict)
+
+
+def open_plan(shared: SharedPlan) -> PlanProcess:
+    """Return the state of a plan in this process, which keeps only the most recent plan."""
+    states = _processes()
+    if shared.key not in states:
+        if states:
+            close_plans()
+        plan = pickle.loads(shared.content)  # noqa: S301 - from the driver of the command
+        states[shared.key] = PlanProcess(plan)
+    return states[shared.key]
+
+
+def close_plans() -> None:
+    """Release the recordings and augmenters that this process keeps."""
+    _processes().clear()
+    _opened.cache_clear()
+
+
+def unchanged_sweep(sweep: Sweep) -> AugmentedSweep:
+    """Return a sweep without effects as an augmented sweep."""
+    count = len(sweep)
+    columns = {**sweep.columns, "cause": np.zeros(count, np.uint8)}
+    return AugmentedSweep(
+        sweep.replace(columns=columns), np.arange(count), np.ones(count, np.bool_)
+    )
+
+
+@dataclass(frozen=True)
+class PointCounts:
+    """Point counts of augmented sweeps.
+
+    Attributes
+    ----------
+    returns
+        Number of recorded returns.
+    kept
+        Number of recorded returns that remain.
+    added
+        Numbers of added returns by cause.
+    """
+
+    returns: int = 0
+    kept: int = 0
+    added: Mapping[str, int] = field(default_factory=dict)
+
+    @classmethod
+    def from_sweep(cls, recorded: Sweep, augmented: AugmentedSweep) -> PointCounts:
+        """Count the points of a sweep."""
+        has_return = augmented.sweep.has_return
+        added = has_return & ~augmented.is_recorded
+        causes = np.asarray(augmented.sweep.columns.get("cause", np.zeros(len(added), np.uint8)))
+        numbers, counts = np.unique(causes[added], return_counts=True)
+        names = [CAUSES[int(number)] for number in numbers]
+        return cls(
+            int(recorded.has_return.sum()),
+            int((has_return & augmented.is_recorded).sum()),
+            dict(zip(names, counts.tolist(), strict=True)),
+        )
+
+    @classmethod
+    def total(cls, counts: Iterable[Mapping[str, Any]]) -> PointCounts:
+        """Add counts that were converted with `to_json`."""
+        returns = kept = 0
+        added: Counter[str] = Counter()
+        for entry in counts:
+            returns += entry["returns"]
+            kept += entry["kept"]
+            added.update(entry["added"])
+        return cls(returns, kept, dict(sorted(added.items())))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the counts as a dictionary for JSON."""
+        return {"returns": self.returns, "kept": self.kept, "added": dict(self.added)}
+
+    @property
+    def points(self) -> int:
+        """Number of points after the augmentation."""
+        return self.kept + sum(self.added.values())

@@ -1,0 +1,360 @@
+"""Augment recorded sweeps in Python: sweep by sweep, or as a transform of a data set."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from threading import Lock
+from typing import Any, overload
+
+import numpy as np
+
+from lidarsim.columns.column_names import standard_names
+from lidarsim.columns.sweep import Sweep
+from lidarsim.errors import LidarError
+from lidarsim.media.weather import Weather
+from lidarsim.numerics.arrays import AnyArray
+from lidarsim.numerics.even_samples import even_indices
+from lidarsim.schema.checks import check_number
+from lidarsim.sensor import Sensor
+from lidarsim.sensor.models import load_sensor, read_model
+from lidarsim.words import did_you_mean, join_names
+
+from ..clouds.boxes import SweepBoxes
+from ..clouds.recording import Recording
+from ..recordings.opening import open_recording
+from .augmented_sweep import AugmentedSweep
+from .augmenter import Augmenter
+from .effects import Effects
+
+EffectsLike = Effects | str | Path | Mapping[str, Any]
+ModelLike = Sensor | str | Path
+
+_REFERENCE_SWEEPS = 5  # sweeps of a reference recording that are kept
+_NUMBERS = 1 << 31  # sweep numbers, which select the random numbers of a transform
+
+
+def augment(
+    recording: str | Path | Recording,
+    effects: EffectsLike | None = None,
+    *,
+    model: ModelLike | None = None,
+    seed: int | None = None,
+    sweeps: Iterable[int] | None = None,
+    **weather: Any,
+) -> Iterator[Sweep]:
+    """Simulate weather, faults, noise and inserted objects on the sweeps of a recording.
+
+    Parameters
+    ----------
+    recording
+        Recording in any format that `open_recording` supports. If it has several sensors, open one
+        of them with ``open_recording(path, sensor)``.
+    effects
+        Effects, an effects file, or a mapping with the sections of an effects file.
+    model
+        Model of the recording's sensor, which defines its intensity scale, optics and sensitivity.
+        By default, they are estimated from the recording.
+    seed
+        Seed of all random numbers. By default, it is the seed of the effects.
+    sweeps
+        Numbers of the sweeps, by default all.
+    **weather
+        Fields of the section `weather` that override those of the effects, such as
+        ``rain_mm_h=25`` or ``visibility_km=0.5``.
+
+    Yields
+    ------
+    Sweep
+        The augmented sweep in the frame of the recorded sweep, with the columns of the recording.
+        The column `cause` is 0 for surfaces; other values are returns that were added. `boxes`
+        includes the inserted objects.
+
+    Raises
+    ------
+    LidarError
+        If the recording cannot be read, or if an effect cannot be applied to it.
+
+    Examples
+    --------
+    >>> for sweep in augment("drive.mcap", rain_mm_h=25):  # doctest: +SKIP
+    ...     print(len(sweep))
+    """
+    chosen = _effects(effects, weather, seed)
+    if not isinstance(recording, Recording):
+        recording = open_recording(recording, keep_noise=True)
+    augmenter = Augmenter(recording, chosen, _model(model))
+    numbers = range(len(recording)) if sweeps is None else sweeps
+    return _augmented_sweeps(recording, augmenter, numbers)
+
+
+def _augmented_sweeps(
+    recording: Recording, augmenter: Augmenter, numbers: Iterable[int]
+) -> Iterator[Sweep]:
+    for number in numbers:
+        sweep = recording[number]
+        yield _with_boxes(sweep, augmenter.augment(sweep, sweep.number))
+
+
+class Augment:
+    """Transform that simulates weather, faults, noise and inserted objects on single sweeps.
+
+    The result depends only on the points and the seed, so a data set has the same augmentations in
+    any order and with any number of workers. The transform can be pickled.
+
+    Without a `reference`, the scan pattern, the intensity scale and the sensitivity of the sensor
+    are estimated from each sweep. With a reference, they are estimated once, which is faster and
+    more accurate, but requires that all sweeps come from the same sensor.
+
+    Parameters
+    ----------
+    effects
+        Effects, an effects file, or a mapping with the sections of an effects file. Effects must
+        not change over time. Positions of actors and insertions refer to the sensor.
+    model
+        Model of the sensor, which defines its intensity scale, optics and sensitivity. By default,
+        they are estimated.
+    reference
+        Recording of the sensor, as a path, a `Recording` or a list of sweeps.
+    columns
+        Names of the columns of arrays after x, y and z, such as ``("intensity", "ring")``.
+    reflectance
+        Reflectance of all recorded surfaces if there are no intensities.
+    **weather
+        Fields of the section `weather` that override those of the effects, such as
+        ``rain_mm_h=25``.
+
+    Raises
+    ------
+    LidarError
+        If an effect cannot be applied to recordings, or changes over time.
+
+    Examples
+    --------
+    >>> augmented = Augment(rain_mm_h=25, model="velodyne/hdl64e")  # doctest: +SKIP
+    >>> points = augmented(points, seed=epoch * len(dataset) + index)  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        effects: EffectsLike | None = None,
+        *,
+        model: ModelLike | None = None,
+        reference: str | Path | Recording | Sequence[Sweep] | None = None,
+        columns: Sequence[str] = ("intensity",),
+        reflectance: float | None = None,
+        **weather: Any,
+    ) -> None:
+        self.effects = _effects(effects, weather, None)
+        _check_constant(self.effects)
+        self.model = _model(model)
+        self.columns = tuple(columns)
+        self.reflectance = reflectance
+        self._standard_names = standard_names(self.columns)
+        if len({*self.columns}) < len(self.columns):
+            raise LidarError(
+                f"The columns must have different names, but are {join_names(self.columns)}."
+            )
+        self._reference = None if reference is None else _reference_sweeps(reference)
+        # {columns of a sweep: state of the reference with these columns}
+        self._states: dict[frozenset[str], _SensorState] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_states": {}}
+
+    @overload
+    def __call__(self, points: Sweep, seed: int = 0) -> Sweep: ...
+
+    @overload
+    def __call__(self, points: AnyArray, seed: int = 0) -> AnyArray: ...
+
+    def __call__(self, points: Any, seed: int = 0) -> Any:
+        """Augment a sweep.
+
+        Parameters
+        ----------
+        points
+            Sweep, or array or PyTorch tensor of shape (n, 3 + k) with x, y and z in meters in the
+            sensor frame and the k columns that were passed to the constructor.
+        seed
+            Seed of the random numbers. Use a different seed for each sweep and epoch.
+
+        Returns
+        -------
+        Sweep or array
+            The augmented points. An array has the type and the columns of the input.
+
+        Raises
+        ------
+        LidarError
+            If the shape of the array does not match the columns, or if the sweep cannot be
+            augmented.
+        """
+        check_number("seed", seed, whole=True, ge=0)
+        if isinstance(points, Sweep):
+            return self._augment_sweep(points, seed)
+        if type(points).__module__.partition(".")[0] == "torch":
+            return points.new_tensor(self._augment_array(points.detach().cpu().numpy(), seed))
+        return self._augment_array(np.asarray(points), seed)
+
+    def _augment_sweep(self, sweep: Sweep, seed: int) -> Sweep:
+        augmented = self._augment(_without_pose(sweep), seed)
+        result = _with_boxes(sweep, augmented)
+        return result.replace(
+            pose=sweep._pose,
+            number=sweep.number,
+            job=sweep.job,
+            job_number=sweep.job_number,
+            split=sweep.split,
+            values=sweep.values,
+        )
+
+    def _augment_array(self, points: AnyArray, seed: int) -> AnyArray:
+        width = 3 + len(self.columns)
+        if points.ndim != 2 or points.shape[1] != width:
+            raise LidarError(
+                f"The points must have the shape (n, {width}) for x, y, z and "
+                f"{join_names(self.columns) or 'no further columns'}, but have the shape "
+                f"{points.shape}. Pass the names of the columns as `columns`."
+            )
+        columns = {name: points[:, 3 + k] for k, name in enumerate(self.columns)}
+        augmented = self._augment(Sweep(points[:, :3].astype(np.float64), columns), seed).sweep
+        values = [augmented.columns[name] for name in self._standard_names]
+        return np.column_stack([augmented.points, *values]).astype(points.dtype)
+
+    def _augment(self, sweep: Sweep, seed: int) -> AugmentedSweep:
+        """Augment a sweep, using the seed as its number."""
+        if self._reference is None:
+            return self._sensor_state([sweep]).augment(sweep, seed)
+        names = frozenset(standard_names(sweep.columns))
+        if names not in self._states:
+            # Rings and times are determined from the columns that the sweep also has.
+            self._states[names] = self._sensor_state(
+                [_with_columns(reference, names) for reference in self._reference]
+            )
+        return self._states[names].augment(sweep, seed)
+
+    def _sensor_state(self, sweeps: Sequence[Sweep]) -> _SensorState:
+        source = _SweepSource(sweeps)
+        recording = Recording("the sweep", len(sweeps), source)
+        augmenter = Augmenter(recording, self.effects, self.model, self.reflectance)
+        return _SensorState(source, recording, augmenter)
+
+
+class _SweepSource:
+    """Function that reads sweeps in memory, or another sweep of the same sensor."""
+
+    def __init__(self, sweeps: Sequence[Sweep]) -> None:
+        self._sweeps = sweeps
+        self.current: Sweep | None = None
+
+    def __call__(self, number: int) -> Sweep:
+        return self._sweeps[number] if self.current is None else self.current
+
+
+@dataclass(frozen=True, eq=False)
+class _SensorState:
+    """What the sweeps of a sensor have in common."""
+
+    source: _SweepSource
+    recording: Recording
+    augmenter: Augmenter
+    lock: Lock = field(default_factory=Lock)
+
+    def augment(self, sweep: Sweep, seed: int) -> AugmentedSweep:
+        with self.lock:
+            self.source.current = sweep
+            try:
+                read = self.recording[0]
+            finally:
+                self.source.current = None
+        return self.augmenter.augment(read, seed % _NUMBERS)
+
+
+def _effects(effects: EffectsLike | None, weather: Mapping[str, Any], seed: int | None) -> Effects:
+    """Return effects in which some fields of the weather and the seed are replaced."""
+    names = [entry.name for entry in fields(Weather)]
+    for name in weather:
+        if name not in names:
+            raise LidarError(
+                f"{name!r} is not a field of the weather.{did_you_mean(name, names)} The fields "
+                f"are {join_names(names)}."
+            )
+    if isinstance(effects, Effects):
+        effects = replace(effects, weather=replace(effects.weather, **weather))
+    else:
+        options = {"weather": dict(weather)} if weather else {}
+        if isinstance(effects, Mapping):
+            merged = {**effects.get("weather", {}), **weather}
+            options = {**effects, **({"weather": merged} if merged else {})}
+            effects = None
+        effects = Effects.load(effects, options)
+    return effects if seed is None else replace(effects, seed=seed)
+
+
+def _model(model: ModelLike | None) -> Sensor | None:
+    """Load a sensor model with the values of its data sheet, if it has any."""
+    if model is None or isinstance(model, Sensor):
+        return model
+    has_sheet = read_model(model).performance is not None
+    return load_sensor(model, performance="datasheet" if has_sheet else "ideal")
+
+
+def _check_constant(effects: Effects) -> None:
+    """Raise LidarError if effects change over time, because single sweeps have no time."""
+    for number, fault in enumerate(effects.faults):
+        if fault.from_s or fault.to_s is not None:
+            raise LidarError(
+                f"faults[{number}]: A transform augments single sweeps, which have no time. Remove "
+                "`from_s` and `to_s`."
+            )
+    for actor in effects.actors:
+        if actor.trajectory.moves:
+            raise LidarError(
+                f"Actor {actor.name!r} moves, but a transform augments single sweeps, which have "
+                "no time. Use `augment` on the recording, or set `at` instead of `trajectory`."
+            )
+
+
+def _reference_sweeps(
+    reference: str | Path | Recording | Sequence[Sweep],
+) -> list[Sweep]:
+    """Return a few sweeps of a reference without their poses."""
+    if isinstance(reference, str | Path):
+        reference = open_recording(reference, keep_noise=True)
+    if not len(reference):
+        raise LidarError("The reference contains no sweeps. Pass at least one sweep.")
+    numbers = even_indices(len(reference), _REFERENCE_SWEEPS).tolist()
+    return [_without_pose(reference[number]) for number in numbers]
+
+
+def _without_pose(sweep: Sweep) -> Sweep:
+    return Sweep(sweep.points, dict(sweep.columns), compensated=sweep.compensated)
+
+
+def _with_columns(sweep: Sweep, names: Collection[str]) -> Sweep:
+    columns = {name: values for name, values in sweep.columns.items() if name in names}
+    return Sweep(sweep.points, columns, compensated=sweep.compensated)
+
+
+def _with_boxes(recorded: Sweep, augmented: AugmentedSweep) -> Sweep:
+    """Return an augmented sweep with the boxes of recorded and of inserted objects."""
+    boxes = augmented.boxes
+    if not len(boxes):
+        return augmented.sweep.replace(boxes=recorded._boxes)
+    return augmented.sweep.replace(boxes=_join_boxes(recorded.boxes, boxes))
+
+
+def _join_boxes(first: SweepBoxes | None, second: SweepBoxes) -> SweepBoxes:
+    if first is None or not len(first):
+        return second
+    return SweepBoxes(
+        names=first.names + second.names,
+        types=first.types + second.types,
+        objects=np.concatenate([first.objects, second.objects]),
+        centers=np.concatenate([first.centers, second.centers]),
+        quaternions=np.concatenate([first.quaternions, second.quaternions]),
+        sizes=np.concatenate([first.sizes, second.sizes]),
+        points=np.concatenate([first.points, second.points]),
+    )
