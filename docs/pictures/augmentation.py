@@ -1,8 +1,8 @@
 """Draw a recorded sweep with simulated weather and inserted cars.
 
 `python -m docs.pictures.augmentation OUT.png` simulates a sweep of an OS1-64 in the generated city,
-augments it with rain, fog, snow, lost packets and cars, and draws the results next to each other. Recorded points
-are colored by height, returns from the air are white, and inserted cars are orange.
+augments it with rain, fog, snow, lost packets and cars, and draws the results next to each other.
+Recorded points are colored by height, returns from the air are white, and inserted cars are orange.
 """
 
 from __future__ import annotations

@@ -10,6 +10,19 @@ EXAMPLE = Path(__file__).parents[2] / "examples/drive.ipynb"
 
 
 @pytest.mark.slow
+def test_the_notebook_of_augmentation_runs(tmp_path):
+    notebook = nbformat.read(EXAMPLE.with_name("augment.ipynb"), 4)
+    assert not any(cell.get("outputs") for cell in notebook.cells)
+    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": tmp_path}}).execute()
+    shown = [output for cell in notebook.cells for output in cell.get("outputs", ())]
+    assert not [output for output in shown if output.output_type == "error"]
+    lines = "".join(o.text for o in shown if o.output_type == "stream").splitlines()
+    from_snow = [int(line.split()[3]) for line in lines if "from snow" in line]
+    assert len(from_snow) == 5 and min(from_snow) > 2000
+    assert any("image/png" in output.data for output in shown if "data" in output)
+
+
+@pytest.mark.slow
 def test_the_notebook_shows_progress_a_result_a_table_and_a_picture(tmp_path):
     notebook = nbformat.read(EXAMPLE, 4)
     assert not any(cell.get("outputs") for cell in notebook.cells)  # they would grow old

@@ -243,6 +243,22 @@ def test_inserted_car_stands_on_the_ground(clear, sensor):
     assert center - size / 2 == pytest.approx(-HEIGHT_M, abs=0.02)
 
 
+def test_points_of_an_inserted_car_are_labeled(clear, sensor):
+    effects = Effects(
+        insertions=(Insertion(CAR, 12, -3, class_name="car"),),
+        weather=Weather(snow_mm_h=2.0),
+        classes={10: "car"},
+    )
+    result = Augmenter(clear, effects, sensor).sweep(0)
+    columns = result.sweep.columns
+    on_car = columns["object"] == result.boxes.objects[0]
+    assert on_car.sum() == result.boxes.points[0] > 100
+    assert (columns["class"] == np.where(on_car, 10, 0)).all()
+    assert (columns["object"][~on_car] == -1).all()
+    assert not result.is_recorded[on_car].any()
+    assert (columns["cause"] == AIR).any()
+
+
 def test_an_occluded_car_is_invisible(clear, sensor):
     """The car stands behind the near wall at y = 6 m."""
     insertion = Insertion(CAR, -5, 9, -HEIGHT_M)

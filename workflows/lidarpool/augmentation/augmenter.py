@@ -321,7 +321,7 @@ class Augmenter:
             columns["returns"] = returns.return_counts[order].astype(columns["returns"].dtype)
         cause = np.zeros(len(order), np.uint8) if returns.cause is None else returns.cause[order]
         columns["cause"] = cause
-        if columns.keys() & {"class", "object"}:
+        if self.objects.has_objects or columns.keys() & {"class", "object"}:
             numbers = self._simulation.objects(returns.take(order[added]))
             self.objects.label(columns, added, numbers, len(sweep.object_names))
         return columns

@@ -245,7 +245,7 @@ class FormatConverter(Rewriter):
         """
         if base == target:
             raise LidarError(
-                f"Only one sensor can be converted to {self.spec.title}. Choose it with `--sensor`."
+                f"Only one sensor can be converted to {self.spec.title}. Choose it with `--topic`."
             )
         summary = _Summary.from_details(encoded)
         spec = self.spec

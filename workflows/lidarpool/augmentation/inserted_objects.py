@@ -127,7 +127,8 @@ class InsertedObjects:
     ) -> None:
         """Set the classes and objects of added points.
 
-        Points in the air have class 0 and no object.
+        Points in the air have class 0 and no object. If objects are inserted, the columns are added
+        to recordings that lack them.
 
         Parameters
         ----------
@@ -140,6 +141,10 @@ class InsertedObjects:
         named_objects
             Number of objects that are named in the recording.
         """
+        if self.has_objects:
+            count = len(columns["cause"])
+            columns.setdefault("object", np.full(count, -1, np.int32))
+            columns.setdefault("class", np.zeros(count, np.uint16))
         if "class" in columns:
             classes = np.array([*self.classes, 0])
             columns["class"][added] = classes[numbers]

@@ -312,15 +312,14 @@ class IntensityScale:
         old = np.asarray(old_energy, np.float64)
         new = np.asarray(new_energy, np.float64)
         factors = self._factors(old_range_m)
-        scaled = self._energies(intensity, old_range_m, factors)
-        replaced = np.flatnonzero(~(old > 0))
+        recorded = self._energies(intensity, old_range_m, factors)
+        scaled = np.where(old > 0, recorded * (new / np.where(old > 0, old, 1.0)), new)
         if self.quantization.steps_per_unit:
             # A value that is the rounded old energy becomes the rounded new energy.
-            finer = np.flatnonzero(scaled != old)
+            finer = np.flatnonzero(old != recorded)
             rounded = self._intensities(old[finer], factors[finer])
-            replaced = np.append(replaced, finer[rounded == intensity[finer]])
-        scaled *= new / np.where(old > 0, old, 1.0)
-        scaled[replaced] = new[replaced]
+            finer = finer[rounded == intensity[finer]]
+            scaled[finer] = new[finer]
         moved = old_range_m != new_range_m
         rows = np.flatnonzero(moved)
         factors[rows] = self._factors(new_range_m[rows])
