@@ -312,7 +312,7 @@ def _compared(task: BuildTask) -> HeldOutRays | None:
     """Return the rays of a submap's held-out sweeps."""
     sweeps = task.read()
     standing = find_stationary_points(sweeps, task.submap.numbers.tolist())
-    rays, _ = compare_held_out_sweeps(sweeps, task, standing)
+    rays, _, _ = compare_held_out_sweeps(sweeps, task, standing)
     return rays
 
 

@@ -117,6 +117,11 @@ def from_standstill(end_s):
     return Track(times_s, np.stack([ahead - 24, ahead * 0 - 3, ahead * 0], axis=1), smooth=True)
 
 
+def straight_on(end_s):
+    """A car at 2 m/s in a street of the city."""
+    return Track([0, end_s], [[-24, -3, 0], [2 * end_s - 24, -3, 0]])
+
+
 def in_a_circle(end_s):
     """A car that turns in a circle of 4 m at a crossing of the city."""
     times_s = np.arange(0, end_s + 0.1, 0.05)
@@ -172,6 +177,37 @@ def test_a_twin_has_the_points_and_the_lost_pulses_of_held_out_sweeps(place):
     assert held["no_return"]["recorded"] > 0.02
     assert held["no_return"]["f1"] > 0.8
     assert "points    " in repr(place)
+
+
+def test_a_twin_has_the_metrics_of_lidar4d(place):
+    found = place.figures["lidar4d"]
+    held = place.figures["held_out"]
+    assert [one["sweep"] for one in found["by_frame"]] == [one["sweep"] for one in held["by_sweep"]]
+    assert found["frames"] == len(found["by_frame"])
+    assert found["chamfer_m2"] < 0.5
+    assert found["f_score"] > 0.9
+    assert found["depth"]["rmse_m"] < 3
+    assert found["ray_drop"]["f1"] > 0.97
+    assert found["intensity"]["factor"] == 1
+    assert found["intensity"]["rmse"] < 0.1
+    assert place.figures["lidar4d_window"] is None
+    assert "lidar4d  " in repr(place)
+
+
+@pytest.mark.slow
+def test_a_window_of_lidar4d_holds_out_its_frames(tmp_path):
+    drive = city_drive("ouster/os1-32", {"columns": 512}, 51, straight_on)
+    save_cloud(drive, tmp_path / "drive.mcap")
+    found = twin(tmp_path / "drive.mcap", lidar4d_window=4950).figures
+    assert found["lidar4d_window"] == 4950
+    assert found["used_sweeps"] == 51
+    held_out = [10, 20, 30, 40]
+    assert [one["sweep"] for one in found["held_out"]["by_sweep"]] == held_out
+    assert [one["sweep"] for one in found["lidar4d"]["by_frame"]] == held_out
+    with pytest.raises(LidarError, match="`lidar4d_window` requires the path of a recording"):
+        twin(drive, lidar4d_window=4950)
+    with pytest.raises(LidarError, match="lidar4d_window"):
+        twin(tmp_path / "drive.mcap", lidar4d_window=4951)
 
 
 def test_lost_pulses_are_steps_of_a_ring_without_a_return():

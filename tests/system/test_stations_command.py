@@ -9,6 +9,7 @@ import trimesh
 import yaml
 from PIL import Image
 
+from lidarpool.clouds.folder import result_folder
 from lidarpool.report.result_pictures import COLORS, COVERED, OTHER, UNCOVERED
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
@@ -66,6 +67,10 @@ def test_stations_become_a_scenario_and_a_picture(hall, lidarpool):
     assert lidarpool("check", folder / "stations.yaml", "--backend", "numpy").code == 0
     for kind in (COVERED, UNCOVERED):
         assert pixels_of_kind(folder / "stations.png", kind) > 500
+
+    with result_folder(folder):
+        locked = lidarpool(*arguments, "--overwrite")
+    assert locked.code == 2 and "Another run or export is using the folder" in locked.err
 
     # The same again, as JSON, and in place of the first.
     again = lidarpool(*arguments, "--json")

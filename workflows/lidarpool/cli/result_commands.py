@@ -400,6 +400,11 @@ def view(
     show_default=True,
     help="Maximum number of points to load from a cloud without sweeps.",
 )
+@click.option(
+    "--protocol",
+    type=click.Choice(["lidar4d"]),
+    help="Published evaluation protocol whose metrics are also computed.",
+)
 @options.as_json
 def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None:
     """Compare two point clouds or recordings of the same scene.
@@ -415,6 +420,7 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None
       lidarpool compare result recording.mcap --sensor-b /lidar/points --out compared
       lidarpool compare scan.laz earlier.laz --distance 0.05
       lidarpool compare scan.laz model.ply --unit-b ft
+      lidarpool compare simulated recorded --protocol lidar4d
     """  # noqa: D301 - Click requires the character \b
     from ..comparing.two_clouds import compare as compared
     from ..processes.fork_server import keep_freed_memory

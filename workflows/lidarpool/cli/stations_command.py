@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lidarsim.errors import LidarError
+from lidarsim.errors import LidarError, explain_os_errors
 from lidarsim.words import join_names, plural, printable
 
 from . import completion
@@ -163,6 +163,7 @@ def stations(
     if settings["count"] is not None and settings["coverage"] is not None:
         raise click.UsageError("`--count` and `--coverage` cannot be combined.")
     print_first_step("reading the scene", quiet=settings["as_json"])
+    from ..clouds.folder import result_folder
     from ..scenario.scenario import Scenario
 
     within_m = settings.pop("within_m")
@@ -183,13 +184,15 @@ def stations(
         out = settings.pop("out")
         overwrites = settings.pop("overwrite")
         folder = Path(f"{scene.stem}-stations") if out is None else out
-        existing = [folder / name for name in (PLAN_FILE, PICTURE_FILE) if (folder / name).exists()]
-        if existing and not overwrites:
-            raise LidarError(
-                f"{existing[0]} already exists. Use another folder with `--out`, or pass "
-                "`--overwrite`."
-            )
-        _plan(scenario, model, folder, **settings)
+        with result_folder(folder):
+            files = [folder / name for name in (PLAN_FILE, PICTURE_FILE)]
+            existing = [file for file in files if file.exists()]
+            if existing and not overwrites:
+                raise LidarError(
+                    f"{existing[0]} already exists. Use another folder with `--out`, or pass "
+                    "`--overwrite`."
+                )
+            _plan(scenario, model, folder, **settings)
 
 
 def _scenario_model(scenario: Scenario) -> str | None:
@@ -204,6 +207,7 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
     from lidarsim.schema.model_names import full_name
     from lidarsim.sensor.models import load_sensor
 
+    from ..clouds.folder import staging
     from ..plan.stations import plan_stations, sensor_elevations
     from ..report.result_pictures import draw_stations
     from .terminal import Terminal
@@ -215,15 +219,16 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
     prepared, notes = _prepared_with_notes(scenario, terminal)
     with terminal.status("computing the visibility from all candidate positions"):
         plan = plan_stations(prepared.scene.with_world_origin((0, 0, 0)), sensor, **settings)
-    folder.mkdir(parents=True, exist_ok=True)
-    file = folder / PLAN_FILE
-    file.write_text(
-        _stations_scenario(scenario, folder, model, plan, settings["targets"], terminal.warnings),
-        "utf-8",
-        newline="\n",
-    )
-    with terminal.status("drawing the picture"):
-        draw_stations(plan).save(folder / PICTURE_FILE)
+    text = _stations_scenario(scenario, folder, model, plan, settings["targets"], terminal.warnings)
+    with (
+        explain_os_errors(f"The stations cannot be written to {folder}", "free some disk space"),
+        staging(folder) as staged,
+    ):
+        (staged / PLAN_FILE).write_text(text, "utf-8", newline="\n")
+        with terminal.status("drawing the picture"):
+            draw_stations(plan).save(staged / PICTURE_FILE)
+        for name in (PLAN_FILE, PICTURE_FILE):
+            (staged / name).replace(folder / name)
     shortfalls = [*_shortfalls(plan, settings["count"], settings["coverage"])]
     if settings["targets"]:
         shortfalls += _unreachable_notes(prepared.scene.names, plan, "candidate positions")
@@ -236,7 +241,7 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
     )
     if not as_json:
         click.echo(f"stations in {click.format_filename(folder)}: {PLAN_FILE}, {PICTURE_FILE}")
-        click.echo(f"next: lidarpool check {shlex.quote(str(file))}")
+        click.echo(f"next: lidarpool check {shlex.quote(str(folder / PLAN_FILE))}")
 
 
 def _reject_planning_options(scene: Path, settings: dict[str, Any]) -> None:

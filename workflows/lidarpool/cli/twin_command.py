@@ -44,6 +44,13 @@ if TYPE_CHECKING:
     "--sensor", metavar="NAME", help="Sensor or topic of the recording, if it contains several."
 )
 @click.option("--intensity", metavar="COLUMN", help="Column that contains the intensity.")
+@click.option(
+    "--lidar4d-window",
+    type=int,
+    metavar="FRAME",
+    help="First frame of a window of KITTI-360 in which LiDAR4D was evaluated, such as 4950. Only "
+    "this window is used, and the same frames are held out.",
+)
 @options.scheduler
 @options.flag("--resume", help="Resume an unfinished reconstruction, if there is one.")
 @overwrite
@@ -74,6 +81,7 @@ def twin(
       lidarpool twin hour.mcap --out twin --resume --scheduler tcp://127.0.0.1:8786
       lidarpool run twin/scenario.yaml --sensor hesai/pandar128 --out again
     """  # noqa: D301 - Click requires the character \b
+    from ..clouds.folder import result_folder
     from ..processes.fork_server import keep_freed_memory
     from ..reconstruction.building import SCENARIO_FILE
     from ..reconstruction.building import twin as build
@@ -82,24 +90,27 @@ def twin(
 
     if resume and overwrite:
         raise click.UsageError("`--resume` and `--overwrite` cannot be combined.")
-    if (out / SCENARIO_FILE).exists() and not overwrite:
-        raise LidarError(
-            f"{out} already contains {SCENARIO_FILE}. Use another folder, or pass `--overwrite`."
-        )
-    steps = out / STEPS_FOLDER
-    if overwrite:
-        FinishedSteps(steps).remove()
     keep_freed_memory()
 
     def report(line: str) -> None:
         if not as_json:
             click.echo(f"{line} …", err=True)
 
-    with nullcontext() if scheduler is None else connect_client(scheduler, files) as client:
-        built = build(
-            recording, client=client, folder=steps, resume=resume, report=report, **settings
-        )
-    paths = [click.format_filename(path) for path in built.save(out)]
+    with result_folder(out):
+        if (out / SCENARIO_FILE).exists() and not overwrite:
+            raise LidarError(
+                f"{out} already contains {SCENARIO_FILE}. Use another folder, or pass "
+                "`--overwrite`."
+            )
+        steps = out / STEPS_FOLDER
+        if overwrite:
+            FinishedSteps(steps).remove()
+        with nullcontext() if scheduler is None else connect_client(scheduler, files) as client:
+            built = build(
+                recording, client=client, folder=steps, resume=resume, report=report, **settings
+            )
+        written = built.write(out)
+    paths = [click.format_filename(path) for path in written]
     scenario = shlex.quote(str(out / SCENARIO_FILE))
     following = f"next: lidarpool run {scenario} [--sensor MODEL]"
     options.print_results(built.figures, [repr(built), *paths, following], as_json)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -168,6 +168,25 @@ class Recording:
         number %= self.count
         with reading(self.name):
             return self._resolved(number, self.read(number))
+
+    def section(self, first: int, count: int) -> Recording:
+        """Return a recording that consists of `count` consecutive sweeps, starting at `first`."""
+        stop = first + count
+        read_stamps, read_poses, fired = self.read_stamps, self.read_poses, self.fired
+
+        def section_poses() -> Floats | None:
+            poses = None if read_poses is None else read_poses()
+            return None if poses is None else poses[first:stop]
+
+        return replace(
+            self,
+            count=count,
+            read=lambda number: self.read(first + number),
+            read_stamps=None if read_stamps is None else lambda: [*read_stamps()][first:stop],
+            read_poses=None if read_poses is None else section_poses,
+            fired=None if fired is None else lambda number: fired(first + number),
+            stations=self.stations[first:stop],
+        )
 
     def read_fired(self, number: int) -> Sweep:
         """Read the returns of a sweep without motion compensation, if possible.

@@ -27,6 +27,7 @@ from ..open3d_access.neighbors import nearest_neighbors
 from ..recordings.opening import open_recording
 from .compared_sweep import compared_in_world, compared_sweep, rings_note
 from .comparison import CELLS, RESIDUALS, Comparison
+from .lidar4d import PROTOCOL, FrameCollector
 from .range_image import RangeImages, RayPairs, images_of_rays, pair_rays, range_images
 
 MAX_POINTS = 10_000_000  # maximum number of points of each cloud in memory
@@ -50,6 +51,7 @@ def compare(
     azimuth_deg: float | None = None,
     distances_m: Sequence[float] = (0.05, 0.1, 0.2, 0.5),
     max_points: int = MAX_POINTS,
+    protocol: Literal["lidar4d"] | None = None,
 ) -> Comparison:
     """Compare two clouds or recordings of the same scene.
 
@@ -89,6 +91,9 @@ def compare(
         other cloud if that cloud has a point within this distance.
     max_points
         Maximum number of points of each cloud in memory. Larger clouds are subsampled evenly.
+    protocol
+        Published evaluation protocol whose metrics are also computed: "lidar4d" for the range
+        images and metrics of LiDAR4D. The sweeps of B are the recorded ones.
 
     Returns
     -------
@@ -103,12 +108,7 @@ def compare(
     """
     check_choice("match", match, ("order", "time"))
     check_number("max_points", max_points, whole=True, ge=1000)
-    if azimuth_deg is not None:
-        check_number("azimuth_deg", azimuth_deg, gt=0, le=90)
-    if not distances_m or any(not 0 < distance < np.inf for distance in distances_m):
-        raise LidarError(
-            f"`distances_m` is {list(distances_m)}; it must contain positive lengths in meters."
-        )
+    _check_options(azimuth_deg, distances_m, protocol)
     with _sensor_chosen_by("--sensor-a"):
         first = open_recording(
             a, sensor_a, intensity_a, name="cloud A", unit=unit_a, keep_noise=keep_noise
@@ -117,7 +117,8 @@ def compare(
         second = open_recording(
             b, sensor_b, intensity_b, name="cloud B", unit=unit_b, keep_noise=keep_noise
         )
-    comparing = _Comparing((first, second), tuple(sorted(distances_m)), azimuth_deg)
+    recordings = first, second
+    comparing = _Comparing(recordings, tuple(sorted(distances_m)), azimuth_deg, protocol)
     if not first.is_cloud and not second.is_cloud:
         pairs = _pair_sweeps(first, second, match)
         if sweeps:
@@ -143,6 +144,8 @@ def compare(
     cloud = first if first.is_cloud else second
     if sweeps or match == "time":
         raise LidarError(f"{cloud.name} has no sweeps. Omit `--sweep` and `--match`.")
+    if protocol is not None:
+        raise LidarError(f"{cloud.name} has no sweeps, which `--protocol {protocol}` requires.")
     comparing.notes.append(
         f"{cloud.name} has no sweeps, so all points are compared at once in world coordinates, "
         "and only by distance and intensity"
@@ -153,6 +156,20 @@ def compare(
         comparing.add_note(f"distances are measured from {MAX_VALUES:,} points of each cloud")
     comparing.add_points(points_a, points_b, MAX_VALUES)
     return comparing.result()
+
+
+def _check_options(
+    azimuth_deg: float | None, distances_m: Sequence[float], protocol: str | None
+) -> None:
+    """Raise LidarError if an option of `compare` is invalid."""
+    if azimuth_deg is not None:
+        check_number("azimuth_deg", azimuth_deg, gt=0, le=90)
+    if not distances_m or any(not 0 < distance < np.inf for distance in distances_m):
+        raise LidarError(
+            f"`distances_m` is {list(distances_m)}; it must contain positive lengths in meters."
+        )
+    if protocol is not None:
+        check_choice("protocol", protocol, (PROTOCOL,))
 
 
 @contextmanager
@@ -245,6 +262,7 @@ class _Comparing:
     recordings: tuple[Recording, Recording]
     distances_m: tuple[float, ...]
     azimuth_deg: float | None
+    protocol: str | None
 
     def __post_init__(self) -> None:
         self.notes = [note for recording in self.recordings for note in recording.notes]
@@ -255,6 +273,9 @@ class _Comparing:
         self.empty_pairs = 0  # number of pairs in which a sweep has no points
         # {reason why pairs of sweeps have no range images: number of these pairs}
         self.without_images: Counter[str] = Counter()
+        self.frames: FrameCollector | None = None  # None without a protocol
+        if self.protocol is not None:
+            self.frames = self._collector(self.protocol)
         self.points: list[Floats] = []  # points of A and B in the first pair that has both
         self.cells: list[_CellPairs] = []
         # Pairs for the points of A, and for the points of B.
@@ -264,6 +285,17 @@ class _Comparing:
         # Number of rays without range images in each state of `CELLS`. The first state cannot be
         # observed, so its count is 0.
         self.ray_counts = np.zeros(4, np.int64)
+
+    def _collector(self, protocol: str) -> FrameCollector:
+        """Return the collector of a protocol, or raise LidarError if returns were discarded."""
+        for recording in self.recordings:
+            if recording.thinned:
+                raise LidarError(
+                    f"{recording.name} contains only some of the returns, so the metrics of "
+                    f"`--protocol {protocol}` are undefined. Use a result with `keep_every: 1`."
+                )
+        first, second = self.recordings
+        return FrameCollector((first.energies, second.energies))
 
     def add_note(self, text: str) -> None:
         if text not in self.notes:
@@ -299,6 +331,8 @@ class _Comparing:
         if len(a) and len(b):
             self.pictured = self.pictured or numbers
             self._add_ranges(a, b, budget)
+            if self.frames is not None:
+                self.frames.add(numbers, a, b)
         else:
             self.empty_pairs += 1
         self.add_points(a, b, budget)
@@ -437,6 +471,7 @@ class _Comparing:
             "ranges": range_figures,
             "intensity": self._intensity_figures(*intensities, paired_by),
             "distances": self._distance_figures(from_a.distance, from_b.distance),
+            "lidar4d": None if self.frames is None else self.frames.figures(),
         }
         distances = from_a.distance, from_b.distance
         return Comparison(figures, self._images(), residuals, distances, intensities, self.points)

@@ -28,7 +28,7 @@ from lidarsim.numerics.even_samples import even_indices
 from lidarsim.scene.colors import Colors, as_srgb
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
-from lidarsim.schema.checks import check_number
+from lidarsim.schema.checks import check_choice, check_number
 from lidarsim.sensor.models import SensorModel, read_model
 from lidarsim.words import plural
 
@@ -37,9 +37,10 @@ from ..clouds.kitti import CALIBRATION_FILE
 from ..clouds.recording import Recording
 from ..columns.parts import StoredCloud
 from ..comparing.fit import Fit, fit
+from ..comparing.lidar4d import WINDOWS
 from ..recordings.opening import open_recording
 from ..report.page.rendering import render_template
-from ..run.cluster.worker_map import MapFunction, parallel_map
+from ..run.cluster.worker_map import LostWorkersError, MapFunction, parallel_map
 from ..scenario.point_scene import CLASS_MATERIAL
 from .alignment import AlignedSweeps, Alignment, first_alignment
 from .charts import (
@@ -56,6 +57,7 @@ from .labels import split_by_object
 from .lost_pulses import SensorCoverage, firings_per_turn
 from .motion import Motion
 from .odometry import RecordedPoses, find_poses
+from .published_metrics import HeldOutFrames
 from .recorded_sweeps import RecordedSweeps, Rotation
 from .reflectances import IntensityModel, Reflectances, Response, fit_response
 from .submap_tasks import BuildTask, SubmapSurfels, SubmapTask, align_submap, build_submap
@@ -80,7 +82,10 @@ _POSE_DECIMALS = 6
 _RESPONSE_SUBMAPS = 4  # submaps from which the response of the sensor is determined
 _POSES = TwinStep("poses", (RecordedPoses,))
 _ALIGN = TwinStep("align", (AlignedSubmap,))
-_BUILD = TwinStep("build", (SubmapSurfels, Observations, HeldOutRays, SweepImages, TopViewPoints))
+_BUILD = TwinStep(
+    "build",
+    (SubmapSurfels, Observations, HeldOutRays, HeldOutFrames, SweepImages, TopViewPoints),
+)
 NO_RETURN = "no return"  # object name of surfels that return no pulses
 _ROTATION_FIELDS = {"clockwise", "zero_deg", "rate_hz"}  # written even if they have default values
 _RATE_DECIMALS = 4
@@ -152,12 +157,16 @@ class Twin:
             If the folder cannot be written to.
         """
         path = Path(folder)
+        with result_folder(path):
+            return self.write(path)
+
+    def write(self, folder: Path) -> list[Path]:
+        """Write the files of `save` to a folder that the caller has locked."""
         with (
-            result_folder(path),
             explain_os_errors(
-                f"The reconstruction cannot be written to {path}", "free some disk space"
+                f"The reconstruction cannot be written to {folder}", "free some disk space"
             ),
-            staging(path) as staged,
+            staging(folder) as staged,
         ):
             write_scene(staged / SCENE_FILE, self.scene)
             pictures = {name: page.svg() for name, page in self.pictures.items()}
@@ -174,7 +183,7 @@ class Twin:
             }
             for name, text in texts.items():
                 (staged / name).write_text(text, encoding="utf-8", newline="\n")
-            return [(staged / name).replace(path / name) for name in (SCENE_FILE, *texts)]
+            return [(staged / name).replace(folder / name) for name in (SCENE_FILE, *texts)]
 
     def _classes(self) -> dict[int, str]:
         """Return the material names of surfels with a recorded class, keyed by class number."""
@@ -238,6 +247,7 @@ def twin(
     voxel_m: float = DEFAULT_VOXEL_M,
     sensor: str | None = None,
     intensity: str | None = None,
+    lidar4d_window: int | None = None,
     client: Client | None = None,
     folder: str | Path | None = None,
     resume: bool = False,
@@ -269,6 +279,10 @@ def twin(
     intensity
         Name of the column that contains the intensities, by default ``intensity``. They may be
         energies or compensated for range, which is detected.
+    lidar4d_window
+        First frame of a window of KITTI-360 in which LiDAR4D was evaluated, such as 4950. Only the
+        frames of this window are used, and the same frames are held out. The recording must be a
+        folder with the frames of the drive 0000, or with the frames of the window.
     client
         Client of a cluster whose OTHER workers can read the recording at the same path. By default,
         processes on this machine reconstruct the submaps. A recording in memory is always processed
@@ -290,15 +304,19 @@ def twin(
     ------
     LidarError
         If the recording cannot be read, has fewer than four sweeps, has no planes, or has no rings
-        and `model` is not set; if an extra is missing; or if the folder contains the steps of a
-        different twin.
+        and `model` is not set; if an extra is missing; if the folder contains the steps of a
+        different twin, or if another reconstruction is using it; or if the cluster is lost.
     """
     check_number("voxel_m", voxel_m, gt=0, le=10)
     require_package("scipy", "twin", "Reconstructing a recording")
+    if lidar4d_window is not None:
+        check_choice("lidar4d_window", str(lidar4d_window), tuple(map(str, WINDOWS)))
     base = None if model is None else read_model(model)  # before the recording, which takes long
     if isinstance(recording, (str, Path)):
-        recorded = RecordedSweeps.open(Path(recording), sensor, intensity)
+        recorded = RecordedSweeps.open(Path(recording), sensor, intensity, lidar4d_window)
     else:
+        if lidar4d_window is not None:
+            raise LidarError("`lidar4d_window` requires the path of a recording.")
         if client is not None:
             raise LidarError(
                 "A recording in memory can only be reconstructed in this process. Pass the "
@@ -313,12 +331,21 @@ def twin(
         raise LidarError(f"{reason} Specify its sensor, for example `--model livox/mid360`.")
     track = None if trajectory is None else Path(trajectory)
     report = report or (lambda line: None)
+    made_of = (_fingerprint_inputs(recorded, track), voxel_m)
     with ExitStack() as stack:
         if folder is None:
-            folder = stack.enter_context(TemporaryDirectory(prefix="lidarpool-"))
-        made_of = (_fingerprint_inputs(recorded, track), voxel_m)
-        steps = FinishedSteps.create_or_resume(Path(folder), made_of, resume=resume)
-        built = _Building(recorded, base, voxel_m, steps, client, report).twin(track)
+            steps_folder = Path(stack.enter_context(TemporaryDirectory(prefix="lidarpool-")))
+        else:
+            steps_folder = stack.enter_context(result_folder(Path(folder)))
+        steps = FinishedSteps.create_or_resume(steps_folder, made_of, resume=resume)
+        try:
+            built = _Building(recorded, base, voxel_m, steps, client, report).twin(track)
+        except (KeyboardInterrupt, LostWorkersError) as error:
+            if folder is not None:
+                error.add_note(
+                    f"The finished steps are stored in {folder}. Continue with `--resume`."
+                )
+            raise
         steps.remove()
     return built
 
@@ -375,13 +402,12 @@ class _Building:
         first = first_alignment(recorded, poses)
         submaps = split_into_submaps(first.poses[:, :3, 3])
         counting = np.concatenate([submap.own_numbers for submap in submaps])
-        others = counting[1::2]
-        compared = others[even_indices(len(others), _COMPARED_SWEEPS)]
+        mapped, compared = _held_out_split(recorded, counting)
         task = BuildTask(
             recorded=recorded,
             alignment=first,
             submap=submaps[0],
-            mapped=counting[::2],
+            mapped=mapped,
             coverage=SensorCoverage.from_sweeps(recorded),
             compared=compared,
             voxel_m=self.voxel_m,
@@ -457,6 +483,9 @@ class _Building:
             "poses": poses.source,
             "motion": alignment.motion.value,
             "held_out": held_out.figures(),
+            "lidar4d": HeldOutFrames.figures(
+                [part.frames for part in built.parts if part.frames is not None]
+            ),
             "response": None if response is None else response.figures(),
             "model": model.name,
             "notes": [
@@ -539,6 +568,7 @@ class _Building:
             "surfels": sum(len(one.corners) for one in surfels),
             "dark_surfels": sum(len(one.dark_corners) for one in surfels),
             "voxel_m": self.voxel_m,
+            "lidar4d_window": _window_of(self.recorded),
             "length_m": float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
             "thickness_m": list(alignment.thickness_m),
             "plane_distance_m": _median(alignment.plane_distance_m),
@@ -547,11 +577,30 @@ class _Building:
         }
 
 
+def _window_of(recorded: RecordedSweeps) -> int | None:
+    """Return the first frame of the window of LiDAR4D that is used, or None."""
+    return None if isinstance(recorded.source, Recording) else recorded.source.window
+
+
+def _held_out_split(recorded: RecordedSweeps, counting: Ints) -> tuple[Ints, Ints]:
+    """Return the numbers of the sweeps from which the map is built, and of those to compare.
+
+    `counting` are the numbers of the sweeps that are used, in ascending order.
+    """
+    window = _window_of(recorded)
+    if window is None:
+        others = counting[1::2]
+        return counting[::2], others[even_indices(len(others), _COMPARED_SWEEPS)]
+    held_out = np.array(WINDOWS[window].held_out) - window
+    return np.setdiff1d(counting, held_out), np.intersect1d(counting, held_out)
+
+
 class _BuiltSubmap(NamedTuple):
     """Results of building a submap that are kept in memory."""
 
     surfels: SubmapSurfels
     held_out: HeldOutRays | None
+    frames: HeldOutFrames | None
     images: SweepImages | None
     top_view: TopViewPoints
 

@@ -7,7 +7,10 @@ only one submap has to fit in memory, and an interrupted command can be resumed.
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
+import struct
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
@@ -25,6 +28,18 @@ if TYPE_CHECKING:
 
 STEPS_FOLDER = ".lidarpool-twin"
 _OF_FILE = "of.json"  # identifies the inputs of the steps
+# Errors that NumPy and zipfile raise for damaged files.
+_DAMAGED = (
+    EOFError,
+    NotImplementedError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    pickle.UnpicklingError,
+    struct.error,
+    zipfile.BadZipFile,
+)
 
 
 class TwinStep(NamedTuple):
@@ -67,11 +82,11 @@ class FinishedSteps:
                     f"{folder.parent} contains an unfinished reconstruction. Continue it with "
                     "`--resume`, or start again with `--overwrite`."
                 )
-            if json.loads(file.read_text(encoding="utf-8")) != own:
+            if _read_json(file) != own:
                 raise LidarError(
                     f"{folder.parent} contains an unfinished reconstruction of another "
                     "recording, or one with other options or from another version of "
-                    "lidarpool. Start again with `--overwrite`."
+                    "lidarpool, or its files are damaged. Start again with `--overwrite`."
                 )
             return cls(folder)
         with explain_os_errors(f"Cannot write to {folder.parent}", "choose another folder"):
@@ -89,29 +104,57 @@ class FinishedSteps:
         """Yield the results of a reconstruction step for each item.
 
         Items without a stored result are processed by `run`, which has the signature of `map`. The
-        function returns a record or None for each type of the step.
+        function returns a record or None for each type of the step. If a stored result is damaged,
+        its item is processed again.
         """
         done = [self._file(step, index).exists() for index in range(len(items))]
         results = iter(
             run(function, [item for item, known in zip(items, done, strict=True) if not known])
         )
         for index, is_known in enumerate(done):
-            if not is_known:
-                self._save(step, index, next(results))
-            yield self.load(step, index)
+            loaded = self._load_intact(step, index) if is_known else None
+            if loaded is None:
+                result = next(iter(run(function, [items[index]])) if is_known else results)
+                self._save(step, index, result)
+                loaded = self.load(step, index)
+            yield loaded
 
     def run_once(self, step: TwinStep, call: Callable[[], tuple[Any, ...]]) -> tuple[Any, ...]:
-        """Load the results of a step that runs once, calling `call` if it has not run yet."""
-        if not self._file(step, 0).exists():
+        """Load the results of a step that runs once.
+
+        `call` computes them if the step has not run yet, or if the stored results are damaged.
+        """
+        if (loaded := self._load_intact(step, 0)) is None:
             self._save(step, 0, call())
-        return self.load(step, 0)
+            loaded = self.load(step, 0)
+        return loaded
 
     def load(self, step: TwinStep, index: int) -> tuple[Any, ...]:
-        """Load the results that a step has computed for an item."""
-        with np.load(self._file(step, index)) as arrays:
-            return tuple(
-                _record(kind, f"{number}.", arrays) for number, kind in enumerate(step.kinds)
-            )
+        """Load the results that a step has computed for an item.
+
+        Raises
+        ------
+        LidarError
+            If the results are damaged or missing.
+        """
+        file = self._file(step, index)
+        try:
+            with file.open("rb") as opened, np.load(opened) as arrays:
+                return tuple(
+                    _record(kind, f"{number}.", arrays) for number, kind in enumerate(step.kinds)
+                )
+        except _DAMAGED as error:
+            raise LidarError(
+                f"The step file {file} is missing or damaged. Delete it, and continue with "
+                "`--resume`."
+            ) from error
+
+    def _load_intact(self, step: TwinStep, index: int) -> tuple[Any, ...] | None:
+        """Load the results for an item, or return None if they are missing or damaged."""
+        try:
+            return self.load(step, index)
+        except LidarError:
+            return None
 
     def _file(self, step: TwinStep, index: int) -> Path:
         return self.folder / f"{step.name}-{index:05d}.npz"
@@ -131,6 +174,14 @@ class FinishedSteps:
 
         with explain_os_errors(f"Cannot write to {self.folder}", "free some disk space"):
             _replace(self._file(step, index), write)
+
+
+def _read_json(file: Path) -> Any:
+    """Return the content of a JSON file, or None if it is damaged."""
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except ValueError:  # not UTF-8, or not JSON
+        return None
 
 
 def _record(kind: type, prefix: str, arrays: Any) -> Any:

@@ -20,6 +20,9 @@ from .alignment import AlignedSweep, AlignedSweeps
 from .reflectances import Reflectances
 from .surface_map import SurfaceMap
 
+# Returned and lost pulses of sweeps, by sweep number.
+HeldOutPulses = Mapping[int, tuple[AlignedSweep, AlignedSweep]]
+
 _RANGE_MARGIN_M = 0.5  # margin beyond the maximum recorded range
 _RANGES_M = (0, 5, 10, 20, 40, 80, np.inf)  # boundaries of the range classes
 
@@ -155,7 +158,7 @@ def simulate_held_out(
     reflectances: Reflectances | None,
     stationary: Mapping[int, Bools],
     numbers: Sequence[int],
-) -> HeldOutRays:
+) -> tuple[HeldOutRays, HeldOutPulses]:
     """Simulate held-out sweeps, using a map that was built from other sweeps.
 
     Parameters
@@ -171,22 +174,24 @@ def simulate_held_out(
 
     Returns
     -------
-    HeldOutRays
-        The rays of the held-out sweeps, including lost pulses.
+    tuple
+        The rays of the held-out sweeps, including lost pulses, and their pulses in the same order.
     """
     parts = []
+    pulses = {}
     for number in numbers:
         sweep, lost = sweeps.read_with_lost(number)
+        pulses[number] = sweep, lost
         no_ranges = np.full(len(lost.points), np.nan)
         no_points = np.zeros(len(lost.points), bool)
         parts.append(
             _rays(surface_map, reflectances, sweep, number, sweep.range_m, stationary[number])
         )
-        parts.append(_rays(surface_map, None, lost, number, no_ranges, no_points))
+        parts.append(_rays(surface_map, reflectances, lost, number, no_ranges, no_points))
     rays = HeldOutRays.concatenate(parts)
     # Surfaces that were only observed at closer range are beyond the range of the sensor.
     in_reach = rays.simulated_m <= sweeps.coverage.max_range_m + _RANGE_MARGIN_M
-    return replace(rays, simulated_m=np.where(in_reach, rays.simulated_m, np.nan))
+    return replace(rays, simulated_m=np.where(in_reach, rays.simulated_m, np.nan)), pulses
 
 
 def _rays(

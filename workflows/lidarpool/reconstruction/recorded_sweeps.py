@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from lidarsim.words import plural
 from ..clouds.point_times import PointTimes
 from ..clouds.recording import Recording
 from ..clouds.rings import MIN_RINGS, Rings, elevations, summarize_rings
+from ..comparing.lidar4d import WINDOWS, Window
 from ..recordings.opening import open_recording
 from .labels import labels_of
 
@@ -32,12 +33,38 @@ _REFERENCE_SWEEPS = 5  # sweeps from which the rotation is determined
 _MAX_START_RAD = np.radians(12)  # maximum angle between the first pulses of rings
 _MIN_AGREEMENT = 0.9  # minimum resultant length of azimuths minus a uniform rotation
 
-RecordingFile = tuple[Path, str | None, str | None]  # path, sensor or topic, intensity column
+
+class RecordingSelection(NamedTuple):
+    """File or folder of a recording, and the part of it to read."""
+
+    path: Path
+    sensor: str | None = None  # sensor or topic
+    intensity: str | None = None  # intensity column
+    window: int | None = None  # first frame of a window of LiDAR4D
 
 
 @lru_cache(maxsize=1)
-def _opened(file: RecordingFile) -> Recording:
-    return open_recording(*file, name="the recording")
+def _opened(file: RecordingSelection) -> Recording:
+    path, sensor, intensity, window = file
+    recording = open_recording(path, sensor, intensity, name="the recording")
+    return recording if window is None else _select_window(recording, WINDOWS[window])
+
+
+def _select_window(recording: Recording, window: Window) -> Recording:
+    """Return the sweeps of a window.
+
+    Raise LidarError if the recording has neither all frames up to the last one of the window, nor
+    only those of the window.
+    """
+    if recording.count == window.count:
+        return recording
+    if recording.is_cloud or recording.count <= window.last:
+        raise LidarError(
+            f"{recording.name} has {plural(recording.count, 'sweep')}, but the window consists of "
+            f"the frames {window.first:,} to {window.last:,}. Use the folder with all frames, or "
+            "one with only the frames of the window."
+        )
+    return recording.section(window.first, window.count)
 
 
 class Rotation(NamedTuple):
@@ -57,8 +84,8 @@ class RecordedSweeps:
     Attributes
     ----------
     source
-        Path, sensor and intensity column of a recording, which each process opens once, or a
-        recording in memory, which cannot be sent to other processes.
+        File of a recording, which each process opens once, or a recording in memory, which cannot
+        be sent to other processes.
     rings
         Rings of the sensor, which are empty for a sensor without rings.
     point_times
@@ -67,7 +94,7 @@ class RecordedSweeps:
         Timestamps of the sweeps in seconds, float64 of shape (s,), or None if there are none.
     """
 
-    source: RecordingFile | Recording
+    source: RecordingSelection | Recording
     rings: Rings
     point_times: PointTimes | None
     stamps_s: Floats | None
@@ -75,16 +102,20 @@ class RecordedSweeps:
 
     @classmethod
     def open(
-        cls, path: Path, sensor: str | None = None, intensity: str | None = None
+        cls,
+        path: Path,
+        sensor: str | None = None,
+        intensity: str | None = None,
+        window: int | None = None,
     ) -> RecordedSweeps:
-        """Open a recording.
+        """Open a recording, or only the frames of a window of LiDAR4D.
 
         Raises
         ------
         LidarError
-            If the recording cannot be read.
+            If the recording cannot be read, or if it does not contain the window.
         """
-        file = (path, sensor, intensity)
+        file = RecordingSelection(path, sensor, intensity, window)
         return replace(cls.from_recording(_opened(file)), source=file)
 
     @classmethod
@@ -106,6 +137,13 @@ class RecordedSweeps:
                 f"{recording.name} contains no points, so there is nothing to reconstruct."
             )
         return cls(recording, rings, recording.point_times, _stamps_s(recording))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state to send to another process, whose working directory may differ."""
+        state = dict(vars(self))
+        if not isinstance(self.source, Recording):
+            state["source"] = self.source._replace(path=self.source.path.absolute())
+        return state
 
     @property
     def recording(self) -> Recording:

@@ -17,6 +17,7 @@ from .charts import SweepImages, TopViewPoints
 from .free_space import find_stationary_points
 from .held_out import HeldOutRays, simulate_held_out
 from .lost_pulses import SensorCoverage
+from .published_metrics import HeldOutFrames
 from .recorded_sweeps import RecordedSweeps
 from .reflectances import Reflectances, fit_response
 from .submaps import AlignedSubmap, Submap
@@ -112,7 +113,12 @@ class SubmapSurfels(NamedTuple):
 
 
 BuiltSubmap = tuple[
-    SubmapSurfels, Observations, HeldOutRays | None, SweepImages | None, TopViewPoints
+    SubmapSurfels,
+    Observations,
+    HeldOutRays | None,
+    HeldOutFrames | None,
+    SweepImages | None,
+    TopViewPoints,
 ]
 
 
@@ -139,7 +145,7 @@ def build_submap(task: BuildTask) -> BuiltSubmap:
     submap = task.submap
     sweeps = task.read()
     stationary = find_stationary_points(sweeps, submap.numbers.tolist())
-    held_out, images = compare_held_out_sweeps(sweeps, task, stationary)
+    held_out, frames, images = compare_held_out_sweeps(sweeps, task, stationary)
     surface_map = build_surface_map(sweeps, stationary, task.voxel_m)
     own = submap.owns(surface_map.surfels.centers, task.alignment.poses)
     observations = surface_map.observations(sweeps, stationary).select_surfels(
@@ -147,12 +153,12 @@ def build_submap(task: BuildTask) -> BuiltSubmap:
     )
     surfels = SubmapSurfels.from_surfels(surface_map.surfels, own, stationary, submap.own_numbers)
     top_view = TopViewPoints.from_sweeps(sweeps, stationary, submap.own_numbers, task.drawn_share)
-    return surfels, observations, held_out, images, top_view
+    return surfels, observations, held_out, frames, images, top_view
 
 
 def compare_held_out_sweeps(
     sweeps: AlignedSweeps, task: BuildTask, stationary: Mapping[int, Bools]
-) -> tuple[HeldOutRays | None, SweepImages | None]:
+) -> tuple[HeldOutRays | None, HeldOutFrames | None, SweepImages | None]:
     """Compare the held-out sweeps of a submap with a map of the other sweeps.
 
     Parameters
@@ -167,8 +173,8 @@ def compare_held_out_sweeps(
     Returns
     -------
     tuple
-        The rays of the held-out sweeps, or None if the submap has none, and images of one of them,
-        or None if none has points.
+        The rays and the metrics of the held-out sweeps, or None if the submap has none, and images
+        of one of them, or None if none has points.
 
     Raises
     ------
@@ -178,15 +184,16 @@ def compare_held_out_sweeps(
     submap = task.submap
     compared = np.intersect1d(task.compared, submap.own_numbers).tolist()
     if not compared:
-        return None, None
+        return None, None, None
     mapped = np.intersect1d(submap.numbers, task.mapped).tolist()
     surface_map, reflectances = build_map_with_reflectances(sweeps, mapped, task.voxel_m)
-    rays = simulate_held_out(sweeps, surface_map, reflectances, stationary, compared)
+    rays, pulses = simulate_held_out(sweeps, surface_map, reflectances, stationary, compared)
+    frames = HeldOutFrames.from_rays(sweeps, rays, pulses)
     with_points = np.unique(rays.sweep[rays.return_mask])
     if not len(with_points):
-        return rays, None
+        return rays, frames, None
     drawn = int(with_points[len(with_points) // 2])
-    return rays, SweepImages.from_sweep(sweeps, surface_map, reflectances, drawn)
+    return rays, frames, SweepImages.from_sweep(sweeps, surface_map, reflectances, drawn)
 
 
 def build_map_with_reflectances(

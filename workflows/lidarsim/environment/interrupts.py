@@ -6,6 +6,7 @@ waiting for its workers.
 
 from __future__ import annotations
 
+import _thread
 import os
 import signal
 import threading
@@ -24,8 +25,13 @@ UNTOUCHED = f"{STOPPED}, and the output folder is unchanged."
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _IMPATIENT_S = 1.0  # a second signal within this time is considered part of the first
 _RETRY_S = 0.01
-# Files that define weak reference callbacks.
-_WEAK = {weakref.__file__, weakref.WeakSet.add.__code__.co_filename}
+# Files that define weak reference callbacks, and the import system.
+_SILENT = {
+    weakref.__file__,
+    weakref.WeakSet.add.__code__.co_filename,
+    "<frozen importlib._bootstrap>",
+    "<frozen importlib._bootstrap_external>",
+}
 
 
 class _Interrupt:
@@ -33,30 +39,46 @@ class _Interrupt:
 
     def __init__(self) -> None:
         self.first_at: float | None = None
+        self._postponed_at: float | None = None  # time of a signal that is waiting to be handled
+        self._is_resent = False  # whether the next signal is sent by `_resend`
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
+        now = time.monotonic()
+        is_resent = self._is_resent
+        self._is_resent = False
         if self.first_at is None:
-            if _drops_errors(frame):  # resend the signal from a thread after a short delay
-                main = threading.main_thread().ident
-                # A signal sent to the thread itself also interrupts a wait for a lock.
-                threading.Timer(_RETRY_S, signal.pthread_kill, (main, signal.SIGINT)).start()
+            if not _drops_errors(frame):
+                self.first_at = now
+                raise KeyboardInterrupt
+            if self._postponed_at is None:
+                self._postponed_at = now
+            if is_resent or now - self._postponed_at <= _IMPATIENT_S:
+                # threading.Timer takes a lock that the interrupted code may hold.
+                _thread.start_new_thread(self._resend, (number,))
                 return
-            self.first_at = time.monotonic()
-            raise KeyboardInterrupt
-        if time.monotonic() - self.first_at > _IMPATIENT_S:
+            self.first_at = self._postponed_at
+        if now - self.first_at > _IMPATIENT_S:
             _exit_at_once(
                 b"lidarpool: stopped at once; workers of this machine end by themselves.\n"
             )
 
+    def _resend(self, number: int) -> None:
+        time.sleep(_RETRY_S)
+        self._is_resent = True
+        # A signal sent to the thread itself also interrupts a wait for a lock.
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+
 
 def _drops_errors(frame: FrameType | None) -> bool:
-    """Return whether a finalizer or weak reference callback is running.
+    """Return whether a finalizer, a weak reference callback or an import is running.
 
-    Python ignores exceptions that are raised there.
+    Python ignores exceptions that are raised in the first two. Imports may also discard them: some
+    packages catch all exceptions while they are imported, and extension modules ignore them. An
+    import that was interrupted cannot be repeated either.
     """
     while frame is not None:
         code = frame.f_code
-        if code.co_name == "__del__" or code.co_filename in _WEAK:
+        if code.co_name == "__del__" or code.co_filename in _SILENT:
             return True
         frame = frame.f_back
     return False

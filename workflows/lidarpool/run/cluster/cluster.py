@@ -288,7 +288,7 @@ class Cluster:
         except BaseException as error:
             # A client that loses its scheduler cancels all futures, so tasks appear as cancelled.
             # A few seconds later the client closes, and its methods may then raise any error.
-            lost = self._is_lost(error)
+            lost = is_connection_lost(self.client, error)
             stop(f"the run was stopped: {str(error) or type(error).__name__}")
             if error is self._callers_error:
                 raise
@@ -300,17 +300,18 @@ class Cluster:
         finally:
             self._release_slots()
 
-    def _is_lost(self, error: BaseException) -> bool:
-        """Return True if the connection to the scheduler is lost.
 
-        Requests may fail shortly before the client notices the loss. If `error` suggests a lost
-        scheduler, wait up to `LOST_S` seconds for the client to notice.
-        """
-        deadline = time.monotonic() + LOST_S
-        while (
-            self.client.status == "running"
-            and isinstance(error, _CLUSTER_LOST)
-            and time.monotonic() < deadline
-        ):
-            time.sleep(0.01)
-        return self.client.status != "running"
+def is_connection_lost(client: Client, error: BaseException) -> bool:
+    """Return True if the connection of a client to its scheduler is lost.
+
+    Requests may fail shortly before the client notices the loss. If `error` suggests a lost
+    scheduler, wait up to `LOST_S` seconds for the client to notice.
+    """
+    deadline = time.monotonic() + LOST_S
+    while (
+        client.status == "running"
+        and isinstance(error, _CLUSTER_LOST)
+        and time.monotonic() < deadline
+    ):
+        time.sleep(0.01)
+    return client.status != "running"

@@ -146,7 +146,7 @@ def local_client(
         ):
             yield cluster
 
-    return _client_of(started())
+    return client_of(started())
 
 
 class BackgroundClient(AbstractContextManager[Client]):
@@ -190,7 +190,7 @@ def start_client(file: ClusterFile, report: Callable[[str], object]) -> Iterator
     LidarError
         If the cluster does not start.
     """
-    with _client_of(file.start(report)) as client:
+    with client_of(file.start(report)) as client:
         report(f"started {file}")
         try:
             yield client
@@ -200,7 +200,7 @@ def start_client(file: ClusterFile, report: Callable[[str], object]) -> Iterator
 
 
 @contextmanager
-def _client_of(cluster: AbstractContextManager[SpecCluster]) -> Iterator[Client]:
+def client_of(cluster: AbstractContextManager[SpecCluster]) -> Iterator[Client]:
     """Start a cluster, yield its client, and stop the cluster at the end.
 
     A cluster cannot be stopped cleanly while it is starting. An interrupt is therefore deferred

@@ -9,16 +9,18 @@ from typing import Any
 
 import dask
 from dask.system import CPU_COUNT
-from distributed import Client
+from distributed import Client, KilledWorker, SpecCluster
 
 import poolpart.deploy
+from lidarsim.errors import LidarError
 from lidarsim.io.allowance import memory
 from poolpart import Partition
 from poolpart.deploy import forked_workers
 
 from ...processes.fork_server import start_fork_server
 from ..pipeline.stage_names import OTHER
-from .connection import check_starts_workers
+from .cluster import is_connection_lost
+from .connection import check_starts_workers, client_of
 
 MapFunction = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
@@ -29,13 +31,18 @@ _UNLIMITED = dict.fromkeys(
 )
 
 
+class LostWorkersError(LidarError):
+    """Raised if the cluster is lost, or if an item repeatedly kills its workers."""
+
+
 @contextmanager
 def parallel_map(
     client: Client | None, count: int, worker_bytes: int, workers: int | None = None
 ) -> Iterator[MapFunction]:
     """Yield a `map` function that runs in worker processes and preserves the order of items.
 
-    Items may come from a generator, because the number of items in flight is limited.
+    Items may come from a generator, because the number of items in flight is limited. The
+    function raises LostWorkersError if the scheduler is lost or if an item kills its workers.
 
     Parameters
     ----------
@@ -59,24 +66,42 @@ def parallel_map(
         workers = min(CPU_COUNT, max(1, memory() // worker_bytes))
     workers = min(count, workers)
     if client is not None:
-        yield partial(_map, Partition(OTHER, client))
+        yield partial(_map, client)
     elif workers <= 1:
         yield map
     else:
         check_starts_workers()
-        forks = start_fork_server()
-        with (
-            dask.config.set(_UNLIMITED),
-            forked_workers() if forks else nullcontext(),
-            closing(
-                poolpart.deploy.local_cluster({OTHER: (workers, 1)}, dashboard_port=None)
-            ) as cluster,
-            Client(cluster, set_as_default=False) as own,
-        ):
-            yield partial(_map, Partition(OTHER, own))
+        with client_of(_local_cluster(workers, forks=start_fork_server())) as own:
+            yield partial(_map, own)
 
 
-def _map(
-    partition: Partition, function: Callable[[Any], Any], items: Iterable[Any]
-) -> Iterable[Any]:
-    return partition.map(function, items, chunk=1)
+@contextmanager
+def _local_cluster(workers: int, *, forks: bool) -> Iterator[SpecCluster]:
+    with (
+        dask.config.set(_UNLIMITED),
+        forked_workers() if forks else nullcontext(),
+        closing(
+            poolpart.deploy.local_cluster({OTHER: (workers, 1)}, dashboard_port=None)
+        ) as cluster,
+    ):
+        yield cluster
+
+
+def _map(client: Client, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+    address = getattr(client.scheduler, "address", "")
+    try:
+        yield from Partition(OTHER, client).map(function, items, chunk=1)
+    except LidarError:
+        raise
+    except KilledWorker as error:
+        raise LostWorkersError(
+            "Several workers ended while they processed the same part of the recording, probably "
+            "because they ran out of memory. Use fewer workers per machine."
+        ) from error
+    except Exception as error:  # a client without a scheduler may raise any error
+        if not is_connection_lost(client, error):
+            raise
+        raise LostWorkersError(
+            f"The cluster at {address} is no longer reachable, or the tasks of this "
+            "command were canceled by a different client."
+        ) from error
