@@ -176,7 +176,7 @@ def simulate_held_out(
     """
     parts = []
     for number in numbers:
-        sweep, lost = sweeps.read_with_lost(number)
+        sweep, lost = sweeps.read_pulses(number)
         no_ranges = np.full(len(lost.points), np.nan)
         no_points = np.zeros(len(lost.points), bool)
         parts.append(
