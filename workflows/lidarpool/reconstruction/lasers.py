@@ -346,7 +346,7 @@ def _robust_slope(design: Floats, values: Floats) -> tuple[float, float]:
         if np.linalg.matrix_rank(normal, hermitian=True) < 2:
             return float("nan"), float("inf")
         before = found
-        found = np.linalg.solve(normal, weighted.T @ values)
+        found = np.asarray(np.linalg.solve(normal, weighted.T @ values), np.float64)
         residuals = values - design @ found
         sigma = max(1.4826 * float(np.median(np.abs(residuals))), _MIN_SIGMA_RAD)
         if np.abs(found - before).max() < _CONVERGED:
