@@ -12,6 +12,7 @@ from lidarpool.comparing.fit.smooth_surfaces import find_surfaces
 from lidarpool.reconstruction.alignment import Alignment
 from lidarpool.reconstruction.free_space import RangeImage
 from lidarpool.reconstruction.labels import labels_of, split_by_object
+from lidarpool.reconstruction.lasers import RingLasers
 from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import RecordedPoses
 from lidarpool.scenario.point_scene import CLASS_MATERIAL, surfel_faces
@@ -192,7 +193,7 @@ def test_range_images_have_a_row_around_each_ring():
     points = ranges[:, None] * np.stack(
         [np.cos(elevation), 0 * elevation, np.sin(elevation)], axis=1
     )
-    image = RangeImage.from_points(points, elevation)
+    image = RangeImage.from_points(points, RingLasers.at_origin(elevation))
     column = np.isfinite(image.nearest_m).all(axis=0)
     assert column.sum() == 3
     np.testing.assert_allclose(image.nearest_m[:, column].T, [[10, 10, 20, 30, 40]] * 3)

@@ -32,8 +32,9 @@ from lidarpool import (
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.point_times import PointTimes
 from lidarpool.clouds.recording import Recording
-from lidarpool.clouds.rings import Rings, elevations
+from lidarpool.clouds.rings import Rings
 from lidarpool.reconstruction.alignment import Alignment
+from lidarpool.reconstruction.lasers import RingLasers
 from lidarpool.reconstruction.lost_pulses import SensorCoverage, lost_pulses
 from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import find_poses
@@ -231,7 +232,8 @@ def test_lost_pulses_are_steps_of_a_ring_without_a_return():
     points = (random.uniform(2, 50, len(ring))[:, None] * directions)[rows]
     sweep = Sweep(points, {"row": ring[rows]})
     coverage = SensorCoverage(np.ones((16, 720), bool), 50.0)
-    lost, _ = lost_pulses(sweep, elevation, coverage, 0.0)
+    lasers = RingLasers.at_origin(elevation)
+    lost, _ = lost_pulses(sweep, lasers, coverage, 0.0)
     expected = ~returned & received
     assert len(lost) == pytest.approx(expected.sum(), rel=0.01)
     for number in (0, 5, 9):
@@ -241,8 +243,8 @@ def test_lost_pulses_are_steps_of_a_ring_without_a_return():
         assert np.mean(cosines.max(axis=1) > np.cos(np.radians(0.25))) > 0.98
     # Second returns of the pulses, whose azimuths are rounded.
     both = Sweep.concatenate([sweep, sweep.replace(points=sweep.points * 1.01 + (1e-6, -1e-6, 0))])
-    assert len(lost_pulses(both, elevation, coverage, 0.0)[0]) == pytest.approx(len(lost), rel=0.01)
-    unknown, _ = lost_pulses(sweep, np.empty(0), coverage, 0.0)
+    assert len(lost_pulses(both, lasers, coverage, 0.0)[0]) == pytest.approx(len(lost), rel=0.01)
+    unknown, _ = lost_pulses(sweep, RingLasers.at_origin(np.empty(0)), coverage, 0.0)
     assert not len(unknown)
 
 
@@ -326,11 +328,14 @@ def test_the_sensor_of_a_twin_rotates_like_the_recorded_sensor(bag):
     assert stated["zero_deg"] == pytest.approx(180 + 4.25, abs=0.1)  # the lasers point sideways
     assert stated["rate_hz"] == pytest.approx(10, abs=1e-4)
     assert stated["firings_per_turn"] == 512
-    recording = open_recording(folder / "drive.mcap", name="drive")
-    sweep = recording[5]
-    elevation = np.degrees(elevations(sweep.points))
-    medians = sorted(np.median(elevation[sweep.rings == ring]) for ring in range(32))
-    np.testing.assert_allclose(stated["beams"]["elevation_deg"], medians, atol=0.03)
+    beams = load_sensor("ouster/os1-32").beams
+    elevation_deg = np.degrees(np.sort(beams.elevation))
+    np.testing.assert_allclose(stated["beams"]["elevation_deg"], elevation_deg, atol=0.03)
+    origins_m = np.array(stated["beams"]["origin_m"])
+    # Only what is perpendicular to the beams is visible.
+    sin, cos = np.sin(np.sort(beams.elevation)), np.cos(np.sort(beams.elevation))
+    upward_m = beams.origin[0, 2] * cos - beams.origin[0, 0] * sin
+    np.testing.assert_allclose(origins_m[:, 2] * cos - origins_m[:, 0] * sin, upward_m, atol=5e-3)
     assert "dropout" not in (stated.get("performance") or {})
     assert not any("direction of rotation" in note for note in found.figures["notes"])
 

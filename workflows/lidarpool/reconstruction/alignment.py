@@ -27,7 +27,8 @@ from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.sweeps.sweep_motion import FiringPoses
 
-from ..clouds.rings import MIN_RINGS, elevations
+from ..clouds.rings import MIN_RINGS
+from .lasers import RingLasers, unit_vectors
 from .lost_pulses import SensorCoverage, lost_pulses
 from .motion import Motion, MotionStep
 from .odometry import RecordedPoses
@@ -86,6 +87,8 @@ class Alignment:
     plane_distance_m
         Median distance between the points of each sweep and their planes. float64 array of shape
         (s,).
+    lasers
+        Positions and directions of the lasers of the rings, or None if they are at the origin.
     """
 
     poses: Floats
@@ -96,10 +99,16 @@ class Alignment:
     ring_offsets: Floats
     thickness_m: tuple[float, ...] = ()
     plane_distance_m: Floats = field(default_factory=lambda: np.empty(0))
+    lasers: RingLasers | None = None
 
     @classmethod
     def from_poses(
-        cls, poses: RecordedPoses, voxel_m: float, motion: Motion, ring_count: int
+        cls,
+        poses: RecordedPoses,
+        voxel_m: float,
+        motion: Motion,
+        ring_count: int,
+        lasers: RingLasers | None = None,
     ) -> Alignment:
         """Create an alignment from poses, converting each pose to the timestamp of its sweep.
 
@@ -107,15 +116,17 @@ class Alignment:
         """
         offsets = np.zeros((ring_count, 3))
         sweep_s = float(np.median(np.diff(poses.times_s)))
-        alignment = cls(poses.matrices.copy(), poses.times_s, sweep_s, voxel_m, motion, offsets)
+        matrices = poses.matrices.copy()
+        alignment = cls(matrices, poses.times_s, sweep_s, voxel_m, motion, offsets, lasers=lasers)
         if motion is Motion.COMPENSATED or not poses.share:
             return alignment
+        first_s = -0.5 * sweep_s if motion.is_centered else poses.first_s
         steps = [alignment.step(number) for number in range(len(poses.matrices))]
         return replace(
             alignment,
             poses=np.stack(
                 [
-                    pose @ step.fraction(-(poses.first_s + poses.share * sweep_s) / step_s)
+                    pose @ step.fraction(-(first_s + poses.share * sweep_s) / step_s)
                     for pose, (step, step_s) in zip(poses.matrices, steps, strict=True)
                 ]
             ),
@@ -147,39 +158,42 @@ class Alignment:
         -------
         tuple of arrays
             Points in the sensor frame at the timestamp of the sweep, and the positions of the
-            sensor in the same frame when it fired. Both have shape (n, 3).
+            lasers in the same frame when they fired. Both have shape (n, 3).
         """
-        points = self._calibrated(sweep)
-        origins = np.zeros_like(points)
+        points, origins = self._calibrated(sweep)
         times_s = self.motion.times_s(sweep, self.sweep_s)
         if times_s is None:
             return points, origins
         compensated = np.empty_like(points)
         for rows, step, fractions in self._split_by_step(number, times_s):
             compensated[rows] = step.compensate(points[rows], fractions)
-            origins[rows] = fractions[:, None] * step.translation
+            origins[rows] = step.compensate(origins[rows], fractions)
         return compensated, origins
 
     def points_as_fired(self, sweep: Sweep, number: int) -> tuple[Floats, FiringPoses] | None:
-        """Return a sweep's calibrated points in the sensor frame at their firing times.
+        """Return a sweep's calibrated points relative to their lasers at their firing times.
 
-        Also returns the poses of the sensor at these times. The points have shape (n, 3). Return
-        None if they are motion-compensated.
+        Also returns the poses of the lasers at these times, whose axes are those of the sensor. The
+        points have shape (n, 3). Return None if the points are motion-compensated and the lasers
+        are at the origin.
         """
         from scipy.spatial.transform import Rotation
 
         times_s = self.motion.times_s(sweep, self.sweep_s)
         if times_s is None:
-            return None
+            if self.lasers is None or self.lasers.is_at_origin:
+                return None
+            times_s = np.zeros(len(sweep))
+        points, origins = self._calibrated(sweep)
         pose = self.poses[number]
         offsets = np.zeros((len(sweep), 3))
         turns = np.zeros((len(sweep), 3))
         for rows, step, fractions in self._split_by_step(number, times_s):
-            offsets[rows] = fractions[:, None] * (pose[:3, :3] @ step.translation)
+            offsets[rows] = step.compensate(origins[rows], fractions) @ pose[:3, :3].T
             turns[rows] = fractions[:, None] * step.rotation
         quaternions = Rotation.from_rotvec(turns).as_quat().T
         poses = FiringPoses(pose[:3, 3], pose[:3, :3], offsets.T, quaternions)
-        return self._calibrated(sweep), poses
+        return points - origins, poses
 
     def _split_by_step(
         self, number: int, times_s: Floats
@@ -193,19 +207,21 @@ class Alignment:
                 step, step_s = self.step(number, backward=backward)
                 yield rows, step, times_s[rows] / step_s
 
-    def _calibrated(self, sweep: Sweep) -> Floats:
-        """Apply the ring offsets to the points of a sweep."""
-        points = sweep.points
+    def _calibrated(self, sweep: Sweep) -> tuple[Floats, Floats]:
+        """Apply the ring offsets to the points of a sweep.
+
+        Returns the points and the positions of their lasers, both with shape (n, 3).
+        """
+        ring = sweep.columns["row"]
+        lasers = self.lasers or RingLasers.at_origin(np.zeros(len(self.ring_offsets)))
+        origins = lasers.origins(sweep.points, ring)
         if not self.ring_offsets.any():
-            return points
-        range_offset_m, elevation_offset, azimuth_offset = self.ring_offsets[sweep.columns["row"]].T
-        range_m = np.linalg.norm(points, axis=1) + range_offset_m
-        elevation = elevations(points) + elevation_offset
-        azimuth = np.arctan2(points[:, 1], points[:, 0]) + azimuth_offset
-        level = range_m * np.cos(elevation)
-        return np.stack(
-            [level * np.cos(azimuth), level * np.sin(azimuth), range_m * np.sin(elevation)], axis=1
-        )
+            return sweep.points, origins
+        range_offset_m, elevation_offset, azimuth_offset = self.ring_offsets[ring].T
+        range_m = np.linalg.norm(sweep.points - origins, axis=1) + range_offset_m
+        azimuth, elevation = lasers.angles(sweep.points, ring)
+        directions = unit_vectors(azimuth + azimuth_offset, elevation + elevation_offset)
+        return origins + range_m[:, None] * directions, origins
 
 
 class AlignedSweep(NamedTuple):
@@ -254,7 +270,7 @@ class AlignedSweeps:
     def read_with_lost(self, number: int) -> tuple[AlignedSweep, AlignedSweep]:
         """Read a sweep, and determine which of its pulses were lost.
 
-        The lost pulses are represented by points at a range of one meter.
+        The lost pulses are represented by points one meter from their lasers.
         """
         step, step_s = self.alignment.step(number)
         # Without motion compensation, motion does not cause gaps between points.
@@ -262,10 +278,24 @@ class AlignedSweeps:
         fraction = self.alignment.sweep_s / step_s if is_compensated else 0.0
         moved_m = fraction * float(np.linalg.norm(step.translation))
         sweep = self.recorded.read(number)
-        elevation_rad = self.recorded.elevation_rad
-        lost, gap_range_m = lost_pulses(sweep, elevation_rad, self.coverage, moved_m)
+        lasers = self.recorded.lasers
+        lost, gap_range_m = lost_pulses(sweep, lasers, self.coverage, moved_m)
         aligned = self.align(lost, number)._replace(gap_range_m=gap_range_m)
         return self.align(sweep, number), aligned
+
+    def read_pulses(self, number: int) -> tuple[AlignedSweep, AlignedSweep]:
+        """Read the pulses of a sweep as the sensor model fires them, and those that were lost.
+
+        A pulse starts at the laser of its ring, at the elevation of the ring. Of the recorded
+        sweep, only the azimuths of the head remain in the directions. In sweeps whose rings have no
+        constant elevations, such as motion-compensated ones, the recorded directions are used.
+        """
+        returned, lost = self.read_with_lost(number)
+        lasers = self.recorded.lasers
+        if not lasers.have_constant_elevations:
+            return returned, lost
+        modeled = self.align(lasers.on_rings(self.recorded.read(number)), number)
+        return modeled, lost
 
     def align(self, sweep: Sweep, number: int) -> AlignedSweep:
         """Transform the points of a sweep to world coordinates."""
@@ -294,7 +324,7 @@ def first_alignment(sweeps: RecordedSweeps, poses: RecordedPoses) -> Alignment:
     numbers = even_indices(sweeps.count, _RANGE_SWEEPS).tolist()
     voxel_m = _voxel_m([_sample(sweeps.read(number), number) for number in numbers])
     motion = _motion(sweeps, poses, voxel_m)
-    return Alignment.from_poses(poses, voxel_m, motion, sweeps.ring_count)
+    return Alignment.from_poses(poses, voxel_m, motion, sweeps.ring_count, sweeps.lasers)
 
 
 def align(
@@ -347,12 +377,18 @@ def _motion(sweeps: RecordedSweeps, poses: RecordedPoses, voxel_m: float) -> Mot
     elif is_timed:
         candidates = [Motion.TIMED, Motion.COMPENSATED]
     elif len(sweeps.elevation_rad):
-        candidates = [Motion.COMPENSATED, Motion.COUNTERCLOCKWISE, Motion.CLOCKWISE]
+        candidates = [
+            Motion.COMPENSATED,
+            Motion.COUNTERCLOCKWISE,
+            Motion.CLOCKWISE,
+            Motion.CENTERED_COUNTERCLOCKWISE,
+            Motion.CENTERED_CLOCKWISE,
+        ]
     else:
         candidates = [Motion.COMPENSATED]
     name = sweeps.recording.name
     local = poses.select(window)
-    trial = partial(_filled_voxels, name, samples, local, sweeps.ring_count, voxel_m)
+    trial = partial(_filled_voxels, sweeps, samples, local, voxel_m)
     filled = {motion: trial(motion) for motion in candidates}
     best = min(candidates, key=filled.__getitem__)
     if filled[best] > _MAX_SHARE_OF_VOXELS * filled[candidates[0]]:
@@ -367,10 +403,9 @@ def _motion(sweeps: RecordedSweeps, poses: RecordedPoses, voxel_m: float) -> Mot
 
 
 def _filled_voxels(
-    name: str,
+    sweeps: RecordedSweeps,
     samples: Sequence[Sweep],
     poses: RecordedPoses,
-    ring_count: int,
     voxel_m: float,
     motion: Motion,
     scale: tuple[int, int, int] = (1, 1, 1),
@@ -382,10 +417,12 @@ def _filled_voxels(
     consistent. Points at long range do not count, because each of them fills its own voxel.
     """
     scaled = [sample.replace(points=sample.points * scale) for sample in samples]
-    alignment = Alignment.from_poses(poses, voxel_m, motion, ring_count)
+    # Mirrored points are not where the lasers expect them.
+    lasers = sweeps.lasers if scale == (1, 1, 1) else None
+    alignment = Alignment.from_poses(poses, voxel_m, motion, sweeps.ring_count, lasers)
     numbers = range(len(scaled))
     rounds = 0 if poses.are_given else _TRIAL_ROUNDS
-    alignment = _align_iteratively(name, scaled, alignment, numbers, rounds)
+    alignment = _align_iteratively(sweeps.recording.name, scaled, alignment, numbers, rounds)
     parts = []
     for number, sample in enumerate(scaled):
         points, _ = alignment.compensate(sample, number)
@@ -463,22 +500,27 @@ class _PlanePoints:
 
     rows: Bools  # (n,), mask of the points of the sample
     points: Floats  # (k, 3), in the sensor frame
+    beams: Floats  # (k, 3), vectors from the lasers to the points, in the sensor frame
     distances: Floats  # (k,), signed distances to the planes, meters
     normals: Floats  # (k, 3), plane normals in the world frame
     weights: Floats  # (k,), 0 to 1
 
     @classmethod
     def from_sweep(
-        cls, points: Floats, pose: Floats, planes: VoxelPlanes, voxel_m: float
+        cls, points: Floats, origins: Floats, pose: Floats, planes: VoxelPlanes, voxel_m: float
     ) -> _PlanePoints:
-        """Find the points of a sweep that are close to planes of the map."""
+        """Find the points of a sweep that are close to planes of the map.
+
+        `origins` are the positions of their lasers.
+        """
         distances, plane, rows = planes.distances(
             transform_points(points, pose), _MAX_VOXELS * voxel_m
         )
         spread_m = 1.4826 * float(np.median(np.abs(distances))) if len(distances) else 0.0
         sigma = max(spread_m, _MIN_SIGMA_M)
         weights = np.maximum(1 - (distances / (_TUKEY_SIGMAS * sigma)) ** 2, 0) ** 2
-        return cls(rows, points[rows], distances, planes.normals[plane], weights)
+        near = points[rows]
+        return cls(rows, near, near - origins[rows], distances, planes.normals[plane], weights)
 
 
 def _register_to_planes(
@@ -491,11 +533,11 @@ def _register_to_planes(
     from scipy.spatial.transform import Rotation
 
     some = sample.select(slice(_SWEEP_POINTS))
-    points, _ = alignment.compensate(some, number)
+    points, origins = alignment.compensate(some, number)
     pose = alignment.poses[number].copy()
     voxel_m = alignment.voxel_m
     for _ in range(_STEPS):
-        on_planes = _PlanePoints.from_sweep(points, pose, planes, voxel_m)
+        on_planes = _PlanePoints.from_sweep(points, origins, pose, planes, voxel_m)
         enough = min(_MIN_PLANE_POINTS, len(points) / 10)
         if len(points) < _MIN_ALIGNED_POINTS or on_planes.weights.sum() < enough:
             return pose, on_planes  # With too few surfaces, odometry is more accurate.
@@ -507,7 +549,7 @@ def _register_to_planes(
         change = np.linalg.solve(normal, -weighted.T @ on_planes.distances)
         pose[:3, :3] = Rotation.from_rotvec(change[:3]).as_matrix() @ pose[:3, :3]
         pose[:3, 3] += change[3:]
-    return pose, _PlanePoints.from_sweep(points, pose, planes, voxel_m)
+    return pose, _PlanePoints.from_sweep(points, origins, pose, planes, voxel_m)
 
 
 def _align_to_planes(
@@ -556,7 +598,7 @@ def _ring_design(on_planes: _PlanePoints, pose: Floats) -> Floats:
 
     The array has shape (k, 3), for range, elevation and azimuth.
     """
-    outward, upward, leftward = _spherical_derivatives(on_planes.points)
+    outward, upward, leftward = _spherical_derivatives(on_planes.beams)
     normals = on_planes.normals @ pose[:3, :3]
     return np.stack(
         [np.einsum("ij,ij->i", axis, normals) for axis in (outward, upward, leftward)], axis=1
@@ -565,6 +607,8 @@ def _ring_design(on_planes: _PlanePoints, pose: Floats) -> Floats:
 
 def _spherical_derivatives(points: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the derivatives of points with respect to range, elevation and azimuth.
+
+    The points are relative to their lasers.
 
     Each array has shape (n, 3).
     """

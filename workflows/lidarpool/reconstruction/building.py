@@ -54,6 +54,7 @@ from .charts import (
 from .finished_steps import FinishedSteps, TwinStep
 from .held_out import HeldOutRays
 from .labels import split_by_object
+from .lasers import RingLasers
 from .lost_pulses import SensorCoverage, firings_per_turn
 from .motion import Motion
 from .odometry import RecordedPoses, find_poses
@@ -89,6 +90,7 @@ _BUILD = TwinStep(
 NO_RETURN = "no return"  # object name of surfels that return no pulses
 _ROTATION_FIELDS = {"clockwise", "zero_deg", "rate_hz"}  # written even if they have default values
 _RATE_DECIMALS = 4
+_ORIGIN_DECIMALS = 4
 _MIN_STEP_S = 1e-5  # minimum time between poses of the trajectory
 _MIN_LEAD = 0.01  # minimum time from the first point to the timestamp, in revolutions
 _MIN_DRIVE_M = 0.3  # On a shorter drive, the sensor counts as stationary.
@@ -659,8 +661,12 @@ class SweepTiming(NamedTuple):
         first_s = 0.0 if recorded.point_times is None else recorded.point_times.first_s
         first_s = first_s if first_s < -_MIN_LEAD * period_s else 0.0
         rotation = recorded.rotation(period_s, first_s)
-        if rotation is None and alignment.motion.is_turning:
-            rotation = recorded.starts(is_clockwise=alignment.motion is Motion.CLOCKWISE)
+        motion = alignment.motion
+        if rotation is None and motion.is_turning:
+            rotation = recorded.starts(is_clockwise=motion.is_clockwise)
+        if rotation is not None and motion.is_centered:
+            first_s = -0.5 * period_s
+            rotation = rotation._replace(start_deg=(rotation.start_deg + 180) % 360)
         return cls(rate_hz, steps + 1, first_s, rotation)
 
     def start(self, alignment: Alignment) -> TwinPose:
@@ -683,22 +689,40 @@ class SweepTiming(NamedTuple):
         The azimuth step is determined from the sweep `number`.
         """
         recorded = sweeps.recorded
-        if not len(recorded.elevation_rad):
+        lasers = recorded.lasers
+        if not len(lasers):
             return None
-        elevation_deg = np.degrees(np.sort(recorded.elevation_rad)).round(3)
         known: dict[str, Any] = {}
         if self.rotation is not None:
             zero_deg = round(self.rotation.start_deg, 2) % 360
             known = {"clockwise": self.rotation.is_clockwise, "zero_deg": zero_deg}
         return SensorModel(
             name="Recorded sensor",
-            sources={"angles": "median angles of the recorded points"},
+            sources={"angles": "median angles of the recorded points"} | _origin_sources(lasers),
             **known,
-            firings_per_turn=firings_per_turn(recorded.read(number)),
+            firings_per_turn=firings_per_turn(recorded.read(number), recorded.lasers),
             rate_hz=self.rate_hz,
             range_m=(0.0, float(np.ceil(1.1 * sweeps.coverage.max_range_m))),
-            beams={"elevation_deg": elevation_deg.tolist()},
+            beams=_beam_table(lasers),
         )
+
+
+def _beam_table(lasers: RingLasers) -> dict[str, Any]:
+    """Return the `beams` of a sensor model, from the lowest ring to the highest."""
+    order = np.arange(len(lasers))[::-1]
+    table = {"elevation_deg": np.degrees(lasers.elevation_rad[order]).round(3).tolist()}
+    if not lasers.is_at_origin:
+        forward = np.zeros(len(lasers))
+        origins_m = lasers.positions(forward, lasers.elevation_rad[order], order)
+        table["origin_m"] = (origins_m.round(_ORIGIN_DECIMALS) + 0.0).tolist()
+    return table
+
+
+def _origin_sources(lasers: RingLasers) -> dict[str, str]:
+    """Return the source of the laser positions, if these are known."""
+    if lasers.is_at_origin:
+        return {}
+    return {"origins": "angles of the recorded points as a function of the range"}
 
 
 def fit_sensor(
@@ -792,7 +816,8 @@ def _fit_to_sweeps(
         sweep = recorded.read(number)
         return with_points(sweep, sweeps.align(sweep, number).points)
 
-    is_compensated = sweeps.alignment.motion is Motion.COMPENSATED
+    # The pulses of lasers at different positions have firing poses of their own.
+    is_compensated = sweeps.alignment.motion is Motion.COMPENSATED and recorded.lasers.is_at_origin
     recording = Recording(
         sweeps.name,
         len(chosen),

@@ -2,7 +2,8 @@
 
 The rays of a sweep form a range image. A point of another sweep is in front of, among, or behind
 the surfaces in the image around its direction. If the point is in front of them, a ray passed
-through its position, so the point was on an object that moved.
+through its position, so the point was on an object that moved. Directions and ranges are as seen
+from the laser whose ray is closest to the point.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
 
 from ..clouds.rings import elevations
 from .alignment import AlignedSweeps
+from .lasers import RingLasers
 
 _COLUMNS = 1024  # number of image columns, more than the pulses per ring of nearly all sensors
 _ROW_RAD = np.radians(0.5)  # height of an image row for a sensor without rings
@@ -25,6 +27,7 @@ _TOLERANCE_M = 0.2
 _TOLERANCE_PER_M = 0.01
 # Offsets of the earlier and later sweeps that a sweep is compared with, in sweeps.
 _OFFSETS = (1, 2, 3, 5, 8, 13, 21, 34)
+_LASER_ROUNDS = 2  # iterations of determining the laser whose ray is closest to a point
 _MIN_PASSING = 2  # From this number of passing rays, a tie counts as motion.
 
 
@@ -36,31 +39,31 @@ class RangeImage:
     to an edge is neither in front of nor behind it.
     """
 
-    edges_rad: Floats  # (r - 1,), negated elevations of the boundaries between rows, ascending
+    lasers: RingLasers  # of the rows, from the highest to the lowest
     limits_rad: tuple[float, float]  # lowest and highest elevation of the rays
     nearest_m: Floats32  # (r, c), inf without a return
     farthest_m: Floats32  # (r, c), -inf without a return
 
     @classmethod
-    def from_points(cls, points: Floats, row_elevation_rad: Floats) -> RangeImage:
+    def from_points(cls, points: Floats, lasers: RingLasers) -> RangeImage:
         """Create a range image from points in sensor coordinates.
 
-        The points have shape (n, 3). The row elevations have shape (r,), highest first.
+        The points have shape (n, 3). The image has a row for each laser, and the highest is first.
         """
         from scipy.ndimage import maximum_filter, minimum_filter
 
-        edges_rad = -(row_elevation_rad[1:] + row_elevation_rad[:-1]) / 2
-        shape = (len(row_elevation_rad), _COLUMNS)
-        cells = _cells(points, edges_rad)
-        range_m = np.linalg.norm(points, axis=1).astype(np.float32)
+        shape = (len(lasers), _COLUMNS)
+        cells, _, range_m = _locate(points, lasers)
+        range_m = range_m.astype(np.float32)
         nearest = np.full(shape, np.inf, np.float32)
         farthest = np.full(shape, -np.inf, np.float32)
         np.minimum.at(nearest, cells, range_m)
         np.maximum.at(farthest, cells, range_m)
         modes = ("nearest", "wrap")
-        limits = row_elevation_rad[-1] - _MARGIN_RAD, row_elevation_rad[0] + _MARGIN_RAD
+        elevation_rad = lasers.elevation_rad
+        limits = elevation_rad[-1] - _MARGIN_RAD, elevation_rad[0] + _MARGIN_RAD
         return cls(
-            edges_rad,
+            lasers,
             (float(limits[0]), float(limits[1])),
             minimum_filter(nearest, 3, mode=modes),
             maximum_filter(farthest, 3, mode=modes),
@@ -72,9 +75,7 @@ class RangeImage:
         Return two masks of shape (n,). The first marks points that a ray passed through, and the
         second marks points that the image confirms.
         """
-        elevation = elevations(points)
-        cells = _cells(points, self.edges_rad)
-        range_m = np.linalg.norm(points, axis=1)
+        cells, elevation, range_m = _locate(points, self.lasers)
         tolerance_m = _TOLERANCE_M + _TOLERANCE_PER_M * range_m
         nearest = self.nearest_m[cells]
         low, high = self.limits_rad
@@ -84,10 +85,20 @@ class RangeImage:
         return passing, observed & ~passing & ~behind
 
 
-def _cells(points: Floats, edges_rad: Floats) -> tuple[Ints, Ints]:
-    turns = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
-    rows = np.searchsorted(edges_rad, -elevations(points))
-    return rows, (turns * _COLUMNS).astype(np.int64) % _COLUMNS
+def _locate(points: Floats, lasers: RingLasers) -> tuple[tuple[Ints, Ints], Floats, Floats]:
+    """Return the image cells, elevations and ranges of points as seen from the closest lasers."""
+    edges_rad = -(lasers.elevation_rad[1:] + lasers.elevation_rad[:-1]) / 2
+    elevation = elevations(points)
+    rows = np.searchsorted(edges_rad, -elevation)
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    if not lasers.is_at_origin:
+        for _ in range(_LASER_ROUNDS):
+            azimuth, elevation = lasers.angles(points, rows)
+            rows = np.searchsorted(edges_rad, -elevation)
+    range_m = lasers.ranges(points, rows)
+    turns = azimuth / (2 * np.pi) + 0.5
+    columns = np.floor(turns * _COLUMNS).astype(np.int64) % _COLUMNS
+    return (rows, columns), elevation, range_m
 
 
 def find_stationary_points(sweeps: AlignedSweeps, numbers: Sequence[int]) -> dict[int, Bools]:
@@ -96,14 +107,14 @@ def find_stationary_points(sweeps: AlignedSweeps, numbers: Sequence[int]) -> dic
     `numbers` are the sweeps to compare with each other, in ascending order. The masks have shape
     (n,).
     """
-    row_elevation_rad = sweeps.recorded.elevation_rad
-    if not len(row_elevation_rad):
+    lasers = sweeps.recorded.lasers.sort_by_elevation()
+    if not len(lasers):
         elevation = np.concatenate([elevations(sweeps.read(number).points) for number in numbers])
         high = float(elevation.max())
-        row_elevation_rad = np.arange(high, float(elevation.min()) - _ROW_RAD, -_ROW_RAD)
+        rows_rad = np.arange(high, float(elevation.min()) - _ROW_RAD, -_ROW_RAD)
+        lasers = RingLasers.at_origin(rows_rad)
     images = {
-        number: RangeImage.from_points(sweeps.read(number).points, row_elevation_rad)
-        for number in numbers
+        number: RangeImage.from_points(sweeps.read(number).points, lasers) for number in numbers
     }
     masks = {}
     for index, number in enumerate(numbers):

@@ -180,7 +180,7 @@ def simulate_held_out(
     parts = []
     pulses = {}
     for number in numbers:
-        sweep, lost = sweeps.read_with_lost(number)
+        sweep, lost = sweeps.read_pulses(number)
         pulses[number] = sweep, lost
         no_ranges = np.full(len(lost.points), np.nan)
         no_points = np.zeros(len(lost.points), bool)

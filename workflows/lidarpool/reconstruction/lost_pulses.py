@@ -16,7 +16,7 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 
-from ..clouds.rings import elevations
+from .lasers import RingLasers
 from .recorded_sweeps import RecordedSweeps, ring_starts
 
 _MIN_STEPS = 1.6  # minimum gap in steps, since motion within a sweep stretches steps
@@ -36,7 +36,7 @@ _MIN_RINGS = 0.05  # minimum share of rings with returns in a sector that receiv
 
 
 def lost_pulses(
-    sweep: Sweep, elevation_rad: Floats, coverage: SensorCoverage, moved_m: float
+    sweep: Sweep, lasers: RingLasers, coverage: SensorCoverage, moved_m: float
 ) -> tuple[Sweep, Floats]:
     """Find the pulses of a sweep that were lost.
 
@@ -44,9 +44,8 @@ def lost_pulses(
     ----------
     sweep
         The returns.
-    elevation_rad
-        Elevations of the rings in radians, of shape (r,). Empty for a sensor without rings, whose
-        lost pulses are unknown.
+    lasers
+        Lasers of the rings. Empty for a sensor without rings, whose lost pulses are unknown.
     coverage
         Directions in which the sensor can have returns.
     moved_m
@@ -56,32 +55,31 @@ def lost_pulses(
     Returns
     -------
     tuple
-        The k lost pulses as points at a range of one meter, without intensities, and the ranges of
-        the surfaces at their gaps. The ranges have shape (k,) and are in meters. They are NaN if
+        The k lost pulses as points one meter from their lasers, without intensities, and the ranges
+        of the surfaces at their gaps. The ranges have shape (k,) and are in meters. They are NaN if
         the gap is wide or lies between different surfaces.
     """
-    if not len(elevation_rad) or len(sweep) < _MIN_RETURNS:
+    if not len(lasers) or len(sweep) < _MIN_RETURNS:
         return sweep.select(slice(0)), np.empty(0)
-    gaps = _Gaps.from_sweep(sweep)
+    gaps = _Gaps.from_sweep(sweep, lasers)
     lost = gaps.between(moved_m)
-    silent = np.setdiff1d(np.arange(len(elevation_rad)), gaps.ring)
+    if lasers.have_constant_elevations:
+        lost = lost._replace(elevation=lasers.elevation_rad[lost.ring])
+    silent = np.setdiff1d(np.arange(len(lasers)), gaps.ring)
     circle = np.arange(-np.pi, np.pi, np.median(gaps.step_rad))
     azimuth = np.append(lost.azimuth, np.tile(circle, len(silent)))
-    elevation = np.append(lost.elevation, elevation_rad[silent].repeat(len(circle)))
+    elevation = np.append(lost.elevation, lasers.elevation_rad[silent].repeat(len(circle)))
     ring = np.append(lost.ring, silent.repeat(len(circle)))
     range_m = np.append(lost.range_m, np.full(len(silent) * len(circle), np.nan))
-    level = np.cos(elevation)
-    directions = np.stack(
-        [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1
-    )
     columns: dict[str, AnyArray] = {"row": ring}
     if "time_s" in sweep.columns:
         columns["time_s"] = _times_s(sweep, azimuth)
     if "start_rad" in sweep.columns:
-        columns["start_rad"] = ring_starts(sweep, len(elevation_rad))[ring]
-    pulses = Sweep(directions, columns)
-    received = _received(gaps, len(elevation_rad))[_sectors(azimuth)]
-    chosen = received & coverage.cells[_cells(pulses)]
+        columns["start_rad"] = ring_starts(sweep, len(lasers))[ring]
+        columns["azimuth_rad"] = azimuth
+    pulses = Sweep(lasers.ends(azimuth, elevation, ring, np.ones(len(ring))), columns)
+    received = _received(gaps, len(lasers))[_sectors(azimuth)]
+    chosen = received & coverage.cells[_cells(azimuth, ring)]
     return pulses.select(chosen), range_m[chosen]
 
 
@@ -94,9 +92,9 @@ def _times_s(sweep: Sweep, azimuth: Floats) -> Floats:
     return np.asarray(sweep.columns["time_s"][order[index]])
 
 
-def firings_per_turn(sweep: Sweep) -> int:
+def firings_per_turn(sweep: Sweep, lasers: RingLasers) -> int:
     """Return the number of firings per revolution, derived from the typical azimuth step."""
-    return round(2 * np.pi / float(np.median(_Gaps.from_sweep(sweep).step_rad)))
+    return round(2 * np.pi / float(np.median(_Gaps.from_sweep(sweep, lasers).step_rad)))
 
 
 class _Lost(NamedTuple):
@@ -112,9 +110,12 @@ class _Lost(NamedTuple):
 
 
 class _Gaps(NamedTuple):
-    """Returns of a sweep sorted by ring and azimuth, and the gaps between these returns."""
+    """Returns of a sweep sorted by ring and azimuth, and the gaps between these returns.
 
-    azimuth: Floats  # (n,), radians
+    Angles and ranges are as seen from the lasers.
+    """
+
+    azimuth: Floats  # (n,), radians, not reduced to a revolution
     elevation: Floats  # (n,), radians
     range_m: Floats  # (n,), meters
     ring: Ints  # (n,)
@@ -123,8 +124,8 @@ class _Gaps(NamedTuple):
     step_rad: Floats  # (n,), azimuth step between consecutive pulses of the ring
 
     @classmethod
-    def from_sweep(cls, sweep: Sweep) -> _Gaps:
-        azimuth = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
+    def from_sweep(cls, sweep: Sweep, lasers: RingLasers) -> _Gaps:
+        azimuth, elevation = lasers.angles(sweep.points, sweep.columns["row"])
         order = np.lexsort((azimuth, sweep.columns["row"]))
         azimuth = azimuth[order]
         ring = sweep.columns["row"][order]
@@ -137,14 +138,12 @@ class _Gaps(NamedTuple):
         gap_rad[lasts] += 2 * np.pi
         # In some sensors, certain rings fire at half the rate of the others. A ring with few
         # returns is uninformative.
-        parts = np.split(gap_rad, starts[1:])
-        steps_rad = np.array([_step_rad(part) for part in parts])
+        steps_rad = np.array([_step_rad(part) for part in np.split(gap_rad, starts[1:])])
         typical_rad = float(np.median(steps_rad[counts >= counts.max() / 2]))
         is_known = (counts >= _MIN_RETURNS) & (steps_rad < _MAX_STEPS * typical_rad)
         step_rad = np.where(is_known, steps_rad, typical_rad).repeat(counts)
-        elevation = elevations(sweep.points)[order]
-        range_m = np.linalg.norm(sweep.points, axis=1)[order]
-        return cls(azimuth, elevation, range_m, ring, following, gap_rad, step_rad)
+        range_m = lasers.ranges(sweep.points[order], ring)
+        return cls(azimuth, elevation[order], range_m, ring, following, gap_rad, step_rad)
 
     def between(self, moved_m: float) -> _Lost:
         """Return the pulses that were lost within gaps."""
@@ -211,7 +210,9 @@ class SensorCoverage(NamedTuple):
         for number in numbers:
             sweep = sweeps.read(number)
             cells = np.zeros_like(returned, bool)
-            cells[_cells(sweep)] = True
+            ring = sweep.columns["row"]
+            azimuth, _ = sweeps.lasers.angles(sweep.points, ring)
+            cells[_cells(azimuth, ring)] = True
             returned += cells
             if len(sweep):
                 max_range_m = max(max_range_m, float(np.linalg.norm(sweep.points, axis=1).max()))
@@ -222,6 +223,6 @@ class SensorCoverage(NamedTuple):
         return cls(returned > least[:, None], max_range_m)
 
 
-def _cells(sweep: Sweep) -> tuple[Ints, Ints]:
-    turns = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi) + 0.5
-    return sweep.columns["row"], (turns * _COLUMNS).astype(np.int64) % _COLUMNS
+def _cells(azimuth: Floats, ring: Ints) -> tuple[Ints, Ints]:
+    turns = azimuth / (2 * np.pi) + 0.5
+    return ring, np.floor(turns * _COLUMNS).astype(np.int64) % _COLUMNS

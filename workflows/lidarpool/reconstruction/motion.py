@@ -5,6 +5,10 @@ motion-compensated, in the sensor frame at the start of the sweep. Files do not 
 compensation of a point as fired is a fraction of the motion to the next or from the previous sweep.
 The fraction follows from the time of the point relative to the timestamp of the sweep or, without
 point times, from its azimuth. The pose of a sweep is valid at its timestamp.
+
+The timestamp is that of the first point, or that of the middle of the sweep, as in KITTI: a camera
+is triggered when the sensor faces forward, and the points are sorted from this azimuth on, although
+the sweep begins and ends at the back.
 """
 
 from __future__ import annotations
@@ -25,11 +29,23 @@ class Motion(StrEnum):
     TIMED = "as fired, with point times"
     COUNTERCLOCKWISE = "as fired, counterclockwise"
     CLOCKWISE = "as fired, clockwise"
+    CENTERED_COUNTERCLOCKWISE = "as fired, counterclockwise, timestamps in the middle of sweeps"
+    CENTERED_CLOCKWISE = "as fired, clockwise, timestamps in the middle of sweeps"
 
     @property
     def is_turning(self) -> bool:
         """Whether firing times are derived from azimuths."""
-        return self in (Motion.COUNTERCLOCKWISE, Motion.CLOCKWISE)
+        return self not in (Motion.COMPENSATED, Motion.TIMED)
+
+    @property
+    def is_clockwise(self) -> bool:
+        """Whether firing times are derived from azimuths, assuming a clockwise rotation."""
+        return self in (Motion.CLOCKWISE, Motion.CENTERED_CLOCKWISE)
+
+    @property
+    def is_centered(self) -> bool:
+        """Whether the timestamps are those of the middle of the sweeps."""
+        return self in (Motion.CENTERED_COUNTERCLOCKWISE, Motion.CENTERED_CLOCKWISE)
 
     def times_s(self, sweep: Sweep, sweep_s: float) -> Floats | None:
         """Return the time of each point in seconds, relative to the sweep's timestamp.
@@ -40,10 +56,14 @@ class Motion(StrEnum):
             return sweep.columns.get("time_s")
         if self is Motion.COMPENSATED:
             return None
-        azimuth = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
+        azimuth = sweep.columns.get("azimuth_rad")  # of lost pulses, which have no position
+        if azimuth is None:
+            azimuth = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
         turn: Floats = ((azimuth - sweep.columns["start_rad"]) / (2 * np.pi)) % 1
-        if self is Motion.CLOCKWISE:
+        if self.is_clockwise:
             turn = -turn % 1  # The first points are at 0, not at 1.
+        if self.is_centered:
+            turn = (turn + 0.5) % 1 - 0.5
         return turn * sweep_s
 
 

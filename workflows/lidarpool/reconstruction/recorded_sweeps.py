@@ -26,6 +26,7 @@ from ..clouds.rings import MIN_RINGS, Rings, elevations, summarize_rings
 from ..comparing.lidar4d import WINDOWS, Window
 from ..recordings.opening import open_recording
 from .labels import labels_of
+from .lasers import RingLasers
 
 _COLUMNS = {"channel", "class", "object", *STRENGTHS, *TIMES}  # columns that are used
 _GAP_RAD = np.radians(0.5)  # angle between rays over many sweeps, for sensors without rings
@@ -92,12 +93,15 @@ class RecordedSweeps:
         Unit and clock of the point times, or None if the points have no times.
     stamps_s
         Timestamps of the sweeps in seconds, float64 of shape (s,), or None if there are none.
+    lasers
+        Positions and directions of the lasers of the rings.
     """
 
     source: RecordingSelection | Recording
     rings: Rings
     point_times: PointTimes | None
     stamps_s: Floats | None
+    lasers: RingLasers
     _kept: dict[int, Sweep] = field(default_factory=dict)
 
     @classmethod
@@ -136,7 +140,8 @@ class RecordedSweeps:
             raise LidarError(
                 f"{recording.name} contains no points, so there is nothing to reconstruct."
             )
-        return cls(recording, rings, recording.point_times, _stamps_s(recording))
+        lasers = _lasers(recording, rings)
+        return cls(recording, rings, recording.point_times, _stamps_s(recording), lasers)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state to send to another process, whose working directory may differ."""
@@ -165,11 +170,11 @@ class RecordedSweeps:
 
     @property
     def elevation_rad(self) -> Floats:
-        """Median elevation of each ring, from the highest to the lowest.
+        """Elevation of the beam of each ring in radians, from the highest ring to the lowest.
 
         The array has shape (r,).
         """
-        return self.rings.elevation_rad
+        return self.lasers.elevation_rad
 
     @property
     def ring_count(self) -> int:
@@ -326,6 +331,18 @@ def _wide(sweep: Sweep) -> Sweep:
 def _exact32(values: AnyArray) -> AnyArray:
     single = values.astype(np.float32)
     return single if np.array_equal(single, values, equal_nan=True) else values
+
+
+def _lasers(recording: Recording, rings: Rings) -> RingLasers:
+    """Determine the lasers of the rings from a few sweeps, without motion compensation."""
+    if not len(rings):
+        return RingLasers.at_origin(rings.elevation_rad)
+    numbers = even_indices(len(recording), _REFERENCE_SWEEPS).tolist()
+    sweeps = [recording.read_fired(number) for number in numbers]
+    used = [(sweep.points, rings.ring_indices(sweep)) for sweep in sweeps if len(sweep)]
+    lasers = RingLasers.from_sweeps(used, rings.elevation_rad)
+    # The sweeps to reconstruct are motion-compensated, unlike the ones that were used.
+    return lasers if recording.fired is None else replace(lasers, spread_rad=float("inf"))
 
 
 def _has_points(recording: Recording) -> bool:
