@@ -8,15 +8,18 @@ import pytest
 import lidarpool
 from lidarpool import (
     Actor,
+    Augment,
     Beams,
     Campaign,
     CampaignRun,
     Cloud,
     Column,
+    Effects,
     Fault,
     Follower,
     Gnss,
     Imu,
+    Insertion,
     Job,
     Material,
     Mounted,
@@ -51,6 +54,9 @@ SCENE = Scene.from_meshes([MESH])
 PLANNING = Planning((0, 0), (10, 0), centers=[(5, 0)] * 100, radii=2.0)
 THINGS = [
     Actor(MESH, TRACK),
+    Augment(rain_mm_h=25, model=SENSOR),
+    Effects(actors=(Actor(MESH, TRACK),) * 9, insertions=(Insertion(MESH, 1, 2),) * 9),
+    Insertion(MESH, 12, 3, heading_deg=90, class_name="car"),
     Beams.even(128, 40),
     Campaign(lambda number, rng: Job(SCENE, SURVEY), 3),
     CampaignRun(tuple(range(1000)), 3, 1000, 1000, 1.2, 0, 1.3, sensors={"a": "x" * 99}),

@@ -16,6 +16,7 @@ from lidarsim.scene.actors import Actor
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.schema.checks import check_fields
 from lidarsim.schema.declared import declared_values
+from lidarsim.schema.value_texts import one_line
 from lidarsim.sensor import Noise
 from lidarsim.sensor.optics import Mode
 from lidarsim.survey.faults import Fault
@@ -27,7 +28,7 @@ from ..scenario.scenario import Scenario
 from .recorded_sections import check_content, check_sections, check_spray, effect_errors
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Insertion:
     """A stationary object that is placed relative to the sensor in the first sweep.
 
@@ -53,11 +54,13 @@ class Insertion:
     heading_deg: float = 0.0
     class_name: str = ""
 
+    __repr__ = one_line
+
     def __post_init__(self) -> None:
         check_fields(self)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Effects:
     """Effects that are simulated on recorded sweeps.
 
@@ -98,6 +101,8 @@ class Effects:
     classes: Mapping[int, str] = field(default_factory=dict)
     seed: int = 0
     notes: tuple[str, ...] = field(default=(), compare=False)
+
+    __repr__ = one_line
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -163,6 +163,11 @@ class Augment:
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_states": {}}
 
+    def __repr__(self) -> str:
+        reference = "" if self._reference is None else ", with a reference"
+        sensor = "" if self.model is None else f", {self.model.model}"
+        return f"<Augment{sensor}, columns {', '.join(self.columns) or 'none'}{reference}>"
+
     @overload
     def __call__(self, points: Sweep, seed: int = 0) -> Sweep: ...
 
