@@ -382,3 +382,26 @@ def test_a_recording_in_snow_is_noted(scene, sensor):
     assert any("are isolated, as in rain" in n for n in Augmenter(snowy, effects, sensor).notes)
     clear = recording_of(scan(scene, sensor))
     assert not any("isolated" in note for note in Augmenter(clear, effects, sensor).notes)
+
+
+def test_a_model_with_fewer_channels_is_refused(clear):
+    effects = Effects(weather=Weather(snow_mm_h=1.0))
+    with pytest.raises(LidarError, match="rings, but Velodyne VLP-16 has 16 channels"):
+        Augmenter(clear, effects, load_sensor("velodyne/vlp16"))
+
+
+def test_classes_have_the_numbers_of_the_recording(clear, sensor):
+    def read(number):
+        sweep = clear.read(number)
+        return sweep.replace(columns={**sweep.columns, "class": np.zeros(len(sweep), np.uint16)})
+
+    named = replace(clear, read=read, read_classes=lambda: {10: "car", 40: "road"})
+    car = Effects(insertions=(Insertion(CAR, 12, -3, class_name="car"),))
+    result = Augmenter(named, car, sensor).sweep(0)
+    assert {*result.sweep.columns["class"][~result.is_recorded].tolist()} == {10}
+    lorry = Effects(insertions=(Insertion(CAR, 12, -3, class_name="lorry"),))
+    with pytest.raises(LidarError, match="Unknown class 'lorry'"):
+        Augmenter(named, lorry, sensor)
+    unnamed = replace(clear, read=read)
+    notes = Augmenter(unnamed, car, sensor).notes
+    assert any("does not state the numbers of its classes" in note for note in notes)

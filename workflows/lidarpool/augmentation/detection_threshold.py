@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidarsim.media.materials import normal_incidence_energy
 from lidarsim.numerics.arrays import AnyArray, Floats
 from lidarsim.sensor.noise import TARGET_REFLECTANCE
 from lidarsim.sensor.sensor import Sensor
@@ -13,6 +14,9 @@ from lidarsim.words import format_rounded
 
 from .intensity_fit import range_of_energy, weakest_energy
 from .intensity_scale import IntensityScale
+
+# Maximum range of the sensor relative to the largest recorded range, if its model is unknown.
+_MAX_RATIO = 2.0
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,13 @@ def detection_threshold(
         energies = scale.energies(intensity, range_m)
         energy = weakest_energy(energies, range_m, scale.step_energies(range_m))
         source = "estimated from the weakest returns"
+        limit_m = _MAX_RATIO * float(np.max(range_m))
+        if model is not None and np.isfinite(model.max_range_m):
+            limit_m = model.max_range_m
+        lowest = TARGET_REFLECTANCE * float(normal_incidence_energy(limit_m))
+        if energy < lowest:
+            energy = lowest
+            source = "limited by the largest range"
     else:
         return DetectionThreshold(0.0, np.inf, False, "There are no returns, so none are lost.")
     distance = range_of_energy(energy, TARGET_REFLECTANCE)

@@ -19,7 +19,7 @@ from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.simulator.recorded_sweeps import FiredPulses, PulseAugmenter, scene_of_bodies
 from lidarsim.simulator.returns import PulseReturns
-from lidarsim.words import did_you_mean
+from lidarsim.words import did_you_mean, join_names
 
 from ..clouds.boxes import SweepBoxes
 from ..clouds.recording import Recording
@@ -97,17 +97,18 @@ class InsertedObjects:
             insertion.class_name or _type(insertion.mesh.name) for insertion in effects.insertions
         ]
         types += [_type(actor.name) for actor in actors]
+        classes, class_notes = _classes(effects, types, names, recording)
         bounds = [_bounds(insertion.mesh) for insertion in effects.insertions]
         bounds += [_bounds(actor.mesh) for actor in actors]
         return cls(
             scene_of_bodies(tuple(meshes), actors),
             tuple(names),
             tuple(types),
-            _classes(effects, types, names),
+            classes,
             effects.materials,
             np.array(bounds),
             placed,
-            tuple(notes),
+            (*notes, *class_notes),
         )
 
     @property
@@ -267,26 +268,44 @@ def _bounds(mesh: SceneMesh) -> Floats:
     return np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)])
 
 
-def _classes(effects: Effects, types: list[str], names: list[str]) -> tuple[int, ...]:
-    """Return the class number of each object."""
-    numbers = {name: number for number, name in effects.classes.items()}
-    insertion_count = len(effects.insertions)
+def _classes(
+    effects: Effects, types: list[str], names: list[str], recording: Recording
+) -> tuple[tuple[int, ...], list[str]]:
+    """Return the class number of each object, and notes about classes without a number.
+
+    Raises
+    ------
+    LidarError
+        If a class is unknown although the classes of the recording have names.
+    """
+    numbers = {name: number for number, name in {**recording.classes, **effects.classes}.items()}
     result = []
+    unknown = []
     for index, (kind, name) in enumerate(zip(types, names, strict=True)):
         material = next(
             (m for m in effects.materials if m.semantic_class is not None and _selects(m, name)),
             None,
         )
-        if index < insertion_count and effects.insertions[index].class_name:
-            if numbers and kind not in numbers and not kind.isdigit():
+        if index < len(effects.insertions) and effects.insertions[index].class_name:
+            is_number = kind.isdecimal()
+            if numbers and kind not in numbers and not is_number:
                 hint = did_you_mean(kind, numbers) or f" Known classes: {', '.join(numbers)}."
                 raise LidarError(f"Unknown class {kind!r} of the inserted object {name!r}.{hint}")
-            result.append(numbers.get(kind, int(kind) if kind.isdigit() else 0))
+            if not numbers and not is_number:
+                unknown.append(kind)
+            result.append(int(kind) if is_number else numbers.get(kind, 0))
         elif material is not None:
             result.append(int(material.semantic_class))
         else:
             result.append(0)
-    return tuple(result)
+    if not unknown or "class" not in recording[0].columns:
+        return tuple(result), []
+    note = (
+        f"{recording.name} does not state the numbers of its classes, so the points of the class "
+        f"{join_names(sorted({*unknown}))} have class 0. Pass a number, for example `--class 10`, "
+        "or set `classes` in an effects file."
+    )
+    return tuple(result), [note]
 
 
 def _selects(material: Material, name: str) -> bool:

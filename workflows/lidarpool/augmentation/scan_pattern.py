@@ -16,11 +16,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from lidarsim.columns.sweep import Sweep
+from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import Bools, Floats, Integers, Ints, to_writable
 from lidarsim.numerics.elementary import arctan2, sin_cos
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.numerics.vectors import hypot
 from lidarsim.sensor import Sensor
+from lidarsim.words import plural
 
 from ..clouds.recording import Recording
 from ..clouds.rings import Rings
@@ -397,6 +399,7 @@ class ScanPattern:
         ]
         max_range_m = max((float(_ranges(sweep.points).max()) for sweep in sweeps), default=1.0)
         period_s = _period_s(recording)
+        _check_model(recording, model)
         pattern = None
         if sweeps:
             channels = Channels.from_rings(recording.rings, model, sweeps)
@@ -446,6 +449,17 @@ class ScanPattern:
         return PulseGrid(
             lambda ray: directions[ray // channels], times_s, fired, cell, range_m, rows
         )
+
+
+def _check_model(recording: Recording, model: Sensor | None) -> None:
+    """Raise LidarError if a recording has more rings than its sensor model has channels."""
+    rings = len(recording.rings)
+    if model is None or not rings or rings <= model.channels:
+        return
+    raise LidarError(
+        f"{recording.name} has {rings} rings, but {model.model} has "
+        f"{plural(model.channels, 'channel')}. Pass the model of the sensor that was used."
+    )
 
 
 def _elevations_from(origin: Floats, rings: Rings, sweeps: Sequence[Sweep]) -> Floats:

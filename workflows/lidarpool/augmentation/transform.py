@@ -14,8 +14,10 @@ from lidarsim.columns.column_names import standard_names
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.media.weather import Weather
+from lidarsim.motion.trajectory import Track
 from lidarsim.numerics.arrays import AnyArray
 from lidarsim.numerics.even_samples import even_indices
+from lidarsim.scene.actors import Actor
 from lidarsim.schema.checks import check_number
 from lidarsim.sensor import Sensor
 from lidarsim.sensor.models import load_sensor, read_model
@@ -223,7 +225,8 @@ class Augment:
                 f"{join_names(self.columns) or 'no further columns'}, but have the shape "
                 f"{points.shape}. Pass the names of the columns as `columns`."
             )
-        columns = {name: points[:, 3 + k] for k, name in enumerate(self.columns)}
+        # In double precision, values from files are not exact multiples of their steps.
+        columns = {name: points[:, 3 + k].astype(np.float32) for k, name in enumerate(self.columns)}
         augmented = self._augment(Sweep(points[:, :3].astype(np.float64), columns), seed).sweep
         values = [augmented.columns[name] for name in self._standard_names]
         return np.column_stack([augmented.points, *values]).astype(points.dtype)
@@ -315,11 +318,20 @@ def _check_constant(effects: Effects) -> None:
                 "`from_s` and `to_s`."
             )
     for actor in effects.actors:
-        if actor.trajectory.moves:
+        if _moves(actor):
             raise LidarError(
                 f"Actor {actor.name!r} moves, but a transform augments single sweeps, which have "
                 "no time. Use `augment` on the recording, or set `at` instead of `trajectory`."
             )
+
+
+def _moves(actor: Actor) -> bool:
+    """Return whether the pose of an actor changes. An actor with `at` has a constant track."""
+    track = actor.trajectory
+    if not track.moves or not isinstance(track, Track):
+        return track.moves
+    turns = track.quaternions is not None and np.ptp(track.quaternions, axis=0).any()
+    return bool(turns or np.ptp(track.positions, axis=0).any())
 
 
 def _reference_sweeps(

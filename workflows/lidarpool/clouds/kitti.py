@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ from .recording import Recording, RecordingSource, sweep_from_columns
 _MATRIX_NUMBERS = [f"m{row}{column}" for row in range(3) for column in range(4)]
 MAX_INSTANCES = 65_535
 CALIBRATION_FILE = "calib.txt"
+CLASS_FILE = "semantic-kitti.yaml"
 # Rotation from a level sensor to a KITTI camera, whose axes point to the right, down and forward.
 _CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 _FILE_PATTERN = (
@@ -192,7 +194,7 @@ class KITTI(MultiFileFormat):
         labels = {0: "unlabeled", **classes}
         colors = {number: [number * step % 256 for step in (37, 91, 151)] for number in labels}
         content = {"labels": labels, "color_map": colors}
-        return {"semantic-kitti.yaml": yaml.safe_dump(content, allow_unicode=True).encode()}
+        return {CLASS_FILE: yaml.safe_dump(content, allow_unicode=True).encode()}
 
 
 def kitti_intensity(points: Cloud) -> Floats32:
@@ -330,9 +332,22 @@ def _sequence(source: RecordingSource, folder: Path, points: Path, name: str = "
         read,
         read_stamps=None if times_ns is None else times_ns.tolist,
         notes=source.prefix_notes(notes),
+        read_classes=partial(_class_names, folder),
         sequence=name,
         calibration=calibration,
     )
+
+
+def _class_names(sequence: Path) -> dict[int, str]:
+    """Read the names of classes from the class file of a data set, if there is one."""
+    for folder in (sequence, *sequence.absolute().parents[:2]):
+        if (folder / CLASS_FILE).exists():
+            content = yaml.safe_load(read_input_text(folder / CLASS_FILE))
+            labels = content.get("labels") if isinstance(content, dict) else None
+            if not isinstance(labels, dict):
+                raise ValueError(f"{CLASS_FILE} has no section `labels` with the names of classes")
+            return {int(number): str(label) for number, label in labels.items()}
+    return {}
 
 
 def lidar_poses(rows: Floats, calibration: Path) -> Floats:

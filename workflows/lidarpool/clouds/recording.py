@@ -78,6 +78,9 @@ class Recording:
     read_poses
         Function that returns the poses of all sweeps in the world frame, with shape (count, 4, 4).
         It returns None if a pose is unknown. It is faster than reading every sweep.
+    read_classes
+        Function that returns the names of the semantic classes by number, or None if the format
+        does not store them.
     fired
         Function that returns the sweep with a given number as fired, including its `firing_poses`.
         None if the firing poses are unknown, as in most recordings from real sensors.
@@ -127,6 +130,7 @@ class Recording:
     intensity_column: str | None = None
     read_stamps: Callable[[], Iterable[float]] | None = None
     read_poses: Callable[[], Floats | None] | None = None
+    read_classes: Callable[[], Mapping[int, str]] | None = None
     fired: Callable[[int], Sweep] | None = None
     sample: Callable[[int], Sweep] | None = None
     compensated: bool | None = None
@@ -293,6 +297,14 @@ class Recording:
                 return None
             poses.append(pose)
         return np.array(poses, np.float64).reshape(-1, 4, 4)
+
+    @cached_property
+    def classes(self) -> Mapping[int, str]:
+        """Names of the semantic classes by number, as far as the recording states them."""
+        if self.read_classes is None:
+            return {}
+        with reading(self.name):
+            return self.read_classes()
 
     @cached_property
     def stamps_ns(self) -> Floats | None:

@@ -45,6 +45,8 @@ from ..writing import ExportSpec
 from .layouts import EXTRA_FIELDS, LAYOUTS, MessageLayout, message_stamp_ns, sensor_traits
 
 _UNSTAMPED = "has no timestamps, so the recording times are used instead"
+_LABEL_TOPIC = "/label_info"
+_LABELS = "vision_msgs/msg/LabelInfo"
 _MAX_DISTANCE_NS = 2e8  # maximum time between a sweep and the first or last pose
 
 
@@ -336,9 +338,22 @@ def _open_bag(source: RecordingSource) -> Recording:
         connection.msgcount,
         read_stamps=read_stamps,
         read_poses=read_poses,
+        read_classes=lambda: _class_names(bags()),
         notes=source.prefix_notes(unstamped),
         compensated=_stated_compensation(source.path),
     )
+
+
+def _class_names(bag: Any) -> dict[int, str]:
+    """Return the names of classes from the first message on `/label_info`, if there is one."""
+    from .messages import message_store
+
+    connections = [c for c in bag.connections if c.topic == _LABEL_TOPIC and c.msgtype == _LABELS]
+    record = next(bag.messages(connections), None) if connections else None
+    if record is None:
+        return {}
+    message: Any = message_store().deserialize_cdr(record[2], _LABELS)
+    return {int(entry.class_id): str(entry.class_name) for entry in message.class_map}
 
 
 def _stated_compensation(path: Path) -> bool | None:
