@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import importlib.util
 import sys
 from pathlib import Path
@@ -32,6 +33,7 @@ from raybeam.compiled import compiled
 
 RECORDINGS = {"mcap": "cloud.mcap", "pcap": "packets"}  # {format: file, or folder of files}
 TRACES = {"osi": "trace_gt.osi", "osi_mcap": "trace.mcap"}  # {format: file}
+PACKED_TRACE = "packed_gt.osi.gz"
 TRAFFIC = """
 scene: seed
 sensor: {rays_per_revolution: 90, layers: 4, step_deg: 4}
@@ -73,6 +75,9 @@ def write_inputs(folder: Path, client: Client) -> list[Target]:
     for name, file in TRACES.items():
         save_cloud(result.cloud, traces / file, format=name)
         (traces / f"{name}.yaml").write_text(f"{TRAFFIC}traffic: {{file: {file}}}\n")
+    packed = gzip.compress((traces / TRACES["osi"]).read_bytes())
+    (traces / PACKED_TRACE).write_bytes(packed)
+    (traces / "osi_packed.yaml").write_text(f"{TRAFFIC}traffic: {{file: {PACKED_TRACE}}}\n")
     return [
         Target(recordings, {"recordings": read_recordings}, lambda file: file.suffix == ".mcap"),
         Target(recordings, {"recordings": read_recordings}, lambda file: file.suffix == ".pcap"),

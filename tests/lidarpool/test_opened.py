@@ -451,7 +451,7 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
     (tmp_path / "notes.txt").write_text("none")
     (tmp_path / "way.tum").write_text("0 1 2 3 0 0 0 1\n")
     (tmp_path / "empty").mkdir()
-    for name in ("run.rrd", "gt.osi"):
+    for name in ("run.rrd", "gt.osi", "gt.osi.gz"):
         (tmp_path / name).write_bytes(b"RRF2")
     mcap = (folder / "cloud.mcap").read_bytes()
     (tmp_path / "osi.mcap").write_bytes(mcap.replace(b"ros2", b"osi2", 1))
@@ -483,6 +483,7 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
             r"is not supported\. It is a Rerun recording\. Open it with the `rerun` command",
         ),
         ("gt.osi", r"is not supported\. It is an OSI trace\. Use it as the traffic of a scenario"),
+        ("gt.osi.gz", r"gt\.osi\.gz is not supported\. It is an OSI trace\. Use it as the traffic"),
         ("osi.mcap", "osi.mcap: it has no ROS 2 messages. Record PointCloud2, or set an OSI trace"),
         ("none.ply", "none.ply contains no points"),
         ("robot.xacro", "Expand it first"),

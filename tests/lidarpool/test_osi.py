@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gzip
 import struct
+import zlib
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -21,9 +23,11 @@ from lidarpool import (
     box,
     save_cloud,
 )
+from lidarpool.scenario.osi_trace import iter_ground_truth
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.columns.table import SCAN
+from lidarsim.io import allowance
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
@@ -302,6 +306,135 @@ def test_garbled_traces_are_read_or_refused(tmp_path):
             prepare(scenario(tmp_path, "a_gt.osi"))
         except LidarError as error:
             assert "\n" not in str(error)
+
+
+def compressed(trace):
+    """Compress a trace as esmini 3.4 does with --osi_compress: flushed after each message."""
+    packer = zlib.compressobj(1, wbits=31)
+    packed = b""
+    while trace:
+        end = 4 + struct.unpack_from("<I", trace)[0]
+        packed += packer.compress(trace[:end]) + packer.flush(zlib.Z_FULL_FLUSH)
+        trace = trace[end:]
+    return packed + packer.flush()
+
+
+@pytest.mark.parametrize("name", ["ground_truth.osi", "Town_GT.OSI", "town_gt.osi.gz", "a.OSI.gz"])
+@pytest.mark.parametrize("pack", [compressed, gzip.compress])
+def test_compressed_traces_have_the_same_actors(tmp_path, name, pack):
+    good = written(tmp_path / "plain.osi", truths()).read_bytes()
+    (tmp_path / name).write_bytes(pack(good))
+    plain = prepare(scenario(tmp_path, "plain.osi")).scene
+    packed = prepare(scenario(tmp_path, name)).scene
+    assert [actor.name for actor in packed.actors] == ["car (0)", "bus (7)", "pedestrian (9)"]
+    for actor, same in zip(packed.actors, plain.actors, strict=True):
+        np.testing.assert_array_equal(actor.trajectory.times_s, same.trajectory.times_s)
+        np.testing.assert_array_equal(actor.trajectory.positions, same.trajectory.positions)
+
+
+def test_concatenated_and_decompressed_files_are_read(tmp_path):
+    good = written(tmp_path / "town_gt.osi", truths()).read_bytes()
+    end = 4 + struct.unpack_from("<I", good)[0]
+    members = gzip.compress(good[: end + 9]) + gzip.compress(good[end + 9 :]) + bytes(512)
+    for data in (members, good):  # the name does not decide whether a trace is compressed
+        (tmp_path / "town.osi.gz").write_bytes(data)
+        read = list(iter_ground_truth(tmp_path / "town.osi.gz"))
+        assert [truth.timestamp.seconds for truth in read] == [0, 1, 2, 3, 4]
+
+
+def test_sensor_views_in_compressed_traces_have_ground_truth(tmp_path):
+    views = [
+        osi.SensorView(
+            timestamp=truth.timestamp,
+            global_ground_truth=None if second == 1 else truth,
+            mounting_position=osi.MountingPosition(),
+        )
+        for second, truth in enumerate(truths())
+    ]
+    good = written(tmp_path / "view.osi", views).read_bytes()
+    (tmp_path / "view.osi").write_bytes(compressed(good))
+    read = list(iter_ground_truth(tmp_path / "view.osi"))
+    assert [truth.timestamp.seconds for truth in read] == [0, 2, 3, 4]
+
+
+@pytest.mark.parametrize("is_packed", [True, False])
+def test_the_complete_messages_of_a_truncated_trace_are_used(tmp_path, is_packed):
+    """A simulation that was killed leaves a trace without an end."""
+    good = written(tmp_path / "town_gt.osi", truths()).read_bytes()
+    end = 0
+    for _ in range(3):
+        end += 4 + struct.unpack_from("<I", good, end)[0]
+    cut = compressed(good[:end])[:-8] if is_packed else good[: end + 20]
+    (tmp_path / "town_gt.osi").write_bytes(cut)
+    read = iter_ground_truth(tmp_path / "town_gt.osi")
+    assert [next(read).timestamp.seconds for _ in range(3)] == [0, 1, 2]
+    ending = "its gzip stream ends" if is_packed else "it ends"
+    with pytest.raises(LidarError, match=rf"town_gt\.osi is truncated: {ending} in message 4\."):
+        next(read)
+    with pytest.raises(LidarError, match=r"is truncated"):  # the survey ends later
+        prepare(scenario(tmp_path, "town_gt.osi"))
+    # Here, the survey ends before the last message, 0.5 s after the start of the trace.
+    car = prepare(scenario(tmp_path, "town_gt.osi", offset_s=3)).scene.actors[0]
+    assert car.trajectory.times_s.tolist() == [3, 4, 5]
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (gzip.compress(b"<?xml version='1.0'?>"), "is truncated or is not an OSI trace"),
+        (gzip.compress(b"RIF"), "is truncated or is not an OSI trace"),
+        (gzip.compress(struct.pack("<I", 2**32 - 1) + b"x"), "is truncated or is not an OSI trace"),
+        (gzip.compress(b""), "contains no ground truth"),
+        (
+            gzip.compress(struct.pack("<I", 40) + bytes(range(40))),
+            "its message 1 is not a valid GroundTruth message (",
+        ),
+        (b"\x1f\x8b\x08", "is truncated: its gzip stream ends in message 1."),
+        (b"\x1f\x8b\x08" + bytes(range(100)), "its gzip data is corrupt after message 0."),
+        (gzip.compress(b"")[:-4] + b"long", "its gzip data is corrupt after message 0."),
+    ],
+)
+@pytest.mark.parametrize("name", ["town_gt.osi", "town_gt.osi.gz"])
+def test_compressed_files_that_are_no_traces_are_refused_in_a_line(tmp_path, name, data, message):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(LidarError) as caught:
+        prepare(scenario(tmp_path, name))
+    told = str(caught.value)
+    assert told.count(str(tmp_path / name)) == 1 and message in told and "\n" not in told
+
+
+@pytest.mark.parametrize(
+    ("sizes", "letters", "told"),
+    [
+        # While it is decoded, a byte counts 16 times, or 215 times if it compresses too well. In
+        # total, it counts 4 times, and there are 100 additional bytes for each message.
+        ([70_000], b"0123456789abcdef", "would unpack to at least 1.07 MiB"),
+        ([7_000], b"0", "would unpack to at least 1.44 MiB"),
+        ([2**31], b"0", "would unpack to at least 430.00 GiB"),
+        ([0] * 2622, b"", "would unpack to at least 1.00 MiB"),
+        ([60_000] * 5, b"0123456789abcdef", "would unpack to at least 1.15 MiB"),
+    ],
+)
+def test_compressed_traces_that_unpack_to_far_more_are_refused(
+    tmp_path, monkeypatch, sizes, letters, told
+):
+    monkeypatch.setattr(allowance, "MIN_LIMIT_BYTES", 2**20)
+    monkeypatch.setattr(allowance, "UNPACKED_TIMES", 1)
+    random = np.random.default_rng(2)
+    trace = b""
+    for size in sizes:
+        content = bytes(min(size, 2**17))
+        if 0 < size < 2**20:
+            text = random.choice([*letters], size - 3 - (size > 16_384)).astype(np.uint8).tobytes()
+            content = osi.GroundTruth(proj_string=text.decode()).to_binary()
+        assert len(content) in (size, 2**17)
+        trace += struct.pack("<I", size) + content
+    (tmp_path / "town_gt.osi").write_bytes(gzip.compress(trace))
+    with pytest.raises(LidarError) as caught:
+        list(iter_ground_truth(tmp_path / "town_gt.osi"))
+    message = str(caught.value)
+    assert "town_gt.osi" in message and told in message and "\n" not in message
+    assert message.endswith("and the limit is 1.00 MiB. Decompress it with gunzip first.")
 
 
 def carried(folder, file, vehicle, **traffic):

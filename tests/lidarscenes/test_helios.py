@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -128,6 +129,7 @@ def expected(deflected, head=0.0):
 
 
 PULSES = np.array([0, 1, 7, 19])
+WIDE = {"scanAngleMax_deg": 120, "scanAngleEffectiveMax_deg": 50}
 
 
 def test_a_cone_is_that_of_helios(imported):
@@ -241,6 +243,106 @@ def test_a_head_turns_from_start_to_stop_while_its_mirror_draws_lines(imported):
     starts = [of.pose(scan).position + scene.origin for scan in (0, 3)]
     assert np.allclose(starts, [[0, 0, 2 + 1.7], [3, 4, 51.7]])
     assert of.begins_ns(3) == pytest.approx((25 / 12 + 0.001) * 1e9)
+
+
+LASER = scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10)
+FLY = legs('pulseFreq_hz="1000"')
+WARMUP = ' opticsWarmupPhase_s="{}"'.format
+
+
+def test_a_cone_is_ahead_by_its_warmup(imported):
+    device = scanner("conic", scanAngleMax_deg=25, scanFreqMax_Hz=10)
+    settings = 'pulseFreq_hz="1000" scanAngle_deg="20" headRotateStart_deg="30"'
+    _, _, of = imported(device, legs(settings + WARMUP("0.0374")))  # 37 pulses
+    there = [about(Y, 3.6 * (k + 37)) @ about(X, 20) for k in PULSES]
+    assert np.allclose(fired(of, 0, PULSES)[:, 0], expected(there, 30), atol=1e-9)
+    assert of.ray_count == 500 and of.begins_ns(0) == 0  # the leg is as long as without
+
+
+@pytest.mark.parametrize("warmup_s", ["0", "-1"])
+def test_warmup_has_no_effect_unless_it_is_positive(imported, tmp_path, warmup_s):
+    made, *_ = imported(LASER, FLY)
+    files = {file.name: file.read_text() for file in made.path.parent.iterdir()}
+    made.path.parent.rename(tmp_path / "without")
+    made, *_ = imported(LASER, FLY.replace("/></leg>", f"{WARMUP(warmup_s)}/></leg>"))
+    assert {file.name: file.read_text() for file in made.path.parent.iterdir()} == files
+
+
+def test_prisms_are_ahead_by_the_warmup_of_a_template(imported, tmp_path):
+    rates = (-77.7, 121.6)
+    values = {f"rotorFreq{i + 1}_Hz": rate for i, rate in enumerate(rates)}
+    values |= {"angle1_deg": 18, "angle2_deg": -12, "refrIndex1": 1.5, "refrIndex2": 1.5}
+    device = scanner("risley", **values)
+    _, _, of = imported(device, legs('pulseFreq_hz="1000"'))
+    (tmp_path / "out").rename(tmp_path / "without")
+    template = f'<scannerSettings id="t" pulseFreq_hz="1000"{WARMUP(0.25)}/>'
+    _, _, ahead = imported(device, legs('template="t"'), around=template)
+    assert ahead.ray_count == of.ray_count
+    assert np.allclose(fired(ahead, 0, PULSES), fired(of, 0, PULSES + 250), atol=1e-9)
+
+
+def test_mirrors_start_with_the_first_complete_line_after_the_warmup(imported, tmp_path):
+    oscillating = scanner("oscillating", scanProduct=200)
+    fibers = scanner("line", numFibers=12, scanAngleMax_deg=30)
+    polygon = scanner("rotating", scanAngleMax_deg=60, scanAngleEffectiveMax_deg=45)
+    settings = 'pulseFreq_hz="1000" scanAngle_deg="30" scanFreq_hz="10"'
+    for device, line in ((oscillating, 100), (fibers, 12), (polygon, 100)):
+        made, _, of = imported(device, legs(settings))
+        made.path.parent.rename(tmp_path / f"{line}{made.path.parent.name}")
+        for warmup, delay in ((0, 0), (1, line - 1), (line, 0), (3 * line + 5, line - 5)):
+            made, _, ahead = imported(device, legs(settings + WARMUP(warmup / 1000)))
+            assert ahead.begins_ns(0) == pytest.approx(delay * 1e6, abs=1)
+            # The same line is drawn, from another position.
+            assert np.allclose(fired(ahead, 0, PULSES), fired(of, 0, PULSES), atol=1e-9)
+            stop_s = ahead.mounted_sensors[0].sensor.begins_ns(np.array([ahead.ray_count]))
+            assert stop_s[0] + delay * 1e6 == pytest.approx(5e8, abs=line * 1e6)
+            shutil.rmtree(made.path.parent)
+        shutil.rmtree(tmp_path / f"{line}out")
+
+
+def test_heads_have_already_turned_during_the_warmup(imported):
+    """Heads of stationary platforms reach their stop earlier."""
+    device = scanner("rotating", "", headRotatePerSecMax_deg=60, **WIDE)
+    head = 'headRotatePerSec_deg="{}" headRotateStart_deg="0" headRotateStop_deg="{}"'
+    common = 'pulseFreq_hz="1000" scanFreq_hz="20" '
+    inside = legs(common + head.format(12, 36) + WARMUP(0.11), (0, 0))
+    inside += legs(common + head.format(-12, -36) + WARMUP(0.1), (3, 4))
+    made, _, of = imported(device, inside, platform="tripod")
+    assert not made.unsupported
+    elevations = [-120 + 4.8 * k for k in range(50)]
+    kept = [e for e in elevations if -50 < e <= 50]
+    # A line takes 50 ms. The first leg starts 10 ms after the third line, and lasts until 2.89 s.
+    for number, lines, sign, first in ((0, 57, 1, 3), (1, 58, -1, 2)):
+        for line in (0, lines - 1):
+            made = fired(of, number, [line])[0]
+            for channel, elevation in enumerate(kept):
+                turned = sign * 12 * ((line + first) * 50 + channel) / 1000
+                assert np.allclose(made[channel], about(Z, turned) @ about(X, elevation) @ Y)
+        last_step = of.steps_each[number] - 1
+        assert of.mounted_sensors[number].sensor.firings(last_step)[1] == lines
+    second = of.steps_each[0]
+    assert of.begins_ns(0) == pytest.approx(0.04e9)
+    assert of.begins_ns(second) == pytest.approx((2.89 + 0.001) * 1e9)
+
+
+def test_legs_without_a_complete_line_after_the_warmup_start_with_it(imported):
+    device = scanner("rotating", "", headRotatePerSecMax_deg=60, **WIDE)
+    head = 'headRotatePerSec_deg="12" headRotateStart_deg="0" headRotateStop_deg="36"'
+    settings = f'pulseFreq_hz="1000" scanFreq_hz="20" maxDuration_s="0.08" {head}{WARMUP(0.01)}'
+    made, _, of = imported(device, legs(settings, (0, 0)), platform="tripod")
+    assert made.unsupported == [
+        "opticsWarmupPhase_s of leg 0 (the leg is shorter than two scan lines)"
+    ]
+    assert of.begins_ns(0) == 0 and of.ray_count == 2 * 21
+    assert np.allclose(fired(of, 0, [0])[0, 0], about(Z, 12 * 0.05) @ about(X, -48) @ Y)
+
+
+def test_heads_that_pass_their_stop_during_the_warmup_are_refused(imported):
+    device = scanner("rotating", "", headRotatePerSecMax_deg=60, **WIDE)
+    head = 'headRotatePerSec_deg="12" headRotateStart_deg="0" headRotateStop_deg="36"'
+    inside = legs(f'pulseFreq_hz="1000" scanFreq_hz="20" {head}{WARMUP(3)}', (0, 0))
+    with pytest.raises(LidarError, match=r"leg 0: the head reaches headRotateStop_deg during"):
+        imported(device, inside, platform="tripod")
 
 
 def test_lines_over_the_zenith_go_down_behind(imported):
@@ -483,10 +585,6 @@ def test_what_is_not_taken_over_is_named(imported, survey, tmp_path):
     assert "already exists. Pass another folder" in str(again.exception)
 
 
-LASER = scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10)
-FLY = legs('pulseFreq_hz="1000"')
-
-
 VOX = """VOXEL SPACE
 #min_corner: 0 0 0
 #max_corner: 1 1 2
@@ -619,6 +717,14 @@ def test_rasters_of_heights_are_scene_files(imported, tmp_path):
             "leg 0: S/1 must have a pulseFreq_hz above 0",
         ),
         (('pulseFreq_hz="1000"', 'active="false"'), "no leg has an active scanner"),
+        (
+            ('pulseFreq_hz="1000"', 'pulseFreq_hz="1000" opticsWarmupPhase_s="1e9"'),
+            "leg 0: opticsWarmupPhase_s is 1e\\+09; it must be at most 86,400",
+        ),
+        (
+            ('pulseFreq_hz="1000"', 'pulseFreq_hz="1000" opticsWarmupPhase_s="long"'),
+            "leg 0: opticsWarmupPhase_s is 'long'; it must be a number",
+        ),
         (("#plane", "#tripod"), "leg 0: neither the platform nor the head moves"),
         (('pulseFreq_hz="1000"', 'headRotatePerSec_deg="9"'), "supported only for rotating optics"),
         (

@@ -560,6 +560,18 @@ def test_a_scanner_of_many_is_named_and_has_its_highest_rates(tmp_path):
     assert [*Scenario.load(tmp_path / "two/scenario.yaml").sensors] == ["low", "high"]
 
 
+def test_a_scanner_without_a_leg_has_no_warmup(tmp_path):
+    """The warmup precedes the start of a leg, which only surveys have."""
+    directions = []
+    for number, warmup in enumerate(("", 'opticsWarmupPhase_s="0.003"')):
+        settings = f'<scannerSettings id="far" pulseFreq_hz="2000" {warmup}/>'
+        text = SCANNERS.replace("</document>", f"{settings}</document>")
+        (tmp_path / "scanners.xml").write_text(text)
+        sensor, *_ = sensor_of_scanner(tmp_path / "scanners.xml#far", tmp_path / f"{number}")
+        directions.append(sensor.directions(np.arange(20)))
+    np.testing.assert_array_equal(*directions)
+
+
 def test_a_python_file_returns_the_rays_of_each_frame(tmp_path):
     """In a process that has NumPy and nothing of ours; vertices of the file are its sensor's."""
     sensor = load_sensor("livox/mid360")

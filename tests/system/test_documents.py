@@ -240,6 +240,7 @@ OF_OTHERS = {
     "--human-readable-time": "sumo",
     "--fcd-output": "sumo",
     "--fcd-output.geo": "sumo",
+    "--osi_compress": "esmini",
     "--step-length": "sumo",
     "--remap": "ros2 run",
     "--writeWaveform": "helios",

@@ -24,11 +24,13 @@ KINDS = (
     ".asc, .csv, .pts, .ptx, .npy, .bin (KITTI, nuScenes), .pcap, .pcapng (Velodyne, Ouster) or "
     ".osf file, a ROS 2 bag, or a folder in KITTI, nuScenes, WebDataset or range image format"
 )
-_CONVERSIONS = {  # {extension of an unsupported format: advice}
+_CONVERSIONS = {  # {ending of an unsupported format: advice}
     ".bag": "It is a ROS 1 bag. Convert it with rosbags-convert --src IN.bag --dst OUT.",
     ".db3": "It is part of a ROS 2 bag. Specify the folder that contains it.",
     ".rrd": "It is a Rerun recording. Open it with the `rerun` command.",
-    ".osi": "It is an OSI trace. Use it as the traffic of a scenario.",
+    **dict.fromkeys(
+        (".osi", ".osi.gz"), "It is an OSI trace. Use it as the traffic of a scenario."
+    ),
     **dict.fromkeys((".glb", ".gltf", ".obj", ".stl"), "It is a mesh. Run a survey of it first."),
 }
 # Extensions of files for which the user can set the unit.
@@ -137,8 +139,9 @@ def _open_path(source: RecordingSource) -> Recording:
         return _open_data_set(source)
     if (cloud_format := format_of_path(path, source.name)) is not None:
         return cloud_format.open(source)
-    suffix = path.suffix.lower()
-    raise UnknownFormatError(source.name, _CONVERSIONS.get(suffix, ""))
+    file_name = path.name.lower()
+    advice = (text for ending, text in _CONVERSIONS.items() if file_name.endswith(ending))
+    raise UnknownFormatError(source.name, next(advice, ""))
 
 
 def _open_data_set(source: RecordingSource) -> Recording:

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lidarsim.columns.mcap_chunks import check_chunks
 from lidarsim.environment.extras import reading, require_package
 from lidarsim.errors import LidarError
-from lidarsim.io.input_files import input_size
 from lidarsim.motion.rotations import quaternions_of, rotations_of
 from lidarsim.motion.trajectory import Track
 from lidarsim.numerics.arrays import Floats
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.words import plural
 
+from .osi_trace import iter_ground_truth
 from .traffic import (
     HOST,
     TrafficClock,
@@ -30,7 +27,6 @@ from .traffic import (
     VehicleSection,
 )
 
-OSI_SUFFIXES = (".osi", ".mcap")
 _MAX_SIZE_M = 1e4  # longer than any ship or train
 # Number of values in a row: x, y and z of the box center in meters, and yaw, pitch and roll in
 # radians.
@@ -184,7 +180,7 @@ def read_osi(
     require_package("betterosi", "osi", f"Reading {path}")
     collector = _PassageCollector(section, first_s, travelers)
     stationary = 0
-    for truth in _iter_ground_truth(path):
+    for truth in iter_ground_truth(path):
         previous_s = collector.time_s
         with reading(str(path)):
             collector.add_message(truth)
@@ -217,49 +213,6 @@ def read_osi(
     ]
     counted = plural(len(collector.travelers), "moving object")
     return TrafficContent(present, counted, collector.left_out, notes)
-
-
-def _iter_ground_truth(path: Path) -> Iterator[Any]:
-    """Yield the ground truth of each message in a trace.
-
-    Raise LidarError if the type of the messages is unknown or not supported.
-    """
-    osi: Any = import_module("betterosi")
-    with reading(str(path)):
-        if not input_size(path):
-            raise LidarError("it is empty.")
-        is_mcap = path.suffix.lower() == ".mcap"
-        if is_mcap:
-            check_chunks(path)
-        kind = None if is_mcap else _message_type(osi, path)
-        messages = osi.read(str(path), return_ground_truth=True, osi_message_type=kind)
-        try:
-            truth = next(messages, None)
-        except ValueError as error:
-            if is_mcap or kind is not None:
-                raise
-            raise LidarError(
-                "the type of its first message (GroundTruth or SensorView) cannot be determined. "
-                "Specify the type in the file name, as in town_gt.osi or town_sv.osi."
-            ) from error
-    while truth is not None:
-        yield truth
-        with reading(str(path)):
-            truth = next(messages, None)
-
-
-def _message_type(osi: Any, path: Path) -> str | None:
-    """Return the message type that is part of a trace's file name, or None if there is none.
-
-    Raise LidarError if messages of this type contain no ground truth.
-    """
-    kind: str | None = osi.io.osi_message_type_from_filename(path)
-    if kind in (None, "GroundTruth", "SensorView"):
-        return kind
-    raise LidarError(
-        f"its name indicates messages of type {kind}, but only GroundTruth and SensorView are "
-        "supported."
-    )
 
 
 def _pose_row(moving: Any) -> list[float]:

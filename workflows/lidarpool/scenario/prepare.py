@@ -44,7 +44,8 @@ from .default_poses import SensorPlacement, place_sensor
 from .georeference import check_epsg
 from .ground import SupportSurfaces
 from .job import Job
-from .osi_traffic import OSI_SUFFIXES, read_osi
+from .osi_trace import OSI_SUFFIXES
+from .osi_traffic import read_osi
 from .scenario import Scenario
 from .sections import CopiesSection, SensorSection
 from .static_scene import FileFindings, SceneCache, ShapeLoader, StaticScene, read_static_scene
@@ -293,7 +294,7 @@ def _read_traffic(
     section = scenario.traffic
     assert section is not None
     file = scenario.path(section.file)
-    if file.suffix.lower() in OSI_SUFFIXES:
+    if file.name.lower().endswith(OSI_SUFFIXES):
         return read_osi(file, section, first_s, last_s, travelers)
     return read_fcd(file, section, first_s, last_s, travelers)
 

@@ -92,7 +92,7 @@ class TrafficSection(Section):
         Text,
         about(
             "output of `sumo --fcd-output` (.xml, .xml.gz), or OSI trace with ground truth (.osi, "
-            ".mcap)"
+            ".osi.gz, .mcap)"
         ),
     ]
     vehicles: Annotated[

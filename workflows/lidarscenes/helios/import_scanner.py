@@ -93,6 +93,7 @@ def import_scanner(survey: Path, folder: Path, assets: Sequence[Path]) -> list[s
     if settings is None:
         lines.append("scanners without <scannerSettings> (the highest rates are used)")
         settings = _highest_rates(first)
+    settings.pop("opticsWarmupPhase_s", None)  # without a survey, there is no leg that it precedes
     devices = {name: make_device(scanner, settings) for name, scanner in scanners.items()}
     sensors = _merged(devices)
     if len(sensors) > MAX_SENSORS:

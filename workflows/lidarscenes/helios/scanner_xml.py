@@ -30,6 +30,7 @@ _PRISM = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 _HEAD = rotation_about(_Z, 90)
 # Maximum rotation per scan with a head. A scan without a head is a full cycle.
 _HEAD_STEP_DEG = 10.0
+_MAX_WARMUP_S = 86_400.0
 _FRAME_HZ = 10.0  # arbitrary, because prism patterns do not repeat
 _SLACK = 1e-9  # tolerance for divisions whose exact results are integers
 
@@ -50,9 +51,14 @@ class Device:
     position
         Origin of the beams (3,), relative to the mount, in meters.
     head_s
-        Time in seconds that the head takes to rotate from start to stop; None without a head.
+        Time in seconds from the start of the leg until the head has rotated to its stop; None
+        without a head. It is not positive if the head passes its stop before the leg.
     range_m
         Minimum and maximum range.
+    line_s
+        Duration of a scan line in seconds, or of a pulse if there are no lines.
+    delay_s
+        Time in seconds from the start of the leg to its first complete scan line.
     """
 
     data: dict[str, Any]
@@ -60,6 +66,8 @@ class Device:
     position: Floats
     head_s: float | None
     range_m: tuple[float, float]
+    line_s: float
+    delay_s: float
 
     def steps(self, seconds: float) -> tuple[float, int]:
         """Return the rotation per time step in degrees, and the number of steps in a duration."""
@@ -145,6 +153,14 @@ def make_device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
     else:
         data, optics_rotation = _OPTICS[optics](scanner, settings, pulse_hz)
         sensor_rotation = read_rotation(emitter) @ optics_rotation
+    warmup_s = _warmup_s(settings, pulse_hz)
+    line_s = 1 / pulse_hz
+    if line is not None:
+        line_s *= line.pulses_per_line
+    elif "mirror" in data:
+        line_s = 1 / data["rate_hz"]
+    # Since sensors start with a complete scan line, the rest of the current line is omitted.
+    moved_s = ceil(warmup_s / line_s - _SLACK) * line_s
     return Device(
         data={
             "name": scanner.name,
@@ -154,11 +170,30 @@ def make_device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
                 name: round_values(value) for name, value in _light(scanner, settings).items()
             },
         },
-        rotation=rotation_about(head.axis, head.start_deg) @ sensor_rotation,
+        rotation=rotation_about(head.axis, head.start_deg + head.deg_per_s * moved_s)
+        @ sensor_rotation,
         position=read_vector(emitter),
-        head_s=abs(head.range_deg / head.deg_per_s) if head.deg_per_s else None,
+        head_s=abs(head.range_deg / head.deg_per_s) - warmup_s if head.deg_per_s else None,
         range_m=(scanner.number("rangeMin_m"), read_number(scanner.values, "rangeMax_m", np.inf)),
+        line_s=line_s,
+        delay_s=max(moved_s - warmup_s, 0.0),
     )
+
+
+def _warmup_s(settings: dict[str, str], pulse_hz: float) -> float:
+    """Return the time for which head and optics have already moved when a leg starts.
+
+    As in HELIOS++, it is rounded to whole pulses, and negative values have no effect. The time is
+    not part of the leg.
+
+    Raises LidarError if the time is too long.
+    """
+    warmup_s = read_number(settings, "opticsWarmupPhase_s", 0)
+    if warmup_s > _MAX_WARMUP_S:
+        raise LidarError(
+            f"opticsWarmupPhase_s is {warmup_s:g}; it must be at most {_MAX_WARMUP_S:,.0f}."
+        )
+    return floor(max(warmup_s, 0) * pulse_hz + 0.5) / pulse_hz
 
 
 def _light(scanner: HeliosScanner, settings: dict[str, str]) -> dict[str, float]:
@@ -412,17 +447,25 @@ def _cone(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> 
     if rate_hz <= 0:
         raise LidarError(f"{scanner.name} must have a scanFreqMax_Hz above 0.")
     beams = {"elevation_deg": [round_values(90 - _half_angle_deg(scanner, settings))]}
-    return {"firing_us": _exact_us(1, pulse_hz), "rate_hz": rate_hz, "beams": beams}, _CONE
+    start_deg = round_values(360 * rate_hz * _warmup_s(settings, pulse_hz) % 360)
+    return {
+        **({"zero_deg": start_deg} if start_deg else {}),
+        "firing_us": _exact_us(1, pulse_hz),
+        "rate_hz": rate_hz,
+        "beams": beams,
+    }, _CONE
 
 
 def _prisms(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> ScannerSection:
     """Return the sensor section for Risley prisms."""
     air = scanner.number("refrIndex_air", 1)
+    warmup_s = _warmup_s(settings, pulse_hz)
     prisms = [
         {
             "wedge_deg": round_values(abs(angle)),
             "index": round_values(scanner.number(f"refrIndex{i}", 1) / air),
-            "rpm": round_values(60 * scanner.number(f"rotorFreq{i}_Hz")),
+            "rpm": round_values(60 * (rotor_hz := scanner.number(f"rotorFreq{i}_Hz"))),
+            **({"phase_deg": round_values(360 * rotor_hz * warmup_s % 360)} if warmup_s else {}),
             "inclined_first": angle > 0,
         }
         for i in (1, 2, 3)

@@ -181,11 +181,7 @@ class _Import:
         if trajectory is None and moves:
             trajectory = moving_trajectory(legs)
         elif trajectory is None:
-            heads = {
-                leg: max(mounted.head_s or 0.0 for mounted in by_channel.values())
-                for leg, by_channel in devices.items()
-            }
-            trajectory = stationary_trajectory(legs, heads)
+            trajectory = stationary_trajectory(legs, _head_times(devices))
         self._mount_devices(mount, devices, trajectory)
         return trajectory
 
@@ -256,7 +252,13 @@ class _Import:
 
         `mount` is the rotation (3, 3) of its mount.
         """
-        step_deg, steps = mounted.steps(segment.seconds)
+        delay_s = mounted.delay_s
+        if delay_s and delay_s + mounted.line_s > segment.seconds:
+            delay_s = 0.0
+            self._notes.append(
+                f"opticsWarmupPhase_s of leg {segment.leg} (the leg is shorter than two scan lines)"
+            )
+        step_deg, steps = mounted.steps(segment.seconds - delay_s)
         min_range_m, max_range_m = mounted.range_m
         pose = Pose.from_rotation((0, 0, 0), AHEAD @ mount @ mounted.rotation)
         angles = {
@@ -268,7 +270,7 @@ class _Import:
             **({"min_range_m": round_values(min_range_m)} if min_range_m else {}),
             **({"max_range_m": round_values(max_range_m)} if np.isfinite(max_range_m) else {}),
             "mount": {name: angle for name, angle in angles.items() if angle},
-            "start_s": round_values(segment.start_s),
+            "start_s": round_values(segment.start_s + delay_s),
             "steps": steps,
         }
 
@@ -347,6 +349,23 @@ class _Import:
             for field, name in ranges.items()
             if name in detector_settings
         }
+
+
+def _head_times(devices: dict[int, dict[str, Device]]) -> dict[int, float]:
+    """Return the time in seconds for which heads rotate during each leg, or 0 without a head.
+
+    Raises LidarError if a head has passed its stop before the leg starts.
+    """
+    times = {}
+    for leg, by_channel in devices.items():
+        heads = [mounted.head_s for mounted in by_channel.values() if mounted.head_s is not None]
+        if heads and max(heads) <= 0:
+            raise LidarError(
+                f"leg {leg}: the head reaches headRotateStop_deg during opticsWarmupPhase_s, so "
+                "the leg has no pulses. Reduce opticsWarmupPhase_s."
+            )
+        times[leg] = max(heads, default=0.0)
+    return times
 
 
 def returns_section(
