@@ -115,7 +115,7 @@ class _Placement(NamedTuple):
     "--model",
     metavar="MODEL|FILE",
     shell_complete=completion.sensors,
-    help="Sensor model of the recording, which defines its intensity scale, optics and "
+    help="Model of the recorded sensor, which defines the intensity scale, optics and "
     "sensitivity (default: estimated from the recording).",
 )
 @click.option(
@@ -135,7 +135,7 @@ class _Placement(NamedTuple):
     "--snow",
     type=click.FloatRange(0, 50),
     metavar="MM_H",
-    help="Snowfall rate in mm/h of melted water.",
+    help="Snowfall rate in mm/h (water equivalent).",
 )
 @click.option(
     "--fog",
@@ -153,7 +153,7 @@ class _Placement(NamedTuple):
     "--dirt",
     type=click.FloatRange(0, 1),
     metavar="SHARE",
-    help="Share of the energy that dirt on the window transmits on the way out and back.",
+    help="Share of the energy that dirt on the window transmits, out and back combined.",
 )
 @click.option(
     "--dead-channels",
@@ -165,7 +165,7 @@ class _Placement(NamedTuple):
     "--dropped-packets",
     type=click.FloatRange(0, 1),
     metavar="SHARE",
-    help=f"Share of packets that are lost, each with {_PACKET_FIRINGS} firings.",
+    help=f"Share of packets that are lost. A packet contains {_PACKET_FIRINGS} firings.",
 )
 @click.option(
     "--dropout",
@@ -177,7 +177,7 @@ class _Placement(NamedTuple):
     "--range-noise",
     type=click.FloatRange(0, 1000),
     metavar="M",
-    help="Standard deviation of the noise that is added to ranges, in meters.",
+    help="Standard deviation of the noise added to ranges, in meters.",
 )
 @click.option(
     "--mode",
@@ -219,8 +219,8 @@ class _Placement(NamedTuple):
     "--sensor",
     metavar="MODEL|FILE",
     shell_complete=completion.sensors,
-    help="Resample the sweeps to another sensor, whose rays must lie within those of the recorded "
-    "sensor.",
+    help="Resample the sweeps to another sensor. Its field of view and resolution must not exceed "
+    "those of the recorded sensor.",
 )
 @click.option("--seed", type=click.IntRange(0), metavar="N", help="Random seed (default: 0).")
 @click.option(
@@ -265,8 +265,8 @@ def augment(
 
     The augmented copy has the format of the recording. EFFECTS is a file with the sections weather,
     noise, faults, returns (mode only), actors, traffic, materials and classes of a scenario, and
-    options override its fields. Actors are placed in the world frame of the recording. A campaign
-    file, whose base is an effects file, writes a copy for each of its variants.
+    options override its fields. Actors are placed in the world frame of the recording. For a
+    campaign file, whose base is an effects file, a copy is written for each variant.
 
     \b
     Examples:
