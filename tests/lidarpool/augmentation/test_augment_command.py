@@ -175,6 +175,8 @@ def test_ranges_may_have_no_end(captured):
 def test_resampling_requires_no_effects(captured):
     augmentation, _ = captured("--sensor", "velodyne/vlp16")
     assert augmentation.variants.effects(0).is_empty
+    assert not augmentation.partial
+    assert captured("--sensor", "velodyne/vlp16", "--partial")[0].partial
 
 
 @pytest.mark.parametrize(
@@ -198,6 +200,7 @@ def test_resampling_requires_no_effects(captured):
             ["--sweeps", "0:2", "--sensor", "velodyne/vlp16"],
             "`--sweeps` and `--sensor` cannot be combined",
         ),
+        (["--rain", 1, "--partial"], "`--partial` requires `--sensor`."),
         (["--rain", 1, "--resume", "--overwrite"], "`--resume` and `--overwrite` cannot be"),
         (["--rain", -1], "-1.0 is not in the range"),
         (["--rain", 1, "--model", "velodyne/none"], "velodyne/none"),

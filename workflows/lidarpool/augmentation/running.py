@@ -129,6 +129,8 @@ class Augmentation:
         Sensor to which the sweeps are resampled, or None to keep the rays of the recorded sensor.
     reflectance
         Reflectance of all recorded surfaces if the recording has no intensities.
+    partial
+        Whether to omit pulses of `resampled` that the recorded sensor does not observe.
     """
 
     file: RecordingFile
@@ -138,6 +140,7 @@ class Augmentation:
     output_format: str | None = None
     resampled: Sensor | None = None
     reflectance: float | None = None
+    partial: bool = False
 
     def __post_init__(self) -> None:
         if self.numbers is not None and self.resampled is not None:
@@ -236,6 +239,7 @@ class Augmentation:
                 self.output_format,
                 self.resampled,
                 self.reflectance,
+                self.partial,
             ),
             "version of lidarpool": software()["lidarpool"],
         }
@@ -354,6 +358,7 @@ class _Run:
             self.output,
             augmentation.resampled,
             augmentation.reflectance,
+            augmentation.partial,
         )
         key = fingerprint(dict(self.work.identity), str(self.work.folder), group.start)
         return SharedPlan.from_plan(key, self.work, plan)
