@@ -221,8 +221,8 @@ COARSE = replace(DENSE, max_range_m=60.0)
             Sensor.grid(240, 8, vertical_fov_deg=60),
             {},
             "Sensor with 8 channels has channels at -30.0°, -21.4°, 21.4° and 1 more, which are "
-            "outside the vertical field of view of drive (-15.0° to 15.0°). Use `--partial` to omit "
-            "such pulses.",
+            "outside the vertical field of view of drive (-15.0° to 15.0°). Use `--partial` to "
+            "omit such pulses.",
         ),
         (
             Sensor.grid(240, 40, vertical_fov_deg=30),

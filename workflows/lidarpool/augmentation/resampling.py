@@ -119,8 +119,8 @@ class SensorResampler:
                 raise LidarError(
                     f"The maximum range of {self.sensor.model} is {max_range_m:g} m, but that of "
                     f"{recorded_sensor.model} in {self.recording.name} is only "
-                    f"{recorded_sensor.max_range_m:g} m. Use a sensor file with a lower `max_range_m`. "
-                    f"{_TWIN_HINT}"
+                    f"{recorded_sensor.max_range_m:g} m. Use a sensor file with a lower "
+                    f"`max_range_m`. {_TWIN_HINT}"
                 )
         elif max_range_m > self._pulses.max_range_m:
             self.notes.append(
@@ -210,8 +210,8 @@ class SensorResampler:
             raise LidarError(
                 f"The azimuth resolution of {self.sensor.model} is "
                 f"{format_rounded(np.degrees(step_rad))}°, but that of {self.recording.name} is "
-                f"only {format_rounded(np.degrees(recorded_rad))}°. Use a sensor with fewer firings "
-                f"per revolution. {_TWIN_HINT}"
+                f"only {format_rounded(np.degrees(recorded_rad))}°. Use a sensor with fewer "
+                f"firings per revolution. {_TWIN_HINT}"
             )
 
     def _check_sharing(self) -> None:

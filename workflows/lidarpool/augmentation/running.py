@@ -20,11 +20,12 @@ from lidarsim.sensor import Sensor
 from lidarsim.words import join_names, plural
 
 from ..clouds.folder import result_folder
-from ..clouds.format_table import format_of_path
+from ..clouds.format_table import format_of_path, formats_of_endings
 from ..clouds.writing import ExportSpec
 from ..identity.fingerprint import fingerprint
 from ..identity.software import software
 from ..run.cluster.worker_map import MapFunction, parallel_map
+from .rewriting.opening import check_sweeps
 from .sweep_tasks import (
     CHECKED_SENSORS,
     MAX_VARIANTS,
@@ -188,12 +189,14 @@ class Augmentation:
         out = Path(out)
         try:
             files = self.file.each_sensor()
+            if len(files) == 1:
+                check_sweeps(self.file.path, files[0].open())
             output = self._output()
             targets = self._targets(out, output)
             with ExitStack() as stack:
                 if targets[0] != out:
                     stack.enter_context(result_folder(out))
-                stack.enter_context(result_folder(WorkFolder.for_output(out)))
+                stack.enter_context(result_folder(WorkFolder.for_output(out), shown=out))
                 identity = self._identity()
                 work = WorkFolder.create_or_resume(
                     out, identity, resume=resume, overwrite=overwrite
@@ -219,11 +222,30 @@ class Augmentation:
         suffix = path.suffix if path.is_file() else ""
         if output is not None:
             suffix = Path(output.row.file).suffix
+        self._check_ending(out, suffix)
         if self.variants.is_campaign:
             return tuple(out / f"{number:04}{suffix}" for number in range(self.variants.count))
         if suffix and out.suffix.lower() != suffix.lower():
             return (out / f"{path.stem}{suffix}",)
         return (out,)
+
+    def _check_ending(self, out: Path, suffix: str) -> None:
+        """Raise LidarError if a folder would have the extension of a file or of another format."""
+        ending = out.suffix.lower()
+        formats = formats_of_endings()
+        if ending not in formats or out.is_dir():
+            return
+        if self.variants.is_campaign:
+            raise LidarError(
+                f"{out} ends in {ending}, but a campaign writes a folder with a copy for each "
+                "variant. Specify a path without this ending with `--out`."
+            )
+        if ending == suffix.lower():
+            return
+        kind = f"{suffix} file" if suffix else "folder"
+        name = formats[ending]
+        remedy = f"Use `--format {name}`, or an output folder." if name else "Use an output folder."
+        raise LidarError(f"{out} ends in {ending}, but the copy is a {kind}. {remedy}")
 
     def _identity(self) -> dict[str, str]:
         """Return hashes of the inputs, keyed by a noun for messages."""
