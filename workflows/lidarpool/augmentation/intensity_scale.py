@@ -28,6 +28,7 @@ from .intensity_fit import (
     is_compensated,
     is_valid,
     range_factors,
+    reference_numbers,
     smallest_positive,
     typical_level,
     white_level,
@@ -181,7 +182,7 @@ class IntensityScale:
         recorded = returns.columns[column]
         valid = is_valid(recorded)
         if not valid.any() or (recorded[valid] == recorded[valid][0]).all():
-            raise LidarError(_missing_text(recording, column, recorded[valid]))
+            raise _unknown_error(recording, column, recorded[valid])
         fit = _Fit(recording, column, returns.select(valid), model)
         return fit.scale()
 
@@ -373,7 +374,7 @@ def _primary_column(recording: Recording, returns: RecordedReturns, model: Senso
     columns = returns.columns
     available = [name for name in STRENGTHS if name in columns]
     if not available:
-        raise LidarError(_missing_text(recording, "", None))
+        raise _unknown_error(recording, "", None)
     intensity, reflectivity = STRENGTHS
     if available != [intensity, reflectivity] or recording.intensity_column is not None:
         return available[0]
@@ -422,18 +423,45 @@ def _has_simulated_energies(returns: RecordedReturns) -> bool:
     )
 
 
-def _missing_text(recording: Recording, column: str, values: AnyArray | None) -> str:
-    """Return the error message for a recording without usable intensities."""
+class UnknownIntensitiesError(LidarError):
+    """Error raised if a recording has no usable intensities.
+
+    `problem` is a sentence that states why. The message also names options of the command line.
+    """
+
+    def __init__(self, problem: str) -> None:
+        super().__init__(
+            f"{problem} Pass `--intensity COLUMN` to use another column, or `--reflectance 0.3` to "
+            "assume the same reflectance for all returns."
+        )
+        self.problem = problem
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.problem,)
+
+
+def _unmeasured(recording: Recording) -> str:
+    """Describe the recording without intensities, or its first sweep if other sweeps have some."""
+    numbers = reference_numbers(recording)
+    lacks = [not {*STRENGTHS} & {*recording[number].columns} for number in numbers]
+    if all(lacks) or True not in lacks:
+        return recording.name
+    number = numbers[lacks.index(True)]
+    item = recording.files[number] if recording.files else f"sweep {number}"
+    return f"Unlike other sweeps, {item} in {recording.name}"
+
+
+def _unknown_error(
+    recording: Recording, column: str, values: AnyArray | None
+) -> UnknownIntensitiesError:
+    """Return the error for a recording without usable intensities."""
     if values is None:
-        problem = f"{recording.name} has no intensity column"
+        problem = f"{_unmeasured(recording)} has no intensity column"
     elif not len(values):
         problem = f"The column {column!r} of {recording.name} has no valid intensities"
     else:
         problem = f"All intensities of {recording.name} are {values[0]:g}"
-    return (
-        f"{problem}, so the energies of its returns are unknown. Pass `--intensity COLUMN` to use "
-        "another column, or `--reflectance 0.3` to assume the same reflectance for all returns."
-    )
+    return UnknownIntensitiesError(f"{problem}, so the energies of its returns are unknown.")
 
 
 @dataclass(frozen=True, eq=False)
