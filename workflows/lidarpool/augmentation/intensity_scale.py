@@ -13,6 +13,7 @@ from typing import Any, Self
 import numpy as np
 
 from lidarsim.columns.column_names import STRENGTHS
+from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import AnyArray, AnyFloats, Floats
 from lidarsim.schema.checks import check_number
@@ -446,9 +447,21 @@ def _unmeasured(recording: Recording) -> str:
     lacks = [not {*STRENGTHS} & {*recording[number].columns} for number in numbers]
     if all(lacks) or True not in lacks:
         return recording.name
-    number = numbers[lacks.index(True)]
+    return _differing_sweep(recording, numbers[lacks.index(True)])
+
+
+def _differing_sweep(recording: Recording, number: int) -> str:
     item = recording.files[number] if recording.files else f"sweep {number}"
     return f"Unlike other sweeps, {item} in {recording.name}"
+
+
+def check_column(recording: Recording, sweep: Sweep, number: int, column: str) -> None:
+    """Raise LidarError if a sweep lacks the column that defines the energies."""
+    if column not in sweep.columns:
+        raise UnknownIntensitiesError(
+            f"{_differing_sweep(recording, number)} has no column {column!r}, so the energies of "
+            "its returns are unknown."
+        )
 
 
 def _unknown_error(
