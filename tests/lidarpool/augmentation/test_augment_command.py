@@ -11,6 +11,7 @@ from tests.recorded_drives import recorded_points, write_pcd_drive
 
 from lidarpool import LidarError, open_recording
 from lidarpool.augmentation.insertions import load_insertion
+from lidarpool.augmentation.rewriting.opening import open_rewriter
 from lidarpool.augmentation.running import Augmentation, AugmentedRecording
 from lidarpool.augmentation.sweep_tasks import PointCounts
 from lidarpool.cli.commands import cli
@@ -175,6 +176,8 @@ def test_ranges_may_have_no_end(captured):
 def test_resampling_requires_no_effects(captured):
     augmentation, _ = captured("--sensor", "velodyne/vlp16")
     assert augmentation.variants.effects(0).is_empty
+    assert not augmentation.partial
+    assert captured("--sensor", "velodyne/vlp16", "--partial")[0].partial
 
 
 @pytest.mark.parametrize(
@@ -198,6 +201,7 @@ def test_resampling_requires_no_effects(captured):
             ["--sweeps", "0:2", "--sensor", "velodyne/vlp16"],
             "`--sweeps` and `--sensor` cannot be combined",
         ),
+        (["--rain", 1, "--partial"], "`--partial` requires `--sensor`."),
         (["--rain", 1, "--resume", "--overwrite"], "`--resume` and `--overwrite` cannot be"),
         (["--rain", -1], "-1.0 is not in the range"),
         (["--rain", 1, "--model", "velodyne/none"], "velodyne/none"),
@@ -216,6 +220,76 @@ def test_invalid_options_are_refused(run, drive, tmp_path, arguments, words):
     message = str(result.exception) if isinstance(result.exception, LidarError) else result.output
     assert words in " ".join(message.split())
     assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("options", [[], ["--format", "mcap"], ["--format", "las"]])
+def test_clouds_are_refused_because_they_have_no_sweeps(run, tmp_path, options):
+    cloud = tmp_path / "c.csv"
+    cloud.write_text("x,y,z,intensity\n1,2,3,4\n5,6,7,8\n")
+    result = run(cloud, "--out", tmp_path / "x.csv", "--rain", 5, *options, fails=True)
+    expected = f"{cloud} contains no sweeps. Use a recording that consists of sweeps."
+    assert str(result.exception) == expected
+    assert [*tmp_path.iterdir()] == [cloud]
+
+
+def test_folders_of_results_name_their_recordings(run, drive, tmp_path):
+    folder = tmp_path / "result"
+    folder.mkdir()
+    header = "ply\nformat ascii 1.0\nelement vertex 2\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz")
+    (folder / "cloud.ply").write_text(f"{header}end_header\n1 2 3\n4 5 6\n")
+    (folder / "notes.txt").write_text("")
+    (folder / "pcd").symlink_to(drive)
+    remedy = f"Pass {folder / 'pcd'} instead."
+    result = run(folder, "--out", tmp_path / "out", "--rain", 5, fails=True)
+    assert str(result.exception) == f"{folder} contains no sweeps. {remedy}"
+    with pytest.raises(LidarError) as error:
+        open_rewriter(folder, open_recording(drive))
+    assert str(error.value) == f"{folder} cannot be rewritten in PLY. {remedy}"
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        (
+            "x.las",
+            [],
+            "x.las ends in .las, but the copy is a folder. Use `--format las`, or an output "
+            "folder.",
+        ),
+        (
+            "x.MCAP",
+            ["--format", "las"],
+            "x.MCAP ends in .mcap, but the copy is a .las file. Use `--format mcap`, or an output "
+            "folder.",
+        ),
+        ("x.pcd", [], "x.pcd ends in .pcd, but the copy is a folder. Use an output folder."),
+    ],
+)
+def test_endings_of_other_formats_are_refused(run, drive, tmp_path, name, options, words):
+    result = run(drive, "--out", tmp_path / name, "--rain", 5, *options, fails=True)
+    assert str(result.exception) == f"{tmp_path}/{words}"
+    assert not [*tmp_path.iterdir()]
+
+
+def test_endings_of_files_are_refused_for_campaigns(run, drive, tmp_path):
+    (tmp_path / "effects.yaml").write_text("weather: {rain_mm_h: 5}")
+    campaign = tmp_path / "campaign.yaml"
+    campaign.write_text("base: effects.yaml\nvary: {weather.rain_mm_h: {each: [1, 20]}}\n")
+    out = tmp_path / "x.mcap"
+    result = run(drive, campaign, "--out", out, fails=True)
+    assert str(result.exception) == (
+        f"{out} ends in .mcap, but a campaign writes a folder with a copy for each variant. "
+        "Specify a path without this ending with `--out`."
+    )
+    assert not out.exists()
+
+
+def test_folders_that_cannot_be_created_are_named_like_the_output(run, drive):
+    result = run(drive, "--out", "/proc/x", "--rain", 5, fails=True)
+    assert str(result.exception) == (
+        "Cannot write to /proc/x: No such file or directory. Specify another path with `--out`."
+    )
 
 
 def test_urls_are_refused(run, drive):

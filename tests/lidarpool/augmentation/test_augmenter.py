@@ -289,6 +289,36 @@ def test_cars_move_during_a_sweep(clear, sensor):
     assert second - first == pytest.approx(0.1 * speed, abs=1e-3)
 
 
+def test_later_sweeps_without_intensities_are_named(clear, sensor):
+    def read(number):
+        sweep = clear.read(number % len(clear))
+        names = {*sweep.columns} - ({"intensity", "reflectivity"} if number == 2 else set())
+        return sweep.replace(columns={name: sweep.columns[name] for name in names})
+
+    mix = Recording("mix", 21, read)
+    augmenter = Augmenter(mix, Effects(weather=Weather(rain_mm_h=5)), sensor)
+    with pytest.raises(
+        LidarError, match=r"Unlike other sweeps, sweep 2 in mix has no column '\w+', "
+    ):
+        augmenter.sweep(2)
+    assert len(augmenter.sweep(4).sweep) > 0
+
+
+@pytest.mark.parametrize(
+    ("x_m", "z_m", "relation"),
+    [(0, -0.5, "contains"), (0, -5, "is below"), (0, 5, "is above"), (12, -0.5, None)],
+)
+def test_objects_around_the_sensor_are_noted(clear, sensor, x_m, z_m, relation):
+    crate = Insertion(box("crate", (1, 1, 1)), x_m, 0, z_m)
+    notes = Augmenter(clear, Effects(insertions=(crate,)), sensor).notes
+    noted = [note for note in notes if note.startswith("The inserted object")]
+    if relation is None:
+        assert not noted
+    else:
+        assert len(noted) == 1
+        assert noted[0].startswith(f"The inserted object 'crate' {relation} the sensor")
+
+
 def test_unknown_rings_are_noted(clear, sensor):
     def without_rings(number):
         sweep = clear.read(number)

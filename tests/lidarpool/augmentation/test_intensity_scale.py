@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -437,6 +438,21 @@ def test_recordings_without_intensities_are_rejected(values, problem):
     with pytest.raises(LidarError) as error:
         IntensityScale.for_recording(recording)
     assert str(error.value) == problem + ADVICE
+    assert str(pickle.loads(pickle.dumps(error.value))) == problem + ADVICE
+
+
+@pytest.mark.parametrize(
+    ("files", "item"), [((), "sweep 1"), (("a.pcd", "b.pcd", "c.pcd"), "b.pcd")]
+)
+def test_the_sweep_without_intensities_is_named(files, item):
+    points = np.ones((5, 3))
+    sweeps = [Sweep(points, {"intensity": np.arange(5)}), Sweep(points)]
+    recording = Recording("mix", 3, lambda number: sweeps[number % 2], files=files)
+    with pytest.raises(LidarError) as error:
+        IntensityScale.for_recording(recording)
+    assert (
+        str(error.value) == f"Unlike other sweeps, {item} in mix has no intensity column, {ADVICE}"
+    )
 
 
 def test_recordings_without_returns_or_sweeps_are_rejected():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from functools import partial
 
 import numpy as np
@@ -81,6 +82,19 @@ def test_points_labels_and_boxes_of_a_sequence(drive, tmp_path):
         int(track.split()[0]) for track in tracks
     )
     assert [track.split()[0] for track in tracks if track.split()[1] == "51"] == ["0", "1", "2"]
+
+
+def test_sweeps_without_labels_are_noted(drive, tmp_path):
+    path = tmp_path / "drive"
+    shutil.copytree(drive, path)
+    (path / "sequences/00/labels/000001.label").unlink()
+    notes = rewrite(opened(path, "00"), tmp_path / "new", tmp_path / "work", changed)
+    assert (
+        f"{path} has no 000001.label in the folder `labels`, so the points of these sweeps are not "
+        "labeled in the copy."
+    ) in notes
+    labels = [file.name for file in sorted((tmp_path / "new/sequences/00/labels").iterdir())]
+    assert labels == ["000000.label", "000002.label"]
 
 
 def test_encoded_sweeps_are_the_same_in_any_order(drive, tmp_path):

@@ -221,8 +221,8 @@ COARSE = replace(DENSE, max_range_m=60.0)
             Sensor.grid(240, 8, vertical_fov_deg=60),
             {},
             "Sensor with 8 channels has channels at -30.0°, -21.4°, 21.4° and 1 more, which are "
-            "outside the vertical field of view of drive (-15.0° to 15.0°). Use `partial` to omit "
-            "such pulses.",
+            "outside the vertical field of view of drive (-15.0° to 15.0°). Use `--partial` to "
+            "omit such pulses.",
         ),
         (
             Sensor.grid(240, 40, vertical_fov_deg=30),
@@ -234,14 +234,13 @@ COARSE = replace(DENSE, max_range_m=60.0)
             Sensor.grid(1440, 16, vertical_fov_deg=30),
             {},
             "The azimuth resolution of Sensor with 16 channels is 0.25°, but that of drive is only "
-            "0.5°. Reduce the number of firings per revolution, for example with a higher "
-            "`rate_hz`.",
+            "0.5°. Use a sensor with fewer firings per revolution.",
         ),
         (
             FAR,
             {"recorded_sensor": COARSE},
             "The maximum range of Sensor with 16 channels is 100 m, but that of Sensor with 31 "
-            "channels in drive is only 60 m. Reduce `max_range_m`.",
+            "channels in drive is only 60 m. Use a sensor file with a lower `max_range_m`.",
         ),
     ],
 )
@@ -250,6 +249,16 @@ def test_finer_sensors_are_refused(dense, sensor, options, message):
         SensorResampler(recording(dense), sensor, **options)
     assert str(error.value).startswith(message)
     assert str(error.value).endswith("use `lidarpool twin`.")
+
+
+def test_pulses_of_prism_sensors_are_not_described_as_channels(dense):
+    with pytest.raises(LidarError) as error:
+        SensorResampler(recording(dense), load_sensor("livox/mid70"))
+    assert str(error.value).startswith(
+        "The pulses of Livox Mid-70 have elevations from -34.9° to 35.1°, but 37 % of them are "
+        "outside the vertical field of view of drive (-15.0° to 15.0°). Use `--partial` to omit "
+        "such pulses. To simulate"
+    )
 
 
 def test_other_kinds_of_sensors_are_refused_unless_their_rays_are_apart(dense):

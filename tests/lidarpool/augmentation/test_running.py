@@ -512,7 +512,7 @@ def test_two_runs_do_not_share_an_output(augmentation, drive, tmp_path):
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as process:
         try:
             process.stdout.readline()
-            with pytest.raises(LidarError, match="is using the folder"):
+            with pytest.raises(LidarError, match=r"is using \S+/wet\. Wait"):
                 augmentation.run(out, workers=1, resume=True)
         finally:
             process.kill()

@@ -233,3 +233,42 @@ def test_tensors_stay_tensors(points):
     result = augmented(torch.from_numpy(points[0]), 4)
     assert result.dtype == torch.float32
     assert np.array_equal(result.numpy(), augmented(points[0], 4))
+
+
+@pytest.mark.parametrize("with_reference", [False, True])
+def test_sweeps_without_returns_are_unchanged(drive, with_reference):
+    augmented = Augment(columns=COLUMNS, reference=drive if with_reference else None, **RAIN)
+    empty = augmented(np.zeros((0, 5), np.float32))
+    assert (empty.shape, empty.dtype) == ((0, 5), np.float32)
+    lost = np.full((3, 5), np.nan)
+    assert np.array_equal(augmented(lost), lost, equal_nan=True)
+    columns = {"intensity": np.zeros(0, np.uint8), "ring": np.zeros(0, np.uint16)}
+    sweep = augmented(Sweep(np.zeros((0, 3)), columns, number=7))
+    assert (len(sweep), sweep.number) == (0, 7)
+    assert {*sweep.columns} == {"intensity", "ring", "cause"}
+    assert sweep.columns["cause"].dtype == np.uint8
+
+
+def test_errors_name_arguments_instead_of_options(points):
+    recording = Recording("drive", 1, lambda _: Sweep(points[0][:, :3]))
+    remedy = "or pass `reflectance=0.3` to assume the same reflectance for all returns."
+    with pytest.raises(LidarError) as error:
+        Augment(columns=(), **RAIN)(points[0][:, :3])
+    assert str(error.value) == (
+        "the sweep has no intensity column, so the energies of its returns are unknown. Pass the "
+        f"names of the columns as `columns`, including an intensity, {remedy}"
+    )
+    with pytest.raises(LidarError) as error:
+        augment(recording, **RAIN)
+    assert str(error.value) == (
+        "drive has no intensity column, so the energies of its returns are unknown. Open the "
+        f"recording with `open_recording(path, intensity=COLUMN)`, {remedy}"
+    )
+    assert len(next(augment(recording, reflectance=0.3, **RAIN))) > 0
+
+
+def test_arrays_are_refused_as_recordings(points):
+    with pytest.raises(
+        ValueError, match=r"type is ndarray\. To augment sweeps and arrays, use the"
+    ):
+        augment(points[0], **RAIN)

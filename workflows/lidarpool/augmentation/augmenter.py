@@ -21,6 +21,7 @@ from ..clouds.recording import Recording
 from .augmented_sweep import AugmentedSweep
 from .effects import Effects
 from .inserted_objects import InsertedObjects
+from .intensity_scale import check_column
 from .recorded_weather import weather_note
 from .scan_pattern import PulseGrid, ScanPattern
 from .sensor_motion import SensorMotion
@@ -207,6 +208,8 @@ class Augmenter:
         if motion.origins is not None and motion.rotations is not None:
             grid = grid.transform(motion.origins, motion.rotations)
         names = self.strengths.names[:1]  # the column that defines the energies
+        for name in names:
+            check_column(self.recording, sweep, number, name)
         recorded = {name: np.asarray(sweep.columns[name])[grid.row] for name in names}
         # What was detected had an energy of about the threshold or more.
         weakest = _WEAKEST * self._simulation.threshold

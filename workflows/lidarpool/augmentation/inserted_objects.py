@@ -19,7 +19,7 @@ from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.simulator.recorded_sweeps import FiredPulses, PulseAugmenter, scene_of_bodies
 from lidarsim.simulator.returns import PulseReturns
-from lidarsim.words import did_you_mean, join_names
+from lidarsim.words import did_you_mean, join_names, plural
 
 from ..clouds.boxes import SweepBoxes
 from ..clouds.recording import Recording
@@ -82,10 +82,12 @@ class InsertedObjects:
         ground = GroundPlane.from_sweep(recording[0]) if effects.insertions else None
         meshes: list[SceneMesh] = []
         placed: dict[int, Floats] = {}
+        sensor_positions = np.zeros((1, 3)) if motion.poses is None else motion.poses[:, :3, 3]
         for number, insertion in enumerate(effects.insertions):
             assert ground is not None
             pose = first_pose @ _sensor_pose(insertion, ground, recording.name)
             placed[number] = pose
+            notes += _position_notes(insertion.mesh, pose, sensor_positions)
             vertices = insertion.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
             meshes.append(replace(insertion.mesh, vertices=vertices, animation=None))
         actors = tuple(_shifted(actor, motion.shift) for actor in effects.actors)
@@ -245,6 +247,26 @@ def _sensor_pose(insertion: Insertion, ground: GroundPlane, name: str) -> Floats
     pose[:3, :3] = np.stack([np.cross(left, up), left, up], axis=1)
     pose[:3, 3] = insertion.x_m, insertion.y_m, z_m
     return pose
+
+
+def _position_notes(mesh: SceneMesh, pose: Floats, sensor_positions: Floats) -> list[str]:
+    """Return a note if an object is around the sensor, or directly below or above it.
+
+    `sensor_positions` are those of the sweeps, with shape (n, 3).
+    """
+    positions = (sensor_positions - pose[:3, 3]) @ pose[:3, :3]
+    low, high = _bounds(mesh)
+    is_in_bounds = (positions >= low) & (positions <= high)
+    is_close = is_in_bounds[:, 0] & is_in_bounds[:, 1]
+    if not is_close.any():
+        return []
+    is_inside = is_close & is_in_bounds[:, 2]
+    concerned = is_inside if is_inside.any() else is_close
+    is_below = positions[concerned.argmax(), 2] > high[2]
+    relation = "contains" if is_inside.any() else "is below" if is_below else "is above"
+    count = len(positions)
+    times = "" if count == 1 else f" in {concerned.sum():,} of {plural(count, 'sweep')}"
+    return [f"The inserted object {mesh.name!r} {relation} the sensor{times}. Check its position."]
 
 
 def _shifted(actor: Actor, shift: Floats) -> Actor:

@@ -56,6 +56,11 @@ _THRESHOLD_RATIO = 1.15
 _THRESHOLD_QUANTILE = 0.05
 
 
+def reference_numbers(recording: Recording) -> list[int]:
+    """Return the numbers of at most five sweeps from which properties are determined."""
+    return even_indices(len(recording), _SWEEPS).tolist()
+
+
 class RecordedReturns(NamedTuple):
     """Returns from a few sweeps of a recording, with all their columns."""
 
@@ -77,8 +82,7 @@ class RecordedReturns(NamedTuple):
                 f"{recording.name} is a cloud without sweeps, so the ranges of its returns are "
                 "unknown. Use a recording with sweeps."
             )
-        numbers = even_indices(len(recording), _SWEEPS).tolist()
-        sweeps = [recording[number].returns() for number in numbers]
+        sweeps = [recording[number].returns() for number in reference_numbers(recording)]
         sweeps = [sweep for sweep in sweeps if len(sweep)]
         if not sweeps:
             raise LidarError(f"{recording.name} has no returns in the sweeps that were read.")

@@ -13,6 +13,7 @@ from typing import Any, Self
 import numpy as np
 
 from lidarsim.columns.column_names import STRENGTHS
+from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
 from lidarsim.numerics.arrays import AnyArray, AnyFloats, Floats
 from lidarsim.schema.checks import check_number
@@ -28,6 +29,7 @@ from .intensity_fit import (
     is_compensated,
     is_valid,
     range_factors,
+    reference_numbers,
     smallest_positive,
     typical_level,
     white_level,
@@ -181,7 +183,7 @@ class IntensityScale:
         recorded = returns.columns[column]
         valid = is_valid(recorded)
         if not valid.any() or (recorded[valid] == recorded[valid][0]).all():
-            raise LidarError(_missing_text(recording, column, recorded[valid]))
+            raise _unknown_error(recording, column, recorded[valid])
         fit = _Fit(recording, column, returns.select(valid), model)
         return fit.scale()
 
@@ -373,7 +375,7 @@ def _primary_column(recording: Recording, returns: RecordedReturns, model: Senso
     columns = returns.columns
     available = [name for name in STRENGTHS if name in columns]
     if not available:
-        raise LidarError(_missing_text(recording, "", None))
+        raise _unknown_error(recording, "", None)
     intensity, reflectivity = STRENGTHS
     if available != [intensity, reflectivity] or recording.intensity_column is not None:
         return available[0]
@@ -422,18 +424,57 @@ def _has_simulated_energies(returns: RecordedReturns) -> bool:
     )
 
 
-def _missing_text(recording: Recording, column: str, values: AnyArray | None) -> str:
-    """Return the error message for a recording without usable intensities."""
+class UnknownIntensitiesError(LidarError):
+    """Error raised if a recording has no usable intensities.
+
+    `problem` is a sentence that states why. The message also names options of the command line.
+    """
+
+    def __init__(self, problem: str) -> None:
+        super().__init__(
+            f"{problem} Pass `--intensity COLUMN` to use another column, or `--reflectance 0.3` to "
+            "assume the same reflectance for all returns."
+        )
+        self.problem = problem
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.problem,)
+
+
+def _unmeasured(recording: Recording) -> str:
+    """Describe the recording without intensities, or its first sweep if other sweeps have some."""
+    numbers = reference_numbers(recording)
+    lacks = [not {*STRENGTHS} & {*recording[number].columns} for number in numbers]
+    if all(lacks) or True not in lacks:
+        return recording.name
+    return _differing_sweep(recording, numbers[lacks.index(True)])
+
+
+def _differing_sweep(recording: Recording, number: int) -> str:
+    item = recording.files[number] if recording.files else f"sweep {number}"
+    return f"Unlike other sweeps, {item} in {recording.name}"
+
+
+def check_column(recording: Recording, sweep: Sweep, number: int, column: str) -> None:
+    """Raise LidarError if a sweep lacks the column that defines the energies."""
+    if column not in sweep.columns:
+        raise UnknownIntensitiesError(
+            f"{_differing_sweep(recording, number)} has no column {column!r}, so the energies of "
+            "its returns are unknown."
+        )
+
+
+def _unknown_error(
+    recording: Recording, column: str, values: AnyArray | None
+) -> UnknownIntensitiesError:
+    """Return the error for a recording without usable intensities."""
     if values is None:
-        problem = f"{recording.name} has no intensity column"
+        problem = f"{_unmeasured(recording)} has no intensity column"
     elif not len(values):
         problem = f"The column {column!r} of {recording.name} has no valid intensities"
     else:
         problem = f"All intensities of {recording.name} are {values[0]:g}"
-    return (
-        f"{problem}, so the energies of its returns are unknown. Pass `--intensity COLUMN` to use "
-        "another column, or `--reflectance 0.3` to assume the same reflectance for all returns."
-    )
+    return UnknownIntensitiesError(f"{problem}, so the energies of its returns are unknown.")
 
 
 @dataclass(frozen=True, eq=False)

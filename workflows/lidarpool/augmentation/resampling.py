@@ -27,7 +27,7 @@ _SLACK = 1.05  # tolerance of the checks, because recorded directions are measur
 _MAX_MISSING = 0.02  # maximum share of rays, or of rays in a channel, that cannot be resampled
 _MIN_STEP_SHARE = 0.97  # minimum azimuth step of a sensor, as a multiple of the recorded step
 _MAX_SHARED = 0.05  # maximum share of rays whose closest pulse is also closest to another ray
-_PARTIAL_HINT = "Use `partial` to omit such pulses."
+_PARTIAL_HINT = "Use `--partial` to omit such pulses."
 _TWIN_HINT = (
     "To simulate this sensor in a scene that is reconstructed from the recording, use `lidarpool "
     "twin`."
@@ -119,7 +119,8 @@ class SensorResampler:
                 raise LidarError(
                     f"The maximum range of {self.sensor.model} is {max_range_m:g} m, but that of "
                     f"{recorded_sensor.model} in {self.recording.name} is only "
-                    f"{recorded_sensor.max_range_m:g} m. Reduce `max_range_m`. {_TWIN_HINT}"
+                    f"{recorded_sensor.max_range_m:g} m. Use a sensor file with a lower "
+                    f"`max_range_m`. {_TWIN_HINT}"
                 )
         elif max_range_m > self._pulses.max_range_m:
             self.notes.append(
@@ -170,8 +171,16 @@ class SensorResampler:
     def _check_elevations(self, rays: _Rays, outside: Ints, distant: Ints) -> None:
         """Raise LidarError if channels are outside the field of view or far from all rings."""
         model, name = self.sensor.model, self.recording.name
+        top_deg, bottom_deg = np.degrees(self._pulses.elevation_rad[[0, -1]])
+        if len(outside) and not _is_spinning(self.sensor):
+            low_deg, high_deg = np.degrees([rays.elevation.min(), rays.elevation.max()])
+            raise LidarError(
+                f"The pulses of {model} have elevations from {low_deg:.1f}° to {high_deg:.1f}°, "
+                f"but {100 * rays.is_outside.mean():.0f} % of them are outside the vertical field "
+                f"of view of {name} ({bottom_deg:.1f}° to {top_deg:.1f}°). {_PARTIAL_HINT} "
+                f"{_TWIN_HINT}"
+            )
         if len(outside):
-            top_deg, bottom_deg = np.degrees(self._pulses.elevation_rad[[0, -1]])
             listed = list_names([f"{self._elevation_deg(rays, k):.1f}°" for k in outside])
             raise LidarError(
                 f"{model} has channels at {listed}, which are outside the vertical field of view "
@@ -201,8 +210,8 @@ class SensorResampler:
             raise LidarError(
                 f"The azimuth resolution of {self.sensor.model} is "
                 f"{format_rounded(np.degrees(step_rad))}°, but that of {self.recording.name} is "
-                f"only {format_rounded(np.degrees(recorded_rad))}°. Reduce the number of firings "
-                f"per revolution, for example with a higher `rate_hz`. {_TWIN_HINT}"
+                f"only {format_rounded(np.degrees(recorded_rad))}°. Use a sensor with fewer "
+                f"firings per revolution. {_TWIN_HINT}"
             )
 
     def _check_sharing(self) -> None:

@@ -20,11 +20,12 @@ from lidarsim.sensor import Sensor
 from lidarsim.words import join_names, plural
 
 from ..clouds.folder import result_folder
-from ..clouds.format_table import format_of_path
+from ..clouds.format_table import format_of_path, formats_of_endings
 from ..clouds.writing import ExportSpec
 from ..identity.fingerprint import fingerprint
 from ..identity.software import software
 from ..run.cluster.worker_map import MapFunction, parallel_map
+from .rewriting.opening import check_sweeps
 from .sweep_tasks import (
     CHECKED_SENSORS,
     MAX_VARIANTS,
@@ -129,6 +130,8 @@ class Augmentation:
         Sensor to which the sweeps are resampled, or None to keep the rays of the recorded sensor.
     reflectance
         Reflectance of all recorded surfaces if the recording has no intensities.
+    partial
+        Whether to omit pulses of `resampled` that the recorded sensor does not observe.
     """
 
     file: RecordingFile
@@ -138,6 +141,7 @@ class Augmentation:
     output_format: str | None = None
     resampled: Sensor | None = None
     reflectance: float | None = None
+    partial: bool = False
 
     def __post_init__(self) -> None:
         if self.numbers is not None and self.resampled is not None:
@@ -185,12 +189,14 @@ class Augmentation:
         out = Path(out)
         try:
             files = self.file.each_sensor()
+            if len(files) == 1:
+                check_sweeps(self.file.path, files[0].open())
             output = self._output()
             targets = self._targets(out, output)
             with ExitStack() as stack:
                 if targets[0] != out:
                     stack.enter_context(result_folder(out))
-                stack.enter_context(result_folder(WorkFolder.for_output(out)))
+                stack.enter_context(result_folder(WorkFolder.for_output(out), shown=out))
                 identity = self._identity()
                 work = WorkFolder.create_or_resume(
                     out, identity, resume=resume, overwrite=overwrite
@@ -216,11 +222,30 @@ class Augmentation:
         suffix = path.suffix if path.is_file() else ""
         if output is not None:
             suffix = Path(output.row.file).suffix
+        self._check_ending(out, suffix)
         if self.variants.is_campaign:
             return tuple(out / f"{number:04}{suffix}" for number in range(self.variants.count))
         if suffix and out.suffix.lower() != suffix.lower():
             return (out / f"{path.stem}{suffix}",)
         return (out,)
+
+    def _check_ending(self, out: Path, suffix: str) -> None:
+        """Raise LidarError if a folder would have the extension of a file or of another format."""
+        ending = out.suffix.lower()
+        formats = formats_of_endings()
+        if ending not in formats or out.is_dir():
+            return
+        if self.variants.is_campaign:
+            raise LidarError(
+                f"{out} ends in {ending}, but a campaign writes a folder with a copy for each "
+                "variant. Specify a path without this ending with `--out`."
+            )
+        if ending == suffix.lower():
+            return
+        kind = f"{suffix} file" if suffix else "folder"
+        name = formats[ending]
+        remedy = f"Use `--format {name}`, or an output folder." if name else "Use an output folder."
+        raise LidarError(f"{out} ends in {ending}, but the copy is a {kind}. {remedy}")
 
     def _identity(self) -> dict[str, str]:
         """Return hashes of the inputs, keyed by a noun for messages."""
@@ -236,6 +261,7 @@ class Augmentation:
                 self.output_format,
                 self.resampled,
                 self.reflectance,
+                self.partial,
             ),
             "version of lidarpool": software()["lidarpool"],
         }
@@ -354,6 +380,7 @@ class _Run:
             self.output,
             augmentation.resampled,
             augmentation.reflectance,
+            augmentation.partial,
         )
         key = fingerprint(dict(self.work.identity), str(self.work.folder), group.start)
         return SharedPlan.from_plan(key, self.work, plan)

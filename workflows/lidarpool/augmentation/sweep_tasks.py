@@ -112,6 +112,8 @@ class AugmentationPlan:
         Sensor to which the sweeps are resampled, or None.
     reflectance
         Reflectance of all recorded surfaces if the recording has no intensities.
+    partial
+        Whether to omit pulses of `resampled` that the recorded sensor does not observe.
     """
 
     files: Sequence[RecordingFile]
@@ -121,6 +123,7 @@ class AugmentationPlan:
     output: ExportSpec | None = None
     resampled: Sensor | None = None
     reflectance: float | None = None
+    partial: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,8 +248,12 @@ class PartProcess:
         sensor = self.plan.resampled
         if sensor is None:
             return None
-        model = self.plan.model
-        return Resampler(SensorResampler(self.recording, sensor, recorded_sensor=model))
+        plan = self.plan
+        return Resampler(
+            SensorResampler(
+                self.recording, sensor, recorded_sensor=plan.model, partial=plan.partial
+            )
+        )
 
     @cached_property
     def source(self) -> Recording:

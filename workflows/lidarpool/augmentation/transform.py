@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from threading import Lock
@@ -12,7 +13,7 @@ import numpy as np
 
 from lidarsim.columns.column_names import standard_names
 from lidarsim.columns.sweep import Sweep
-from lidarsim.errors import LidarError
+from lidarsim.errors import ArgumentError, LidarError
 from lidarsim.media.weather import Weather
 from lidarsim.motion.trajectory import Track
 from lidarsim.numerics.arrays import AnyArray
@@ -29,6 +30,7 @@ from ..recordings.opening import open_recording
 from .augmented_sweep import AugmentedSweep
 from .augmenter import Augmenter
 from .effects import Effects
+from .intensity_scale import UnknownIntensitiesError
 
 EffectsLike = Effects | str | Path | Mapping[str, Any]
 ModelLike = Sensor | str | Path
@@ -44,6 +46,7 @@ def augment(
     model: ModelLike | None = None,
     seed: int | None = None,
     sweeps: Iterable[int] | None = None,
+    reflectance: float | None = None,
     **weather: Any,
 ) -> Iterator[Sweep]:
     """Simulate weather, faults, noise and inserted objects on the sweeps of a recording.
@@ -62,6 +65,8 @@ def augment(
         Seed of all random numbers. By default, it is the seed of the effects.
     sweeps
         Numbers of the sweeps, by default all.
+    reflectance
+        Reflectance of all recorded surfaces if the recording has no intensities.
     **weather
         Fields of the section `weather` that override those of the effects, such as
         ``rain_mm_h=25`` or ``visibility_km=0.5``.
@@ -83,10 +88,17 @@ def augment(
     >>> for sweep in augment("drive.mcap", rain_mm_h=25):  # doctest: +SKIP
     ...     print(len(sweep))
     """
+    if not isinstance(recording, str | Path | Recording):
+        raise ArgumentError(
+            f"The recording must be a path or a Recording, but its type is "
+            f"{type(recording).__name__}. To augment sweeps and arrays, use the transform "
+            "`Augment`."
+        )
     chosen = _effects(effects, weather, seed)
     if not isinstance(recording, Recording):
         recording = open_recording(recording, keep_noise=True)
-    augmenter = Augmenter(recording, chosen, _model(model))
+    with _python_advice("Open the recording with `open_recording(path, intensity=COLUMN)`"):
+        augmenter = Augmenter(recording, chosen, _model(model), reflectance)
     numbers = range(len(recording)) if sweeps is None else sweeps
     return _augmented_sweeps(recording, augmenter, numbers)
 
@@ -190,7 +202,8 @@ class Augment:
         Returns
         -------
         Sweep or array
-            The augmented points. An array has the type and the columns of the input.
+            The augmented points. An array has the type and the columns of the input. If no point
+            is a return, the points are unchanged.
 
         Raises
         ------
@@ -206,6 +219,8 @@ class Augment:
         return self._augment_array(np.asarray(points), seed)
 
     def _augment_sweep(self, sweep: Sweep, seed: int) -> Sweep:
+        if not sweep.has_return.any():  # its pulses are unknown
+            return sweep.replace(columns={**sweep.columns, "cause": np.zeros(len(sweep), np.uint8)})
         augmented = self._augment(_without_pose(sweep), seed)
         result = _with_boxes(sweep, augmented)
         return result.replace(
@@ -227,7 +242,10 @@ class Augment:
             )
         # In double precision, values from files are not exact multiples of their steps.
         columns = {name: points[:, 3 + k].astype(np.float32) for k, name in enumerate(self.columns)}
-        augmented = self._augment(Sweep(points[:, :3].astype(np.float64), columns), seed).sweep
+        sweep = Sweep(points[:, :3].astype(np.float64), columns)
+        if not sweep.has_return.any():  # its pulses are unknown
+            return points.copy()
+        augmented = self._augment(sweep, seed).sweep
         values = [augmented.columns[name] for name in self._standard_names]
         return np.column_stack([augmented.points, *values]).astype(points.dtype)
 
@@ -246,7 +264,8 @@ class Augment:
     def _sensor_state(self, sweeps: Sequence[Sweep]) -> _SensorState:
         source = _SweepSource(sweeps)
         recording = Recording("the sweep", len(sweeps), source)
-        augmenter = Augmenter(recording, self.effects, self.model, self.reflectance)
+        with _python_advice("Pass the names of the columns as `columns`, including an intensity"):
+            augmenter = Augmenter(recording, self.effects, self.model, self.reflectance)
         return _SensorState(source, recording, augmenter)
 
 
@@ -278,6 +297,18 @@ class _SensorState:
             finally:
                 self.source.current = None
         return self.augmenter.augment(read, seed % _NUMBERS)
+
+
+@contextmanager
+def _python_advice(advice: str) -> Iterator[None]:
+    """Replace options of the command line in the error for unknown intensities."""
+    try:
+        yield
+    except UnknownIntensitiesError as error:
+        raise LidarError(
+            f"{error.problem} {advice}, or pass `reflectance=0.3` to assume the same reflectance "
+            "for all returns."
+        ) from error
 
 
 def _effects(effects: EffectsLike | None, weather: Mapping[str, Any], seed: int | None) -> Effects:

@@ -222,6 +222,9 @@ class _Placement(NamedTuple):
     help="Resample the sweeps to another sensor. Its field of view and resolution must not exceed "
     "those of the recorded sensor.",
 )
+@options.flag(
+    "--partial", help="Omit pulses of --sensor that the recorded sensor does not observe."
+)
 @click.option("--seed", type=click.IntRange(0), metavar="N", help="Random seed (default: 0).")
 @click.option(
     "--sweeps",
@@ -251,6 +254,7 @@ def augment(
     reflectance: float | None,
     output_format: str | None,
     sensor: str | None,
+    partial: bool,
     sweeps: range | None,
     scheduler: str | None,
     files: TlsFiles,
@@ -283,6 +287,8 @@ def augment(
             "`--workers` and `--scheduler` cannot be combined, because the workers are those of "
             "the cluster."
         )
+    if partial and sensor is None:
+        raise click.UsageError("`--partial` requires `--sensor`.")
     if not isinstance(out, Path):
         raise LidarError(
             f"{out} is a URL, but files are linked to the recording. Specify a local path with "
@@ -306,6 +312,7 @@ def augment(
         output_format,
         None if sensor is None else _load_model(sensor),
         reflectance,
+        partial,
     )
     client = nullcontext() if scheduler is None else connect_client(scheduler, files)
     with client as connected, terminal.writing("augmenting the sweeps") as show:

@@ -30,12 +30,19 @@ def output_destination(text: str | Path) -> Path | Storage:
 
 
 @contextmanager
-def result_folder(output: Path | Storage) -> Iterator[Path]:
+def result_folder(output: Path | Storage, shown: Path | None = None) -> Iterator[Path]:
     """Create and lock the folder for a result or export.
 
     Temporary files of a killed run or export are removed. Folders that were created on entry are
     removed on exit if they are still empty. If the output is storage, the context manager yields a
     temporary folder, and the caller must copy its files to the storage.
+
+    Parameters
+    ----------
+    output
+        Path of the folder, or storage.
+    shown
+        Path of the output in error messages, if the folder only contains temporary files for it.
 
     Raises
     ------
@@ -54,9 +61,9 @@ def result_folder(output: Path | Storage) -> Iterator[Path]:
     missing_folders = [
         path for path in (folder, *folder.parents) if not path.exists()
     ]  # innermost first
-    with explain_os_errors(
-        f"Cannot write to the folder {folder}", "specify another folder with `--out`"
-    ):
+    kind = "folder" if shown is None else "path"
+    place = f"the folder {folder}" if shown is None else str(shown)
+    with explain_os_errors(f"Cannot write to {place}", f"specify another {kind} with `--out`"):
         try:
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
@@ -64,8 +71,8 @@ def result_folder(output: Path | Storage) -> Iterator[Path]:
             Storage.at(folder).remove_unfinished(deep=False)
         except BlockingIOError as error:
             raise LidarError(
-                f"Another run or export is using the folder {folder}. Wait until it has "
-                "finished, or specify another folder with `--out`."
+                f"Another run or export is using {place}. Wait until it has finished, or specify "
+                f"another {kind} with `--out`."
             ) from error
     try:
         yield folder

@@ -183,6 +183,18 @@ def point_suffixes() -> tuple[str, ...]:
     return tuple(suffix for row in rows for suffix in row.suffixes)
 
 
+def formats_of_endings() -> dict[str, str]:
+    """Return the formats that write a file, by the extension of the file.
+
+    Extensions of other files that can be read have an empty string.
+    """
+    formats = {suffix: "" for row in _all_rows() for suffix in row.suffixes}
+    for name, row in FORMATS.items():
+        if suffix := Path(row.file).suffix:
+            formats[suffix] = name
+    return formats
+
+
 def plugin_formats(files: Collection[str]) -> list[str]:
     """Return plug-in formats whose file or folder is in `files`.
 

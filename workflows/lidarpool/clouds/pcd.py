@@ -108,6 +108,7 @@ def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
         read,
         meters=source.chosen_meters(),
         compensated=_stated_compensation(files[0]),
+        files=[path.name for path in files],
     )
 
 

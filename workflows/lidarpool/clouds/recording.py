@@ -106,6 +106,8 @@ class Recording:
     stations
         Names of the sweeps if each sweep was recorded at a scan station. The name of an unnamed
         sweep is an empty string.
+    files
+        Names of the files of the sweeps if each sweep has its own file.
     thinned
         Whether some returns were discarded, so that gaps are not necessarily lost returns.
     white
@@ -141,6 +143,7 @@ class Recording:
     sequence: str = ""
     calibration: Path | None = None
     stations: Sequence[str] = ()
+    files: Sequence[str] = ()
     thinned: bool = False
     white: float | None = None
     energies: bool = False
@@ -190,6 +193,7 @@ class Recording:
             read_poses=None if read_poses is None else section_poses,
             fired=None if fired is None else lambda number: fired(first + number),
             stations=self.stations[first:stop],
+            files=self.files[first:stop],
         )
 
     def read_fired(self, number: int) -> Sweep:

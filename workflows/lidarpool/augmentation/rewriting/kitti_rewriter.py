@@ -11,7 +11,7 @@ from lidarsim.errors import LidarError
 from lidarsim.io.input_files import read_input, read_input_text
 from lidarsim.numerics.arrays import Ints
 from lidarsim.scene.files.float_rows import columns_by_name
-from lidarsim.words import plural
+from lidarsim.words import list_names, plural
 
 from ...clouds.kitti import CALIBRATION_FILE, MAX_INSTANCES, point_files, sequence_folders
 from ...clouds.recording import Recording, RecordingSource
@@ -61,7 +61,8 @@ class KittiRewriter(Rewriter):
         if not self.path.is_dir():
             return files, details | {"boxes": len(augmented.boxes)}
         label_file = self._folder / "labels" / f"{file.stem}.label"
-        if label_file.exists():
+        details["unlabeled"] = not label_file.exists()
+        if not details["unlabeled"]:
             numbers = np.frombuffer(read_input(label_file), "<u4")[template]
             files[self._name(label_file)] = _labels(numbers, stored, augmented).tobytes()
         labels = self._box_labels(file, augmented)
@@ -127,10 +128,18 @@ class KittiRewriter(Rewriter):
         notes = []
         boxes = labels = 0
         has_labels = False
+        unlabeled = []
         for sweep in encoded.details():
+            if sweep.get("unlabeled"):
+                unlabeled.append(f"{self._files[sweep['number']].stem}.label")
             boxes += sweep["boxes"]
             labels += sweep.get("labels", 0)
             has_labels |= "labels" in sweep
+        if unlabeled and (self._folder / "labels").is_dir():
+            notes.append(
+                f"{self.source.name} has no {list_names(unlabeled)} in the folder `labels`, so the "
+                "points of these sweeps are not labeled in the copy."
+            )
         if boxes and not has_labels:
             notes.append(
                 f"{self.source.name} has no folder `label_2`, so the boxes of inserted objects are "

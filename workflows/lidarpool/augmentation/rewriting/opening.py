@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 from lidarsim.errors import LidarError
+from lidarsim.words import join_alternatives
 
 from ...clouds.format_table import format_of_path
 from ...clouds.kitti import KITTI
@@ -19,6 +21,7 @@ from .nuscenes_rewriter import NuScenesRewriter
 from .pcd_rewriter import PCDRewriter
 from .rewriter import Rewriter
 
+_MAX_LISTED = 3  # recordings in a folder that messages list
 _FORMATS = "KITTI, nuScenes, PCD, MCAP and rosbag2"
 _REMEDY = "Choose another format with `--format`, for example `--format mcap`."
 
@@ -56,7 +59,43 @@ def open_rewriter(source: str | Path, recording: Recording, sensor: str | None =
     if cloud_format is not None and issubclass(cloud_format, Rosbag2):
         return BagRewriter(opened, recording)
     kind = cloud_format.title if cloud_format is not None and cloud_format.title else "this format"
+    if contained := _rewritable_entries(path):
+        raise LidarError(f"{source} cannot be rewritten in {kind}. {_pass_one_of(contained)}")
     raise LidarError(
         f"{source} cannot be augmented in its own format. Recordings can be rewritten in the "
         f"formats {_FORMATS}, but not in {kind}. {_REMEDY}"
     )
+
+
+def check_sweeps(source: str | Path, recording: Recording) -> None:
+    """Raise LidarError if a recording contains no sweeps.
+
+    The message names recordings in the folder `source` that may contain some.
+    """
+    if not recording.is_cloud and len(recording):
+        return
+    contained = _rewritable_entries(Path(source))
+    remedy = _pass_one_of(contained) if contained else "Use a recording that consists of sweeps."
+    raise LidarError(f"{source} contains no sweeps. {remedy}")
+
+
+def _rewritable_entries(folder: Path) -> list[Path]:
+    """Return the files and folders in a folder that can be augmented in their own format."""
+    if not folder.is_dir():
+        return []
+    return [path for path in sorted(folder.iterdir()) if _is_rewritable(path)]
+
+
+def _is_rewritable(path: Path) -> bool:
+    if path.name.startswith("."):
+        return False
+    with suppress(LidarError, OSError):  # a package is missing, or the folder cannot be read
+        cloud_format = format_of_path(path, str(path))
+        return cloud_format is not None and issubclass(
+            cloud_format, KITTI | PCD | NuScenes | Rosbag2
+        )
+    return False
+
+
+def _pass_one_of(paths: list[Path]) -> str:
+    return f"Pass {join_alternatives([str(path) for path in paths[:_MAX_LISTED]])} instead."
