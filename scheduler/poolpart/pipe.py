@@ -37,6 +37,7 @@ from .extras.listening import PipeListener
 from .extras.notebook import table_of_pipe
 from .internals.client import send_request
 from .internals.names import PIPES, require_feature
+from .internals.partition_client import whole_client
 from .internals.queues import Packed, unpack_item
 from .internals.worker import current_task, start_time_of_task
 from .pipe_states import (
@@ -177,7 +178,7 @@ class Pipe:
         self.producers = producers
         self.fails_with_tasks = fails_with_tasks
         self.drop_repeats = drop_repeats
-        self._client = client
+        self._client = None if client is None else whole_client(client)
         # Items that were fetched from the scheduler but not returned yet. The client's event loop
         # appends them, and threads that share this object remove them.
         self._buffer: deque[Packed] = deque()
