@@ -28,7 +28,8 @@ from .extras.background import run_in_background
 from .extras.cancelling import cancel_tasks
 from .extras.notebook import table_of_partition
 from .for_each import ItemTasks
-from .internals.names import CANCELLING, MAP, require_feature
+from .internals.names import CANCELLING, CLIENTS, MAP, require_feature
+from .internals.partition_client import PartitionClient, whole_client
 from .mapping import Results, Stage
 from .membership import MemberName, register
 from .partition_stats import PartitionStats
@@ -94,7 +95,7 @@ class Partition:
     ) -> None:
         self.name = name
         self.note = note
-        self._client = client
+        self._client = None if client is None else whole_client(client)
         self.by_rule = by_rule
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -580,6 +581,41 @@ class Partition:
         """
         _refuse_options("compute", options, resources=_SLOTS_INSTEAD)
         return self.client.compute(collections, resources=self._resources_for(slots), **options)
+
+    def as_client(self) -> Client:
+        """Return a client that only uses and shows the workers of this partition.
+
+        Pass it to libraries that list workers or submit tasks themselves, such as ``xgboost.dask``,
+        or call them in a ``with`` block. In the block, it is the current client of this thread,
+        which libraries find with `get_client` and Dask collections use by default.
+
+        All tasks that the client submits or computes take a slot of the partition. The methods
+        `scheduler_info`, `nthreads`, `has_what`, `run`, `scatter`, `wait_for_workers` and others
+        refer to the workers of the partition, and so do requests such as
+        ``client.scheduler.identity()``. In the tasks, `get_client` and `worker_client` return such
+        a client as well.
+
+        Returns
+        -------
+        Client
+            It shares the connection of this partition's client, and closing it has no effect. Both
+            clients can use the same futures. It cannot restart or shut down the cluster, and its
+            `cluster` is None.
+
+        Raises
+        ------
+        PoolError
+            If the tasks could never run, as described for `submit`, or if the installed version of
+            Dask does not support such clients.
+
+        Examples
+        --------
+        >>> with gpu.as_client() as client:                              # doctest: +SKIP
+        ...     model = xgboost.dask.train(client, {"device": "cuda"}, data)
+        """
+        require_feature(CLIENTS)
+        self._resources_for(1, asks=not self.client.asynchronous)
+        return PartitionClient(self.client, self.name)
 
     def scatter(self, data: Any, **options: Any) -> Any:
         """Scatter data into the memory of these workers, and return futures.

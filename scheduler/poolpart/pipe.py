@@ -37,8 +37,9 @@ from .extras.listening import PipeListener
 from .extras.notebook import table_of_pipe
 from .internals.client import send_request
 from .internals.names import PIPES, require_feature
+from .internals.partition_client import whole_client
 from .internals.queues import Packed, unpack_item
-from .internals.worker import current_task
+from .internals.worker import current_task, start_time_of_task
 from .pipe_states import (
     CHANGE,
     PUT,
@@ -82,6 +83,9 @@ class Pipe:
     fails_with_tasks
         Whether the pipe fails if a task that received it as an argument is lost. Pass False if the
         program resubmits lost tasks.
+    drop_repeats
+        Whether to drop the items that a task sends again when Dask runs it again, for example
+        because its worker has died. See "Repeated items" below.
 
     Notes
     -----
@@ -115,6 +119,15 @@ class Pipe:
     lost, because an item that arrives within the next second is kept in the object for its next
     `get`. If an event loop stops awaiting a thread (`asyncio.to_thread`), the thread continues to
     wait, and the item that it receives is lost. To limit this wait, pass `timeout_s`.
+
+    **Repeated items.** If Dask runs a producer again, the task sends its items from the beginning.
+    The pipe numbers the items of each task, and drops an item if an earlier run of the task has
+    sent an item with the same number and the same pickled content. Each item of a producer that
+    sends the same items in the same order is therefore accepted once. If a run sends a different
+    item, this item and all later items of the run are accepted, and a warning is logged on the
+    scheduler. Items are not dropped if the task also takes items from a pipe, or if they are sent
+    outside of tasks or from a thread that a task has started. Pass ``drop_repeats=False`` if equal
+    items of different runs are distinct, for example measurements of a live sensor.
 
     **Order.** Each object returns items in the order in which they were put. Threads that share an
     object receive the items in any order.
@@ -152,6 +165,7 @@ class Pipe:
         producers: int = 1,
         *,
         fails_with_tasks: bool = True,
+        drop_repeats: bool = True,
     ) -> None:
         for quantity, number in (("capacity", capacity), ("number of producers", producers)):
             if not isinstance(number, int) or number < 1:
@@ -163,7 +177,8 @@ class Pipe:
         self.capacity = capacity
         self.producers = producers
         self.fails_with_tasks = fails_with_tasks
-        self._client = client
+        self.drop_repeats = drop_repeats
+        self._client = None if client is None else whole_client(client)
         # Items that were fetched from the scheduler but not returned yet. The client's event loop
         # appends them, and threads that share this object remove them.
         self._buffer: deque[Packed] = deque()
@@ -171,7 +186,8 @@ class Pipe:
 
     def __reduce__(self) -> tuple[Any, ...]:
         arguments = (self.name, self.capacity, None, self.producers)
-        return partial(Pipe, fails_with_tasks=self.fails_with_tasks), arguments
+        make = partial(Pipe, fails_with_tasks=self.fails_with_tasks, drop_repeats=self.drop_repeats)
+        return make, arguments
 
     def __repr__(self) -> str:
         state = self._state_in_words()
@@ -207,7 +223,12 @@ class Pipe:
         """
         require_feature(PIPES)
         client = self.client
-        state = {"owner": client.id, "capacity": self.capacity, "producers": self.producers}
+        state = {
+            "owner": client.id,
+            "capacity": self.capacity,
+            "producers": self.producers,
+            "drop_repeats": self.drop_repeats,
+        }
         if not run_on_scheduler(client, create_pipe, name=self.name, **state):
             raise ValueError(
                 f"The cluster already has a queue or variable named {self.name!r}. Choose another "
@@ -357,13 +378,15 @@ class Pipe:
         deadline = _deadline(timeout_s)
         source = iter(items)
         unsent: list[bytes] = []
+        options: dict[str, Any] = {"unbounded": unbounded, "run": start_time_of_task()}
         while unsent := unsent or [dumps(item) for item in islice(source, self.capacity)]:
-            reply = self._ask_until(deadline, _is_answered, PUT, items=unsent, unbounded=unbounded)
+            reply = self._ask_until(deadline, _is_answered, PUT, items=unsent, **options)
             if reply["failure"]:
                 raise PipeFailed(reply["failure"])
-            if reply["closed"]:
-                raise PipeClosed(f"Pipe {self.name!r} is closed and accepts no more items.")
             unsent = unsent[reply["answer"] :]
+            # A task that runs again after it has closed the pipe only sends repeated items.
+            if unsent and reply["closed"]:
+                raise PipeClosed(f"Pipe {self.name!r} is closed and accepts no more items.")
             if unsent and time.monotonic() > deadline:
                 raise TimeoutError(f"Pipe {self.name!r} remained full for {timeout_s} s.")
 
@@ -564,10 +587,10 @@ def _is_answered(reply: Reply) -> bool:
     return bool(reply["answer"])
 
 
-def _key_of_task() -> str:
-    """Return the key of this thread's task, or "" outside tasks."""
+def _key_of_task() -> Any:
+    """Return the key of this thread's task, or None outside tasks."""
     running = current_task()
-    return "" if running is None else str(running[1].key)
+    return None if running is None else running[1].key
 
 
 def _producer() -> str:
@@ -575,7 +598,8 @@ def _producer() -> str:
 
     The ID is the key of the current task, or a random ID outside of tasks.
     """
-    return _key_of_task() or uuid.uuid4().hex
+    key = _key_of_task()
+    return uuid.uuid4().hex if key is None else str(key)
 
 
 def delete_pipes(client: Client, names: Sequence[str]) -> None:

@@ -13,13 +13,15 @@ names, and only takes items if its client is still connected.
 from __future__ import annotations
 
 import asyncio
+import logging
 import sys
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
 
+from .accepted_items import AcceptedItems
 from .errors import PipeClosed, PipeFailed
 from .internals.queues import (
     BoundedQueue,
@@ -30,6 +32,8 @@ from .internals.queues import (
 )
 from .internals.scheduler import handlers_of
 
+logger = logging.getLogger(__name__)
+
 NAME = "poolpart-pipes"
 CHANGE, PUT, TAKE = (f"poolpart_pipes_{name}" for name in ("change", "put", "take"))
 
@@ -39,6 +43,7 @@ Replies = dict[str, Reply]  # replies by pipe, for pipes that exist
 USES_PIPES = "poolpart-pipes"  # annotation of tasks with the names of their pipes
 _UNFINISHED = ("waiting", "queued", "no-worker", "processing")  # states of unfinished tasks
 _ENDED = ("memory", "erred", "forgotten")  # states of tasks that have ended
+MAX_KEPT = 1000  # maximum number of forgotten tasks whose items are still recognized
 _SETTABLE = ("closed", "failure", "advice")  # fields that any client may set
 
 
@@ -59,12 +64,20 @@ class PipeState:
     """
 
     def __init__(
-        self, scheduler: Any, name: str, owner: str, capacity: int, producers: int
+        self,
+        scheduler: Any,
+        name: str,
+        owner: str,
+        capacity: int,
+        producers: int,
+        drop_repeats: bool,
     ) -> None:
         self.name = name
         self.owner = owner  # constant, and still available if a client deletes the Variable
-        self.putters: set[str] = set()  # keys of the tasks that have put items
-        self.takers: set[str] = set()  # keys of the tasks that have requested items
+        self.putters: set[Any] = set()  # keys of the tasks that have put items
+        self.takers: set[Any] = set()  # keys of the tasks that have requested items
+        self.drops_repeats = drop_repeats
+        self.accepted: dict[Any, AcceptedItems] = {}  # {task key: items of the task}
         self.queue = BoundedQueue(capacity, self.put_error, self.get_error)
         value = {
             "owner": owner,
@@ -191,7 +204,12 @@ def describe_pipe(name: str, dask_scheduler: Any = None) -> str:
 
 
 async def create_pipe(
-    name: str, owner: str, capacity: int, producers: int, dask_scheduler: Any = None
+    name: str,
+    owner: str,
+    capacity: int,
+    producers: int,
+    drop_repeats: bool = True,
+    dask_scheduler: Any = None,
 ) -> bool:
     """Create a pipe, or return False if the name is already in use. Runs on the scheduler."""
     # The last request of a killed owner may arrive after the owner was removed. Nobody would delete
@@ -200,7 +218,7 @@ async def create_pipe(
         return False
     if NAME not in dask_scheduler.plugins:
         dask_scheduler.add_plugin(PipeRegistry(dask_scheduler))
-    state = PipeState(dask_scheduler, name, owner, capacity, producers)
+    state = PipeState(dask_scheduler, name, owner, capacity, producers, drop_repeats)
     pipes_of(dask_scheduler)[name] = state
     await state.wake_early_readers()
     return True
@@ -244,10 +262,11 @@ class PipeRegistry(SchedulerPlugin):
         self.scheduler = scheduler
         self.states: dict[str, PipeState] = {}
         # {task key: requests that wait for the end of the task}
-        self._awaited: defaultdict[str, Waiters] = defaultdict(Waiters)
+        self._awaited: defaultdict[Any, Waiters] = defaultdict(Waiters)
         # Keys of unfinished tasks with pipes that were released from their worker or the queue.
         # Dask either runs such a task again or forgets it.
-        self._released: set[str] = set()
+        self._released: set[Any] = set()
+        self._kept: deque[Any] = deque()  # keys of forgotten tasks whose items are still known
         handlers = handlers_of(scheduler)
         handlers.update({CHANGE: self.change, PUT: self.put, TAKE: self.pop_items})
         self._end_interception = intercept_variable_set(handlers, self._check, self._notify)
@@ -263,9 +282,35 @@ class PipeRegistry(SchedulerPlugin):
         # Polling every 5 ms used 2 % of a core on the scheduler of a run.
         if finish in _ENDED and key in self._awaited:
             self._awaited[key].notify()
+        if finish == "released" and start == "processing":
+            for accepted in self._all_accepted_items(key):
+                accepted.may_still_run = True
+        elif finish == "forgotten":
+            self._forget_accepted_items(key)
         task = self.scheduler.tasks[key]
         if task.annotations and (names := task.annotations.get(USES_PIPES)):
             self._fail_if_lost(task, names, start, finish)
+
+    def _all_accepted_items(self, key: Any) -> list[AcceptedItems]:
+        """Return what each pipe has accepted from a task."""
+        return [s.accepted[key] for s in self.states.values() if key in s.accepted]
+
+    def _forget_accepted_items(self, key: Any) -> None:
+        """Forget the items of a task that the scheduler has forgotten.
+
+        If the task may still run on a worker, its items are kept for a while.
+        """
+        forgotten = self._all_accepted_items(key)
+        for accepted in forgotten:
+            accepted.is_forgotten = True
+        if any(accepted.may_still_run for accepted in forgotten):
+            self._kept.append(key)
+            if len(self._kept) <= MAX_KEPT:
+                return
+            key = self._kept.popleft()
+        for state in self.states.values():
+            if key in state.accepted and state.accepted[key].is_forgotten:
+                del state.accepted[key]
 
     def _fail_if_lost(self, task: Any, names: Sequence[str], start: str, finish: str) -> None:
         """Make a task's pipes fail if the task is lost."""
@@ -279,13 +324,13 @@ class PipeRegistry(SchedulerPlugin):
                 f"Task {task.key!r}, which uses the pipe, was canceled before it had used the "
                 "pipe. Dask also cancels a task if no reference to its future is kept."
             )
-            self._fail_soon(names, reason, cancelled=str(task.key))
+            self._fail_soon(names, reason, cancelled=task.key)
         if finish == "released" and start in _UNFINISHED:
             self._released.add(task.key)
         else:
             self._released.discard(task.key)
 
-    def _fail_soon(self, names: Sequence[str], reason: str, cancelled: str = "") -> None:
+    def _fail_soon(self, names: Sequence[str], reason: str, cancelled: Any = None) -> None:
         """Fail those pipes that are still open after the current step of the event loop.
 
         `cancelled` is the key of a canceled task. If this task has already used a pipe, the pipe
@@ -306,7 +351,7 @@ class PipeRegistry(SchedulerPlugin):
         """Make a canceled task's open pipes fail after its worker was restarted."""
         for state in self._existing(names).values():
             # If a consumer is lost, other consumers can continue, so the pipe does not fail.
-            if not state.has_ended and str(key) not in state.takers:
+            if not state.has_ended and key not in state.takers:
                 state.fail(
                     f"Task {key!r}, which uses the pipe, was canceled, and its worker "
                     "was restarted."
@@ -378,24 +423,61 @@ class PipeRegistry(SchedulerPlugin):
         items: list[bytes],
         unbounded: bool,
         seconds: float,
-        task: str = "",
+        task: Any = None,
+        run: float = 0.0,
     ) -> Replies | Awaitable[Replies]:
         """Put items into a pipe once it has space for at least one of them.
 
-        The answer is the number of items that were put. If there is space, the reply is returned
-        directly, because Dask would create a task for a coroutine, which takes longer than the
-        request itself.
+        The answer is the number of items that were put, including items that were dropped because
+        an earlier run of the task has put them. If there is space, the reply is returned directly,
+        because Dask would create a task for a coroutine, which takes longer than the request
+        itself.
+
+        Parameters
+        ----------
+        names
+            Name of the pipe.
+        client_id
+            ID of the client. Items of a client that has left are not put.
+        items
+            Pickled items.
+        unbounded
+            Whether to ignore the capacity.
+        seconds
+            Maximum wait.
+        task
+            Key of the requesting task, or None outside tasks.
+        run
+            Time when this run of the task started, or 0 outside tasks.
         """
 
         def put_into(state: PipeState) -> int:
-            if state.has_ended or client_id not in self.scheduler.clients:
+            if client_id not in self.scheduler.clients:
                 return 0
-            fitting = items if unbounded else items[: state.queue.free_capacity]
+            accepted = self._accepted_items(state, task, run)
+            dropped = 0 if accepted is None else accepted.skip_repeats(run, items)
+            if state.has_ended:
+                return dropped
+            end = None if unbounded else dropped + state.queue.free_capacity
+            fitting = items[dropped:end]
             state.put(fitting)
-            return len(fitting)
+            if accepted is not None and fitting and not accepted.append(run, fitting):
+                logger.warning(
+                    "Task %r runs again, and sends items to pipe %r that differ from those of its "
+                    "previous run. Some of its items may arrive twice.",
+                    task,
+                    state.name,
+                )
+            return dropped + len(fitting)
+
+        def can_proceed(state: PipeState) -> bool:
+            if unbounded or state.has_ended or state.queue.free_capacity:
+                return True
+            accepted = self._accepted_items(state, task, run)
+            return accepted is not None and accepted.count_repeats(run, items) > 0
 
         def ready() -> bool:
-            return unbounded or all(s.has_ended or s.queue.free_capacity for s in states.values())
+            return all(can_proceed(state) for state in states.values())
 
         async def later() -> Replies:
             await wait_until(ready, [state.queue.waiters for state in states.values()], seconds)
@@ -403,8 +485,28 @@ class PipeRegistry(SchedulerPlugin):
 
         states = self._existing(names)
         for state in states.values():
-            state.putters |= {task} - {""}
+            state.putters |= {task} - {None}
         return self._replies(states, put_into) if ready() else later()
+
+    def _accepted_items(self, state: PipeState, task: Any, run: float) -> AcceptedItems | None:
+        """Return the items that a pipe has accepted from a task, or None if they are not recorded.
+
+        A task that takes items from any pipe receives different items when it runs again, so all
+        of its items are accepted.
+        """
+        if not state.drops_repeats:
+            return None
+        is_known = task in self.scheduler.tasks
+        accepted = state.accepted.get(task)
+        if is_known and (accepted is None or accepted.is_forgotten):
+            # A task with the key of a forgotten task is a different task.
+            accepted = state.accepted[task] = AcceptedItems()
+        if accepted is None:
+            return None
+        runs_again = accepted.count > 0 and accepted.starts(run)
+        if runs_again and any(task in other.takers for other in self.states.values()):
+            accepted.accept_all(run)
+        return accepted
 
     async def pop_items(
         self,
@@ -416,7 +518,7 @@ class PipeRegistry(SchedulerPlugin):
         keys: Sequence[str] = (),
         puts: Mapping[str, list[bytes]] | None = None,
         limit: int = sys.maxsize,
-        task: str = "",
+        task: Any = None,
     ) -> Replies:
         """Take items from pipes, after waiting for an item or for the end of a pipe or task.
 
@@ -438,7 +540,7 @@ class PipeRegistry(SchedulerPlugin):
             Number of items to take from each pipe. If it is 0, the request waits for the end of a
             pipe or a task.
         task
-            Key of the requesting task, or "" outside tasks.
+            Key of the requesting task, or None outside tasks.
         """
         for name, items in (puts or {}).items():
             self.put([name], client_id, items, unbounded=True, seconds=0.0)
@@ -475,11 +577,11 @@ class PipeRegistry(SchedulerPlugin):
             await wait_until(is_full_or_ended, pipe_waiters, min(linger_s, seconds))
         return self._replies(states, take_from)
 
-    def _states_for_taker(self, task: str, names: Sequence[str]) -> dict[str, PipeState]:
+    def _states_for_taker(self, task: Any, names: Sequence[str]) -> dict[str, PipeState]:
         """Return the states of the named pipes that exist, and record which task takes items."""
         states = self._existing(names)
         for state in states.values():
-            state.takers |= {task} - {""}
+            state.takers |= {task} - {None}
         return states
 
     def _existing(self, names: Sequence[str]) -> dict[str, PipeState]:

@@ -16,6 +16,7 @@ from .division import call_steward, create_partitions, request_dissolution
 from .errors import PoolError
 from .extras.dashboard_page import leave_page, open_page
 from .extras.notebook import table_of_partitions
+from .internals.partition_client import whole_client
 from .membership import partition_names
 from .partition import Partition
 from .pipe_states import names_of_pipes
@@ -55,7 +56,7 @@ class Pool:
     """
 
     def __init__(self, client: Client, workers: Sequence[WorkerInfo]) -> None:
-        self.client = client
+        self.client = whole_client(client)
         self._workers = tuple(workers)  # workers at the last access
         # {name: description at the first access}
         self._first_seen = {worker.name: worker for worker in self._workers}

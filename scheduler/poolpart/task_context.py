@@ -9,6 +9,8 @@ from contextlib import contextmanager, suppress
 
 from distributed import Client, Status, default_client, get_client, get_worker
 
+from .internals.partition_client import whole_client
+
 _TRIES = 5
 _CLOSE_S = 5.0
 
@@ -29,16 +31,16 @@ def own_client() -> Client:
     would be a deadlock.
     """
     if is_in_event_loop():
-        return get_client()
+        return whole_client(get_client())
     with _one_at_a_time:
         for _ in range(_TRIES - 1):
             try:
-                return get_client()
+                return whole_client(get_client())
             except AssertionError:
                 with suppress(ValueError):  # no client was created
                     if (client := default_client()).status != "running":
                         client.close(timeout=_CLOSE_S)
-        return get_client()
+        return whole_client(get_client())
 
 
 def is_in_event_loop() -> bool:

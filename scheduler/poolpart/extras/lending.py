@@ -47,6 +47,8 @@ from distributed.diagnostics.plugin import WorkerPlugin
 from distributed.protocol.pickle import dumps
 
 from ..internals.client import install_wait_hooks
+from ..internals.names import CLIENTS, missing_names
+from ..internals.partition_client import show_partitions_to_tasks
 from ..internals.scheduler import Resources, SubmittingTask, call_worker
 from ..internals.worker import (
     count_slots,
@@ -338,6 +340,8 @@ def begin_lending(worker: Any, name: str) -> Lender:
     """Let a partition's tasks lend their slots. Runs in the worker's event loop."""
     with _lock:
         install_wait_hooks(WAIT_HOOKS)
+        if not missing_names(CLIENTS):
+            show_partitions_to_tasks()
         lender = _lenders.setdefault(worker, Lender(worker))
     lender.names.add(name)
     return lender

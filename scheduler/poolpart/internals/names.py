@@ -18,6 +18,7 @@ from typing import Any
 import distributed
 
 from ..errors import PoolError
+from .partition_client import PRIVATE_NAMES as CLIENT_NAMES
 from .queues import PRIVATE_NAMES as PIPE_NAMES
 
 TESTED = "2025.5.0", "2026.8.0"  # oldest and newest tested version of distributed (`make compat`)
@@ -35,6 +36,7 @@ PAGE = "the partitions page"
 CLUSTERS = "clusters with several kinds of workers"
 ADAPTING = "adaptive partitions"
 CANCELLING = "Partition.cancel"
+CLIENTS = "Partition.as_client"
 READING = "errors for inputs that cannot be unpickled"
 
 
@@ -308,6 +310,15 @@ PRIVATE_NAMES = (
         (
             "test_cancelling.py::test_a_worker_with_nothing_but_cancelled_tasks_is_restarted",
             "test_cancelling.py::test_a_function_sees_that_it_was_cancelled",
+        ),
+    ),
+    PrivateNames(
+        CLIENTS,
+        CLIENT_NAMES,
+        "show only the workers of a partition to libraries",
+        (
+            "test_partition_client.py::test_only_the_workers_of_the_partition_are_shown",
+            "test_partition_client.py::test_tasks_find_the_client_of_their_partition",
         ),
     ),
     PrivateNames(

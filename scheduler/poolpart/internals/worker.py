@@ -82,6 +82,16 @@ def current_task() -> tuple[Any, Any] | None:
     return None if task is None else (worker, task)
 
 
+def start_time_of_task() -> float:
+    """Return when this run of this thread's task started, or 0 outside tasks.
+
+    If Dask runs a task again, the new run has the same key and a different start time.
+    """
+    from distributed.worker import thread_state
+
+    return 0.0 if current_task() is None else float(getattr(thread_state, "start_time", 0.0))
+
+
 def submitter_of(worker: Any, key: Any) -> SubmittingTask | None:
     """Return the task that submitted a nested task on this worker, or None if it is unknown."""
     task = worker.state.tasks.get(key)

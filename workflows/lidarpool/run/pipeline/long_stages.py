@@ -47,6 +47,10 @@ MAX_DEATHS = 12  # maximum number of deaths of a stage without any commits in be
 ASK_LOCK_S = 0.05  # time limit for acquiring the lock
 LAST_WORDS_S = 3.0  # time limit for the stages to exit after everything has been committed
 
+# `LongStages` restarts lost stages, so the pipes must not fail together with a task. A restarted
+# stage may report the same items again, and their recipients recognize them.
+_PIPE_OPTIONS = {"fails_with_tasks": False, "drop_repeats": False}
+
 Order = Description | CollectOrder | Summaries  # message from the driver to a stage
 
 
@@ -115,10 +119,9 @@ class LongStages:
         self._submitted = 0
         # Name and content of a file with which workers check whether they can access the storage.
         self.probe = (probe_name(mark, run), secrets.token_bytes(16))
-        # The pipes must not fail together with a task, because `_restart` restarts lost stages.
         scans, news = f"lidarpool-{run}-scans", f"lidarpool-{run}-news"
-        self._scans = Pipe(scans, queue_capacity, self.client, fails_with_tasks=False)
-        self._news = Pipe(news, 64, self.client, fails_with_tasks=False)  # from stages 3 and 4
+        self._scans = Pipe(scans, queue_capacity, self.client, **_PIPE_OPTIONS)
+        self._news = Pipe(news, 64, self.client, **_PIPE_OPTIONS)  # from stages 3 and 4
         self._outbox: dict[str, list[Order]] = {}  # {name of a pipe: messages}
         self._refreshed_at = 0.0  # monotonic time of the last `refresh`
         self._progress = -1  # progress of the driver at the last `refresh`
@@ -393,9 +396,8 @@ class LongStages:
         earlier = self._tasks.get(name)
         if earlier is not None:
             delete_pipes(self.client, [earlier.inlet.name])
-        inlet = Pipe(
-            f"lidarpool-{self.run}-{name}-{number}", 1_000_000, self.client, fails_with_tasks=False
-        ).create()
+        inlet_name = f"lidarpool-{self.run}-{name}-{number}"
+        inlet = Pipe(inlet_name, 1_000_000, self.client, **_PIPE_OPTIONS).create()
         start = StageStart(self.run, name.partition("-")[0], number)
         work: dict[str, tuple[Any, ...]] = {
             GENERATE: (generate, start, inlet, self._scans),

@@ -1,0 +1,263 @@
+"""Libraries that list workers, or submit by themselves, stay inside a partition."""
+
+import gc
+import os
+import warnings
+
+import dask
+import pytest
+from distributed import (
+    Client,
+    as_completed,
+    default_client,
+    get_client,
+    get_worker,
+    wait,
+    worker_client,
+)
+from distributed.diagnostics.plugin import SchedulerPlugin
+from tests.poolpart.helpers import LONG_S, addresses, worker_name
+
+from poolpart import Partition, Pipe, Pool, PoolError
+from poolpart.internals.partition_client import PartitionClient
+
+A_WORKERS = {"A-0", "A-1"}
+
+
+class RanOn(SchedulerPlugin):
+    """Names of the workers that have run tasks."""
+
+    def __init__(self, scheduler):
+        self.names = set()
+        self.scheduler = scheduler
+
+    def transition(self, key, start, finish, *args, worker=None, **kwargs):
+        if finish == "memory" and start == "processing":
+            self.names.add(str(self.scheduler.workers[worker].name))
+
+
+@pytest.fixture
+def ran_on(client):
+    """Names of the workers that run tasks during a test."""
+    scheduler = client.cluster.scheduler
+    plugin = RanOn(scheduler)
+    scheduler.add_plugin(plugin, name="ran-on")
+    yield plugin.names
+    scheduler.remove_plugin("ran-on")
+
+
+def members(client):
+    return {address for name, address in addresses(client).items() if name in A_WORKERS}
+
+
+def test_only_the_workers_of_the_partition_are_shown(client, a):
+    view = a.as_client()
+    expected = members(client)
+    info = view.scheduler_info()
+    assert info["workers"].keys() == expected
+    assert info.get("total_threads", 4) == 4
+    assert view.scheduler_info(n_workers=1)["workers"].keys() < expected
+    assert view.nthreads() == view.ncores() == dict.fromkeys(expected, 2)
+    assert view.has_what().keys() == view.processing().keys() == expected
+    assert view.run(worker_name_of).keys() == expected
+    assert view.sync(view.scheduler.identity)["workers"].keys() == expected
+    view.wait_for_workers(2, timeout=LONG_S)
+    with pytest.raises(TimeoutError):
+        view.wait_for_workers(3, timeout="100ms")
+    assert view.cluster is None
+    assert "PartitionClient 'A'" in repr(view)
+    assert len(client.scheduler_info()["workers"]) == 4
+    assert len(client.nthreads()) == 4
+
+
+def worker_name_of(dask_worker):
+    return dask_worker.name
+
+
+def test_everything_it_submits_runs_in_the_partition(client, a, ran_on):
+    view = a.as_client()
+    futures = view.map(worker_name, range(20), pure=False)
+    futures.append(view.submit(worker_name, -1, pure=False))
+    assert {*view.gather(futures)} | {*client.gather(futures)} == ran_on == A_WORKERS
+    values = [dask.delayed(worker_name)(number) for number in range(20)]
+    assert {*view.gather(view.compute(values))} == A_WORKERS
+    assert view.get({"x": (worker_name,)}, "x") in A_WORKERS
+    (kept,) = dask.persist(values[0], scheduler=view)
+    assert kept.compute(scheduler=view) in A_WORKERS
+    assert view.get_executor().submit(worker_name).result(LONG_S) in A_WORKERS
+    total = view.submit(sum, [view.submit(int, 1), client.submit(int, 2), view.scatter(3)])
+    assert total.result(LONG_S) == 6
+    [scattered] = view.scatter([1], broadcast=True)
+    assert {*client.who_has([scattered])[scattered.key]} == members(client)
+    name = view.submit(worker_name, workers=["A-1"], resources={"A": 2}, pure=False)
+    assert name.result(LONG_S) == "A-1"
+
+
+def test_a_block_makes_it_the_client_that_libraries_find(client, a, ran_on):
+    with a.as_client() as view:
+        assert get_client() is default_client() is Client.current() is view
+        values = [dask.delayed(worker_name)(number) for number in range(20)]
+        assert {*dask.compute(*values)} == A_WORKERS
+        with Partition("B", client).as_client():
+            assert dask.delayed(worker_name)().compute() == "B-0"
+        assert get_client() is view
+        futures = get_client().map(worker_name, range(4), pure=False)
+        wait(futures)
+        assert {future.result() for future in as_completed(futures)} <= A_WORKERS
+    assert get_client() is client
+    assert dask.config.get("scheduler", None) != view
+
+
+def workers_of_current_clients():
+    with worker_client() as client:
+        listed = [get_client().scheduler_info()["workers"], client.nthreads()]
+        nested = client.gather(client.map(worker_name, range(8), pure=False))
+        deeper = client.submit(len_of_workers, pure=False).result()
+    outside = Partition("B").submit(worker_name).result()
+    return [*map(len, listed), deeper, set(nested), outside]
+
+
+def len_of_workers():
+    return len(get_client().scheduler_info()["workers"])
+
+
+def in_a_block(partition):
+    with partition.as_client():
+        return len_of_workers()
+
+
+def test_tasks_find_the_client_of_their_partition(client, a):
+    view = a.as_client()
+    *counts, nested, outside = view.submit(workers_of_current_clients, pure=False).result(LONG_S)
+    assert counts == [2, 2, 2]
+    assert nested <= A_WORKERS
+    assert outside == "B-0"
+    assert a.submit(len_of_workers).result(LONG_S) == 4  # as in other tasks
+    assert a.submit(in_a_block, a).result(LONG_S) == 2
+    assert isinstance(get_client(), Client)
+
+
+def test_closing_it_leaves_the_connection_open(client, a):
+    with a.as_client() as view:
+        pass
+    view.close()
+    del view
+    gc.collect()
+    assert client.submit(os.getpid).result(LONG_S) == os.getpid()
+    view = a.as_client()
+    for call in (view.restart, view.shutdown):
+        with pytest.raises(PoolError, match="client of partition 'A' cannot"):
+            call()
+
+
+def test_partitions_and_pipes_use_the_whole_client(client, a, make_pipe):
+    with a.as_client() as view:
+        assert len(Pool.from_client(view).names) == 4
+        assert Partition("B", view).submit(worker_name).result(LONG_S) == "B-0"
+        assert Partition("B").client is client
+        pipe = make_pipe(view)
+        pipe.put(1)
+        assert Pipe(pipe.name).get() == 1
+
+
+def test_a_partition_without_workers_stores_nothing(start):
+    client = start({"plain": {}})
+    view = PartitionClient(client, "A")
+    assert view.nthreads() == view.run(worker_name_of) == {}
+    with pytest.raises(PoolError, match="'A' has no workers to store the data"):
+        view.scatter(1)
+
+
+def test_coroutines_use_it(client, a):
+    view = a.as_client()
+
+    async def use():
+        [future] = await view.scatter([5])
+        result = await view.submit(worker_name, future, pure=False)
+        return result, await view.gather(future), {*(await view.nthreads())}
+
+    result, value, workers = view.sync(use)
+    assert result in A_WORKERS
+    assert value == 5
+    assert workers == members(client)
+
+
+# -- libraries -----------------------------------------------------------------------------
+
+
+def test_shuffles_of_arrays_and_dataframes(client, a, ran_on):
+    da = pytest.importorskip("dask.array")
+    pytest.importorskip("dask.dataframe")
+    ways = {"array.rechunk.method": "p2p", "dataframe.shuffle.method": "p2p"}
+    with dask.config.set(ways), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with a.as_client():
+            numbers = da.random.default_rng(1).random((60, 60), chunks=(10, 60))
+            assert numbers.rechunk((60, 10)).persist().sum().compute() > 0
+            total, length = shuffle_a_table()
+    assert total == sum(range(200))
+    assert length == 200
+    assert ran_on
+    assert ran_on <= A_WORKERS
+
+
+def shuffle_a_table():
+    import dask.dataframe as dd
+    import pandas as pd
+
+    table = pd.DataFrame({"x": [n % 7 for n in range(200)], "y": range(200)})
+    frame = dd.from_pandas(table, npartitions=8).shuffle("x").persist()
+    return frame.groupby("x").y.sum().compute().sum(), len(frame)
+
+
+class Trainer:
+    """A library as they are written: one task for each worker that holds data, which must meet."""
+
+    def __init__(self):
+        self.client = get_client()
+
+    def fit(self, parts):
+        return self.client.sync(self._fit, parts)
+
+    async def _fit(self, parts):
+        client = self.client
+        parts = await client.scatter(parts)
+        await wait(parts)
+        who_has = await client.scheduler.who_has(keys=[part.key for part in parts])
+        info = await client.scheduler.identity()
+        workers = {address for holders in who_has.values() for address in holders}
+        assert workers <= info["workers"].keys()
+        every = [
+            client.submit(train, workers=[address], allow_other_workers=False, pure=False)
+            for address in info["workers"]
+        ]
+        return await client.gather(every)
+
+
+def train():
+    return str(get_worker().name)
+
+
+def test_a_library_that_sends_a_task_to_each_worker(client, a, ran_on):
+    with a.as_client():
+        assert {*Trainer().fit([1, 2, 3, 4])} == A_WORKERS
+    assert ran_on == A_WORKERS
+
+
+@pytest.mark.extended
+def test_xgboost_trains_in_a_partition(processes):
+    """Its tasks load a library of its own, so they run in processes."""
+    xgboost = pytest.importorskip("xgboost")
+    dxgb = pytest.importorskip("xgboost.dask")
+    da = pytest.importorskip("dask.array")
+    pool = Pool.from_client(processes)
+    before = {name: pool[name].stats().done for name in ("GPU", "OTHER")}
+    with pool["IO"].as_client() as io:
+        numbers = da.random.default_rng(1).random((2000, 4), chunks=(500, 4))
+        labels = (numbers[:, 0] > 0.5).astype(int)
+        data = dxgb.DaskDMatrix(io, numbers, labels)
+        output = dxgb.train(io, {"objective": "binary:logistic"}, data, num_boost_round=5)
+        guesses = dxgb.predict(io, output["booster"], data).compute()
+    assert isinstance(output["booster"], xgboost.Booster)
+    assert ((guesses > 0.5) == labels.compute(scheduler="sync")).mean() > 0.95
+    assert {name: pool[name].stats().done for name in ("GPU", "OTHER")} == before
