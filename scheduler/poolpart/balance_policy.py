@@ -238,7 +238,7 @@ def divide_by_demand(
         targets[name] += added
         spare -= added
     queue = [
-        ((targets[name] + 1) * samples[name].slots / demand, name)
+        (targets[name] * samples[name].slots / demand, name)
         for name, demand in demands.items()
         if demand and targets[name] < samples[name].maximum
     ]
@@ -248,8 +248,8 @@ def divide_by_demand(
         targets[name] += 1
         spare -= 1
         if targets[name] < samples[name].maximum:
-            following = (targets[name] + 1) * samples[name].slots / demands[name]
-            heapq.heappush(queue, (following, name))
+            supply = targets[name] * samples[name].slots / demands[name]
+            heapq.heappush(queue, (supply, name))
     for name, sample in samples.items():  # workers that nobody can use
         returned = min(spare, max(0, sample.workers - targets[name]))
         targets[name] += returned

@@ -128,10 +128,15 @@ def test_bursts_that_alternate_are_finished_sooner_than_with_a_fixed_division():
 
 
 def test_random_running_times_do_not_move_workers_back_and_forth():
-    rng = random.Random(3)
-    cluster = Cluster(
-        Stage("DECODE", 4, lambda _: rng.expovariate(1 / DECODE_S), 16, endless),
-        Stage("DETECT", 4, lambda _: rng.expovariate(1 / DETECT_S), 8),
-    ).run(100)
-    assert cluster.moved < 60  # less than one move per 30 tasks
-    assert cluster.throughput(5, 100) > 0.9 * 8 / (DECODE_S + DETECT_S)
+    def run(balanced):
+        rng = random.Random(3)
+        return Cluster(
+            Stage("DECODE", 4, lambda _: rng.expovariate(1 / DECODE_S), 16, endless),
+            Stage("DETECT", 4, lambda _: rng.expovariate(1 / DETECT_S), 8),
+            balanced=balanced,
+        ).run(100)
+
+    balanced = run(True)
+    assert balanced.moved < 60  # less than one move per 30 tasks
+    # No fixed division of eight workers is better than this one.
+    assert balanced.throughput(5, 100) > 0.95 * run(False).throughput(5, 100)
