@@ -189,7 +189,7 @@ class GroupBalancer(SchedulerPlugin):
     def add(self, group: _Group) -> None:
         """Balance a group from now on."""
         self.groups.append(group)
-        if self._loop is None:
+        if self._loop is None or self._loop.done():
             self._loop = _start(self._run())
 
     def remove(self, group: _Group) -> None:
@@ -353,8 +353,8 @@ def _explain(group: _Group, shift: WorkerShift) -> str:
     for name in (shift.destination, shift.source):
         sample = group.samples[name]
         demand = group.policy.demands[name].slots / sample.slots
-        parts.append(f"{name} has {sample.workers} of {demand:.1f} workers")
-    return f"{parts[0]} that its work demands, and {parts[1]}"
+        parts.append(f"{name} needs {demand:.1f} workers and has {sample.workers}")
+    return ", ".join(parts)
 
 
 def _start(

@@ -92,7 +92,7 @@ def test_the_division_follows_the_running_times_and_each_item_arrives_once(
         ("DECODE", "DETECT"),
         ("DETECT", "DECODE"),
     }
-    assert "DETECT has 4 of" in stats.moves[0].reason
+    assert "DETECT needs " in stats.moves[0].reason
     assert parts[0].stats().target == len(parts[0])
     # Tasks that waited for the full pipe did not make their partition appear slow.
     assert parts[0].stats().pipe_seconds > 1
@@ -267,7 +267,7 @@ def test_moves_are_shown_on_the_page_and_logged(eight, quickly, wait_until, capl
         text = repr(group.stats())
         html = group.stats()._repr_html_()
     for shown in (page, text, html, caplog.text):
-        assert "A has 4 of" in shown
+        assert "workers and has 4, B needs " in shown
     assert len(b) < 4
 
 
