@@ -117,8 +117,6 @@ class _Averages:
         last = self._last
         self._last = sample
         if last is None:
-            # All present tasks have arrived since the group was created.
-            self.arrived = sample.backlog
             return
         weight = math.exp(-elapsed_s / memory_s)
         finished = max(0, sample.finished - last.finished)

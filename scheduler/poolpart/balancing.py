@@ -29,6 +29,7 @@ from .balance_policy import BalancePolicy, LoadSample, WorkerShift
 from .balance_stats import BalanceStats, DemandStats, WorkerMove
 from .division import call_steward, in_moving_order, move_workers, settled_members
 from .errors import PoolError
+from .internals.names import BALANCING, require_feature
 from .internals.scheduler import call_worker, unrunnable_tasks, used_slots
 from .pipe_states import feeding_pipes
 from .probe import worker_gpus
@@ -402,6 +403,7 @@ async def _create_group(steward: Steward, spec: GroupSpec) -> None:
         If a partition does not exist, is adaptive, or belongs to another group, or if the workers
         are not interchangeable.
     """
+    require_feature(BALANCING)
     scheduler = steward.scheduler
     for name in spec.names:
         if name in adaptive_names(scheduler):
