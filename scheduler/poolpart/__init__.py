@@ -2,6 +2,8 @@
 
 from . import extras as extras  # registers the features
 from ._version import __version__
+from .balance_stats import BalanceStats, DemandStats, WorkerMove
+from .balancing import BalancedGroup
 from .devices import own_device, own_device_share
 from .errors import PipeClosed, PipeFailed, PoolError
 from .extras.background import after_all
@@ -17,6 +19,9 @@ from .task_table import TaskRow, TaskTable
 from .workers import WorkerInfo
 
 __all__ = [
+    "BalanceStats",
+    "BalancedGroup",
+    "DemandStats",
     "Partition",
     "PartitionStats",
     "Pipe",
@@ -31,6 +36,7 @@ __all__ = [
     "TaskRow",
     "TaskTable",
     "WorkerInfo",
+    "WorkerMove",
     "__version__",
     "after_all",
     "cancelled",

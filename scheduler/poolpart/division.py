@@ -255,14 +255,14 @@ async def grow_partition(
     check_count(_MOVES, count)
     steward.adopt_partition(name)
     joining = _select_joining(steward, name, count, source)
-    return await _move(steward, dict.fromkeys(joining, name), timeout_s)
+    return await move_workers(steward, dict.fromkeys(joining, name), timeout_s)
 
 
 async def shrink_partition(steward: Steward, name: str, count: int, timeout_s: float) -> list[str]:
     """Move workers out of a partition, and return their names."""
     check_count(_MOVES, count)
     steward.adopt_partition(name)
-    return await _move(steward, _select_leaving(steward, name, count), timeout_s)
+    return await move_workers(steward, _select_leaving(steward, name, count), timeout_s)
 
 
 async def resize_partition(
@@ -287,7 +287,7 @@ async def resize_partition(
     # present size first, because moving workers changes it by the number of workers moved.
     steward.change_target(name, size - _requested_workers(rule, size))
     try:
-        return await _move(steward, targets, timeout_s)
+        return await move_workers(steward, targets, timeout_s)
     finally:
         if name in steward.rules:
             minimum = min(rule.minimum, _requested_workers(steward.rules[name], rule.minimum))
@@ -323,9 +323,9 @@ def _select_joining(
         else [record for record in steward.free_records() if steward.is_settled(record)]
     )
     if donor is not None and donor != name:
-        members = _settled_members(steward, donor)
+        members = settled_members(steward, donor)
         spared = max(0, len(members) - steward.rules[donor].minimum)
-        spare += _in_order(steward, members, name)[:spared]
+        spare += in_moving_order(steward, members, name)[:spared]
     if len(spare) < count:
         available = f"only {format_workers(len(spare))}" if spare else "no workers"
         if source:
@@ -338,7 +338,7 @@ def _select_joining(
             f"Partition {name!r} cannot grow by {format_workers(count)}, because {reason}. "
             f"Start more workers, or {advice}."
         )
-    return _in_order(steward, spare, name)[:count]
+    return in_moving_order(steward, spare, name)[:count]
 
 
 def _select_leaving(steward: Steward, name: str, count: int) -> dict[WorkerRecord, str | None]:
@@ -349,14 +349,14 @@ def _select_leaving(steward: Steward, name: str, count: int) -> dict[WorkerRecor
     PoolError
         If fewer workers than the minimum of the partition would remain.
     """
-    members = _settled_members(steward, name)
+    members = settled_members(steward, name)
     minimum = steward.rules[name].minimum
     if len(members) - count < minimum:
         raise PoolError(
             f"Partition {name!r} cannot shrink by {format_workers(count)}, because it has "
             f"{format_workers(len(members))} and its minimum is {minimum}."
         )
-    leaving = _in_order(steward, members)[:count]
+    leaving = in_moving_order(steward, members)[:count]
     return {record: _destination(steward, record) for record in leaving}
 
 
@@ -372,7 +372,7 @@ def _destination(steward: Steward, record: WorkerRecord) -> str | None:
     return remainder if home == record.partition else home or remainder
 
 
-async def _move(
+async def move_workers(
     steward: Steward, targets: Mapping[WorkerRecord, str | None], timeout_s: float
 ) -> list[str]:
     """Move workers to the given partitions. The target None stands for no partition.
@@ -410,7 +410,7 @@ async def _move(
     return [record.info.name for record in targets if not record.is_removed]
 
 
-def _settled_members(steward: Steward, name: str) -> list[WorkerRecord]:
+def settled_members(steward: Steward, name: str) -> list[WorkerRecord]:
     """Return the members that can be moved now.
 
     Members that are about to arrive are excluded, because they may still return to their former
@@ -419,7 +419,7 @@ def _settled_members(steward: Steward, name: str) -> list[WorkerRecord]:
     return [record for record in steward.members(name) if steward.is_settled(record)]
 
 
-def _in_order(
+def in_moving_order(
     steward: Steward, records: Sequence[WorkerRecord], destination: str | None = None
 ) -> list[WorkerRecord]:
     """Sort workers into the order in which they are moved to a destination.

@@ -38,8 +38,9 @@ class TaskSubmitter(Protocol):
 class _PipeItems:
     """Items from a pipe, whose producers wait until the items are taken."""
 
-    def __init__(self, pipe: Pipe) -> None:
+    def __init__(self, pipe: Pipe, partition: str) -> None:
         self.name = f"pipe {pipe.name!r}"
+        self._partition = partition
         self.closed = False  # whether no further items can be put into the pipe
         self.drained = False  # whether all items have been taken
         self._pipe = pipe
@@ -47,7 +48,9 @@ class _PipeItems:
 
     def next_items(self, futures: Sequence[Future], limit: int, seconds: float) -> Sequence[Any]:
         """Return up to `limit` items, after waiting for an item or the end of a task."""
-        items, self.closed, self.drained = take_items(self._pipe, futures, limit, seconds)
+        items, self.closed, self.drained = take_items(
+            self._pipe, futures, limit, seconds, self._partition
+        )
         return items
 
     def fail(self, reason: str) -> None:
@@ -76,9 +79,9 @@ class _IterableItems:
         """Do nothing, because there are no producers."""
 
 
-def _items_of(source: object) -> _PipeItems | _IterableItems:
+def _items_of(source: object, partition: str) -> _PipeItems | _IterableItems:
     if isinstance(source, Pipe):
-        return _PipeItems(source)
+        return _PipeItems(source, partition)
     if isinstance(source, Iterable):
         return _IterableItems(source)
     raise PoolError(f"`for_each` expects a pipe or an iterable of items, but got {source!r}.")
@@ -109,7 +112,7 @@ class ItemTasks:
             )
         self._count = 0  # number of items for which a task was submitted
         self._partition = partition
-        self._items = _items_of(source)
+        self._items = _items_of(source, partition.name)
         self._function = function
         self._given_window = window
         self._options = options  # for `Partition.submit`, including arguments of the function

@@ -19,7 +19,12 @@ _TABLE = Template("""<table>
 """)
 _PARAGRAPH = Template("<p>{{ text }}</p>\n")
 # Columns that contain text and are left-aligned. Numbers are right-aligned.
-TEXT_COLUMNS = frozenset({"", "partition", "stage", "worker", "pipe", "state", "status", "address"})
+TEXT_COLUMNS = frozenset(
+    {
+        *("", "partition", "stage", "worker", "pipe", "state", "status", "address"),
+        *("time", "from", "to", "reason"),  # columns of moves
+    }
+)
 
 
 def html_table(title: str, head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

@@ -50,6 +50,9 @@ class StageStats:
     queued_seconds
         Total time in seconds that these tasks waited for a worker or a slot after their inputs were
         available.
+    pipe_seconds
+        Time in seconds that tasks waited for pipes, because a pipe was full or empty. For finished
+        tasks, it is part of `seconds`. Running tasks are included.
     lost
         Number of times that a task was assigned to a worker that died, whether or not the task had
         started. Dask runs these tasks again. Finished results that are lost are not counted. A task
@@ -64,6 +67,7 @@ class StageStats:
     seconds: float = 0.0
     queued_seconds: float = 0.0
     lost: int = 0
+    pipe_seconds: float = 0.0
 
     def _repr_html_(self) -> str:
         return html_table(type(self).__name__, _HEAD_OF_STAGES[1:], [self._figures])

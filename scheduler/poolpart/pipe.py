@@ -635,7 +635,7 @@ def put_back(pipe: Pipe, item: Any) -> None:
 
 
 def take_items(
-    pipe: Pipe, futures: Sequence[Future], limit: int, seconds: float
+    pipe: Pipe, futures: Sequence[Future], limit: int, seconds: float, partition: str = ""
 ) -> tuple[list[Any], bool, bool]:
     """Fetch up to `limit` items, after waiting for an item or the end of a task.
 
@@ -652,6 +652,8 @@ def take_items(
         task.
     seconds
         Maximum time to wait.
+    partition
+        Partition whose tasks will process the items, which balanced groups consider.
 
     Returns
     -------
@@ -676,7 +678,7 @@ def take_items(
     if not (limit and pipe._buffer):
         keys = [future.key for future in futures]
         deadline = time.monotonic() + seconds
-        reply = pipe._fill_buffer(deadline, is_settled, keys=keys, limit=limit)
+        reply = pipe._fill_buffer(deadline, is_settled, keys=keys, limit=limit, partition=partition)
         closed = reply["closed"]
     items = pipe._unpack(pipe._remove(limit))
     return items, closed, closed and not pipe._buffer and len(items) < limit

@@ -15,6 +15,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import sys
+import time
 from collections import defaultdict, deque
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from typing import Any
@@ -31,6 +32,8 @@ from .internals.queues import (
     wait_until,
 )
 from .internals.scheduler import handlers_of
+from .stats import NAME as STATISTICS
+from .stats import partition_of
 
 logger = logging.getLogger(__name__)
 
@@ -78,6 +81,7 @@ class PipeState:
         self.takers: set[Any] = set()  # keys of the tasks that have requested items
         self.drops_repeats = drop_repeats
         self.accepted: dict[Any, AcceptedItems] = {}  # {task key: items of the task}
+        self.consumers: set[str] = set()  # partitions that process the items
         self.queue = BoundedQueue(capacity, self.put_error, self.get_error)
         value = {
             "owner": owner,
@@ -201,6 +205,12 @@ def describe_pipe(name: str, dask_scheduler: Any = None) -> str:
         return "does not exist"
     depth, capacity, state = pipe.summary
     return f"{depth} of {capacity} items, {state}"
+
+
+def feeding_pipes(scheduler: Any, partition: str) -> list[PipeState]:
+    """Return the existing pipes whose items are processed by a partition."""
+    pipes = pipes_of(scheduler).values()
+    return [state for state in pipes if partition in state.consumers and state.exists]
 
 
 async def create_pipe(
@@ -480,7 +490,9 @@ class PipeRegistry(SchedulerPlugin):
             return all(can_proceed(state) for state in states.values())
 
         async def later() -> Replies:
+            began_at = time.monotonic()
             await wait_until(ready, [state.queue.waiters for state in states.values()], seconds)
+            self._add_wait(task, began_at)
             return self._replies(states, put_into)
 
         states = self._existing(names)
@@ -519,6 +531,7 @@ class PipeRegistry(SchedulerPlugin):
         puts: Mapping[str, list[bytes]] | None = None,
         limit: int = sys.maxsize,
         task: Any = None,
+        partition: str = "",
     ) -> Replies:
         """Take items from pipes, after waiting for an item or for the end of a pipe or task.
 
@@ -541,6 +554,8 @@ class PipeRegistry(SchedulerPlugin):
             pipe or a task.
         task
             Key of the requesting task, or None outside tasks.
+        partition
+            Partition whose tasks will process the items. By default, that of the requesting task.
         """
         for name, items in (puts or {}).items():
             self.put([name], client_id, items, unbounded=True, seconds=0.0)
@@ -564,7 +579,8 @@ class PipeRegistry(SchedulerPlugin):
         def take_from(state: PipeState) -> list[Any]:
             return state.pop_items(limit) if client_id in self.scheduler.clients else []
 
-        states = self._states_for_taker(task, names)
+        states = self._states_for_taker(task, partition, names)
+        began_at = time.monotonic()
         pipe_waiters = [state.queue.waiters for state in states.values()]
         try:
             task_waiters = [self._awaited[key] for key in keys]
@@ -575,14 +591,26 @@ class PipeRegistry(SchedulerPlugin):
                     del self._awaited[key]
         if linger_s:
             await wait_until(is_full_or_ended, pipe_waiters, min(linger_s, seconds))
+        self._add_wait(task, began_at)
         return self._replies(states, take_from)
 
-    def _states_for_taker(self, task: Any, names: Sequence[str]) -> dict[str, PipeState]:
-        """Return the states of the named pipes that exist, and record which task takes items."""
+    def _states_for_taker(
+        self, task: Any, partition: str, names: Sequence[str]
+    ) -> dict[str, PipeState]:
+        """Return the states of the named pipes that exist, and record who takes items."""
         states = self._existing(names)
+        if not partition and task is not None and (found := self.scheduler.tasks.get(task)):
+            partition = partition_of(found)
         for state in states.values():
             state.takers |= {task} - {None}
+            state.consumers |= {partition} - {""}
         return states
+
+    def _add_wait(self, task: Any, began_at: float) -> None:
+        """Add the time since `began_at` to the statistics of the waiting task."""
+        statistics = self.scheduler.plugins.get(STATISTICS)
+        if statistics is not None and task is not None:
+            statistics.add_pipe_wait(task, time.monotonic() - began_at)
 
     def _existing(self, names: Sequence[str]) -> dict[str, PipeState]:
         states = {name: self.states[name] for name in names if name in self.states}

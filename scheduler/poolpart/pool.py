@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 from distributed import Client
 
 from .adapting import adaptive_names
+from .balancing import BalancedGroup, balance_partitions
 from .division import call_steward, create_partitions, request_dissolution
 from .errors import PoolError
 from .extras.dashboard_page import leave_page, open_page
@@ -423,6 +424,64 @@ class Pool:
         [rule] = selectors
         parts, remainder = self._divide({name: rule})
         return parts[name], remainder
+
+    def balance(
+        self,
+        partitions: Iterable[Partition | str],
+        *,
+        min: int | Mapping[str, int] = 1,  # noqa: A002 - reads as a bound
+        max: int | Mapping[str, int] | None = None,  # noqa: A002
+        workers: Iterable[str] | None = None,
+    ) -> BalancedGroup:
+        """Move workers between partitions according to their work, until the group is stopped.
+
+        Twice a second, the scheduler estimates how many workers each partition needs: the rate at
+        which tasks arrive or finish, times their mean running time, plus up to a quarter if tasks
+        or items of pipes wait. If a partition has too few workers and others can spare some, up to
+        an eighth of the workers are moved at a time. Each of them first finishes its running tasks.
+        If there is a group of the same partitions, it is replaced.
+
+        Parameters
+        ----------
+        partitions
+            Partitions or their names. Other partitions, for example with GPUs, neither give nor
+            receive workers.
+        min, max
+            Minimum and maximum number of workers of each partition, as a number for all partitions
+            or by name. A partition also keeps the minimum of its rule.
+        workers
+            Names of the workers that may be moved. By default, all of them may be moved, and it is
+            an error if only some of them have GPUs.
+
+        Returns
+        -------
+        BalancedGroup
+            Object with the methods `stats`, which reports all moves and their reasons, and `stop`.
+
+        Raises
+        ------
+        PoolError
+            If a partition does not exist, is adaptive, or belongs to another group, if a bound is
+            invalid, or if only some of the workers have GPUs.
+
+        Notes
+        -----
+        A worker whose tasks do not finish within a minute stays in its partition, and is not moved
+        again for five minutes. A task that runs as long as the program therefore keeps its worker.
+
+        Examples
+        --------
+        >>> group = pool.balance([decode, detect], min=1)                  # doctest: +SKIP
+        >>> group.stats()                                                  # doctest: +SKIP
+        <BalanceStats: 7 moves>
+        partition  workers  demand  backlog  tasks/s  task seconds  wait seconds
+        DECODE     56       58.2    180      331      0.17          0.37
+        DETECT     70       72.1    232      331      0.21          0.49
+        """
+        names = [part.name if isinstance(part, Partition) else part for part in partitions]
+        for name in names:
+            check_name(name)
+        return balance_partitions(self.client, names, min, max, workers)
 
     def page(self) -> str:
         """Add a page to Dask's dashboard, and return its URL.

@@ -80,6 +80,12 @@ class TaskStatistics(SchedulerPlugin):
         if computing and runnable is not None:  # Dask converts both to the scheduler's clock
             counts["queued_seconds"] += max(0.0, computing[0]["start"] - runnable)
 
+    def add_pipe_wait(self, key: Any, seconds: float) -> None:
+        """Record how long a running task has waited for a pipe."""
+        task = self.scheduler.tasks.get(key)
+        if task is not None:
+            self.ended[partition_of(task), task.prefix.name]["pipe_seconds"] += seconds  # type: ignore[assignment]
+
     def queued_since(self, key: Any) -> float | None:
         """Return when a task became ready to run, or None if this is unknown.
 

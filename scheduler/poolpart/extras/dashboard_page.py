@@ -1,4 +1,4 @@
-"""A page in Dask's dashboard that shows partitions, stages, workers, and pipes in tables.
+"""A page in Dask's dashboard that shows partitions, stages, workers, pipes and moves in tables.
 
 The scheduler renders the page, which contains no scripts and reloads every two seconds.
 """
@@ -17,6 +17,8 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 from tornado import web
 from tornado.template import Template
 
+from ..balance_stats import HEAD_OF_MOVES
+from ..balancing import recent_moves
 from ..errors import PoolError
 from ..features import FEATURES, Feature
 from ..fence import fence_names
@@ -39,6 +41,7 @@ from .other_sites import names_of_machine, refusal
 
 NAME = "poolpart-page"
 PATH = "partitions"
+_SHOWN_MOVES = 20  # number of moves of balanced groups on the page
 _ANY_ADDRESS = "0.0.0.0"  # dashboards listen on all interfaces by default
 _HUB = "JUPYTERHUB_SERVICE_PREFIX"  # environment variable that JupyterHub sets behind its proxy
 
@@ -111,6 +114,7 @@ def render_page(scheduler: Any) -> bytes:
         ("Stages", ["stage", "partition", *_FIGURES], stages),
         ("Workers", _OF_A_WORKER, rows_of_workers),
         ("Pipes", ["pipe", "depth", "capacity", "state"], pipes),
+        ("Moves", HEAD_OF_MOVES, [move.cells for move in recent_moves(scheduler, _SHOWN_MOVES)]),
     ]
     counts = f"workers {len(workers)}, partitions {len(partitions) - 1}, pipes {len(pipes)}"
     return _PAGE.generate(

@@ -37,6 +37,7 @@ CLUSTERS = "clusters with several kinds of workers"
 ADAPTING = "adaptive partitions"
 CANCELLING = "Partition.cancel"
 CLIENTS = "Partition.as_client"
+BALANCING = "Pool.balance"
 READING = "errors for inputs that cannot be unpickled"
 
 
@@ -290,6 +291,12 @@ PRIVATE_NAMES = (
             "test_adapting.py::test_a_worker_whose_job_was_cancelled_too_late_gets_no_task",
             "test_worker_groups.py::test_a_container_of_a_closed_worker_gets_no_task_and_is_removed",
         ),
+    ),
+    PrivateNames(
+        BALANCING,
+        (f"{_SCHEDULER}.unrunnable", f"{_SCHEDULER_WORKER}.used_resources"),
+        "count the slots that unfinished tasks request",
+        ("test_balancing.py::test_submitted_tasks_attract_workers_in_bursts",),
     ),
     PrivateNames(
         CANCELLING,

@@ -55,6 +55,11 @@ def recount_used_resources(worker: Any) -> None:
             worker.used_resources[name] += quantity
 
 
+def used_slots(worker: Any, name: str) -> float:
+    """Return the slots that a worker's tasks in a partition request, even before they start."""
+    return float(worker.used_resources.get(name, 0.0))
+
+
 def send_waiting_tasks(scheduler: Any, worker: Any) -> None:
     """Send tasks to a worker that have been waiting for its resources.
 

@@ -1,0 +1,491 @@
+"""Balanced groups, whose partitions exchange workers according to their work.
+
+A scheduler plugin observes the partitions of each group twice a second: the slots that unfinished
+tasks request, the items in the pipes that feed the partition, and the running times of finished
+tasks. All of these values are counted anyway, so a group does not increase the cost of a task.
+`balance_policy.py` decides how many workers to move, and `division.py` moves them: a worker first
+finishes its running tasks.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import time
+from collections import deque
+from collections.abc import Collection, Coroutine, Hashable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from itertools import islice
+from typing import Any, Self
+
+from distributed import Client
+from distributed.diagnostics.plugin import SchedulerPlugin
+
+from .adapting import adaptive_names
+from .balance_policy import BalancePolicy, LoadSample, WorkerShift
+from .balance_stats import BalanceStats, DemandStats, WorkerMove
+from .division import call_steward, in_moving_order, move_workers, settled_members
+from .errors import PoolError
+from .internals.names import BALANCING, require_feature
+from .internals.scheduler import call_worker, unrunnable_tasks, used_slots
+from .pipe_states import feeding_pipes
+from .probe import worker_gpus
+from .rules import check_count
+from .stats import statistics_of
+from .steward import NAME as STEWARD
+from .steward import Steward, WorkerRecord, join_names
+from .workers import run_on_scheduler
+
+logger = logging.getLogger(__name__)
+
+NAME = "poolpart-balancing"
+INTERVAL_S = 0.5  # interval between decisions
+DRAIN_S = 60.0  # maximum time that a worker has to finish its running tasks
+PAUSE_S = 300.0  # time for which a worker that has not finished them in time is not moved
+MAX_MOVES = 1000  # number of moves in the history of a group
+_MAX_WAITING = 10_000  # number of tasks without a worker that are examined
+_MIN_PARTITIONS = 2
+
+Bounds = int | Mapping[str, int] | None
+
+
+class BalancedGroup:
+    """Partitions that exchange workers according to their work. `Pool.balance` returns it.
+
+    The scheduler balances the partitions until `stop` is called, or until fewer than two of them
+    remain, even if this client closes. At the end of a ``with`` block, `stop` is called.
+
+    Examples
+    --------
+    >>> group = pool.balance([decode, detect])                       # doctest: +SKIP
+    >>> group.stats().moves[-1].worker                               # doctest: +SKIP
+    '17'
+    >>> group.stop()                                                 # doctest: +SKIP
+    """
+
+    def __init__(self, client: Client, names: Sequence[str]) -> None:
+        self.client = client
+        self.names = tuple(names)
+
+    def __repr__(self) -> str:
+        return f"<BalancedGroup: {', '.join(self.names)}>"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(OSError):  # the scheduler has ended, and the group with it
+            self.stop()
+
+    def stats(self) -> BalanceStats:
+        """Return the load of each partition, and the workers that were moved and why."""
+        stats: BalanceStats = run_on_scheduler(self.client, _stats_of_group, names=self.names)
+        return stats
+
+    def stop(self) -> None:
+        """Stop moving workers. Each worker stays in the partition to which it was moved last."""
+        run_on_scheduler(self.client, _stop_group, names=self.names)
+
+
+def balance_partitions(
+    client: Client,
+    names: Sequence[str],
+    minimum: Bounds,
+    maximum: Bounds,
+    workers: Iterable[str] | None,
+) -> BalancedGroup:
+    """Create a balanced group. See `Pool.balance`."""
+    if len(set(names)) < _MIN_PARTITIONS or len(set(names)) < len(names):
+        raise PoolError(
+            f"`balance` requires at least two different partitions, but got {list(names)!r}."
+        )
+    if isinstance(workers, str):
+        raise PoolError(f"Invalid value {workers!r} for `workers`. Expected a list of names.")
+    spec = GroupSpec(
+        tuple(names),
+        _bounds("min", names, minimum, 1, 0),
+        _bounds("max", names, maximum, math.inf, 1),
+        None if workers is None else frozenset(map(str, workers)),
+    )
+    for name in names:
+        if spec.minimum[name] > spec.maximum[name]:
+            raise PoolError(
+                f"The minimum of partition {name!r} is {spec.minimum[name]}, but its maximum is "
+                f"{spec.maximum[name]:g}."
+            )
+    call_steward(client, _create_group, spec=spec)
+    return BalancedGroup(client, names)
+
+
+def _bounds(
+    option: str, names: Sequence[str], bounds: Bounds, default: float, lowest: int
+) -> dict[str, Any]:
+    """Validate the bounds that a user has passed, and return the bound of each partition."""
+    if bounds is None:
+        return dict.fromkeys(names, default)
+    if not isinstance(bounds, Mapping):
+        bounds = dict.fromkeys(names, bounds)
+    for name, bound in bounds.items():
+        check_count(f"`{option}` of partition {name!r}", bound, lowest)
+        if name not in names:
+            raise PoolError(f"`{option}` names {name!r}, which is not one of {list(names)!r}.")
+    return {name: bounds.get(name, default) for name in names}
+
+
+@dataclass(frozen=True)
+class GroupSpec:
+    """Partitions of a balanced group, their bounds, and the workers that may be moved."""
+
+    names: tuple[str, ...]
+    minimum: Mapping[str, int]
+    maximum: Mapping[str, float]
+    # Names of the workers that may be moved. If None, these are all workers of the same kind.
+    workers: frozenset[str] | None = None
+
+
+# -- on the scheduler --------------------------------------------------------------------
+
+
+@dataclass(eq=False)
+class _Group:
+    """State of a balanced group. All times are values of `time.monotonic`."""
+
+    spec: GroupSpec
+    has_gpus: bool  # whether workers of the group have GPUs
+    policy: BalancePolicy = field(default_factory=BalancePolicy)
+    moves: deque[WorkerMove] = field(default_factory=lambda: deque(maxlen=MAX_MOVES))
+    tasks: set[asyncio.Task[None]] = field(default_factory=set)  # moves in progress
+    samples: dict[str, LoadSample] = field(default_factory=dict)
+    sampled_at: float = field(default_factory=time.monotonic)
+    paused_until: dict[Hashable, float] = field(default_factory=dict)  # {worker key: time}
+    # {worker key: whether it has GPUs, or None if it has not responded}
+    gpus: dict[Hashable, bool | None] = field(default_factory=dict)
+
+    def may_move(self, record: WorkerRecord) -> bool:
+        """Return whether a worker may be moved to another partition of the group."""
+        if self.paused_until.get(record.key, 0.0) > time.monotonic():
+            return False
+        if self.spec.workers is not None:
+            return record.info.name in self.spec.workers
+        return self.gpus.get(record.key) is self.has_gpus
+
+
+class GroupBalancer(SchedulerPlugin):
+    """Scheduler plugin that moves workers within balanced groups. It is removed with the last."""
+
+    name = NAME
+
+    def __init__(self, scheduler: Any) -> None:
+        self.scheduler = scheduler
+        self.groups: list[_Group] = []
+        self._loop: asyncio.Task[None] | None = None
+
+    def find(self, names: Collection[str]) -> _Group | None:
+        """Return the group with exactly these partitions, or None."""
+        return next((g for g in self.groups if set(g.spec.names) == set(names)), None)
+
+    def add(self, group: _Group) -> None:
+        """Balance a group from now on."""
+        self.groups.append(group)
+        if self._loop is None or self._loop.done():
+            self._loop = _start(self._run())
+
+    def remove(self, group: _Group) -> None:
+        """Stop balancing a group. Moves that are in progress are completed."""
+        if group in self.groups:
+            self.groups.remove(group)
+        if not self.groups and self.scheduler.plugins.get(NAME) is self:
+            self._stop()
+            self.scheduler.remove_plugin(NAME)
+
+    async def close(self) -> None:
+        """Stop when the scheduler closes."""
+        for group in self.groups:
+            for task in group.tasks:
+                task.cancel()
+        self._stop()
+
+    def _stop(self) -> None:
+        if self._loop is not None and self._loop is not asyncio.current_task():
+            self._loop.cancel()
+
+    async def _run(self) -> None:
+        """Balance all groups at regular intervals, until there are none."""
+        while self.groups:
+            await asyncio.sleep(INTERVAL_S)
+            for group in list(self.groups):
+                self._balance(group)
+
+    # -- decisions ---------------------------------------------------------------------
+
+    def _balance(self, group: _Group) -> None:
+        """Take samples of a group's partitions, and start to move workers if necessary."""
+        steward: Steward | None = self.scheduler.plugins.get(STEWARD)
+        names = [name for name in group.spec.names if steward and name in steward.rules]
+        if steward is None or len(names) < _MIN_PARTITIONS:
+            self.remove(group)
+            return
+        sampled_at = time.monotonic()
+        members = {name: steward.members(name) for name in names}
+        self._ask_for_gpus(group, [record for group_ in members.values() for record in group_])
+        group.samples = self._take_samples(steward, group, members)
+        moving = sum(
+            not (record.is_absent or steward.is_settled(record))
+            for records in members.values()
+            for record in records
+        )
+        elapsed_s = sampled_at - group.sampled_at
+        group.sampled_at = sampled_at
+        for shift in group.policy.update(group.samples, elapsed_s, moving):
+            self._begin_moves(steward, group, shift)
+
+    def _take_samples(
+        self, steward: Steward, group: _Group, members: Mapping[str, Sequence[WorkerRecord]]
+    ) -> dict[str, LoadSample]:
+        """Return the current load of each partition."""
+        unfinished = dict.fromkeys(members, 0.0)
+        for record in steward.records.values():
+            # A worker that is leaving a partition still runs tasks of it.
+            if (worker := self.scheduler.workers.get(record.info.address)) is not None:
+                for name in record.declared.keys() & unfinished.keys():
+                    unfinished[name] += used_slots(worker, name)
+        for task in islice(unrunnable_tasks(self.scheduler), _MAX_WAITING):
+            for name, slots in (task.resource_restrictions or {}).items():
+                if name in unfinished:
+                    unfinished[name] += slots
+        samples = {}
+        for name, records in members.items():
+            rule = steward.rules[name]
+            pipes = feeding_pipes(self.scheduler, name)
+            depths = [(pipe.queue.qsize(), pipe.queue.capacity) for pipe in pipes]
+            finished, seconds = self._finished_tasks(name)
+            slots = [record.slots for record in records] or [rule.slots or 1]
+            samples[name] = LoadSample(
+                workers=len(records),
+                minimum=max(group.spec.minimum[name], rule.minimum),
+                maximum=group.spec.maximum[name],
+                slots=sum(slots) / len(slots),
+                movable=len(self._movable(steward, group, name)),
+                finished=finished,
+                seconds=seconds,
+                backlog=unfinished[name] + sum(depth for depth, _ in depths),
+                fullness=max((depth / capacity for depth, capacity in depths), default=0.0),
+            )
+        return samples
+
+    def _finished_tasks(self, name: str) -> tuple[int, float]:
+        """Return the number of a partition's finished tasks, and their running time.
+
+        The time that tasks have waited for pipes is excluded. Otherwise, a partition whose tasks
+        wait for a slower one would appear to need more workers.
+        """
+        finished = 0
+        seconds = 0.0
+        for (partition, _), counts in statistics_of(self.scheduler, keep=False).ended.items():
+            if partition == name:
+                finished += counts["done"] + counts["failed"]
+                seconds += counts["seconds"] - counts["pipe_seconds"]
+        return finished, seconds
+
+    def _movable(self, steward: Steward, group: _Group, name: str) -> list[WorkerRecord]:
+        """Return the members of a partition that may be moved to another one now."""
+        return [record for record in settled_members(steward, name) if group.may_move(record)]
+
+    def _ask_for_gpus(self, group: _Group, records: Sequence[WorkerRecord]) -> None:
+        """Ask workers that have joined later whether they have GPUs."""
+        joined = [r for r in records if r.key not in group.gpus and not r.is_absent]
+        if joined and group.spec.workers is None:
+            group.gpus.update(dict.fromkeys((record.key for record in joined), None))
+            _start(find_gpus(self.scheduler, joined, group.gpus), group.tasks)
+
+    # -- moves -------------------------------------------------------------------------
+
+    def _begin_moves(self, steward: Steward, group: _Group, shift: WorkerShift) -> None:
+        """Start to move workers, which first finish their running tasks."""
+        movable = self._movable(steward, group, shift.source)
+        records = in_moving_order(steward, movable, shift.destination)[: shift.workers]
+        if not records:
+            return
+        reason = _explain(group, shift)
+        logger.info(
+            "Moving %s from %r to %r: %s",
+            join_names(records),
+            shift.source,
+            shift.destination,
+            reason,
+        )
+        _start(self._move(steward, group, records, shift, reason), group.tasks)
+
+    async def _move(
+        self,
+        steward: Steward,
+        group: _Group,
+        records: Sequence[WorkerRecord],
+        shift: WorkerShift,
+        reason: str,
+    ) -> None:
+        try:
+            await move_workers(steward, dict.fromkeys(records, shift.destination), DRAIN_S)
+        except PoolError as error:
+            logger.info("%s", error)
+        for record in records:
+            if record.is_removed:
+                continue
+            if record.partition == shift.source:
+                group.paused_until[record.key] = time.monotonic() + PAUSE_S
+            elif record.partition == shift.destination:
+                group.moves.append(
+                    WorkerMove(
+                        datetime.now(UTC),
+                        record.info.name,
+                        shift.source,
+                        shift.destination,
+                        reason,
+                    )
+                )
+
+
+def _explain(group: _Group, shift: WorkerShift) -> str:
+    """Return the demands of two partitions as the reason of a move."""
+    parts = []
+    for name in (shift.destination, shift.source):
+        sample = group.samples[name]
+        demand = group.policy.demands[name].slots / sample.slots
+        parts.append(f"{name} needs {demand:.1f} workers and has {sample.workers}")
+    return ", ".join(parts)
+
+
+def _start(
+    coroutine: Coroutine[Any, Any, None], tasks: set[asyncio.Task[None]] | None = None
+) -> asyncio.Task[None]:
+    """Run a coroutine in the background, and log its error."""
+    task = asyncio.ensure_future(coroutine)
+    task.add_done_callback(_log_error)
+    if tasks is not None:
+        tasks.add(task)
+        task.add_done_callback(tasks.discard)
+    return task
+
+
+def _log_error(task: asyncio.Task[None]) -> None:
+    if not task.cancelled() and (error := task.exception()):
+        logger.error("Partitions are no longer balanced: %r", error, exc_info=error)
+
+
+async def find_gpus(
+    scheduler: Any, records: Iterable[WorkerRecord], gpus: dict[Hashable, bool | None]
+) -> None:
+    """Ask workers whether they have GPUs, and store the answers by worker key.
+
+    The answer of a worker that does not respond is None.
+    """
+
+    async def ask(record: WorkerRecord) -> None:
+        try:
+            answer = await call_worker(scheduler, record.info.address, worker_gpus)
+        except OSError as error:
+            logger.warning("Worker %s cannot list its GPUs: %s", record.info.name, error)
+            return
+        gpus[record.key] = bool(answer)
+
+    await asyncio.gather(*map(ask, records))
+
+
+async def _create_group(steward: Steward, spec: GroupSpec) -> None:
+    """Create a balanced group, or replace the group of the same partitions.
+
+    Raises
+    ------
+    PoolError
+        If a partition does not exist, is adaptive, or belongs to another group, or if the workers
+        are not interchangeable.
+    """
+    require_feature(BALANCING)
+    scheduler = steward.scheduler
+    for name in spec.names:
+        if name in adaptive_names(scheduler):
+            raise PoolError(
+                f"Partition {name!r} is adaptive, so its workers cannot be moved to other "
+                "partitions. Balance only partitions with a fixed number of jobs."
+            )
+        steward.adopt_partition(name)
+    gpus: dict[Hashable, bool | None] = {}
+    if spec.workers is None:
+        members = [record for name in spec.names for record in steward.members(name)]
+        await find_gpus(scheduler, [r for r in members if not r.is_absent], gpus)
+        _check_same_kind(steward, spec, gpus)
+    balancer: GroupBalancer | None = scheduler.plugins.get(NAME)
+    former = balancer.find(spec.names) if balancer is not None else None
+    others = [g for g in balancer.groups if g is not former] if balancer is not None else []
+    for name in spec.names:
+        if any(name in other.spec.names for other in others):
+            raise PoolError(
+                f"Partition {name!r} already belongs to another balanced group. Stop that group "
+                "first, or balance all of the partitions together."
+            )
+    statistics_of(scheduler, keep=False)
+    if balancer is None:
+        balancer = GroupBalancer(scheduler)
+        scheduler.add_plugin(balancer)
+    group = _Group(spec, any(gpus.values()), gpus=gpus)
+    if former is not None:
+        balancer.groups.remove(former)
+        group.moves.extend(former.moves)
+    balancer.add(group)
+
+
+def _check_same_kind(
+    steward: Steward, spec: GroupSpec, gpus: Mapping[Hashable, bool | None]
+) -> None:
+    """Raise PoolError if some workers have GPUs and others do not."""
+    kinds = {
+        has_gpus: name
+        for name in spec.names
+        for record in steward.members(name)
+        if (has_gpus := gpus.get(record.key)) is not None
+    }
+    if len(kinds) > 1:
+        raise PoolError(
+            f"Workers of partition {kinds[True]!r} have GPUs and workers of partition "
+            f"{kinds[False]!r} do not, so they are not interchangeable. Balance only partitions "
+            "with the same kind of workers, or pass the names of the workers that may be moved as "
+            "`workers`."
+        )
+
+
+def _stats_of_group(names: Sequence[str], dask_scheduler: Any = None) -> BalanceStats:
+    """Return the statistics of a group, which are empty if it does not exist."""
+    balancer: GroupBalancer | None = dask_scheduler.plugins.get(NAME)
+    group = balancer.find(names) if balancer is not None else None
+    if group is None:
+        return BalanceStats({})
+    partitions = {}
+    for name, sample in group.samples.items():
+        demand = group.policy.demands[name]
+        partitions[name] = DemandStats(
+            workers=sample.workers,
+            demand=demand.slots / sample.slots,
+            backlog=sample.backlog,
+            rate=demand.rate,
+            task_s=demand.task_s,
+            wait_s=demand.wait_s,
+        )
+    return BalanceStats(partitions, list(group.moves))
+
+
+def _stop_group(names: Sequence[str], dask_scheduler: Any = None) -> None:
+    """Stop balancing a group, if it exists."""
+    balancer: GroupBalancer | None = dask_scheduler.plugins.get(NAME)
+    if balancer is not None and (group := balancer.find(names)) is not None:
+        balancer.remove(group)
+
+
+def recent_moves(scheduler: Any, count: int) -> list[WorkerMove]:
+    """Return the last moves within all balanced groups, newest first."""
+    balancer: GroupBalancer | None = scheduler.plugins.get(NAME)
+    groups = balancer.groups if balancer is not None else []
+    moves = sorted((move for group in groups for move in group.moves), key=lambda move: move.time)
+    return moves[: -count - 1 : -1]
