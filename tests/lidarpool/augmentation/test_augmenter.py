@@ -435,3 +435,14 @@ def test_classes_have_the_numbers_of_the_recording(clear, sensor):
     unnamed = replace(clear, read=read)
     notes = Augmenter(unnamed, car, sensor).notes
     assert any("does not state the numbers of its classes" in note for note in notes)
+
+
+def test_sweeps_of_different_sensors_are_refused(scene, sensor):
+    other = load_sensor("velodyne/vlp16")
+    clouds = [
+        cloud
+        for pair in zip(scan(scene, sensor, 2), scan(scene, other, 2), strict=True)
+        for cloud in pair
+    ]
+    with pytest.raises(LidarError, match="the sweeps come from different sensors"):
+        Augmenter(recording_of(clouds), Effects(weather=Weather(snow_mm_h=1.0)))

@@ -25,7 +25,7 @@ from lidarsim.sensor import Sensor
 from lidarsim.words import plural
 
 from ..clouds.recording import Recording
-from ..clouds.rings import Rings
+from ..clouds.rings import Rings, elevations, summarize_rings
 from .sensor_motion import SensorMotion
 
 if TYPE_CHECKING:
@@ -44,6 +44,9 @@ _MAX_STEP_CHANGE = 0.1  # maximum relative deviation of the step of a sweep
 _PHASE_SAMPLE = 8  # one in this many returns determines the phase of a sweep
 _MIN_RESULTANT = 0.5  # minimum resultant length of azimuths minus the rotation
 _MIN_RINGS = 0.05  # minimum fraction of rings that return in a sector that was recorded
+# Maximum change of the median elevation of a ring between the sweeps of a sensor. Motion
+# compensation and surfaces at different ranges change it by less.
+_MAX_ELEVATION_CHANGE = np.radians(3)
 _LOW_RAD = np.radians(-3)  # rings below this elevation return from the ground
 _SWEEP_S = 0.1  # assumed duration of a sweep without timestamps
 _DIGITS = 9  # decimals of fitted angles, so that rounding errors do not affect results
@@ -400,6 +403,7 @@ class ScanPattern:
         max_range_m = max((float(_ranges(sweep.points).max()) for sweep in sweeps), default=1.0)
         period_s = _period_s(recording)
         _check_model(recording, model)
+        _check_single_sensor(recording, sweeps)
         pattern = None
         if sweeps:
             channels = Channels.from_rings(recording.rings, model, sweeps)
@@ -460,6 +464,25 @@ def _check_model(recording: Recording, model: Sensor | None) -> None:
         f"{recording.name} has {rings} rings, but {model.model} has "
         f"{plural(model.channels, 'channel')}. Pass the model of the sensor that was used."
     )
+
+
+def _check_single_sensor(recording: Recording, sweeps: Sequence[Sweep]) -> None:
+    """Raise LidarError if rings with the same number have different elevations in some sweeps."""
+    medians: dict[int, list[float]] = {}
+    for sweep in sweeps:
+        if "channel" not in sweep.columns:
+            return
+        channel = np.asarray(sweep.columns["channel"]).astype(np.int64)
+        numbers, elevation, _ = summarize_rings(channel, elevations(sweep.points))
+        for number, median in zip(numbers.tolist(), elevation.tolist(), strict=True):
+            medians.setdefault(number, []).append(median)
+    spreads = [max(values) - min(values) for values in medians.values() if len(values) > 1]
+    if spreads and np.median(spreads) > _MAX_ELEVATION_CHANGE:
+        raise LidarError(
+            f"Rings with the same number have different elevations in different sweeps of "
+            f"{recording.name}, so the sweeps come from different sensors. Augment the sweeps of "
+            "each sensor separately."
+        )
 
 
 def _elevations_from(origin: Floats, rings: Rings, sweeps: Sequence[Sweep]) -> Floats:
