@@ -102,8 +102,9 @@ def run_partitions(client: Client, load: Load, balanced: bool, decode_workers: i
     frames = Pipe("frames", workers, client).create()
     group = pool.balance(parts.values(), min=1) if balanced else nullcontext()
     group.__enter__()
-    first = parts["DECODE"].for_each(load, decode, out=frames, wait=False)
-    second = parts["DETECT"].for_each(frames, detect, seconds=load.detect_s, wait=False)
+    options = {"window": 2 * workers, "wait": False}
+    first = parts["DECODE"].for_each(load, decode, out=frames, **options)
+    second = parts["DETECT"].for_each(frames, detect, seconds=load.detect_s, **options)
 
     def end() -> dict[str, Any]:
         load.ended.set()
