@@ -222,6 +222,29 @@ def test_labels_of_the_object_benchmark(benchmark, tmp_path):
     assert (tmp_path / "new" / image).stat().st_ino == (folder / image).stat().st_ino
 
 
+def test_open3d_ml_reads_the_box_of_an_inserted_car(benchmark, tmp_path):
+    """Its reader requires scikit-learn."""
+    pytest.importorskip("sklearn")
+    from open3d._ml3d.datasets.kitti import KITTI
+
+    folder, _ = benchmark
+    (folder / "label_2/000000.txt").write_text("")
+    augment = partial(changed, boxes=two_boxes(points=(9, 0)), visibility=[0.9, 1.0])
+    rewrite(opened(folder), tmp_path / "new", tmp_path / "work", augment)
+    camera, *others = (tmp_path / "new/calib/000000.txt").read_text().splitlines()
+    cameras = [camera.replace("P2", f"P{number}") for number in range(4)]
+    (tmp_path / "calib.txt").write_text("\n".join([*cameras, *others]))  # the reader needs four
+    calibration = KITTI.read_calib(str(tmp_path / "calib.txt"))
+    *_, car = KITTI.read_label(str(tmp_path / "new/label_2/000000.txt"), calibration)
+    assert car.label_class == "Car"
+    np.testing.assert_allclose(car.center, [10, 2, -1], atol=0.01)
+    np.testing.assert_allclose(car.size, [2.0, 1.5, 4.0])
+    points = np.array([[10, 2, -1], [10, 3.9, -1], [10.9, 2, -1], [10, 4.2, -1], [11.2, 2, -1]])
+    axes = np.array([car.left, car.up, car.front])
+    inside = (np.abs((points - car.center) @ axes.T) <= np.array(car.size) / 2).all(axis=1)
+    assert inside.tolist() == [True] * 3 + [False] * 2
+
+
 def test_truncated_boxes(benchmark, tmp_path):
     folder, _ = benchmark
     boxes = two_boxes(points=(9, 0))
