@@ -158,6 +158,7 @@ def wait_for_loss(number):
     return number
 
 
+@pytest.mark.extended
 def test_a_lost_scheduler_is_one_sentence():
     with thread_cluster({"OTHER": 1}) as cluster, Client(cluster, set_as_default=False) as client:
         address = cluster.scheduler_address

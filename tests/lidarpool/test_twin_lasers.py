@@ -273,6 +273,7 @@ def hdl64(street):
     return twin(as_fired(recorded_drive(street, replace(sensor, beams=used))))
 
 
+@pytest.mark.extended
 def test_a_twin_states_where_the_lasers_of_an_hdl_64e_are(hdl64, tmp_path):
     hdl64.save(tmp_path / "twin")
     stated = yaml.safe_load((tmp_path / "twin" / "sensor.yaml").read_text())
@@ -292,6 +293,7 @@ def test_a_twin_states_where_the_lasers_of_an_hdl_64e_are(hdl64, tmp_path):
     np.testing.assert_allclose(loaded.beams.origin, origins_m[order])
 
 
+@pytest.mark.extended
 def test_a_twin_of_an_hdl_64e_has_the_ranges_of_held_out_sweeps(hdl64):
     held = hdl64.figures["held_out"]["stationary"]
     assert held["median_abs_difference_m"] < 0.01

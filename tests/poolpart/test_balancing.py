@@ -146,6 +146,7 @@ def test_a_task_that_waits_for_a_pipe_does_not_make_its_partition_appear_slow(
         assert group.stats().partitions["A"].task_s < 0.5
 
 
+@pytest.mark.extended
 def test_submitted_tasks_attract_workers_in_bursts(eight, quickly, wait_until):
     parts = divide(eight, A=4, B=4)
     with balance(eight, parts, min=2):

@@ -130,6 +130,7 @@ def test_an_interrupted_run_continues_with_the_same_bytes(augmentation, tmp_path
     assert not WorkFolder.for_output(out).exists()
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("sweeps", [1, 4])
 def test_a_killed_process_is_resumed(augmentation, drive, tmp_path, sweeps):
     augmentation.run(tmp_path / "expected", workers=1)
@@ -179,6 +180,7 @@ def test_workers_without_the_work_folder_return_files(augmentation, tmp_path, mo
     assert content(tmp_path / "wet") == content(tmp_path / "expected")
 
 
+@pytest.mark.extended
 def test_a_cluster_augments_sweeps(augmentation, tmp_path):
     augmentation.run(tmp_path / "expected", workers=1)
     with (
@@ -357,6 +359,7 @@ def kitti(points, tmp_path):
     return write_kitti(tmp_path / "kitti", points[:2])
 
 
+@pytest.mark.extended
 def test_all_sequences_of_a_data_set_are_augmented(kitti, tmp_path):
     everything = Augmentation(RecordingFile(kitti), Variants(Effects.load(options=RAIN)))
     augmented = everything.run(tmp_path / "all", workers=1)
@@ -413,6 +416,7 @@ def test_one_of_several_sensors_is_converted(kitti, tmp_path):
     assert sum(counts) == augmented.counts.points
 
 
+@pytest.mark.extended
 def test_recordings_are_converted(drive, tmp_path):
     wet = Variants(Effects.load(options=RAIN))
     augmentation = Augmentation(RecordingFile(drive), wet, output_format="mcap")
@@ -438,6 +442,7 @@ def campaign(tmp_path):
     return path
 
 
+@pytest.mark.extended
 def test_campaigns_write_variants(augmentation, campaign, tmp_path):
     variants = replace(augmentation, variants=CampaignVariants(campaign))
     augmented = variants.run(tmp_path / "one", workers=1)
