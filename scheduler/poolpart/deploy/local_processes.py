@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache, wraps
@@ -55,16 +56,25 @@ class ScriptlessNanny(Nanny):
     multiprocessing imports the main script of the parent process to find functions by name. A
     script without a main guard would therefore run again in each worker. Dask pickles the functions
     of a script by value, so the import is not needed.
+
+    A restart waits for the previous start. In distributed 2026.8, a worker may die right after it
+    has connected. The previous start then returns during the restart, and marks the process that
+    has not started yet as running. Closing the nanny would raise an AssertionError.
     """
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._start_lock = asyncio.Lock()
 
     async def instantiate(self) -> Status:
         """Start or restart the worker process, without importing the script."""
         _spare_workers_the_script()
-        _starting.add(self)
-        try:
-            return await super().instantiate()
-        finally:
-            _starting.discard(self)
+        async with self._start_lock:
+            _starting.add(self)
+            try:
+                return await super().instantiate()
+            finally:
+                _starting.discard(self)
 
 
 class FixedCluster(SpecCluster):
