@@ -9,26 +9,22 @@ import signal
 import subprocess
 import sys
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from distributed import Client
+from tests.city_drives import write_city_drive
 from tests.clusters import thread_cluster
 
-from lidarpool import LidarError, Mounted, Pose, Sensor, Survey, Track, save_cloud, twin
+from lidarpool import LidarError, Sensor, twin
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.folder import result_folder
 from lidarpool.reconstruction.finished_steps import STEPS_FOLDER, FinishedSteps, TwinStep
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.run.cluster.worker_map import LostWorkersError, parallel_map
-from lidarscenes.procedural.city import city
-from lidarsim.columns.table import SCAN
-from lidarsim.simulator.points.batch_columns import columns_of
-from lidarsim.simulator.rig import Rig
-from lidarsim.sweeps.sweeps import Sweeps
 
 pytest.importorskip("scipy")
 
@@ -38,21 +34,8 @@ SWEEPS = 6
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
     """Return a bag of a short drive through a city."""
-    scene = city(5_000)
-    end_s = 0.1 * (SWEEPS + 1)
-    survey = Survey(
-        sensors=[Mounted(Sensor.grid(240, 16, vertical_fov_deg=40), Pose((0, 0, 1.9)), "lidar")],
-        trajectory=Track([0, end_s], [[-24, -3, 0], [4 * end_s - 24, -3, 0]]),
-        steps=36 * SWEEPS,
-        columns=["time", "intensity", "class", "ray", "range"],
-        precision_m=1e-3,
-    )
-    part = columns_of(list(Rig(scene, survey, "auto").cast(0, survey.scan_count)))
-    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
-    sweeps = Sweeps.from_survey(survey, scene)
     path = tmp_path_factory.mktemp("drive") / "drive.mcap"
-    save_cloud(replace(cloud, sweeps=lambda: sweeps), path)
-    return path
+    return write_city_drive(path, Sensor.grid(240, 16, vertical_fov_deg=40), SWEEPS, -24)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +177,7 @@ def test_a_submap_that_kills_its_workers_is_one_sentence():
         list(run(os._exit, [1, 1]))
 
 
+@pytest.mark.extended
 def test_an_interrupted_reconstruction_can_be_continued(bag, tmp_path):
     out = tmp_path / "twin"
     command = [sys.executable, "-m", "lidarpool", "twin", str(bag), "--out", str(out)]

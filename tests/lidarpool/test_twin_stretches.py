@@ -14,24 +14,19 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from distributed import Client
+from tests.city_drives import write_city_drive
 
 import poolpart.deploy
-from lidarpool import LidarError, Mounted, Pose, Sensor, Survey, Track, save_cloud, twin
+from lidarpool import LidarError, Sensor, twin
 from lidarpool.cli.commands import cli
 from lidarpool.reconstruction.alignment import Alignment
 from lidarpool.reconstruction.finished_steps import STEPS_FOLDER
 from lidarpool.reconstruction.motion import Motion, MotionStep
 from lidarpool.reconstruction.submaps import AlignedSubmap, merge_alignments, split_into_submaps
-from lidarscenes.procedural.city import city
-from lidarsim.columns.table import SCAN
-from lidarsim.simulator.points.batch_columns import columns_of
-from lidarsim.simulator.rig import Rig
-from lidarsim.sweeps.sweeps import Sweeps
 
 pytest.importorskip("scipy")
 
 SWEEPS = 130
-SPEED_M_S = 4.0
 
 
 def straight(count, step_m):
@@ -108,21 +103,8 @@ def test_poses_go_over_from_one_submap_to_the_next():
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
     """Return a bag of a drive of 52 m through a city, which makes two submaps."""
-    scene = city(5_000)
-    end_s = 0.1 * (SWEEPS + 1)
-    survey = Survey(
-        sensors=[Mounted(Sensor.grid(320, 24, vertical_fov_deg=40), Pose((0, 0, 1.9)), "lidar")],
-        trajectory=Track([0, end_s], [[-34, -3, 0], [SPEED_M_S * end_s - 34, -3, 0]]),
-        steps=36 * SWEEPS,
-        columns=["time", "intensity", "class", "ray", "range"],
-        precision_m=1e-3,
-    )
-    part = columns_of(list(Rig(scene, survey, "auto").cast(0, survey.scan_count)))
-    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
-    sweeps = Sweeps.from_survey(survey, scene)
     path = tmp_path_factory.mktemp("drive") / "drive.mcap"
-    save_cloud(replace(cloud, sweeps=lambda: sweeps), path)
-    return path
+    return write_city_drive(path, Sensor.grid(320, 24, vertical_fov_deg=40), SWEEPS, -34)
 
 
 def written(folder):

@@ -13,35 +13,15 @@ import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
-from tests.drives import points_of, the_scene, the_sweeps
 from tests.fake_augmenters import changed, content, identity, rewrite, two_boxes
 
 from lidarpool import LidarError
 from lidarpool.augmentation.rewriting.opening import open_rewriter
 from lidarpool.clouds.ros.messages import message_store
-from lidarpool.clouds.writing import ExportSpec
 from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.bags import POINT_CLOUD, point_columns
 
 TOPIC = "/front/points"
-
-
-@pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    """Write a drive with a format and options once."""
-    scene = the_scene()
-    sweeps = the_sweeps(scene)
-    cloud = points_of(scene, 0)
-    paths = {}
-
-    def write(name, **options):
-        key = name, *options.items()
-        if key not in paths:
-            paths[key] = tmp_path_factory.mktemp("bag") / ExportSpec(name).row.file
-            ExportSpec(name, **options).write(paths[key], cloud, sweeps)
-        return paths[key]
-
-    return write
 
 
 def opened(path, sensor=TOPIC):

@@ -8,7 +8,6 @@ import cloudpickle
 import laspy
 import numpy as np
 import pytest
-from tests.drives import points_of, the_scene, the_sweeps
 from tests.fake_augmenters import changed, content, identity, rewrite, two_boxes
 
 from lidarpool import LidarError, read_cloud
@@ -16,24 +15,6 @@ from lidarpool.augmentation.conversion import open_converter
 from lidarpool.augmentation.rewriting.opening import open_rewriter
 from lidarpool.clouds.writing import ExportSpec
 from lidarpool.recordings.opening import open_recording
-
-
-@pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    """Write a drive in a format once."""
-    scene = the_scene()
-    sweeps = the_sweeps(scene)
-    cloud = points_of(scene, 0)
-    paths = {}
-
-    def write(name, **options):
-        key = name, *options.items()
-        if key not in paths:
-            paths[key] = tmp_path_factory.mktemp("drive") / ExportSpec(name).row.file
-            ExportSpec(name, **options).write(paths[key], cloud, sweeps)
-        return paths[key]
-
-    return write
 
 
 def converter(path, spec, sensor=None):

@@ -1,4 +1,4 @@
-"""Resampling and thinning of recorded sweeps."""
+"""Resampling of recorded sweeps."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import pytest
 
 from lidarpool import LidarError, Sensor, load_sensor
 from lidarpool.augmentation.resampling import SensorResampler
-from lidarpool.augmentation.thinning import SweepThinner
 from lidarpool.clouds.recording import Recording
 from lidarsim.columns.sweep import Sweep
 
@@ -286,31 +285,7 @@ def test_notes_state_the_accuracy_and_the_range(dense):
     assert resampler.notes[1].endswith("vertically and 0.25° horizontally.")
 
 
-def test_thinning_keeps_every_other_ring_and_pulse(dense):
-    augmented = SweepThinner(recording(dense), every_ring=2).sweep(0)
-    kept = dense.columns["channel"] % 2 == 0
-    assert (augmented.template == np.flatnonzero(kept)).all()
-    assert (augmented.sweep.columns["channel"] == dense.columns["channel"][kept] // 2).all()
-    both = SweepThinner(recording(dense), every_ring=2, every_column=3).sweep(0)
-    expected = Sensor.grid(240, 16, vertical_fov_deg=30)
-    assert np.bincount(both.sweep.columns["channel"]).tolist() == [240] * 16
-    assert np.allclose(both.sweep.points, scan_room(expected).points)
-
-
-def test_thinning_to_listed_rings(dense):
-    augmented = SweepThinner(recording(dense), rings=[20, 4, 7]).sweep(0)
-    assert np.unique(dense.columns["channel"][augmented.template]).tolist() == [4, 7, 20]
-    assert np.bincount(augmented.sweep.columns["channel"]).tolist() == [720] * 3
-    with pytest.raises(LidarError, match="drive has no ring 31, 40"):
-        SweepThinner(recording(dense), rings=[3, 31, 40])
-    with pytest.raises(LidarError, match="`rings` is empty"):
-        SweepThinner(recording(dense), rings=[])
-    with pytest.raises(LidarError, match="`rings` and `every_ring` cannot be combined"):
-        SweepThinner(recording(dense), rings=[3], every_ring=2)
-
-
 def test_an_empty_sweep_stays_empty(dense):
     sweeps = [dense, dense.select(slice(0))]
     two = Recording("drive", 2, lambda number: sweeps[number])
     assert not len(SensorResampler(two, SPARSE).sweep(1).sweep)
-    assert not len(SweepThinner(two, every_column=2).sweep(1).sweep)

@@ -511,6 +511,7 @@ def test_invalid_campaigns_are_refused(campaign, text, words):
     assert words in str(refused.value)
 
 
+@pytest.mark.extended
 def test_two_runs_do_not_share_an_output(augmentation, drive, tmp_path):
     out = tmp_path / "wet"
     arguments = [sys.executable, "-c", SLOW, str(drive), str(out)]

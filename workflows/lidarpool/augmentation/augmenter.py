@@ -30,7 +30,6 @@ from .strength_columns import StrengthColumns
 _DIVERGENCE_MRAD = 3.0  # beam divergence of a sensor whose divergence is unknown
 _SUBRAYS = 7  # sub-rays per beam if objects are inserted
 _RECEIVER = ("detection_range_m", "overlap_m", "saturation", "seed")  # properties of the receiver
-_UNSUPPORTED_FAULTS = ("frozen", "time_jump")
 # Minimum energy of recorded returns relative to the detection threshold. With this energy, 2.3 % of
 # the pulses are detected.
 _WEAKEST = 0.6
@@ -71,12 +70,6 @@ class Augmenter:
             raise LidarError(
                 f"{recording.name} contains no sweeps. Use a recording that consists of sweeps."
             )
-        for number, fault in enumerate(effects.faults):
-            if fault.kind in _UNSUPPORTED_FAULTS:
-                raise LidarError(
-                    f"faults[{number}]: a fault of kind {fault.kind!r} cannot be simulated on a "
-                    "recording. Remove it, or edit the timestamps of the recording."
-                )
         self.recording = recording
         self.effects = effects
         self.motion = SensorMotion.from_recording(

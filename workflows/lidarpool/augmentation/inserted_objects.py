@@ -115,7 +115,7 @@ class InsertedObjects:
 
     @property
     def has_objects(self) -> bool:
-        """Whether any object is inserted."""
+        """Whether there are objects to insert."""
         return bool(self.names)
 
     @property

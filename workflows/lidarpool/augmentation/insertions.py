@@ -34,7 +34,7 @@ def load_insertion(shape: str | Path, report: Callable[[str], None] = lambda _: 
     Raises
     ------
     LidarError
-        If there is no such mesh or file, or if the file cannot be read.
+        If `shape` is not a built-in mesh, or if the file does not exist or cannot be read.
     """
     if str(shape) == "car":
         return replace(car(MODELS[0]), name="car")

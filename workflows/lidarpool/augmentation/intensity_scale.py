@@ -141,12 +141,6 @@ class IntensityScale:
         ------
         LidarError
             If the recording has no intensities, or if they are all equal.
-
-        Examples
-        --------
-        >>> scale = IntensityScale.for_recording(open_recording("drive.mcap"))  # doctest: +SKIP
-        >>> scale.energies(np.array([100.0]), np.array([20.0]))  # doctest: +SKIP
-        array([0.25])
         """
         if assumed_reflectance is not None:
             return cls.with_reflectance(assumed_reflectance)
@@ -158,6 +152,11 @@ class IntensityScale:
         """Create the scale of a recording without intensities.
 
         Raises LidarError if the reflectance is not greater than 0 or exceeds 1.
+
+        Examples
+        --------
+        >>> IntensityScale.with_reflectance(0.3).energies(None, np.array([20.0, 40.0]))
+        array([0.075  , 0.01875])
         """
         check_number("assumed_reflectance", reflectance, gt=0, le=1)
         return cls(

@@ -84,9 +84,16 @@ class SensorResampler:
 
     Examples
     --------
-    >>> resampler = SensorResampler(recording, load_sensor("velodyne/vlp16"))  # doctest: +SKIP
-    >>> resampler.sweep(0).sweep  # doctest: +SKIP
-    <Sweep 0: 21,480 points>
+    >>> from lidarpool import Pose, Scanner, Scene, box
+    >>> room = Scene.from_meshes([box("Room", (30, 20, 4))])
+    >>> recorded = Sensor.grid(720, 32, vertical_fov_deg=30)
+    >>> scanner = Scanner(room, recorded, columns=["channel"], coordinates="sensor")
+    >>> cloud = scanner.sweep(Pose([0, 0, 2]))
+    >>> sweep = Sweep(cloud.positions, {"channel": cloud["channel"]})
+    >>> recording = Recording("drive", 1, lambda number: sweep)
+    >>> resampler = SensorResampler(recording, Sensor.grid(360, 8, vertical_fov_deg=20))
+    >>> len(sweep), len(resampler.sweep(0).sweep)
+    (23040, 2880)
     """
 
     def __init__(
@@ -262,10 +269,10 @@ class SensorResampler:
         rows, ray = self._pulses.closest(sweep, rays.azimuth, rays.elevation, self._candidates)
         range_m = np.linalg.norm(np.asarray(sweep.points[rows], np.float64), axis=1)
         measured = (range_m >= self.sensor.min_range_m) & (range_m <= self.sensor.max_range_m)
-        return copied_returns(sweep, rows[measured], rays.channel[ray[measured]])
+        return _copied_returns(sweep, rows[measured], rays.channel[ray[measured]])
 
 
-def copied_returns(sweep: Sweep, rows: Ints, channel: Ints) -> AugmentedSweep:
+def _copied_returns(sweep: Sweep, rows: Ints, channel: Ints) -> AugmentedSweep:
     """Create a sweep that consists of some recorded returns with new channels.
 
     Parameters

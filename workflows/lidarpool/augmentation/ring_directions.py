@@ -98,7 +98,7 @@ class RingDirections:
             )
         if not len(recording.rings):
             reason = recording.rings.note or f"The rings of {recording.name} are unknown."
-            raise LidarError(f"{reason} Without rings, its sweeps cannot be resampled or thinned.")
+            raise LidarError(f"{reason} Without rings, its sweeps cannot be resampled.")
 
     def __len__(self) -> int:
         """Return the number of rings."""
@@ -125,14 +125,6 @@ class RingDirections:
             return sweep.points
         fired = recording.read_fired(sweep.number)
         return fired.points if len(fired) == len(sweep) else sweep.points
-
-    def ringed_rows(self, sweep: Sweep) -> tuple[Ints, Ints]:
-        """Return the rows of a sweep that have a return, and the ring of each of them.
-
-        Both arrays have shape (n,). Unknown rings are -1.
-        """
-        rows, _, rings = self._ringed(sweep)
-        return rows, rings
 
     def _measured_profiles(self, rings: Ints, azimuth: Floats, elevation: Floats) -> Floats:
         """Return the elevation of each ring at the centers of sectors, with shape (r, SECTORS).

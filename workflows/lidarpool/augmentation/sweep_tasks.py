@@ -101,7 +101,7 @@ class AugmentationPlan:
     files
         File of the recording, once for each of its sensors.
     variants
-        Effects by the number of their variant.
+        Mapping of variant numbers to effects.
     model
         Model of the recording's sensor, or None if it is unknown.
     numbers

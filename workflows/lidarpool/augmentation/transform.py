@@ -146,8 +146,14 @@ class Augment:
 
     Examples
     --------
-    >>> augmented = Augment(rain_mm_h=25, model="velodyne/hdl64e")  # doctest: +SKIP
-    >>> points = augmented(points, seed=epoch * len(dataset) + index)  # doctest: +SKIP
+    >>> from lidarpool import Pose, Scanner, Scene, load_sensor
+    >>> sensor = load_sensor("velodyne/vlp16")
+    >>> scanner = Scanner(Scene.seed(), sensor, columns=["reflectivity"], coordinates="sensor")
+    >>> cloud = scanner.sweep(Pose((0, 0, 1.5)))
+    >>> points = np.column_stack([cloud.positions, cloud["reflectivity"]])
+    >>> fog = Augment(visibility_km=0.1, model="velodyne/vlp16")
+    >>> points.shape, fog(points, seed=1).shape
+    ((2296, 4), (2083, 4))
     """
 
     def __init__(

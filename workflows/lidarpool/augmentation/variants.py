@@ -112,7 +112,7 @@ class CampaignVariants(Variants):
 
     @property
     def identity(self) -> str:
-        """Hash of the campaign and its files, which does not depend on the number of variants."""
+        """Hash of the campaign and its files. Independent of the number of variants."""
         files = file_hashes(self._jobs.files)
         return fingerprint(self._made_of, dict(self._jobs.identity), files, self._insertions)
 

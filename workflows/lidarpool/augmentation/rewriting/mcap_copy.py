@@ -68,8 +68,8 @@ class AddedTopic:
     qos: str = ""
 
 
-# Function that returns the new content of a message, given its topic, type, log time in nanoseconds
-# and content, or None if the message is not replaced.
+# Function that returns the new data of a message, given its topic, type, log time in nanoseconds
+# and data, or None if the message is not replaced.
 Replacement = Callable[[str, str, int, bytes], NewContent | None]
 
 
@@ -89,7 +89,7 @@ def copy_mcap(
     replaced_topic
         Topic with the messages that are replaced.
     replacement
-        Function that returns the new content of a message on this topic.
+        Function that returns the new data of a message on this topic. See `Replacement`.
     added
         Topic for additional messages, or None.
 

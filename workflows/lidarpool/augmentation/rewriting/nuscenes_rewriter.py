@@ -368,9 +368,9 @@ class _AnnotationTables:
         self._added.update(key)
 
     def count_points(self, encoded: EncodedSweeps, target: Path) -> int:
-        """Count the points in the boxes of changed key frames, as nuscenes-devkit counts them.
+        """Update `num_lidar_pts` in changed key frames, with the same rules as nuscenes-devkit.
 
-        The key frames of all lidar channels of a sample count. Returns the number of annotations
+        Points from all lidar channels of a sample are counted. Returns the number of annotations
         of recorded objects whose count differs from the stored count.
         """
         annotations: dict[str, list[dict[str, Any]]] = {}
