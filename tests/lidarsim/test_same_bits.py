@@ -38,7 +38,6 @@ EXCEPTIONS = {
     "lidarscenes/procedural/": "scenes are made once, and read by all",
     "lidarscenes/writers/": "scenes are written once, and read by all",
     "lidarsim/scene/simplified.py": "for pictures and planning",
-    "lidarsim/simulator/body_spheres.py": "bounds are larger than the bodies",
     "lidarsim/sensor/helios_scanner.py": "sensors are written once, for another program",
     "lidarsim/columns/sweep.py": "poses move recorded points, which one process reads",
     "lidarsim/sweeps/": "files of sweeps are written by one process for all",

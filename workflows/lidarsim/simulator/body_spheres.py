@@ -9,6 +9,7 @@ import numpy as np
 
 from ..motion.trajectory import full_poses
 from ..numerics.arrays import Bools, Floats
+from ..numerics.vectors import dot, norm, rotate_into_frames
 from ..scene.scene import Scene
 from ..sensor.disc import Beam
 from .casting.motion import CastPoses
@@ -43,19 +44,19 @@ def firings_near_bodies(
     origins
         (f, c, 3): origins of the beams in the same frame in meters, or None.
     """
-    spread_rad = float(np.linalg.norm(beam.angles, axis=1).max())
-    offset_m = 0.0 if beam.starts is None else float(np.linalg.norm(beam.starts, axis=1).max())
+    spread_rad = float(norm(beam.angles).max())
+    offset_m = 0.0 if beam.starts is None else float(norm(beam.starts).max())
     near = np.zeros(len(firing_ns), np.bool_)
     for center, radius_m in _spheres(scene, firing_ns):
-        toward = center - poses.positions
+        toward = np.broadcast_to(center - poses.positions, (len(firing_ns), 3))
         if poses.rotations is not None:
-            toward = np.einsum("...ji,...j->...i", poses.rotations, toward)
-        toward = np.broadcast_to(toward, (len(firing_ns), 3))[:, None]
-        if origins is not None:
-            toward = toward - origins
-        squared = np.einsum("fci,fci->fc", toward, toward)
-        x, y, z = np.moveaxis(toward, 2, 0)
-        along = directions[..., 0] * x + directions[..., 1] * y + directions[..., 2] * z
+            toward = rotate_into_frames(
+                toward, np.broadcast_to(poses.rotations, (len(firing_ns), 3, 3))
+            )
+        toward = toward[:, None] if origins is None else toward[:, None] - origins
+        components = np.moveaxis(toward, 2, 0)
+        squared = dot(components, components)
+        along = dot(components, np.moveaxis(directions, 2, 0))
         reach_m = radius_m + offset_m + spread_rad * np.sqrt(squared)
         meets = (along > -reach_m) & (squared - along * along < reach_m * reach_m)
         near |= meets.any(axis=1)
@@ -80,9 +81,9 @@ def ranges_of_firings(near: Bools, channels: int) -> Iterator[tuple[int, int, bo
 def _spheres(scene: Scene, firing_ns: Floats) -> Iterator[tuple[Floats, float]]:
     """Yield the center (3,) or (f, 3) and the radius of each body, in the scene frame in meters."""
     for low, high in scene.object_bounds[1:]:
-        yield (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+        yield (low + high) / 2, float(norm(high - low)) / 2
     for actor in scene.actors:
         low, high = actor.bounds
         positions, _ = full_poses(actor.trajectory, 0, firing_ns)
         # The box rotates about the origin of the actor.
-        yield positions, float(np.linalg.norm(np.maximum(np.abs(low), np.abs(high))))
+        yield positions, float(norm(np.maximum(np.abs(low), np.abs(high))))
