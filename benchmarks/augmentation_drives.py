@@ -64,7 +64,7 @@ class Condition:
 
     @property
     def effects(self) -> Effects:
-        """The condition as effects on a recording."""
+        """Return the condition as effects for `augment`."""
         return Effects(weather=Weather(**self.weather), noise=self.noise, faults=self.faults)
 
 

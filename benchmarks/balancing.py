@@ -95,7 +95,7 @@ def cluster_of(workers: int, resources: bool) -> Iterator[Client]:
 
 
 def run_partitions(client: Client, load: Load, balanced: bool, decode_workers: int) -> Callable:
-    """Start to process items with partitions. Returns a function that ends it."""
+    """Start processing items with partitions. Return a function that stops it."""
     pool = Pool.from_client(client)
     parts = pool.divide({"DECODE": n_workers(decode_workers), "DETECT": rest(minimum=1)})
     workers = len(pool)
@@ -117,7 +117,7 @@ def run_partitions(client: Client, load: Load, balanced: bool, decode_workers: i
 
 
 def run_resources(client: Client, load: Load, workers: int) -> Callable:
-    """Start to process items with Dask resources. Returns a function that ends it."""
+    """Start processing items with Dask resources. Return a function that stops it."""
     counts = {"items": 0, "detected": 0}
 
     def submit(seconds: float) -> Any:

@@ -191,6 +191,7 @@ def test_directions_are_those_of_the_protocol():
     assert PanoramaImage.from_points(above).return_mask.sum() == 1
 
 
+@pytest.mark.extended
 def test_metrics_are_those_of_the_second_implementation(pair):
     metrics = FrameMetrics.between(*(PanoramaImage.from_points(*one) for one in pair))
     expected = [*metrics_by_loop(*(project_by_loop(*one) for one in pair))]

@@ -171,7 +171,7 @@ class FrameMetrics(NamedTuple):
 
 
 class FrameCollector:
-    """Compares the sweeps of two recordings frame by frame, and collects the metrics.
+    """Computes the metrics of each frame of two recordings.
 
     Intensities are divided by the full scale of their recording: 1, 255 or 65535. If both are
     energies, they are divided by the highest one in the first frame of B. If only those of one

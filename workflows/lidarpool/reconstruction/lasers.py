@@ -76,7 +76,7 @@ class RingLasers:
     ) -> RingLasers:
         """Determine the lasers of a sensor.
 
-        An offset is only used if it is significant. Otherwise, the elevations are the given ones.
+        If no vertical offset is significant, the elevations are not changed.
 
         Parameters
         ----------

@@ -495,7 +495,7 @@ class PCDRecords:
         return cls(records, header.height, header, counts, data[:start], bytes(body))
 
     def encode(self, rows: Records, template: Ints, height: int = 1) -> bytes:
-        """Return the content of a file with other points, in the same encoding.
+        """Encode points in the format of this file, and return the bytes of a new file.
 
         Parameters
         ----------
