@@ -212,6 +212,26 @@ class Material(FileSection):
             "ellipsoid"
         ),
     ] = "spherical"
+    gap_fraction: Annotated[
+        float,
+        about(
+            "fraction of the sub-rays that pass through gaps in the surface, such as a hedge or a "
+            "fence",
+            0.3,
+            ge=0,
+            lt=1,
+        ),
+    ] = 0.0
+    range_spread_m: Annotated[
+        float,
+        about(
+            "standard deviation in meters of the ranges of returns from the surface, if it stands "
+            "for a layer with depth, such as a hedge",
+            0.1,
+            ge=0,
+            le=10,
+        ),
+    ] = 0.0
     material: Annotated[
         str | Sequence[str] | None,
         scenario_type(TextOrTexts | None),
@@ -236,6 +256,7 @@ class Material(FileSection):
         self._check_reflectance()
         self._check_roughness()
         self._check_medium()
+        self._check_gaps()
 
     def _set_names(self, field_name: str) -> None:
         """Convert a name or names in a field to a tuple. Raises LidarError for empty names."""
@@ -295,6 +316,19 @@ class Material(FileSection):
                 "leaf_area_density cannot be combined with transparent, retro, roughness or "
                 "specular_reflectance, and requires a number or a spectrum as the reflectance."
             )
+
+    def _check_gaps(self) -> None:
+        """Check that gaps and a range spread are only set for surfaces without a medium."""
+        if self.is_porous and (self.transparent != "none" or self.leaf_area_density is not None):
+            raise LidarError(
+                "gap_fraction and range_spread_m cannot be combined with transparent or "
+                "leaf_area_density."
+            )
+
+    @property
+    def is_porous(self) -> bool:
+        """Whether light passes through gaps in the surface, or returns from different depths."""
+        return self.gap_fraction > 0 or self.range_spread_m > 0
 
     @property
     def _suits_leaves(self) -> bool:
@@ -654,6 +688,8 @@ class MaterialTable:
     leaf_area: Floats  # leaf area density inside the surface in m²/m³, or 1 for voxels
     leaf_angle: Indices  # indices into `leaf_angles`
     leaf_angles: tuple[str | float, ...]
+    gap_fraction: Floats  # fraction of the sub-rays that pass through gaps
+    range_spread_m: Floats  # standard deviation of the ranges of returns
 
     @classmethod
     def build(
@@ -717,6 +753,8 @@ class MaterialTable:
             leaf_area=leaf_area,
             leaf_angle=np.array([angles.index(m.leaf_angle) for m in entries], np.intp)[first],
             leaf_angles=angles,
+            gap_fraction=np.array([m.gap_fraction for m in entries], np.float64)[first],
+            range_spread_m=np.array([m.range_spread_m for m in entries], np.float64)[first],
         )
 
     @property

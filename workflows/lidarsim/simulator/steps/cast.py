@@ -26,7 +26,7 @@ from ...numerics.arrays import (
     UInts32,
     to_writable,
 )
-from ...numerics.random_numbers import Purpose, raw
+from ...numerics.random_numbers import Purpose, normal, raw, uniform
 from ...numerics.vectors import dot, rotate_into_frames
 from ...scene.colors import luminance
 from ..casting.actor_trajectories import ActorTrajectories
@@ -39,7 +39,10 @@ from .doppler import range_rates_of_origins, velocities_of_ends
 from .light_in_media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, MediaRays, random_depths
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
+GAP = Purpose(32, "gaps in surfaces that light passes")
+SPREAD = Purpose(33, "depth of a return in a porous surface")
 GHOST = CAUSES.index("ghost")
+_TINY = 1e-300  # avoids division by zero for surfaces without gaps
 MAX_PASSES = 16  # number of surfaces that light can pass before it is dropped
 MAX_LEAFY_PASSES = 64  # limit with crowns, whose surface light passes twice
 MAX_REFLECTIONS = 2  # number of times that light can be reflected; each may divide the light
@@ -70,6 +73,10 @@ class LightPaths:
     # earlier surfaces, in m/s, as if the next surface were static; None if no column stores
     # velocities.
     range_rate: Floats | None = None
+    # Uniform random number in [0, 1). The light passes through a porous surface if the number is
+    # less than the gap fraction. The number divided by the gap fraction is then uniformly
+    # distributed as well, and applies to the next surface. None if no surface is porous.
+    gap_number: Floats | None = None
 
     def take(self, row_indices: Integers) -> LightPaths:
         """Return the light paths in the given rows."""
@@ -117,6 +124,7 @@ class SurfaceHits(NamedTuple):
     energy: Floats  # received energy, in the unit of `SceneSurfaces.energy`
     film: Bools | None  # whether there may be a film of water; None if no surface is wet
     leaves: Indices  # (l,): rows where light hits a leaf within a crown
+    gaps: Bools | None  # whether light passes through a gap; None if no surface is porous
     velocities: Floats  # velocities of the surfaces; shape (0, 3) if they are not needed
 
 
@@ -202,11 +210,12 @@ class CastStep(PulseStep):
         "Gaussian and elliptical beams",
         "Refraction",
         "Vegetation",
+        "Porous surfaces",
         "Rays without a return",
     )
     writes = *RETURN_COLUMNS, "velocity"
     causes = (GHOST,)
-    purposes = LEAF, CROWN
+    purposes = LEAF, CROWN, GAP, SPREAD
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: SceneSurfaces) -> None:
         super().__init__(setup, caster, surfaces)
@@ -314,10 +323,15 @@ class CastStep(PulseStep):
         """Return a function `draw(purpose, ray)` that returns random bits for sub-rays."""
 
         def draw(purpose: Purpose, ray: Ints) -> NDArray[np.uint64]:
-            scan, number = batch.keys.scan_and_number(batch.start + ray // batch.subrays_per_beam)
-            return raw(self._seed, purpose, scan, number, ray % batch.subrays_per_beam)
+            return raw(self._seed, purpose, *self._random_key(batch, ray))
 
         return draw
+
+    @staticmethod
+    def _random_key(batch: PulseBatch, ray: Ints) -> tuple[Ints, Ints, Ints]:
+        """Return the scans, beams and sub-rays of rays, as keys of random numbers."""
+        scan, beam = batch.keys.scan_and_number(batch.start + ray // batch.subrays_per_beam)
+        return scan, beam, ray % batch.subrays_per_beam
 
     # -- the first cast ----------------------------------------------------------------------
 
@@ -364,6 +378,8 @@ class CastStep(PulseStep):
             light.range_rate = range_rates_of_origins(poses, ray, origins, directions)
         if setup.has_mirrors:
             light.mirrored = np.zeros(count, np.uint8)
+        if setup.porous:
+            light.gap_number = uniform(self._seed, GAP, *self._random_key(batch, ray))
         deflected = setup.has_mirrors or (media is not None and media.refracts)
         if batch.subrays_per_beam > 1 and deflected:
             light.mirror_matrices = np.broadcast_to(np.eye(3), (count, 3, 3))
@@ -391,6 +407,9 @@ class CastStep(PulseStep):
         if self._colored:
             points = light.origins + step_m[:, None] * light.directions
             color = surfaces.colors(triangle, points, light.times, actor_trajectories)
+        gaps = None
+        if light.gap_number is not None:
+            distance, gaps = self._meet_gaps(light, surfaces.kinds(triangle), distance, batch)
         normals, cosines, kinds, energy, film = surfaces.illuminate(
             triangle,
             light.directions,
@@ -419,8 +438,34 @@ class CastStep(PulseStep):
             energy=energy,
             film=film,
             leaves=np.zeros(0, np.intp) if leaves is None else leaves.row_indices,
+            gaps=gaps,
             velocities=self._velocities(light, step_m, triangle, actor_trajectories),
         )
+
+    def _meet_gaps(
+        self, light: LightPaths, kinds: Ints32, distance: Floats, batch: PulseBatch
+    ) -> tuple[Floats, Bools]:
+        """Determine where light passes through gaps, and the depths of the other returns.
+
+        This advances `light.gap_number` to the next surface. Return the optical path lengths of the
+        hits in meters, and whether light passes through a gap. Both have shape (n,), like `kinds`
+        and `distance`.
+        """
+        assert light.gap_number is not None
+        table = self.surfaces.at_wavelength(self._sensor_light.wavelength_nm)
+        gap_fraction = table.gap_fraction[kinds]
+        gaps = light.gap_number < gap_fraction
+        light.gap_number = np.where(
+            gaps, light.gap_number / np.maximum(gap_fraction, _TINY), light.gap_number
+        )
+        spread_m = table.range_spread_m[kinds]
+        rows = np.flatnonzero((spread_m > 0) & ~gaps)
+        depth_m = normal(self._seed, SPREAD, *self._random_key(batch, light.ray[rows]))
+        distance = distance.copy()
+        distance[rows] = np.maximum(
+            distance[rows] + spread_m[rows] * depth_m, self.setup.sensor.min_range_m
+        )
+        return distance, gaps
 
     def _meet_leaves(self, cast: CastLight, batch: PulseBatch) -> tuple[CastLight, Leaves | None]:
         """Shorten light paths at the leaves that they hit. Return the paths and the leaves.
@@ -513,13 +558,22 @@ class CastStep(PulseStep):
             film = False if surface_hits.film is None else surface_hits.film
             smooth = (materials.specular > 0)[surface_hits.kinds] | film
             mirrors = smooth & (mirrored < MAX_REFLECTIONS)
-        if light.in_media is None:
+        gaps = surface_hits.gaps
+        if light.in_media is None and gaps is None:
             return VisibleHits(hits, normals, transmits, mirrors)
+        visible = np.ones(len(surface_hits.kinds), np.bool_)
+        if gaps is not None:
+            transmits = transmits | gaps
+            mirrors = mirrors & ~gaps
+            visible = ~gaps & (surface_hits.distance <= self.setup.sensor.max_range_m)
+        if light.in_media is None:
+            row_indices = np.flatnonzero(visible)
+            return VisibleHits(hits.take(row_indices), normals[row_indices], transmits, mirrors)
         crowns = materials.leafy[surface_hits.kinds]  # surfaces of crowns reflect no light
         crowns[surface_hits.leaves] = False
         # Optical path lengths exceed the lengths of the cast rays.
         in_range = surface_hits.distance <= self.setup.sensor.max_range_m
-        row_indices = np.flatnonzero(in_range & ~crowns)
+        row_indices = np.flatnonzero(visible & in_range & ~crowns)
         return VisibleHits(
             hits.take(row_indices),
             normals[row_indices],
@@ -590,6 +644,10 @@ class CastStep(PulseStep):
         )
         fraction = np.empty(len(row_indices))
         film = np.zeros(0, np.bool_) if surface_hits.film is None else surface_hits.film
+        shares = materials.diffuse_reflectances(surface_hits.kinds[row_indices], bright)
+        if surface_hits.gaps is not None:  # nothing scatters or reflects light in a gap
+            shares = np.where(surface_hits.gaps[row_indices], 0.0, shares)
+            film = film & ~surface_hits.gaps if len(film) else film
         count = surface_loops.divide_light(
             row_indices,
             reflected,
@@ -600,7 +658,7 @@ class CastStep(PulseStep):
                 light.share,
                 surface_hits.distance,
             ),
-            shares=materials.diffuse_reflectances(surface_hits.kinds[row_indices], bright),
+            shares=shares,
             optics=surface_loops.OnwardOptics(
                 materials.specular, materials.passes, ~materials.refracts, materials.leafy
             ),
@@ -708,6 +766,7 @@ class CastStep(PulseStep):
             mirrored=None if light.mirrored is None else light.mirrored + crossings.reflected,
             in_media=in_media,
             range_rate=range_rate,
+            gap_number=light.gap_number,
         )
         return OnwardLight(behind, -clear_m, pattern)
 

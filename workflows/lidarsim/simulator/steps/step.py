@@ -100,9 +100,14 @@ class Setup:
 
     @property
     def has_onward_light(self) -> bool:
-        """Whether surfaces transmit light or reflect it specularly."""
+        """Whether light can continue beyond surfaces, or return from different depths."""
         glass = any(m.transparent == "pass" for m in self.survey.materials)
-        return glass or self.has_mirrors or self.leafy
+        return glass or self.has_mirrors or self.leafy or self.porous
+
+    @property
+    def porous(self) -> bool:
+        """Whether surfaces have gaps, or return light from different depths."""
+        return any(m.is_porous for m in self.survey.materials)
 
     @property
     def has_mirrors(self) -> bool:
