@@ -41,6 +41,9 @@ _CELL_BITS = 21  # bits per cell coordinate, which repeats after one million met
 _CELL_MASK = (1 << _CELL_BITS) - 1
 _MAX_VIEW_FACTOR = 1.5  # Points are omitted beyond this multiple of the shortest range in a cell.
 _ON_RAY_M = 0.15  # maximum range difference of a ray that ends on a surfel
+# Pulses that are lost at a dark surfel, per pulse that returns from it or from behind it. With a
+# lower limit, the surfel would hide more returns at long range than it explains lost pulses.
+_MIN_LOST_RATIO = 2
 
 
 class Observations(NamedTuple):
@@ -132,7 +135,7 @@ class SurfaceMap:
     def refine(self, sweeps: AlignedSweeps, stationary: Mapping[int, Bools]) -> Surfels:
         """Remove surfels that more rays contradict than support, and adjust the other surfels.
 
-        Each surfel that is not dark moves along its normal to the median of the rays that end on
+        A ray that contradicts a dark surfel counts `_MIN_LOST_RATIO` times. Each surfel that is not dark moves along its normal to the median of the rays that end on
         it.
 
         Raises
@@ -153,9 +156,9 @@ class SurfaceMap:
             dark = self.surfels.dark[hits.surfel]
             passing = ~ends & (farther_m > _ON_RAY_M)
             votes += np.bincount(hits.surfel[ends & ~dark], minlength=count)
-            votes -= np.bincount(
-                hits.surfel[np.where(dark, ends | passing, passing)], minlength=count
-            )
+            votes -= np.bincount(hits.surfel[passing & ~dark], minlength=count)
+            returned = dark & (ends | passing)
+            votes -= _MIN_LOST_RATIO * np.bincount(hits.surfel[returned], minlength=count)
             votes += sign * np.bincount(self.cast(lost).surfel, minlength=count)
             moving = ~dark & (ends | (np.abs(farther_m) < _MAX_SHIFT_M))
             surfel.append(hits.surfel[moving])
