@@ -100,8 +100,28 @@ class SurfelHits(NamedTuple):
 
         The array has shape (k,).
         """
-        near = np.abs(self.distance_m - self.range_m) < _ON_RAY_M
+        near = np.abs(self.farther_m) < _ON_RAY_M
         return np.asarray(near | (self.off_plane_m < _ON_SURFEL_M))
+
+    @property
+    def farther_m(self) -> Floats:
+        """Distance by which each ray continues behind the surfel, in meters. Shape (k,)."""
+        return self.range_m - self.distance_m
+
+    @property
+    def passes(self) -> Bools:
+        """Mask of the rays that return from behind the surfel. Shape (k,)."""
+        return np.asarray(~self.ends & (self.farther_m > _ON_RAY_M))
+
+    @property
+    def votes(self) -> Ints:
+        """Votes for a surfel that returns pulses: 1 for rays that end on it, -1 for others."""
+        return self.ends.astype(np.int64) - self.passes
+
+    @property
+    def dark_votes(self) -> Ints:
+        """Votes for a surfel that returns no pulses, at most 0. Shape (k,)."""
+        return -_MIN_LOST_RATIO * (self.ends | self.passes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,8 +155,8 @@ class SurfaceMap:
     def refine(self, sweeps: AlignedSweeps, stationary: Mapping[int, Bools]) -> Surfels:
         """Remove surfels that more rays contradict than support, and adjust the other surfels.
 
-        A ray that contradicts a dark surfel counts `_MIN_LOST_RATIO` times. Each surfel that is not dark moves along its normal to the median of the rays that end on
-        it.
+        A ray that contradicts a dark surfel counts `_MIN_LOST_RATIO` times. Each surfel that is not
+        dark moves along its normal to the median of the rays that end on it.
 
         Raises
         ------
@@ -151,18 +171,12 @@ class SurfaceMap:
         for number in _evenly_chosen(stationary):
             sweep, lost = sweeps.read_with_lost(number)
             hits = self.cast(sweep, stationary[number])
-            ends = hits.ends
-            farther_m = hits.range_m - hits.distance_m
             dark = self.surfels.dark[hits.surfel]
-            passing = ~ends & (farther_m > _ON_RAY_M)
-            votes += np.bincount(hits.surfel[ends & ~dark], minlength=count)
-            votes -= np.bincount(hits.surfel[passing & ~dark], minlength=count)
-            returned = dark & (ends | passing)
-            votes -= _MIN_LOST_RATIO * np.bincount(hits.surfel[returned], minlength=count)
+            np.add.at(votes, hits.surfel, np.where(dark, hits.dark_votes, hits.votes))
             votes += sign * np.bincount(self.cast(lost).surfel, minlength=count)
-            moving = ~dark & (ends | (np.abs(farther_m) < _MAX_SHIFT_M))
+            moving = ~dark & (hits.ends | (np.abs(hits.farther_m) < _MAX_SHIFT_M))
             surfel.append(hits.surfel[moving])
-            offset_m.append((farther_m * hits.inward)[moving])
+            offset_m.append((hits.farther_m * hits.inward)[moving])
         shifts_m = _shifts(np.concatenate(surfel), np.concatenate(offset_m), count)
         supported = votes >= self.surfels.dark  # a dark surfel requires at least one lost pulse
         if not supported.any():

@@ -396,7 +396,6 @@ class CastStep(PulseStep):
 
         This advances `cast.light.in_media`, the state of the light in media, to the hits.
         """
-        surfaces = self.surfaces
         actor_trajectories = batch.subray_poses.actor_trajectories
         light = cast.light
         cast, leaves = self._meet_leaves(cast, batch)
@@ -406,11 +405,9 @@ class CastStep(PulseStep):
         color = None
         if self._colored:
             points = light.origins + step_m[:, None] * light.directions
-            color = surfaces.colors(triangle, points, light.times, actor_trajectories)
-        gaps = None
-        if light.gap_number is not None:
-            distance, gaps = self._meet_gaps(light, surfaces.kinds(triangle), distance, batch)
-        normals, cosines, kinds, energy, film = surfaces.illuminate(
+            color = self.surfaces.colors(triangle, points, light.times, actor_trajectories)
+        distance, gaps = self._meet_gaps(light, triangle, distance, batch)
+        normals, cosines, kinds, energy, film = self.surfaces.illuminate(
             triangle,
             light.directions,
             distance=distance,
@@ -443,15 +440,17 @@ class CastStep(PulseStep):
         )
 
     def _meet_gaps(
-        self, light: LightPaths, kinds: Ints32, distance: Floats, batch: PulseBatch
-    ) -> tuple[Floats, Bools]:
+        self, light: LightPaths, triangle: Ints32, distance: Floats, batch: PulseBatch
+    ) -> tuple[Floats, Bools | None]:
         """Determine where light passes through gaps, and the depths of the other returns.
 
         This advances `light.gap_number` to the next surface. Return the optical path lengths of the
-        hits in meters, and whether light passes through a gap. Both have shape (n,), like `kinds`
-        and `distance`.
+        hits in meters, and whether light passes through a gap. The second is None if no surface is
+        porous. All arrays have shape (n,).
         """
-        assert light.gap_number is not None
+        if light.gap_number is None:
+            return distance, None
+        kinds = self.surfaces.kinds(triangle)
         table = self.surfaces.at_wavelength(self._sensor_light.wavelength_nm)
         gap_fraction = table.gap_fraction[kinds]
         gaps = light.gap_number < gap_fraction
@@ -558,26 +557,20 @@ class CastStep(PulseStep):
             film = False if surface_hits.film is None else surface_hits.film
             smooth = (materials.specular > 0)[surface_hits.kinds] | film
             mirrors = smooth & (mirrored < MAX_REFLECTIONS)
-        gaps = surface_hits.gaps
-        if light.in_media is None and gaps is None:
+        if light.in_media is None and surface_hits.gaps is None:
             return VisibleHits(hits, normals, transmits, mirrors)
-        visible = np.ones(len(surface_hits.kinds), np.bool_)
-        if gaps is not None:
-            transmits = transmits | gaps
-            mirrors = mirrors & ~gaps
-            visible = ~gaps & (surface_hits.distance <= self.setup.sensor.max_range_m)
-        if light.in_media is None:
-            row_indices = np.flatnonzero(visible)
-            return VisibleHits(hits.take(row_indices), normals[row_indices], transmits, mirrors)
-        crowns = materials.leafy[surface_hits.kinds]  # surfaces of crowns reflect no light
-        crowns[surface_hits.leaves] = False
-        # Optical path lengths exceed the lengths of the cast rays.
+        # Optical path lengths exceed the lengths of the cast rays, and ranges can have a spread.
         in_range = surface_hits.distance <= self.setup.sensor.max_range_m
-        row_indices = np.flatnonzero(visible & in_range & ~crowns)
+        passed = materials.leafy[surface_hits.kinds]  # surfaces of crowns reflect no light
+        passed[surface_hits.leaves] = False
+        if surface_hits.gaps is not None:
+            passed |= surface_hits.gaps
+            mirrors &= ~surface_hits.gaps
+        row_indices = np.flatnonzero(in_range & ~passed)
         return VisibleHits(
             hits.take(row_indices),
             normals[row_indices],
-            (transmits | crowns) & in_range,
+            (transmits | passed) & in_range,
             mirrors & in_range,
         )
 
