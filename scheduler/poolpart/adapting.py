@@ -12,11 +12,16 @@ it receives a task.
 
 In a worker group (see `deploy/worker_groups.py`), each worker is a job, and has no name before it
 joins. Therefore, such a job cannot be canceled before it joins.
+
+If jobs of other users wait in the queue, the process with the cluster object reports how many jobs
+the partition should release. Until the next report, the partition starts no further jobs, and jobs
+that run are drained (see `draining.py`).
 """
 
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -25,6 +30,7 @@ from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
 
+from .draining import DrainingJobs
 from .errors import PoolError
 from .fetch import holds_bytes
 from .internals.scheduler import (
@@ -41,8 +47,11 @@ from .internals.scheduler import (
 from .internals.worker import has_running_tasks
 from .rules import check_count
 
+logger = logging.getLogger(__name__)
+
 NAME = "poolpart-adapting"
 IDLE_S = 60.0  # default time without work after which a job ends
+YIELD_IDLE_S = 5.0  # maximum of this time while jobs of other users wait
 _ANSWER_S = 5.0  # time for an idle worker to confirm that it runs no task
 _LOST_S = 120.0  # time without a report after which the process that starts jobs counts as dead
 
@@ -74,6 +83,14 @@ class JobBounds:
                 "of seconds, for example 60."
             )
         return cls(minimum, maximum, float(idle_s))
+
+    def while_others_wait(self) -> JobBounds:
+        """Return the bounds that apply while jobs of other users wait.
+
+        A single job may run even if the minimum is 0. Otherwise, the partition would never make
+        progress in a queue in which jobs always wait.
+        """
+        return JobBounds(self.minimum, max(1, self.minimum), min(self.idle_s, YIELD_IDLE_S))
 
 
 @dataclass(frozen=True)
@@ -123,6 +140,7 @@ class _Record:
     """State of an adaptive partition. All times are values of `time.monotonic`."""
 
     spec: JobSpec
+    draining: DrainingJobs
     queued_jobs: int = 0  # number of jobs whose workers have not joined
     reported_at: float = 0.0  # time of the last report
     missing_slots: float = 0.0  # number of missing slots at the last report
@@ -242,7 +260,11 @@ class AdaptivePartitions(SchedulerPlugin):
         return min(limit, max(movable - free, requested - total))
 
     def decide(
-        self, name: str, jobs: Mapping[str, Sequence[str]], waiting: float
+        self,
+        name: str,
+        jobs: Mapping[str, Sequence[str]],
+        waiting: float,
+        to_release: int | None = None,
     ) -> _Decision | None:
         """Decide which of a partition's jobs to start and which to end.
 
@@ -254,6 +276,8 @@ class AdaptivePartitions(SchedulerPlugin):
             Names of the workers of each job, by job. The newest job is last.
         waiting
             Number of slots that tasks without a worker request.
+        to_release
+            Number of running jobs to release for jobs of other users, or None if no such jobs wait.
 
         Returns
         -------
@@ -261,20 +285,15 @@ class AdaptivePartitions(SchedulerPlugin):
             None if the number of jobs is fixed.
         """
         record = self.records[name]
-        decided_at = time.monotonic()
-        states = {str(worker.name): worker for worker in self.scheduler.workers.values()}
-        present = {
-            job: [states[worker] for worker in names if worker in states]
-            for job, names in jobs.items()
-        }
-        running = {job: workers for job, workers in present.items() if workers}
-        ended = [job for job, names in jobs.items() if self._cancelled.issuperset(names)]
-        queued = [job for job, workers in present.items() if not workers and job not in ended]
+        running, queued, ended = self._job_states(jobs)
         record.queued_jobs = len(queued)
-        record.reported_at = decided_at
+        record.reported_at = time.monotonic()
         bounds = record.spec.bounds
         if bounds is None:
             return None
+        if to_release is not None:
+            bounds = bounds.while_others_wait()
+        drained = self._drain(name, running, min(to_release or 0, len(running) - bounds.maximum))
         slots_per_job = record.spec.slots * record.spec.workers
         missing = self.missing_slots(name, waiting, float(bounds.maximum * slots_per_job))
         # Work that takes less than a second is finished before a new job starts.
@@ -288,20 +307,56 @@ class AdaptivePartitions(SchedulerPlugin):
             upper = bounds.maximum - len(running)
             return max(0, min(max(number, lower), upper))
 
-        superfluous = queued[jobs_needed(missing) :] if record.spec.cancellable else []
-        record.superfluous_since = {
-            job: record.superfluous_since.get(job, decided_at) for job in superfluous
-        }
-        cancelled = [
-            job
-            for job, since in record.superfluous_since.items()
-            if decided_at - since >= bounds.idle_s
-        ]
+        cancelled = self._cancel(record, queued[jobs_needed(missing) :], bounds.idle_s)
         self._cancelled.update(worker for job in cancelled for worker in jobs[job])
         to_start = max(0, jobs_needed(lasting) - len(queued))
         # Jobs that have ended are listed in each reply, because an earlier reply may be lost.
         advice = JobAdvice(to_start, [*cancelled, *ended])
-        return _Decision(advice, self._idle(name, running, -missing / slots_per_job, bounds))
+        assigned = {job: workers for job, workers in running.items() if job not in record.draining}
+        idle = self._idle(name, assigned, -missing / slots_per_job, bounds)
+        return _Decision(advice, drained | idle)
+
+    def _job_states(
+        self, jobs: Mapping[str, Sequence[str]]
+    ) -> tuple[dict[str, list[Any]], list[str], list[str]]:
+        """Return running jobs with the states of their workers, queued jobs, and ended jobs."""
+        states = {str(worker.name): worker for worker in self.scheduler.workers.values()}
+        present = {
+            job: [states[worker] for worker in names if worker in states]
+            for job, names in jobs.items()
+        }
+        running = {job: workers for job, workers in present.items() if workers}
+        ended = [job for job, names in jobs.items() if self._cancelled.issuperset(names)]
+        queued = [job for job, workers in present.items() if not workers and job not in ended]
+        return running, queued, ended
+
+    @staticmethod
+    def _cancel(record: _Record, superfluous: Sequence[str], idle_s: float) -> list[str]:
+        """Return the queued jobs that have not been needed for some time, and must be canceled."""
+        decided_at = time.monotonic()
+        jobs = superfluous if record.spec.cancellable else ()
+        record.superfluous_since = {
+            job: record.superfluous_since.get(job, decided_at) for job in jobs
+        }
+        return [
+            job for job, since in record.superfluous_since.items() if decided_at - since >= idle_s
+        ]
+
+    def _drain(
+        self, name: str, running: Mapping[str, Sequence[Any]], count: int
+    ) -> dict[str, list[Any]]:
+        """Drain jobs, and return those that have finished, and the states of their workers."""
+        draining = self.records[name].draining
+        before = len(draining)
+        finished = draining.update(running, max(0, count))
+        if len(draining) > before:
+            logger.info(
+                "Partition %r releases %d of %d jobs, because jobs of other users wait.",
+                name,
+                len(draining),
+                len(running),
+            )
+        return finished
 
     def _idle(
         self, name: str, running: Mapping[str, Sequence[Any]], spare_jobs: float, bounds: JobBounds
@@ -369,16 +424,19 @@ def add_partitions(specs: Mapping[str, JobSpec], dask_scheduler: Any = None) -> 
     if NAME not in dask_scheduler.plugins:
         dask_scheduler.add_plugin(record)
     for name, spec in specs.items():
-        record.records[name] = _Record(spec)
+        record.records[name] = _Record(spec, DrainingJobs(dask_scheduler, name))
 
 
 async def advise_jobs(
-    jobs: Mapping[str, Mapping[str, Sequence[str]]], dask_scheduler: Any = None
+    jobs: Mapping[str, Mapping[str, Sequence[str]]],
+    to_release: Mapping[str, int] | None = None,
+    dask_scheduler: Any = None,
 ) -> dict[str, JobAdvice]:
     """Close idle workers, and return advice on each partition's jobs.
 
-    `jobs` maps each partition to its jobs, and each job to the names of its workers. Partitions
-    with a fixed number of jobs are omitted from the result.
+    `jobs` maps each partition to its jobs, and each job to the names of its workers. `to_release`
+    contains the number of jobs to release for each partition for which jobs of other users wait.
+    Partitions with a fixed number of jobs are omitted from the result.
     """
     adaptation = _adaptation_of(dask_scheduler)
     if adaptation is None:
@@ -387,7 +445,9 @@ async def advise_jobs(
     advice: dict[str, JobAdvice] = {}
     closing: list[tuple[str, str, list[Any]]] = []
     for name, jobs_of_partition in jobs.items():
-        decision = adaptation.decide(name, jobs_of_partition, waiting.get(name, 0.0))
+        decision = adaptation.decide(
+            name, jobs_of_partition, waiting.get(name, 0.0), (to_release or {}).get(name)
+        )
         if decision is None:
             continue
         advice[name] = decision.advice
@@ -416,7 +476,7 @@ async def advise_groups(
         return {}
     jobs = {name: adaptation.group_jobs(name, report) for name, report in reports.items()}
     advice: dict[str, GroupAdvice] = {}
-    for name, change in (await advise_jobs(jobs, dask_scheduler)).items():
+    for name, change in (await advise_jobs(jobs, dask_scheduler=dask_scheduler)).items():
         leaving = adaptation.records[name].leaving
         leaving.update(change.jobs_to_forget)
         size = len(jobs[name]) + change.jobs_to_start - len(change.jobs_to_forget)

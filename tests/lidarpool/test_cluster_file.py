@@ -88,6 +88,10 @@ WRONG = {
         GOOD.replace("workers: 5", "idle_s: 60"),
         "partitions.OTHER.idle_s requires adapt",
     ),
+    "room for others without a range": (
+        GOOD.replace("workers: 5", "yield_to_others: true"),
+        "partitions.OTHER.yield_to_others requires adapt",
+    ),
     "no host": (
         GOOD.replace("[a, b], slots: 2", "[]"),
         "partitions.GPU.hosts must have at least 1 item",

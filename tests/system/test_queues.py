@@ -1,6 +1,7 @@
 """Runs whose workers are jobs of a real Slurm, or processes that a real SSH server starts."""
 
 import json
+import os
 import re
 import signal
 from collections.abc import Iterator
@@ -220,6 +221,36 @@ def test_a_run_waits_for_jobs_that_replace_lost_ones(empty_queue, tmp_path):
     checksum, _ = run.result()
     assert checksum == expected
     assert empty_queue.jobs() == {}
+
+
+@needs_slurm
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can submit jobs of other users")
+def test_a_run_releases_a_gpu_to_another_user(empty_queue, tmp_path):
+    expected, _ = Command(tmp_path, None, MINUTE).result()
+    file = slurm_file(tmp_path)
+    gpu = {option: value for option, value in JOBS["GPU"].items() if option != "workers"}
+    file["partitions"]["GPU"] = gpu | ADAPTIVE | {"yield_to_others": True}
+    run = Command(tmp_path, file, MINUTE)
+    run.wait_for(r"survey +[1-9]")
+
+    def gpu_jobs() -> int:
+        return empty_queue.ask("squeue", "--noheader", "--name=gpu").count("\n")
+
+    wait_until(lambda: gpu_jobs() == 2)
+    script = tmp_path / "other.sh"
+    script.write_text("#!/bin/sh\nsleep 600\n")
+    empty_queue.ask(
+        *("sbatch", "--uid=nobody", "--job-name=other", "--gres=gpu:2", "--chdir=/tmp"),
+        *("--output=/dev/null", str(script)),
+    )
+    try:
+        wait_until(lambda: gpu_jobs() == 1)
+        assert run.process.poll() is None
+        checksum, report = run.result()
+    finally:
+        empty_queue.ask("scancel", "--name=other")
+    assert checksum == expected
+    assert report["tasks"]["GPU"].keys() == {"intersect"}
 
 
 def configure_certificates(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

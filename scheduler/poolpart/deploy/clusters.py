@@ -27,6 +27,7 @@ from ..errors import PoolError
 from ..internals.names import ADAPTING, CLUSTERS, require_feature
 from ..internals.scheduler import run_on_cluster_scheduler
 from ..rules import check_count, check_name
+from .waiting_jobs import QueueWatch, waiting_jobs_counter
 
 logger = logging.getLogger(__name__)
 
@@ -60,7 +61,9 @@ def start_partitions(
         and ``slots`` is the number of tasks that each worker runs at the same time (1 by default).
         Instead of ``workers``, ``adapt`` sets the minimum and maximum number, for example ``[0,
         8]`` (see `Partition.adapt`), and ``idle_s`` the time in seconds without work after which a
-        job ends (60 by default). All other options are passed to the class of the cluster, for
+        job ends (60 by default). With ``yield_to_others``, the partition releases jobs while jobs
+        of other users wait in the queue. Its value is True for Slurm, or a function that returns
+        the number of these jobs. All other options are passed to the class of the cluster, for
         example ``job_extra_directives``, ``queue`` or ``memory``. An `SSHCluster` accepts
         ``connect_options``, ``remote_python``, ``worker_class``, ``worker_options`` and ``hosts``.
         Workers are distributed over the hosts in turn. By default, there is one for each host.
@@ -124,6 +127,7 @@ class _PartitionJobs:
     initial_count: int  # number of jobs to start initially
     spec: JobSpec
     describe: Describe
+    watch: QueueWatch | None = None  # None if the partition does not yield to other users
     submitted: int = 0  # number of jobs submitted so far
     host_indices: dict[str, int] = field(default_factory=dict)  # {job: index of its host}
 
@@ -143,6 +147,12 @@ class _PartitionJobs:
         slots = cluster_options.pop("slots", 1)
         check_count(f"the number of slots of partition {name!r}", slots)
         bounds = pop_bounds(name, cluster_options)
+        yields = cluster_options.pop("yield_to_others", False)
+        if yields and bounds is None:
+            raise PoolError(
+                f"Partition {name!r} sets `yield_to_others`, which requires `adapt`. Set `adapt`, "
+                "for example to [0, 8]."
+            )
         try:
             if bounds is not None:
                 count = bounds.minimum
@@ -155,7 +165,9 @@ class _PartitionJobs:
         except (TypeError, ValueError) as error:
             raise PoolError(f"Partition {name!r} cannot be started. {error}") from error
         spec = JobSpec(slots, len(sample.get("group", ".")), bounds)
-        return cls(name, cluster_options, count, spec, describe)
+        count_waiting = waiting_jobs_counter(cluster, name, yields, sample["options"])
+        watch = count_waiting and QueueWatch(count_waiting)
+        return cls(name, cluster_options, count, spec, describe, watch)
 
     def add(self, cluster: SpecCluster, count: int) -> None:
         """Add jobs to the cluster, which starts them when it is awaited."""
@@ -269,10 +281,15 @@ class _JobStarter:
     async def _adapt(self) -> bool:
         """Apply the scheduler's advice on jobs, and return whether any jobs must start."""
         jobs = {name: part.workers(self._cluster) for name, part in self._parts.items()}
-        advice = await run_on_cluster_scheduler(self._cluster, advise_jobs, jobs=jobs)
+        to_release = self._jobs_to_release(jobs)
+        advice = await run_on_cluster_scheduler(
+            self._cluster, advise_jobs, jobs=jobs, to_release=to_release
+        )
         for name, advice_of_part in advice.items():  # adaptive partitions only
             part = self._parts[name]
             to_start = advice_of_part.jobs_to_start
+            if part.watch is not None:
+                part.watch.count_released(len(jobs[name].keys() & advice_of_part.jobs_to_forget))
             await asyncio.gather(
                 *(self._remove_job(part, job) for job in advice_of_part.jobs_to_forget)
             )
@@ -283,6 +300,21 @@ class _JobStarter:
             await asyncio.gather(*(self._remove_job(part, job) for job in lost[to_start:]))
             part.add(self._cluster, to_start - len(lost))
         return any(advice_of_part.jobs_to_start for advice_of_part in advice.values())
+
+    def _jobs_to_release(self, jobs: Mapping[str, Mapping[str, Sequence[str]]]) -> dict[str, int]:
+        """Return the number of jobs to release, for partitions for which other users wait."""
+        to_release: dict[str, int] = {}
+        for name, part in self._parts.items():
+            if part.watch is not None:
+                part.watch.refresh(has_jobs=bool(jobs[name]))
+                number = part.watch.to_release()
+                if number is not None:
+                    to_release[name] = number
+                if part.watch.problem:
+                    self._report_once(
+                        f"The waiting jobs of other users could not be listed. {part.watch.problem}"
+                    )
+        return to_release
 
     async def _remove_job(self, part: _PartitionJobs, job: str) -> None:
         """Remove a job. Its workers have been closed, or will be closed when they join."""

@@ -195,6 +195,25 @@ def holds_nothing(scheduler: Any, worker: Any) -> bool:
     return all(len(task.who_has) > 1 for task in worker.has_what)
 
 
+async def copy_results(scheduler: Any, workers: Collection[Any], name: str) -> None:
+    """Copy results of which workers have the only copy to another worker of a partition.
+
+    The other worker is the one with the fewest bytes of results. If a result cannot be copied, Dask
+    logs a warning.
+    """
+    members = (worker for worker in scheduler.running if worker.resources.get(name))
+    others = [worker for worker in members if worker not in workers]
+    holders = {
+        task.key: [worker.address]
+        for worker in workers
+        for task in worker.has_what
+        if len(task.who_has) == 1
+    }
+    if others and holders:
+        target = min(others, key=lambda worker: worker.nbytes)
+        await scheduler.gather_on_worker(target.address, holders)
+
+
 def accepts_tasks(worker: Any) -> bool:
     """Return whether a worker accepts tasks, either now or once it has joined."""
     return worker.status in (Status.running, Status.init)

@@ -39,6 +39,7 @@ class WorkerGroup(BaseModel):
     workers: int = Field(1, ge=0, le=10_000)
     adapt: list[int] | None = Field(None, min_length=2, max_length=2)  # minimum and maximum number
     idle_s: float | None = Field(None, ge=0, allow_inf_nan=False)
+    yield_to_others: bool = False
     slots: int = Field(1, ge=1, le=10_000)
     hosts: list[str] | None = Field(None, min_length=1)
 
@@ -56,7 +57,9 @@ class WorkerGroup(BaseModel):
     def describe_mistake(self) -> str:
         """Return an error message if the number of workers is invalid, or else an empty string."""
         if self.adapt is None:
-            return "" if self.idle_s is None else "idle_s requires adapt, such as `adapt: [0, 8]`."
+            options = {"idle_s": self.idle_s is not None, "yield_to_others": self.yield_to_others}
+            option = next((name for name, is_set in options.items() if is_set), "")
+            return option and f"{option} requires adapt, such as `adapt: [0, 8]`."
         if "workers" in self.model_fields_set:
             return "adapt and workers cannot be combined."
         min_workers, max_workers = self.adapt

@@ -1,0 +1,298 @@
+"""Adaptive partitions that make room for jobs of other users.
+
+The queue is a stand-in, and its jobs are workers of this process. `test_slurm.py` has a real one.
+"""
+
+import json
+import re
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from distributed import Client, Event, secede, wait
+from tests.clusters import import_jobqueue
+from tests.poolpart.helpers import LONG_S, wait_for, worker_name
+from tests.poolpart.job_queue import SCHEDULER
+
+from poolpart import Partition, PoolError
+from poolpart.deploy import start_partitions
+from poolpart.deploy.waiting_jobs import count_slurm_jobs
+
+NEVER_S = 3600.0  # longer than a test
+
+
+@pytest.fixture(autouse=True)
+def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """List the queue often, and end idle jobs soon while others wait."""
+    monkeypatch.setattr("poolpart.deploy.waiting_jobs.LIST_EVERY_S", 0.05)
+    monkeypatch.setattr("poolpart.adapting.YIELD_IDLE_S", 0.1)
+
+
+@contextmanager
+def cluster_of(
+    others: Callable[[], int], minimum: int, maximum: int, **options: Any
+) -> Iterator[Client]:
+    """Client of a cluster with a partition that yields to other users."""
+    report = {"report": options.pop("report")} if "report" in options else {}
+    partition = {
+        "adapt": [minimum, maximum], "idle_s": NEVER_S, "yield_to_others": others, **options
+    }  # fmt: skip
+    with import_jobqueue().SLURMCluster(
+        cores=2, processes=1, memory="2GB", scheduler_options=SCHEDULER
+    ) as cluster:
+        start_partitions(cluster, {"GPU": partition}, **report)
+        with Client(cluster) as client:
+            yield client
+
+
+def begin_and_wait(event):
+    Event(f"{event}-{worker_name()}").set()
+    return wait_for(event)
+
+
+def test_a_job_ends_after_its_task_and_is_replaced_when_no_other_waits(queue, wait_until):
+    waiting = [0]
+
+    def others() -> int:
+        return waiting[0] if len(queue.workers) == 3 else 0
+
+    with cluster_of(others, 0, 3) as client:
+        gpu = Partition("GPU", client)
+        tasks = [gpu.submit(begin_and_wait, f"go-{n}") for n in range(9)]
+        wait_until(lambda: len(gpu) == 3)
+        workers = client.cluster.scheduler.workers
+        wait_until(lambda: all(worker.processing for worker in workers.values()))
+        waiting[0] = 1
+        wait_until(lambda: {w.status.name for w in workers.values()} > {"running"})
+        [leaving] = [w for w in workers.values() if w.status.name != "running"]
+        wait_until(lambda: len(leaving.processing) == 1)  # those that wait have been handed over
+        [running] = leaving.processing
+        assert len(queue.submitted) == 3  # none beside those that run
+        number = [task.key for task in tasks].index(running.key)
+        Event(f"go-{number}", client).set()
+        # The job that ends makes room. Nobody waits then, and there still is work.
+        wait_until(lambda: len(queue.submitted) == 4 and len(gpu) == 3)
+        assert leaving.name not in {w.name for w in gpu.workers}
+        for n in range(9):
+            Event(f"go-{n}", client).set()
+        assert client.gather(tasks) == [True] * 9
+
+
+def test_one_job_is_left_while_there_is_work_and_none_after_it(queue, wait_until):
+    with cluster_of(lambda: 5 * bool(queue.submitted), 0, 3) as client:
+        gpu = Partition("GPU", client)
+        queue.held = True
+        tasks = [gpu.submit(worker_name) for _ in range(20)]
+        wait_until(lambda: len(queue.cancelled) == 2)
+        time.sleep(0.3)
+        assert sorted(queue.submitted) == ["GPU-0", "GPU-1", "GPU-2"]
+        client.sync(queue.release)
+        assert client.gather(tasks) == ["GPU-0"] * 20
+        del tasks
+        wait_until(lambda: not queue.workers)  # long before `idle_s`
+        assert len(gpu) == 0
+
+
+def test_the_minimum_is_kept(queue, wait_until):
+    with cluster_of(lambda: 9, 2, 4) as client:
+        gpu = Partition("GPU", client)
+        wait_until(lambda: len(gpu) == 2)
+        tasks = [gpu.submit(wait_for, "go") for _ in range(8)]
+        time.sleep(0.5)
+        assert sorted(queue.submitted) == ["GPU-0", "GPU-1"]
+        Event("go", client).set()
+        assert client.gather(tasks) == [True] * 8
+        del tasks
+        time.sleep(0.5)
+        assert len(gpu) == 2
+
+
+ran: list[int] = []
+
+
+def note(number):
+    time.sleep(0.01)
+    ran.append(number)
+    return number
+
+
+@pytest.mark.extended
+def test_no_task_of_a_map_is_lost_or_run_twice(queue):
+    """Jobs come and go all the time, because others wait whenever there are two jobs."""
+    ran.clear()
+    with cluster_of(lambda: int(len(queue.workers) > 1), 0, 3) as client:
+        results = Partition("GPU", client).map(note, range(150), chunk=1)
+        assert list(results) == [*range(150)]
+    assert sorted(ran) == [*range(150)]
+    assert len(queue.submitted) > 4
+
+
+def secedes(event):
+    secede()
+    return wait_for(event)
+
+
+class Unpicklable:
+    """A result that cannot be copied to another worker."""
+
+    def __reduce__(self):
+        raise TypeError("cannot be pickled")
+
+
+@pytest.mark.extended
+def test_results_are_copied_and_seceded_tasks_are_not_interrupted(queue, wait_until):
+    waiting = [0]
+    with cluster_of(lambda: waiting[0], 0, 3) as client:
+        gpu = Partition("GPU", client)
+        gpu.adapt(3, 3, idle_s=NEVER_S)
+        wait_until(lambda: len(gpu) == 3)
+        long = gpu.submit(secedes, "go", workers="GPU-0")
+        kept = gpu.submit(worker_name, workers="GPU-1")
+        wait([kept])
+        gpu.adapt(0, 3, idle_s=NEVER_S)
+        waiting[0] = 3
+        wait_until(lambda: [worker.name for worker in gpu.workers] == ["GPU-0"])
+        assert kept.result(LONG_S) == "GPU-1"
+        time.sleep(0.3)
+        assert len(gpu) == 1
+        Event("go", client).set()
+        assert long.result(LONG_S)
+        assert sorted(queue.submitted) == ["GPU-0", "GPU-1", "GPU-2"]
+
+
+@pytest.mark.extended
+def test_a_job_stays_whose_results_cannot_be_copied(queue, wait_until, monkeypatch):
+    monkeypatch.setattr("poolpart.draining.HELD_S", 0.1)
+    waiting = [0]
+    with cluster_of(lambda: waiting[0], 0, 2) as client:
+        gpu = Partition("GPU", client)
+        gpu.adapt(2, 2, idle_s=NEVER_S)
+        wait_until(lambda: len(gpu) == 2)
+        kept = [gpu.submit(Unpicklable, workers=f"GPU-{n}") for n in range(2)]
+        wait(kept)
+        gpu.adapt(0, 2, idle_s=NEVER_S)
+        waiting[0] = 1
+        time.sleep(1)
+        # Neither has ended, and both receive tasks again.
+        for name in ("GPU-0", "GPU-1"):
+            assert gpu.submit(worker_name, workers=name).result(LONG_S) == name
+        assert sorted(queue.submitted) == ["GPU-0", "GPU-1"]
+
+
+def test_a_queue_that_cannot_be_listed_is_reported_and_jobs_stay(queue, wait_until):
+    said: list[str] = []
+
+    def fails() -> int:
+        raise OSError("qstat: no server")
+
+    with cluster_of(fails, 0, 2, report=said.append) as client:
+        gpu = Partition("GPU", client)
+        tasks = [gpu.submit(wait_for, "go") for _ in range(4)]
+        wait_until(lambda: len(gpu) == 2 and said)
+        time.sleep(0.3)
+        assert said == ["The waiting jobs of other users could not be listed. qstat: no server"]
+        assert len(gpu) == 2
+        Event("go", client).set()
+        assert client.gather(tasks) == [True] * 4
+
+
+WRONG = {
+    "fixed": ({"yield_to_others": True}, "`yield_to_others`, which requires `adapt`"),
+    "text": ({"adapt": [0, 1], "yield_to_others": "yes"}, "Invalid value 'yes'"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_options_are_refused(queue, case):
+    options, says = WRONG[case]
+    with (
+        import_jobqueue().SLURMCluster(
+            cores=1, memory="1GB", scheduler_options=SCHEDULER
+        ) as cluster,
+        pytest.raises(PoolError, match=says),
+    ):
+        start_partitions(cluster, {"GPU": options})
+
+
+def test_other_systems_need_a_function():
+    with import_jobqueue().PBSCluster(
+        cores=1, memory="1GB", scheduler_options=SCHEDULER
+    ) as cluster:
+        with pytest.raises(PoolError, match="cannot list the queue of a PBSCluster"):
+            start_partitions(cluster, {"GPU": {"adapt": [0, 1], "yield_to_others": True}})
+        start_partitions(cluster, {"GPU": {"adapt": [0, 1], "yield_to_others": lambda: 0}})
+
+
+@pytest.fixture
+def slurm_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Stand-ins for the commands of Slurm; returns the file with the arguments of squeue."""
+    asked = tmp_path / "asked"
+    listing = "alice Resources\\nbob Priority\\nbob Dependency\\nme Resources\\ncarol None\\n"
+    scripts = {
+        "squeue": f"echo \"$@\" SQUEUE_USERS=$SQUEUE_USERS > {asked}; printf '{listing}'",
+        "sinfo": "printf 'gpu\\nmain*\\nmain*\\n'",
+    }
+    for name, body in scripts.items():
+        script = tmp_path / name
+        script.write_text(f"#!/bin/sh\n{body}\n")
+        script.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    monkeypatch.setenv("SQUEUE_USERS", "me")
+    monkeypatch.setattr("getpass.getuser", lambda: "me")
+    return asked
+
+
+@pytest.mark.parametrize(("queue_name", "listed"), [("gpu,big", "gpu,big"), (None, "main")])
+def test_slurm_jobs_that_wait_for_resources_count(slurm_commands, queue_name, listed):
+    assert count_slurm_jobs(queue_name) == 2
+    asked = slurm_commands.read_text().split()
+    assert f"--partition={listed}" in asked
+    assert "SQUEUE_USERS=" in asked  # it would hide the jobs of others
+
+
+def test_a_failing_squeue_is_reported(slurm_commands):
+    script = slurm_commands.with_name("squeue")
+    script.write_text("#!/bin/sh\necho 'squeue: error: Invalid partition' >&2; exit 1\n")
+    with pytest.raises(PoolError, match="squeue failed: squeue: error: Invalid partition"):
+        count_slurm_jobs("nowhere")
+
+
+def test_the_function_for_pbs_in_the_manual(tmp_path, monkeypatch):
+    page = Path(__file__).parents[2] / "docs/pool-partitions/adapt.md"
+    [code] = re.findall(r"```python\n(import getpass\n.*?)```", page.read_text("utf-8"), re.S)
+    jobs = {
+        "1.pbs": {"job_state": "Q", "Job_Owner": "alice@login"},
+        "2.pbs": {"job_state": "R", "Job_Owner": "alice@login"},
+        "3.pbs": {"job_state": "Q", "Job_Owner": "me@login"},
+        "4.pbs": {"job_state": "H", "Job_Owner": "bob@login"},
+        "5.pbs": {"job_state": "Q", "Job_Owner": "me2@login"},
+    }
+    (tmp_path / "jobs.json").write_text(json.dumps({"pbs_version": "2022", "Jobs": jobs}))
+    qstat = tmp_path / "qstat"
+    qstat.write_text(f"#!/bin/sh\ncat {tmp_path}/jobs.json\n")
+    qstat.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    monkeypatch.setattr("getpass.getuser", lambda: "me")
+    names: dict[str, Any] = {}
+    exec(code, names)
+    assert names["count_waiting_jobs"]() == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "listed"),
+    [
+        ({"queue": "gpu"}, "gpu"),
+        ({"job_extra_directives": ["--partition=big"]}, "big"),
+        ({"queue": "gpu", "job_extra_directives": ["-p big"]}, "big"),
+        ({}, "main"),
+    ],
+)
+def test_the_queue_of_the_jobs_is_listed(queue, slurm_commands, wait_until, options, listed):
+    with cluster_of(True, 0, 1, **options) as client:
+        task = Partition("GPU", client).submit(worker_name)
+        assert task.result(LONG_S) == "GPU-0"
+        wait_until(slurm_commands.exists)
+        wait_until(lambda: f"--partition={listed} " in slurm_commands.read_text())
