@@ -68,9 +68,13 @@ class DrainingJobs:
         dict
             Jobs without tasks and results, and the states of their workers.
         """
-        self._drains = {job: drain for job, drain in self._drains.items() if job in running}
+        # A worker that was lost or restarted has another state, which accepts tasks.
+        for job, drain in list(self._drains.items()):
+            if list(running.get(job, ())) != list(drain.workers):
+                self._resume(job)
         for job in list(self._drains)[count:]:
             self._resume(job)
+        self._kept_until = {job: until for job, until in self._kept_until.items() if job in running}
         for job in self._candidates(running)[: count - len(self._drains)]:
             self._drains[job] = _Drain(running[job])
         return {job: [*self._drains[job].workers] for job in list(self._drains) if self._step(job)}
