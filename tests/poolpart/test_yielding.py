@@ -3,12 +3,14 @@
 The queue is a stand-in, and its jobs are workers of this process. `test_slurm.py` has a real one.
 """
 
+import itertools
 import json
 import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
@@ -113,6 +115,10 @@ def test_the_minimum_is_kept(queue, wait_until):
 ran: list[int] = []
 
 
+def add(x, y):
+    return x + y
+
+
 def note(number):
     time.sleep(0.01)
     ran.append(number)
@@ -128,6 +134,25 @@ def test_no_task_of_a_map_is_lost_or_run_twice(queue):
         assert list(results) == [*range(150)]
     assert sorted(ran) == [*range(150)]
     assert len(queue.submitted) > 4
+
+
+@pytest.mark.slow
+def test_no_task_or_result_is_lost_while_other_users_come_and_go(queue):
+    """The client keeps all results on the workers, some of which are inputs of later tasks."""
+    ran.clear()
+    random = Random(7)
+    with cluster_of(lambda: random.randint(0, 3), 1, 4) as client:
+        gpu = Partition("GPU", client)
+        first: list[Any] = []
+        for number in range(600):
+            first.append(gpu.submit(note, number))
+            if number % 50 == 0:
+                time.sleep(0.2)
+        second = [gpu.submit(add, *pair) for pair in itertools.pairwise(first)]
+        assert client.gather(second) == [2 * number + 1 for number in range(599)]
+        assert client.gather(first) == [*range(600)]
+    assert sorted(ran) == [*range(600)]
+    assert len(queue.submitted) > 10
 
 
 def secedes(event):
