@@ -98,6 +98,7 @@ def test_one_job_is_left_while_there_is_work_and_none_after_it(queue, wait_until
         assert len(gpu) == 0
 
 
+@pytest.mark.extended
 def test_the_minimum_is_kept(queue, wait_until):
     with cluster_of(lambda: 9, 2, 4) as client:
         gpu = Partition("GPU", client)
