@@ -10,6 +10,9 @@ FOLDER contains the recordings, each in the folder of its repository:
 | `tram` | FrankMoosmann/FranksVelodyneAlgos | HDL-64E, range images |
 | `kitti360` | heisenberg141/Pointcloud-Segmentation | HDL-64E |
 | `hdl32` | cwchen1102/map_reconstruction | HDL-32E |
+| `udacity-1` | udacity/SFND_Lidar_Obstacle_Detection | HDL-64E |
+| `sfnd` | udacity/SFND_3D_Object_Tracking | HDL-64E |
+| `foggy` | marcelsheeny/radiate_sdk | HDL-32E, in fog |
 
 There are two rules for held-out sweeps: `easy` holds out every second sweep, and `hard` holds out
 blocks of 20 sweeps. The static mask is independent of the twin. A point is static if sweeps that
@@ -50,6 +53,7 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 
+from .augmentation_fog import open_csv_folder
 from .harness import argument_parser, write_results
 
 _COMPARED_SWEEPS = 24
@@ -118,6 +122,21 @@ SOURCES = {
         {"drive": slice(None)},
     ),
     "hdl32": Source("map_reconstruction", _opened("pcd"), {"drive": slice(None)}),
+    "udacity-1": Source(
+        "SFND_Lidar_Obstacle_Detection",
+        _opened("src/sensors/data/pcd/data_1"),
+        {"drive": slice(None)},
+    ),
+    "sfnd": Source(
+        "SFND_3D_Object_Tracking",
+        _opened("images/KITTI/2011_09_26/velodyne_points/data"),
+        {"drive": slice(None)},
+    ),
+    "foggy": Source(
+        "radiate_sdk",
+        lambda root: open_csv_folder(root / "data/radiate/tiny_foggy/velo_lidar"),
+        {"drive": slice(None)},
+    ),
 }
 
 

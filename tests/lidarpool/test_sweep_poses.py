@@ -11,10 +11,11 @@ from lidarpool import SceneMesh
 from lidarpool.comparing.fit.smooth_surfaces import find_surfaces
 from lidarpool.reconstruction.alignment import Alignment
 from lidarpool.reconstruction.free_space import RangeImage
-from lidarpool.reconstruction.labels import labels_of, split_by_object
+from lidarpool.reconstruction.labels import SurfelMaterial, labels_of, split_by_object
 from lidarpool.reconstruction.lasers import RingLasers
 from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import RecordedPoses
+from lidarpool.reconstruction.porosity import Porosity
 from lidarpool.scenario.point_scene import CLASS_MATERIAL, surfel_faces
 from lidarsim.columns.sweep import Sweep
 from lidarsim.scene.face_materials import FaceMaterials
@@ -176,14 +177,25 @@ def test_surfels_are_divided_by_the_objects_and_classes_of_their_labels():
     names = tuple(f"{CLASS_MATERIAL}{label}" for label in rows.tolist())
     index = np.repeat(np.searchsorted(rows, labels), 2).astype(np.int32)
     mesh = SceneMesh("SurfaceMap", corners, surfel_faces(5), materials=FaceMaterials(names, index))
-    parts = split_by_object(mesh)
+    porosity = Porosity(np.array([0, 0, 0.2, 0, 0.4]), np.array([0, 0, 0, 0, 0.06]))
+    parts = split_by_object(mesh, porosity)
     assert [part.name for part in parts] == ["object 0", "object 2", "SurfaceMap"]
     surfels = corners.reshape(5, 4, 3)
     for part, expected in zip(parts, ([1, 4], [0, 3], [2]), strict=True):
         np.testing.assert_array_equal(part.vertices.reshape(-1, 4, 3), surfels[expected])
-    assert parts[0].materials is None  # a class above 65,535 is none
+    assert parts[0].materials.names == ("", "gaps 0.4, spread 0.06")  # no class above 65,535
+    np.testing.assert_array_equal(parts[0].materials.index, [0, 0, 1, 1])
     assert parts[1].materials.names == (f"{CLASS_MATERIAL}7",)
-    assert parts[2].materials.names == (f"{CLASS_MATERIAL}9",)
+    assert parts[2].materials.names == (f"{CLASS_MATERIAL}9, gaps 0.2",)
+    for part in parts:
+        for name in part.materials.names[-1:]:
+            assert SurfelMaterial.from_name(name).name == name
+    assert SurfelMaterial(7, 0.4, 0.06).entry() == {
+        "material": "class 7, gaps 0.4, spread 0.06",
+        "class": 7,
+        "gap_fraction": 0.4,
+        "range_spread_m": 0.06,
+    }
 
 
 def test_range_images_have_a_row_around_each_ring():

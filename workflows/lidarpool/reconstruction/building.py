@@ -53,11 +53,12 @@ from .charts import (
 )
 from .finished_steps import FinishedSteps, TwinStep
 from .held_out import HeldOutRays
-from .labels import split_by_object
+from .labels import SurfelMaterial, split_by_object
 from .lasers import RingLasers
 from .lost_pulses import SensorCoverage, firings_per_turn
 from .motion import Motion
 from .odometry import RecordedPoses, find_poses
+from .porosity import Porosity
 from .published_metrics import HeldOutFrames
 from .recorded_sweeps import RecordedSweeps, Rotation
 from .reflectances import IntensityModel, Reflectances, Response, fit_response
@@ -187,12 +188,11 @@ class Twin:
                 (staged / name).write_text(text, encoding="utf-8", newline="\n")
             return [(staged / name).replace(folder / name) for name in (SCENE_FILE, *texts)]
 
-    def _classes(self) -> dict[int, str]:
-        """Return the material names of surfels with a recorded class, keyed by class number."""
+    def _materials(self) -> list[SurfelMaterial]:
+        """Return the materials of surfels that have a class or gaps, in ascending order."""
         materials = self.scene.materials
-        names = () if materials is None else sorted({*chain.from_iterable(materials.names)})
-        numbers = {int(name.removeprefix(CLASS_MATERIAL)): name for name in names if name}
-        return {number: numbers[number] for number in sorted(numbers) if number >= 0}
+        names = set() if materials is None else {*chain.from_iterable(materials.names)}
+        return sorted(SurfelMaterial.from_name(name) for name in names if name)
 
     def _trajectory(self) -> str:
         """Format the trajectory as CSV, from the start of the first sweep to the end of the last.
@@ -219,18 +219,16 @@ class Twin:
         if self.origin.any():
             scenario["world"] = {"origin": self.origin.tolist()}
         light = {"reflectance": "texture"} if self.scene.has_colors.any() else {}
-        classes = self._classes()
+        surfel_materials = self._materials()
         is_dark = NO_RETURN in self.scene.names
         materials: list[dict[str, Any]] = [{"objects": NO_RETURN, "reflectance": 0}] * is_dark
-        materials += [
-            {"material": name} | light | {"class": number} for number, name in classes.items()
-        ]
-        if light:
-            materials.append({"objects": "*"} | light)
-        if materials:
-            scenario["materials"] = materials
+        materials += [material.entry() | light for material in surfel_materials]
+        if light or materials:
+            scenario["materials"] = [*materials, {"objects": "*"} | light]
         scenario["classes"] = {0: "unlabeled"} | {
-            number: name for number, name in classes.items() if number
+            number: f"{CLASS_MATERIAL}{number}"
+            for number in sorted({material.semantic_class for material in surfel_materials})
+            if number
         }
         scenario["cloud"] = {"columns": _COLUMNS}
         head = (
@@ -514,7 +512,10 @@ class _Building:
             }
         return Twin(
             scene=Scene.from_meshes(
-                [*split_by_object(merge_surfels([*meshes.values()])), *built.dark()]
+                [
+                    *split_by_object(merge_surfels([*meshes.values()]), built.porosity()),
+                    *built.dark(),
+                ]
             ),
             poses=alignment.poses,
             times_s=poses.times_s,
@@ -624,6 +625,11 @@ class _Built:
         """
         corners = np.concatenate([part.surfels.dark_corners for part in self.parts])
         return [surfel_mesh(NO_RETURN, corners)] if len(corners) else []
+
+    def porosity(self) -> Porosity:
+        """Return the gaps of all surfels that return pulses."""
+        parts = [part.surfels.porosity for part in self.parts]
+        return Porosity(*map(np.concatenate, zip(*parts, strict=True)))
 
     def images(self) -> SweepImages:
         """Return the images of a held-out sweep from the middle of the drive.

@@ -69,7 +69,7 @@ class SweepImages(NamedTuple):
         """Create images of a sweep and of its simulation on a surface map."""
         sweep = sweeps.read(number)
         cells = _cells(sweep, sweeps)
-        hits = surface_map.cast(sweep)
+        hits = surface_map.cast_likely(sweep)
         simulated_m = np.full(len(sweep.points), np.nan)
         simulated_m[hits.rays] = hits.distance_m
         range_m, in_twin_m = (_image(values, cells) for values in (sweep.range_m, simulated_m))

@@ -203,7 +203,7 @@ def _rays(
     stationary: Bools,
 ) -> HeldOutRays:
     """Cast the rays of a sweep, and combine the results with the recorded ranges."""
-    hits = surface_map.cast(sweep)
+    hits = surface_map.cast_likely(sweep)
     simulated_m = np.full(len(sweep.points), np.nan)
     simulated_m[hits.rays] = np.where(
         surface_map.surfels.dark[hits.surfel], np.nan, hits.distance_m

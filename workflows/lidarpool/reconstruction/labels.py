@@ -8,15 +8,17 @@ of a surfel always has a consistent class and object.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lidarsim.columns.sweep import Sweep
-from lidarsim.numerics.arrays import Ints
+from lidarsim.numerics.arrays import Floats, Ints
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.scene_mesh import SceneMesh
 
 from ..scenario.point_scene import CLASS_MATERIAL, surfel_faces
+from .porosity import Porosity
 
 OBJECT_NAME = "object "  # followed by the object number in the recording
 _CLASS_BITS = 16
@@ -38,38 +40,84 @@ def labels_of(sweep: Sweep) -> Ints | None:
     return label
 
 
-def split_by_object(mesh: SceneMesh) -> list[SceneMesh]:
-    """Split a surfel mesh by object, and name its materials by class.
+class SurfelMaterial(NamedTuple):
+    """Class and porosity of surfels, which determine their material in the scene."""
+
+    semantic_class: int  # 0 without a class
+    gap_fraction: float
+    range_spread_m: float
+
+    @property
+    def name(self) -> str:
+        """Name of the material, which is empty for opaque surfels without a class."""
+        parts = []
+        if self.semantic_class:
+            parts.append(f"{CLASS_MATERIAL}{self.semantic_class}")
+        if self.gap_fraction:
+            parts.append(f"gaps {self.gap_fraction:.1f}")
+        if self.range_spread_m:
+            parts.append(f"spread {self.range_spread_m:.2f}")
+        return ", ".join(parts)
+
+    @classmethod
+    def from_name(cls, name: str) -> SurfelMaterial:
+        """Return the material with the given name."""
+        values = {
+            key: float(value) for key, value in (part.split(" ") for part in name.split(", "))
+        }
+        return cls(
+            int(values.get(CLASS_MATERIAL.strip(), 0)),
+            values.get("gaps", 0.0),
+            values.get("spread", 0.0),
+        )
+
+    def entry(self) -> dict[str, Any]:
+        """Return the fields of the material in a scenario, except for the reflectance."""
+        fields = {"class": self.semantic_class} | self._asdict()
+        fields.pop("semantic_class")
+        return {"material": self.name} | {name: value for name, value in fields.items() if value}
+
+
+def split_by_object(mesh: SceneMesh, porosity: Porosity) -> list[SceneMesh]:
+    """Split a surfel mesh by object, and name its materials by class and porosity.
 
     Objects are in ascending order of their numbers. Surfels without an object are last, and keep
-    the name of the mesh. Class 0 means that there is no class, so it has no material.
+    the name of the mesh. Class 0 means that there is no class. Opaque surfels without a class have
+    no material.
     """
-    if mesh.materials is None:
-        return [mesh]
-    names = mesh.materials.names
-    label = np.array([int(name.removeprefix(CLASS_MATERIAL) or 0) for name in names])
-    index = mesh.materials.index
-    of_face = np.full(len(mesh.faces), label[0]) if index is None else label[index]
-    number = (of_face >> _CLASS_BITS) - 1
-    classes = of_face & _MAX_CLASS
+    count = len(mesh.faces) // 2
+    labels = np.zeros(count, np.int64)
+    if mesh.materials is not None:
+        names = mesh.materials.names
+        label = np.array([int(name.removeprefix(CLASS_MATERIAL) or 0) for name in names])
+        index = mesh.materials.index
+        labels[:] = label[0] if index is None else label[index[::2]]
+    number = (labels >> _CLASS_BITS) - 1
+    kinds = np.column_stack([labels & _MAX_CLASS, *porosity])
     parts = []
     for value in sorted(np.unique(number).tolist(), key=lambda value: (value < 0, value)):
-        faces = np.flatnonzero(number == value)
+        surfels = np.flatnonzero(number == value)
         name = mesh.name if value < 0 else f"{OBJECT_NAME}{value}"
-        parts.append(_part(mesh, name, faces, classes[faces]))
+        parts.append(_part(mesh, name, surfels, kinds[surfels]))
     return parts
 
 
-def _part(mesh: SceneMesh, name: str, faces: Ints, classes: Ints) -> SceneMesh:
-    """Return the surfels with the given faces as a mesh whose materials are named by class."""
-    corners = mesh.vertices.reshape(-1, 4, 3)[faces[::2] // 2]
-    present, rows = np.unique(classes, return_inverse=True)
-    names = tuple(f"{CLASS_MATERIAL}{number}" if number else "" for number in present.tolist())
+def _part(mesh: SceneMesh, name: str, surfels: Ints, kinds: Floats) -> SceneMesh:
+    """Return the given surfels as a mesh whose materials are named by class and porosity.
+
+    `kinds` has the fields of `SurfelMaterial` as columns.
+    """
+    corners = mesh.vertices.reshape(-1, 4, 3)[surfels]
+    present, rows = np.unique(kinds, axis=0, return_inverse=True)
+    materials = [SurfelMaterial(int(number), *rest) for number, *rest in present.tolist()]
+    names = tuple(material.name for material in materials)
+    faces = np.stack([2 * surfels, 2 * surfels + 1], axis=1).ravel()
+    index = rows.reshape(-1).astype(np.int32).repeat(2)
     return replace(
         mesh,
         name=name,
         vertices=corners.reshape(-1, 3),
         faces=surfel_faces(len(corners)),
         colors=None if mesh.colors is None else mesh.colors.take(faces),
-        materials=FaceMaterials(names, rows.astype(np.int32)) if any(names) else None,
+        materials=FaceMaterials(names, index) if any(names) else None,
     )

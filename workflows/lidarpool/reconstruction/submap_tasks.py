@@ -17,12 +17,13 @@ from .charts import SweepImages, TopViewPoints
 from .free_space import find_stationary_points
 from .held_out import HeldOutRays, simulate_held_out
 from .lost_pulses import SensorCoverage
+from .porosity import Porosity
 from .published_metrics import HeldOutFrames
 from .recorded_sweeps import RecordedSweeps
 from .reflectances import Reflectances, fit_response
 from .submaps import AlignedSubmap, Submap
 from .surface_map import Observations, SurfaceMap, build_surface_map
-from .surfels import Surfels, surfel_mesh
+from .surfels import surfel_mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,14 +82,21 @@ class SubmapSurfels(NamedTuple):
     dark_corners: Floats  # (d, 4, 3), meters, of surfels that return no pulses
     materials: AnyArray | None  # names
     material: Ints32 | None  # (m,), indices of `materials`
+    gap_fraction: Floats  # (m,)
+    range_spread_m: Floats  # (m,), meters
     points: Ints  # (k,), points in each of its own sweeps
     moved: Ints  # (k,), how many of them are on moving objects
 
     @classmethod
     def from_surfels(
-        cls, surfels: Surfels, chosen: Bools, stationary: Mapping[int, Bools], own: Ints
+        cls,
+        surface_map: SurfaceMap,
+        chosen: Bools,
+        stationary: Mapping[int, Bools],
+        own: Ints,
     ) -> SubmapSurfels:
         """Extract the selected surfels, and count the points of the sweeps in `own`."""
+        surfels = surface_map.surfels
         corners = surfels.mesh.vertices.reshape(-1, 4, 3)
         lit = chosen & ~surfels.dark
         materials = surfels.mesh.materials
@@ -99,9 +107,15 @@ class SubmapSurfels(NamedTuple):
             corners[chosen & surfels.dark],
             None if materials is None else np.array(materials.names),
             None if index is None else index[::2][lit],
+            *surface_map.porosity.select(lit),
             np.array([len(mask) for mask in masks]),
             np.array([int((~mask).sum()) for mask in masks]),
         )
+
+    @property
+    def porosity(self) -> Porosity:
+        """Gaps of those surfels that return pulses."""
+        return Porosity(self.gap_fraction, self.range_spread_m)
 
     def mesh(self, name: str) -> SceneMesh:
         """Return a mesh of those surfels that return pulses."""
@@ -151,7 +165,7 @@ def build_submap(task: BuildTask) -> BuiltSubmap:
     observations = surface_map.observations(sweeps, stationary).select_surfels(
         own & ~surface_map.surfels.dark
     )
-    surfels = SubmapSurfels.from_surfels(surface_map.surfels, own, stationary, submap.own_numbers)
+    surfels = SubmapSurfels.from_surfels(surface_map, own, stationary, submap.own_numbers)
     top_view = TopViewPoints.from_sweeps(sweeps, stationary, submap.own_numbers, task.drawn_share)
     return surfels, observations, held_out, frames, images, top_view
 

@@ -5,6 +5,9 @@ corrects both. A ray of the recording that passes through a surfel that should h
 counts against the surfel. A ray that ends on a surfel supports it. Lost pulses count against
 surfels, too.
 
+Vegetation, fences and the outlines of objects have gaps, which are estimated at the end
+(`porosity.py`).
+
 Windows and black cars return few pulses, and hide the surfaces behind them. Where pulses are lost
 between returns of the same surface, candidates for dark surfels are created. Lost pulses that hit a
 candidate support it. Pulses that return from it or from behind it count against it.
@@ -17,7 +20,7 @@ its rays ends on it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,6 +32,7 @@ from lidarsim.numerics.even_samples import even_indices
 from raybeam import RayCaster
 
 from .alignment import AlignedSweep, AlignedSweeps
+from .porosity import Crossings, Porosity
 from .surfels import Surfels
 
 _ROUNDS = 3  # iterations of casting rays, and of removing and moving surfels
@@ -41,9 +45,15 @@ _CELL_BITS = 21  # bits per cell coordinate, which repeats after one million met
 _CELL_MASK = (1 << _CELL_BITS) - 1
 _MAX_VIEW_FACTOR = 1.5  # Points are omitted beyond this multiple of the shortest range in a cell.
 _ON_RAY_M = 0.15  # maximum range difference of a ray that ends on a surfel
+# Votes of a ray that ends on a surfel. A surfel remains if at least a fifth of its rays end on it,
+# because vegetation and the outlines of objects have gaps.
+_END_VOTES = 4
 # Pulses that are lost at a dark surfel, per pulse that returns from it or from behind it. With a
 # lower limit, the surfel would hide more returns at long range than it explains lost pulses.
 _MIN_LOST_RATIO = 2
+_POROSITY_SWEEPS = 24  # maximum number of sweeps from which gaps are determined
+_MAX_CROSSINGS = 6  # maximum number of surfels that a ray crosses
+_BEHIND_M = 1e-4  # distance behind a surfel from which a ray is cast again
 
 
 class Observations(NamedTuple):
@@ -115,8 +125,8 @@ class SurfelHits(NamedTuple):
 
     @property
     def votes(self) -> Ints:
-        """Votes for a surfel that returns pulses: 1 for rays that end on it, -1 for others."""
-        return self.ends.astype(np.int64) - self.passes
+        """Votes for a surfel that returns pulses, negative for rays that pass through it."""
+        return _END_VOTES * self.ends - self.passes.astype(np.int64)
 
     @property
     def dark_votes(self) -> Ints:
@@ -130,11 +140,13 @@ class SurfaceMap:
 
     surfels: Surfels
     caster: RayCaster
+    porosity: Porosity
 
     @classmethod
     def from_surfels(cls, surfels: Surfels) -> SurfaceMap:
-        """Create a map with a ray caster for the surfels."""
-        return cls(surfels, RayCaster(surfels.mesh.vertices, surfels.mesh.faces))
+        """Create a map with a ray caster for opaque surfels."""
+        caster = RayCaster(surfels.mesh.vertices, surfels.mesh.faces)
+        return cls(surfels, caster, Porosity.opaque(len(surfels)))
 
     def cast(self, sweep: AlignedSweep, chosen: Bools | None = None) -> SurfelHits:
         """Cast the rays of a sweep, or only those that `chosen` marks."""
@@ -143,14 +155,60 @@ class SurfaceMap:
         ray_hits = self.caster.cast(sweep.origins[rows], directions)
         met = np.flatnonzero(ray_hits.hit)
         surfel = ray_hits.triangle[met].astype(np.int64) // 2
-        range_m = np.linalg.norm(directions[met], axis=1)
+        return self._hits(sweep, rows[met], surfel, ray_hits.distance[met])
+
+    def cast_likely(self, sweep: AlignedSweep) -> SurfelHits:
+        """Cast the rays of a sweep, and return the surfels from which they most likely return."""
+        crossings = self.crossings(sweep)
+        layer = self.porosity.likely_crossings(crossings, self.surfels.dark)
+        rows = np.flatnonzero(crossings.present[:, 0])
+        surfel = crossings.surfel[rows, layer[rows]].astype(np.int64)
+        distance_m = crossings.distance_m[rows, layer[rows]].astype(np.float64)
+        return self._hits(sweep, rows, surfel, distance_m)
+
+    def crossings(self, sweep: AlignedSweep, chosen: Bools | None = None) -> Crossings:
+        """Return the surfels that the rays of a sweep cross, or only those `chosen` marks."""
+        rows = np.arange(len(sweep.world)) if chosen is None else np.flatnonzero(chosen)
+        origins = sweep.origins[rows]
+        directions = sweep.world[rows] - origins
+        range_m = np.linalg.norm(directions, axis=1)
+        directions /= range_m[:, None]
+        surfel = np.full((len(rows), _MAX_CROSSINGS), -1, np.int32)
+        distance_m = np.full(surfel.shape, np.inf, np.float32)
+        active = np.arange(len(rows))
+        start_m = np.zeros(len(rows))
+        for layer in range(_MAX_CROSSINGS):
+            starts = origins[active] + start_m[:, None] * directions[active]
+            hits = self.caster.cast(starts, directions[active])
+            met = hits.hit
+            active = active[met]
+            start_m = start_m[met] + hits.distance[met]
+            surfel[active, layer] = hits.triangle[met] // 2
+            distance_m[active, layer] = start_m
+            start_m += _BEHIND_M
+        return Crossings(surfel, distance_m, range_m)
+
+    def _hits(
+        self, sweep: AlignedSweep, rows: Ints, surfel: Ints, distance_m: Floats
+    ) -> SurfelHits:
+        """Return the given hits with their recorded ranges and incidence angles."""
+        directions = sweep.world[rows] - sweep.origins[rows]
+        range_m = np.linalg.norm(directions, axis=1)
         normals = self.surfels.normals[surfel]
-        offsets = sweep.world[rows[met]] - self.surfels.centers[surfel]
+        offsets = sweep.world[rows] - self.surfels.centers[surfel]
         off_plane_m = np.abs(np.einsum("ij,ij->i", offsets, normals))
-        inward = np.einsum("ij,ij->i", directions[met], normals) / range_m
-        return SurfelHits(
-            rows[met], surfel, ray_hits.distance[met], range_m, off_plane_m, np.abs(inward), inward
-        )
+        inward = np.einsum("ij,ij->i", directions, normals) / range_m
+        return SurfelHits(rows, surfel, distance_m, range_m, off_plane_m, np.abs(inward), inward)
+
+    def with_porosity(self, sweeps: AlignedSweeps, stationary: Mapping[int, Bools]) -> SurfaceMap:
+        """Estimate the gaps of the surfels from the rays of several sweeps."""
+        crossings = [
+            self.crossings(sweeps.read(number), stationary[number])
+            for number in _evenly_chosen(stationary, _POROSITY_SWEEPS)
+        ]
+        surfels = self.surfels
+        porosity = Porosity.from_crossings(crossings, surfels.centers, surfels.dark, _ON_RAY_M)
+        return replace(self, porosity=porosity)
 
     def refine(self, sweeps: AlignedSweeps, stationary: Mapping[int, Bools]) -> Surfels:
         """Remove surfels that more rays contradict than support, and adjust the other surfels.
@@ -231,7 +289,7 @@ def build_surface_map(
         surfels = surfels.with_dark(dark)
     for _ in range(_ROUNDS):  # Keep only one ray caster at a time, to save memory.
         surfels = SurfaceMap.from_surfels(surfels).refine(sweeps, stationary)
-    return SurfaceMap.from_surfels(surfels)
+    return SurfaceMap.from_surfels(surfels).with_porosity(sweeps, stationary)
 
 
 def _lost_positions(
@@ -270,9 +328,9 @@ def _shifts(surfel: Ints, offset_m: Floats, count: int) -> Floats:
     return shifts_m
 
 
-def _evenly_chosen(stationary: Mapping[int, Bools]) -> list[int]:
+def _evenly_chosen(stationary: Mapping[int, Bools], count: int = _VOTING_SWEEPS) -> list[int]:
     numbers = np.fromiter(stationary, np.int64)
-    chosen: list[int] = numbers[even_indices(len(numbers), _VOTING_SWEEPS)].tolist()
+    chosen: list[int] = numbers[even_indices(len(numbers), count)].tolist()
     return chosen
 
 

@@ -1,0 +1,116 @@
+"""Gaps of hedges and fences in reconstructed scenes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from tests.shapes import wall
+
+from lidarpool import Material, Mounted, Pose, Scene, SceneMesh, Sensor, Survey, Track, twin
+from lidarpool.reconstruction.porosity import Crossings, Porosity
+from lidarpool.scenario.prepare import prepare
+from lidarpool.scenario.scenario import Scenario
+from lidarsim.columns.table import SCAN
+from lidarsim.simulator.points.batch_columns import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarsim.sweeps.sweeps import Sweeps
+
+pytest.importorskip("scipy")
+
+SWEEPS = 12
+GAPS = 0.4
+SPREAD_M = 0.05
+HEDGE_Y = 5.0
+HOUSE_Y = 9.0
+
+
+def test_gap_fractions_are_the_share_of_the_rays_that_pass():
+    """40 rays meet two surfels: 10 end on the first, 24 on the second, and 6 pass through both."""
+    surfel = np.tile(np.array([[0, 1, -1]], np.int32), (40, 1))
+    distance_m = np.tile([[5.0, 8.0, np.inf]], (40, 1))
+    range_m = np.repeat([5.02, 7.98, 12.0], [10, 24, 6])
+    crossings = Crossings(surfel, distance_m, range_m)
+    opaque = np.zeros(2, bool)
+    centers = np.array([[5.0, 0, 0], [8.0, 0, 0]])
+    porosity = Porosity.from_crossings([crossings], centers, opaque, 0.15)
+    assert porosity.gap_fraction == pytest.approx([0.6, 0.2])  # 30/40 and 6/30, rounded
+    assert porosity.range_spread_m == pytest.approx([0, 0])
+    layers = porosity.likely_crossings(crossings, opaque)
+    assert (layers == 1).all(), "most rays return from the second surfel"
+    layers = porosity.likely_crossings(crossings, np.array([True, False]))
+    assert (layers == 0).all(), "nothing is visible behind a dark surfel"
+
+
+def upright(name, y, height):
+    """A wall along x."""
+    corners = [(x, y, z) for x, z in ((-40, 0), (40, 0), (40, height), (-40, height))]
+    return SceneMesh(name, np.array(corners, float), np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def ground():
+    corners = np.array([[-40, -12, 0], [40, -12, 0], [40, 12, 0], [-40, 12, 0]], float)
+    return SceneMesh("ground", corners, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """A drive along a hedge with a house behind it."""
+    scene = Scene.from_meshes(
+        [
+            ground(),
+            upright("hedge", HEDGE_Y, 2.0),
+            upright("house", HOUSE_Y, 6.0),
+            upright("house opposite", -7.0, 6.0),
+            wall("end", 40, (-12, 12), (0, 6)),
+            *(wall(f"side {x}", x, (-7, -6), (0, 3)) for x in range(-30, 31, 10)),
+        ]
+    )
+    end_s = 0.1 * SWEEPS + 0.2
+    survey = Survey(
+        sensors=[Mounted(Sensor.grid(400, 24, vertical_fov_deg=40), Pose((0, 0, 1.8)))],
+        trajectory=Track([0, end_s], [[-4, 0, 0], [4 * end_s - 4, 0, 0]]),
+        steps=36 * SWEEPS,
+        columns=["time", "intensity"],
+        materials=[
+            Material("hedge", 0.5, gap_fraction=GAPS, range_spread_m=SPREAD_M),
+            Material("*", 0.5),
+        ],
+        precision_m=1e-3,
+    )
+    part = columns_of(list(Rig(scene, survey, "auto").cast(0, survey.scan_count)))
+    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
+    sweeps = Sweeps.from_survey(survey, scene)
+    return replace(cloud, sweeps=lambda: sweeps)
+
+
+def shares(world):
+    """Shares of the points on the hedge, on the house behind it, and spread on the hedge."""
+    x, y, z = world.T
+    # Rays to the house below this height pass through the hedge.
+    behind = 1.8 + (2.0 - 1.8) * HOUSE_Y / HEDGE_Y - 0.1
+    along = np.abs(x) < 10
+    hedge = along & (np.abs(y - HEDGE_Y) < 0.3) & (z > 0.3) & (z < 1.9)
+    house = along & (np.abs(y - HOUSE_Y) < 0.3) & (z > 0.3) & (z < behind)
+    return house.sum() / hedge.sum(), float(y[hedge].std())
+
+
+@pytest.mark.extended
+def test_hedges_have_the_gaps_and_depths_of_the_recording(recorded, tmp_path):
+    place = twin(recorded)
+    place.save(tmp_path)
+    scenario = yaml.safe_load((tmp_path / "scenario.yaml").read_text())
+    fractions = {entry.get("gap_fraction", 0) for entry in scenario["materials"]}
+    assert {0, 0.4} <= fractions
+    job = prepare(Scenario.load(tmp_path / "scenario.yaml"))
+    part = columns_of(list(Rig(job.scene, job.survey, "auto").cast(0, job.survey.scan_count)))
+    simulated = part.cloud((SCAN, *job.survey.stored_columns[3:]), 1e-3, job.scene.origin)
+    recorded_share, recorded_spread_m = shares(recorded.positions)
+    share, spread_m = shares(simulated.positions)
+    assert recorded_share > 0.2
+    assert share == pytest.approx(recorded_share, rel=0.15)
+    assert spread_m == pytest.approx(recorded_spread_m, rel=0.3)
+    opposite = (np.abs(recorded.positions[:, 1] + 7) < 0.3).mean()
+    assert (np.abs(simulated.positions[:, 1] + 7) < 0.3).mean() == pytest.approx(opposite, rel=0.03)

@@ -1,0 +1,195 @@
+"""Estimate the gaps in surfels and the depths of their returns from recorded rays.
+
+Hedges, fences and the outlines of objects are not opaque: some rays end on a surfel, and others
+pass through it. A ray crosses several surfels until it ends on one that is close to its return. If
+several surfels are close to the return, it is unknown on which of them the ray ended, so each is
+assigned a probability. Expectation maximization alternates between these probabilities and the gap
+fractions, so that a ray passes through all surfels of a layer as often as in the recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints, Ints32
+
+_PRIOR_RAYS = 2.2  # weight of the prior, in rays
+_PRIOR_GAPS = 0.2  # rays of the prior that pass through, without observations nearby
+_NEIGHBORS = 9  # surfels whose rays determine the prior
+_ROUNDS = 8  # iterations of expectation maximization
+_GAP_STEP = 0.2  # step to which gap fractions are rounded
+_MAX_GAP_FRACTION = 0.8
+_SPREAD_STEP_M = 0.02  # step to which the spreads of the ranges are rounded
+_PRIOR_SPREAD_RAYS = 4.0  # weight of the mean spread, in rays
+_GOLDEN = 0.6180339887498949  # fraction whose multiples are evenly distributed modulo 1
+
+
+class Crossings(NamedTuple):
+    """Surfels that the rays of a sweep cross, the nearest first.
+
+    The arrays have a row for each of the n rays, and k columns.
+    """
+
+    surfel: Ints32  # (n, k), -1 beyond the last surfel
+    distance_m: Floats32  # (n, k), inf beyond the last surfel
+    range_m: Floats  # (n,), recorded range
+
+    @property
+    def present(self) -> Bools:
+        """Mask of the surfels. Shape (n, k)."""
+        return np.asarray(self.surfel >= 0)
+
+    def first_ends(self, dark: Bools, on_surfel_m: float) -> _RayCounts:
+        """Count the rays, assuming that each ends on the first surfel close to its return."""
+        near = self._near(dark, on_surfel_m)
+        first = np.zeros(near.shape)
+        rows = np.flatnonzero(near.any(axis=1))
+        first[rows, near[rows].argmax(axis=1)] = 1
+        return self._count(first, len(dark), on_surfel_m)
+
+    def expected_ends(self, gap_fraction: Floats, dark: Bools, on_surfel_m: float) -> _RayCounts:
+        """Count the rays, given the gap fractions of the m surfels."""
+        gaps = np.where(self.present, gap_fraction[self.surfel], 1.0)
+        reaching = np.cumprod(gaps, axis=1)
+        reaching = np.column_stack([np.ones(len(gaps)), reaching[:, :-1]])
+        ending = np.where(self._near(dark, on_surfel_m), reaching * (1 - gaps), 0)
+        ending /= np.maximum(ending.sum(axis=1, keepdims=True), 1e-300)
+        return self._count(ending, len(dark), on_surfel_m)
+
+    def _near(self, dark: Bools, on_surfel_m: float) -> Bools:
+        near = np.abs(self.range_m[:, None] - self.distance_m) < on_surfel_m
+        return np.asarray(near & self.present & ~dark[self.surfel])
+
+    def _count(self, ending: Floats, count: int, on_surfel_m: float) -> _RayCounts:
+        """Add up the probabilities (n, k) that rays end on their surfels, for `count` surfels."""
+        beyond_m = np.where(self.present, self.range_m[:, None] - self.distance_m, 0)
+        ends = ending.any(axis=1, keepdims=True)
+        later = 1 - np.cumsum(ending, axis=1)  # probability that the ray ends on a later surfel
+        passing = np.where(ends, later, beyond_m > on_surfel_m)
+        present = self.present
+        surfel = self.surfel[present]
+        offset_m = beyond_m[present]
+        return _RayCounts(
+            *(
+                np.asarray(np.bincount(surfel, weights, count), np.float64)
+                for weights in (
+                    ending[present],
+                    np.maximum(passing[present], 0),
+                    ending[present] * offset_m,
+                    ending[present] * np.square(offset_m),
+                )
+            )
+        )
+
+
+class Porosity(NamedTuple):
+    """Gaps of m surfels, and depths of their returns."""
+
+    gap_fraction: Floats  # (m,), share of the rays that pass through
+    range_spread_m: Floats  # (m,), standard deviation of the ranges of the other rays
+
+    @classmethod
+    def opaque(cls, count: int) -> Porosity:
+        """Return the porosity of surfels without gaps."""
+        return cls(np.zeros(count), np.zeros(count))
+
+    @classmethod
+    def from_crossings(
+        cls, sweeps: Sequence[Crossings], centers: Floats, dark: Bools, on_surfel_m: float
+    ) -> Porosity:
+        """Estimate the porosity of surfels from stationary returns.
+
+        Parameters
+        ----------
+        sweeps
+            Crossings of the rays of several sweeps.
+        centers
+            Centers of the surfels in meters. Shape (m, 3).
+        dark
+            Surfels that return no pulses, which are treated as opaque. Shape (m,).
+        on_surfel_m
+            Maximum range difference in meters between a surfel and a return from it.
+        """
+        from scipy.spatial import cKDTree
+
+        neighbors = cKDTree(centers).query(centers, min(_NEIGHBORS, len(centers)))[1]
+        neighbors = neighbors.reshape(len(centers), -1)
+        counts = _RayCounts.sum(one.first_ends(dark, on_surfel_m) for one in sweeps)
+        for _ in range(_ROUNDS):
+            gap_fraction = counts.gap_fraction(neighbors)
+            counts = _RayCounts.sum(
+                one.expected_ends(gap_fraction, dark, on_surfel_m) for one in sweeps
+            )
+        gap_fraction = np.where(dark, 0, counts.gap_fraction(neighbors))
+        gap_fraction = _dithered(gap_fraction, _GAP_STEP).clip(max=_MAX_GAP_FRACTION)
+        porous = gap_fraction > 0
+        spread_m = np.where(porous, counts.spread_m(porous), 0)
+        return cls(gap_fraction, np.round(_SPREAD_STEP_M * np.rint(spread_m / _SPREAD_STEP_M), 6))
+
+    def select(self, rows: Bools) -> Porosity:
+        """Select surfels with a mask."""
+        return Porosity(self.gap_fraction[rows], self.range_spread_m[rows])
+
+    def likely_crossings(self, crossings: Crossings, dark: Bools) -> Ints:
+        """Return the column of the surfel from which the pulse of each ray most likely returns.
+
+        This is the median of the surfels, weighted by the probabilities of their returns. If the
+        first surfel returns no pulses, it is the first. The result has shape (n,).
+        """
+        is_dark = dark[crossings.surfel]
+        gap_fraction = np.where(is_dark, 0.0, self.gap_fraction[crossings.surfel])
+        gap_fraction[~crossings.present] = 1.0
+        reaching = np.cumprod(gap_fraction, axis=1)
+        reaching = np.column_stack([np.ones(len(reaching)), reaching[:, :-1]])
+        returning = np.where(is_dark, 0.0, reaching * (1 - gap_fraction))
+        cumulative = np.cumsum(returning, axis=1)
+        return np.asarray((cumulative >= cumulative[:, -1:] / 2).argmax(axis=1))
+
+
+class _RayCounts(NamedTuple):
+    """Rays that end on each of m surfels or pass through it, and their offsets."""
+
+    ending: Floats  # (m,)
+    passing: Floats  # (m,)
+    sum_m: Floats  # (m,), sum of the recorded minus the simulated ranges of the ending rays
+    sum_m2: Floats  # (m,), sum of their squares
+
+    @classmethod
+    def sum(cls, parts: Iterable[_RayCounts]) -> _RayCounts:
+        """Add the counts of several sweeps."""
+        total = next(iterator := iter(parts))
+        for part in iterator:
+            total = cls(*(a + b for a, b in zip(total, part, strict=True)))
+        return total
+
+    def gap_fraction(self, neighbors: Ints) -> Floats:
+        """Return the share of the rays that pass through each surfel.
+
+        Surfels with few rays have about the mean of their neighbors, whose indices have shape
+        (m, q). The result has shape (m,).
+        """
+        rays = self.passing + self.ending
+        nearby = self.passing[neighbors].sum(axis=1) + _PRIOR_GAPS
+        nearby /= rays[neighbors].sum(axis=1) + _PRIOR_RAYS
+        return np.asarray((self.passing + _PRIOR_RAYS * nearby) / (rays + _PRIOR_RAYS))
+
+    def spread_m(self, chosen: Bools) -> Floats:
+        """Return the standard deviation of the offsets of each surfel in meters.
+
+        The result has shape (m,). Surfels with few rays have about the mean of the chosen surfels.
+        """
+        offset_m = self.sum_m / np.maximum(self.ending, 1e-9)
+        total_m2 = np.maximum(self.sum_m2 - self.ending * offset_m**2, 0)
+        degrees = np.maximum(self.ending - 1, 0)
+        typical_m2 = total_m2[chosen].sum() / max(float(degrees[chosen].sum()), 1.0)
+        variance_m2 = total_m2 + _PRIOR_SPREAD_RAYS * typical_m2
+        return np.asarray(np.sqrt(variance_m2 / (degrees + _PRIOR_SPREAD_RAYS)))
+
+
+def _dithered(values: Floats, step: float) -> Floats:
+    """Round values to multiples of a step, up or down such that their mean is preserved."""
+    thresholds = np.arange(len(values)) * _GOLDEN % 1
+    return np.round(step * np.floor(values / step + thresholds), 6)
