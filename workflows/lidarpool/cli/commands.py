@@ -37,6 +37,7 @@ from . import completion
 from . import shared_options as shared
 from .augment_command import augment
 from .first_step import print_first_step
+from .follow_command import follow
 from .play_command import play
 from .result_commands import compare, export, fit, plot, view
 from .scenario_commands import check, import_, init, scene, schema, sensors
@@ -229,7 +230,7 @@ class _Commands(click.Group):
     cls=_Commands,
     commands=[
         *(init, import_, check, schema, scene, sensors, stations),
-        *(view, play, plot, export, compare, fit, twin, augment),
+        *(view, play, follow, plot, export, compare, fit, twin, augment),
     ],
     context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]},
 )

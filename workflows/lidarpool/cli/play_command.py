@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -142,7 +141,7 @@ def play(
             sweeps = replace(sweeps, start_ns=start_at_ns - round(float(sweeps.begins_ns.min())))
         bridge_options = BridgeOptions(to, played.period_ns if loop else 0, bridge_settings)
         bridge = kind(sweeps, schedule, bridge_options, terminal.report)
-        with _summary_at_end(lambda: bridge.summary), bridge:
+        with options.summary_at_end(lambda: bridge.summary), bridge:
             bridge.show_content(played.content)
             click.echo(f"ready: {bridge.description}. Press Ctrl-C to stop.")
             play_sweeps(
@@ -163,19 +162,6 @@ def _play_recording(
         terminal.report(note)
     streams = recorded_streams(recording, to, settings.get("api", ()))
     transmitter = Transmitter(streams, terminal.report, settings.get("lateness"))
-    with _summary_at_end(lambda: transmitter.summary), transmitter:
+    with options.summary_at_end(lambda: transmitter.summary), transmitter:
         click.echo(f"ready: {transmitter.description}. Press Ctrl-C to stop.")
         play_recording(recording, transmitter, schedule, loop=loop)
-
-
-@contextmanager
-def _summary_at_end(summary: Callable[[], str]) -> Iterator[None]:
-    """Print a summary after the body, even if Ctrl-C interrupts it."""
-    try:
-        yield
-    except KeyboardInterrupt as error:
-        if words := summary():
-            error.add_note(words)
-        raise
-    if words := summary():
-        click.echo(words)

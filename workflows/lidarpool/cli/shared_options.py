@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial, reduce, wraps
 from itertools import chain
 from pathlib import Path
@@ -312,3 +313,16 @@ def print_results(figures: Mapping[str, Any], lines: Iterable[str], as_json: boo
         lines = [json.dumps(figures, indent=1, allow_nan=False, default=str)]
     for line in lines:
         click.echo(line)
+
+
+@contextmanager
+def summary_at_end(summary: Callable[[], str]) -> Iterator[None]:
+    """Print a summary after the body, even if Ctrl-C interrupts it."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        if words := summary():
+            error.add_note(words)
+        raise
+    if words := summary():
+        click.echo(words)

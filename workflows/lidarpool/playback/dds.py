@@ -5,17 +5,26 @@ from __future__ import annotations
 import ipaddress
 import os
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
-from cyclonedds.core import DDSException
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+from cyclonedds.core import (
+    DDSException,
+    InstanceState,
+    ReadCondition,
+    SampleState,
+    ViewState,
+    WaitSet,
+)
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import make_idl_struct, types
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 from rosbags.interfaces import Nodetype
@@ -27,6 +36,7 @@ from lidarsim.words import join_names, shorten_name
 from ..clouds.ros.messages import LATCHED_TOPICS, RosMessage, message_store
 
 LOOPBACK = "127.0.0.1"
+CLOCK_TOPIC = "/clock"
 DOMAIN_VARIABLE = "ROS_DOMAIN_ID"
 _MAX_DOMAIN = 232  # ports of higher domains would exceed 65,535
 _PARTICIPANTS = 32  # maximum number of participants per machine, as in ROS 2
@@ -57,6 +67,8 @@ _BASE_TYPES = {
 # Number of messages that are kept per topic, as in ROS 2 nodes.
 _DEPTHS = {"/clock": 1, "/tf": 100}
 _DEPTH = 10
+_RECEIVED_DEPTH = 5000  # messages of a topic that are kept until they are read
+_TAKEN = 1000  # messages that are taken at once
 
 
 @dataclass(frozen=True)
@@ -197,6 +209,108 @@ class RosPublisher:
         )
         dds_topic = Topic(self._participant, f"rt{topic}", message_class(kind))
         return DataWriter(self._participant, dds_topic, qos=qos)
+
+
+class ReceivedMessage(NamedTuple):
+    """A message that another program has published."""
+
+    topic: str
+    kind: str  # type of the message
+    cdr: bytes  # serialized message with its encapsulation header
+
+
+class _SerializedMessage:
+    """A message that cyclonedds leaves serialized, because deserialization by rosbags is faster."""
+
+    sample_info: Any  # set by cyclonedds
+
+    def __init__(self, cdr: bytes) -> None:
+        self.cdr = cdr
+
+    @classmethod
+    def deserialize(cls, cdr: bytes, **_: Any) -> _SerializedMessage:
+        return cls(bytes(cdr))
+
+    deserialize_key = deserialize
+
+
+class RosSubscriber:
+    """Receives the messages of topics as soon as other programs publish them.
+
+    A topic is read with the reliability and the durability of its publisher.
+
+    Parameters
+    ----------
+    publisher
+        Publisher whose connection to the network is used.
+    is_wanted
+        Function that returns whether messages are received, given a topic and a message type.
+    """
+
+    def __init__(self, publisher: RosPublisher, is_wanted: Callable[[str, str], bool]) -> None:
+        self._participant = publisher._participant
+        self._is_wanted = is_wanted
+        self._discovery = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+        self._wait_set = WaitSet(self._participant)
+        self._attach(self._discovery)
+        # Readers by topic, message type, and whether they are reliable and receive old messages.
+        self._readers: dict[tuple[str, str, bool, bool], Any] = {}
+        self._writers: dict[Any, str] = {}  # {key of a publisher: topic}
+
+    def publishers(self, topic: str) -> int:
+        """Return the number of programs that publish a topic."""
+        return sum(published == topic for published in self._writers.values())
+
+    def receive(self, wait_s: float) -> Iterator[ReceivedMessage]:
+        """Yield the messages that have arrived. Wait for messages if there are none."""
+        with suppress(DDSException):  # the time has passed
+            self._wait_set.wait(duration(seconds=wait_s))
+        self._discover()
+        # The clock comes first, because it determines which other messages are up to date.
+        readers = sorted(self._readers.items(), key=lambda item: item[0][0] != CLOCK_TOPIC)
+        for (topic, kind, *_), reader in readers:
+            while samples := reader.take(_TAKEN):
+                for sample in samples:
+                    if isinstance(sample, _SerializedMessage):
+                        yield ReceivedMessage(topic, kind, sample.cdr)
+                if len(samples) < _TAKEN:
+                    break
+
+    def _attach(self, reader: Any) -> None:
+        """Let messages of a reader end waiting."""
+        mask = ViewState.Any | SampleState.Any | InstanceState.Any
+        self._wait_set.attach(ReadCondition(reader, mask))
+
+    def _discover(self) -> None:
+        """Create readers for new publishers of wanted topics."""
+        for endpoint in self._discovery.take(_TAKEN):
+            if endpoint.sample_info.instance_state != InstanceState.Alive:
+                self._writers.pop(endpoint.key, None)
+                continue
+            topic = endpoint.topic_name.removeprefix("rt")
+            kind = endpoint.type_name.replace("::", "/").replace("/dds_/", "/").removesuffix("_")
+            if endpoint.topic_name == topic or not self._is_wanted(topic, kind):
+                continue
+            self._writers[endpoint.key] = topic
+            policies = [*endpoint.qos]
+            is_reliable = any(isinstance(p, Policy.Reliability.Reliable) for p in policies)
+            is_latched = Policy.Durability.TransientLocal in policies
+            key = topic, kind, is_reliable, is_latched
+            if key not in self._readers:
+                self._readers[key] = self._reader(*key)
+                self._attach(self._readers[key])
+
+    def _reader(self, topic: str, kind: str, is_reliable: bool, is_latched: bool) -> Any:
+        qos = Qos(
+            Policy.Reliability.Reliable(0) if is_reliable else Policy.Reliability.BestEffort,
+            Policy.Durability.TransientLocal if is_latched else Policy.Durability.Volatile,
+            Policy.History.KeepLast(_RECEIVED_DEPTH),
+            Policy.DataRepresentation(use_cdrv0_representation=True),
+        )
+        dds_topic = Topic(self._participant, f"rt{topic}", message_class(kind))
+        reader = DataReader(self._participant, dds_topic, qos=qos)
+        dds_topic.data_type = _SerializedMessage
+        return reader
 
 
 def _serialized(kind: Any, cdr: bytes) -> Any:

@@ -53,6 +53,7 @@ class PlacedModel(NamedTuple):
     name: str
     body: GazeboBody
     matrix: Floats  # (4, 4) matrix to the frame of the world or model
+    is_static: bool  # whether physics never moves it
 
 
 @dataclass(eq=False)
@@ -69,11 +70,14 @@ class GazeboBody:
         Links of the model itself.
     children
         Nested models.
+    is_static
+        Whether the model is declared as static.
     """
 
     frames: FrameGraph
     links: list[Link] = field(default_factory=list)
     children: list[PlacedModel] = field(default_factory=list)
+    is_static: bool = False
 
     @cached_property
     def size(self) -> int:
@@ -114,6 +118,7 @@ class BodyReader:
     def _fill(self, body: GazeboBody, element: Element, source: Source) -> None:
         """Read the links, frames, and models of an element into a body."""
         self.notes.check_children(element)
+        body.is_static = _is_true(element.findtext("static"))
         frames = body.frames
         for link in element.findall("link"):
             with prefix_errors(f"link {_name(link)!r}"):
@@ -129,14 +134,18 @@ class BodyReader:
             if child is not None:
                 frames.define(_name(joint), read_pose(joint), printable(link_name) or frames.root)
         nested = [*self._nested(body, element, source)]
-        for name, child_body, _ in nested:
+        for name, child_body, is_static in nested:
             with prefix_errors(f"model {name!r}"):
-                body.children.append(PlacedModel(name, child_body, frames.matrix(name)))
+                child = PlacedModel(name, child_body, frames.matrix(name), is_static)
+                body.children.append(child)
 
     def _nested(
         self, body: GazeboBody, element: Element, source: Source
-    ) -> Iterator[tuple[str, GazeboBody, RelativePose]]:
-        """Define the frames of nested models, and yield each model's name, body, and pose."""
+    ) -> Iterator[tuple[str, GazeboBody, bool]]:
+        """Define the frames of nested models.
+
+        Yield each model's name, body, and whether it is static.
+        """
         for child in element:
             if child.tag == "model":
                 name = _name(child)
@@ -148,7 +157,7 @@ class BodyReader:
 
     def _include(
         self, body: GazeboBody, include: Element, source: Source
-    ) -> Iterator[tuple[str, GazeboBody, RelativePose]]:
+    ) -> Iterator[tuple[str, GazeboBody, bool]]:
         """Yield the model to which an <include> refers, or merge this model into the body."""
         self.notes.check_children(include)
         uri = (include.findtext("uri") or "").strip()
@@ -167,10 +176,10 @@ class BodyReader:
 
     def _define(
         self, body: GazeboBody, name: str, nested: GazeboBody, posed: Element, placing: Element
-    ) -> tuple[str, GazeboBody, RelativePose]:
-        """Define the frame of a nested model, and return the model's name, body, and pose.
+    ) -> tuple[str, GazeboBody, bool]:
+        """Define the frame of a nested model.
 
-        `posed` is the element whose <pose> applies, and `placing` may name the placement frame. If
+        Return the model's name, its body, and whether it is static. `posed` is the element whose <pose> applies, and `placing` may name the placement frame. If
         the name is already used, the returned name has a number.
         """
         placement = _placement_frame(placing, posed)
@@ -179,7 +188,8 @@ class BodyReader:
         frames = body.frames
         name = frames.define(name, pose, frames.root)
         frames.nested[name] = nested.frames
-        return name, nested, pose
+        is_static = nested.is_static or _is_true(placing.findtext("static"))
+        return name, nested, is_static
 
     def _merge(
         self, body: GazeboBody, nested: GazeboBody, posed: Element, placing: Element
@@ -269,6 +279,11 @@ def _placement_frame(placing: Element, posed: Element) -> str:
     """Return the frame within a model to which its pose refers, or "" for its own frame."""
     text = placing.findtext("placement_frame") or posed.get("placement_frame") or ""
     return printable(text)
+
+
+def _is_true(text: str | None) -> bool:
+    """Return whether the text of an element is a true value."""
+    return (text or "").strip() in ("true", "1")
 
 
 def _name(element: Element) -> str:

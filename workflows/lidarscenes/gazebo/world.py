@@ -23,6 +23,8 @@ from lidarsim.numerics.vectors import matmul
 from lidarsim.scene.files.scene_graph import (
     Content,
     MeshFileError,
+    NamedFrames,
+    ObjectFrame,
     PlacedNode,
     ReadOptions,
     placed_content,
@@ -69,8 +71,28 @@ class PlacedLink(NamedTuple):
     body: GazeboBody
     link: Link
     matrix: Floats  # (4, 4) matrix to the world
-    model: Floats  # (4, 4) matrix of the outermost model
+    # Scoped names and (4, 4) matrices of the enclosing models, outermost first.
+    models: NamedFrames
     scale: tuple[float, ...]
+    is_static: bool  # whether an enclosing model is static
+
+    @property
+    def model(self) -> Floats:
+        """Matrix of the outermost model.
+
+        The shape is (4, 4).
+        """
+        return self.models[0][1]
+
+    def frame(self, name: str) -> ObjectFrame:
+        """Return the frame of an object in the link, given the name of the object."""
+        enclosing = self.models if name == "/".join(self.path) else self.frames
+        return ObjectFrame(self.matrix, enclosing, self.is_static)
+
+    @property
+    def frames(self) -> NamedFrames:
+        """Frames of the enclosing models and of the link itself."""
+        return (*self.models, ("/".join(self.path), self.matrix))
 
 
 @dataclass
@@ -112,20 +134,22 @@ class World:
     def _placed_links(self) -> Iterator[PlacedLink]:
         """Yield the links of all models, with poses from the state if it contains any."""
         state = self.state
-        # Models with the names, the matrix, and the outermost matrix of their enclosing models.
-        stack: list[tuple[PlacedModel, tuple[str, ...], Floats | None, Floats | None]] = [
-            (child, (), None, None)
+        # Models with the names of their enclosing models, the frames of these models, and whether
+        # one of them is static.
+        stack: list[tuple[PlacedModel, tuple[str, ...], NamedFrames, bool]] = [
+            (child, (), (), False)
             for child in reversed(self.body.children)
             if child.name not in state.deleted
         ]
         while stack:
-            instance, outer, outer_matrix, outermost = stack.pop()
+            instance, outer, models, is_static = stack.pop()
             path = (*outer, instance.name)
             matrix = instance.matrix
-            if outer_matrix is not None:
-                matrix = matmul(outer_matrix, matrix)
+            if models:
+                matrix = matmul(models[-1][1], matrix)
             matrix = state.poses.get(scoped_name(path), matrix)
-            outermost = matrix if outermost is None else outermost
+            models = (*models, ("/".join(path), matrix))
+            is_static = is_static or instance.is_static
             scale = state.scales.get(path[0], _NO_SCALE)
             for link in instance.body.links:
                 with prefix_errors(f"model {scoped_name(path)[:80]!r}, link {link.name!r}"):
@@ -133,9 +157,9 @@ class World:
                 placed = matmul(matrix, in_model)
                 link_path = (*path, link.name)
                 placed = state.poses.get(scoped_name(link_path), placed)
-                yield PlacedLink(link_path, instance.body, link, placed, outermost, scale)
+                yield PlacedLink(link_path, instance.body, link, placed, models, scale, is_static)
             stack += [
-                (child, path, matrix, outermost) for child in reversed(instance.body.children)
+                (child, path, models, is_static) for child in reversed(instance.body.children)
             ]
 
 
@@ -180,13 +204,16 @@ def build_content(world: World, options: ReadOptions) -> tuple[Content, list[Pla
         parts = meshes.link_meshes(link.body, link.link, scoped_name(link.path), link.scale)
         for part in parts:
             name = "/".join(link.path) + part.suffix
-            objects.append(PlacedObject(PlacedNode(part.mesh, link.matrix, name), part.flags))
+            node = PlacedNode(part.mesh, link.matrix, name, frame=link.frame(name))
+            objects.append(PlacedObject(node, part.flags))
     actors = read_actors(world.element, world.source, meshes, notes)
     standing = [node for node in actors.standing if is_in_reach(node.matrix)]
     notes.remote |= {node.name: None for node in actors.standing if not is_in_reach(node.matrix)}
     objects += [PlacedObject(node, ALL_BITS) for node in (*_roads(world, meshes), *standing)]
     content = placed_content([item.node for item in objects])
     content.moving = actors.moving
+    content.root_frame = world.element.get("name", "")
+    content.empty_frames = [link.frames for link in world.links]
     content.unit_m = 1.0
     content.up_axis = "z"
     content.notes = [*notes.lines()]

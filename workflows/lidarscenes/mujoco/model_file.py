@@ -26,6 +26,7 @@ from lidarsim.scene.files.scene_graph import (
     MAX_NODES,
     Content,
     MeshFileError,
+    ObjectFrame,
     PlacedNode,
     ReadOptions,
     placed_content,
@@ -169,11 +170,19 @@ def _placed(model: Any, options: ReadOptions) -> list[PlacedNode]:
     for part in (world, inner):
         parts = create_bodies(model, part)
         nodes += [
-            PlacedNode(_stripped(mesh, options), np.eye(4), mesh.name) for mesh in parts.static
+            PlacedNode(
+                _stripped(mesh, options),
+                np.eye(4),
+                mesh.name,
+                frame=ObjectFrame(np.eye(4), is_static=True),
+            )
+            for mesh in parts.static
         ]
         for body, mesh in parts.moving:
             shared = meshes.setdefault(id(mesh.faces), _stripped(mesh, options))
-            nodes.append(PlacedNode(shared, body_matrix(model, body), mesh.name))
+            matrix = body_matrix(model, body)
+            frame = ObjectFrame(matrix, is_static=False)
+            nodes.append(PlacedNode(shared, matrix, mesh.name, frame=frame))
     return nodes
 
 

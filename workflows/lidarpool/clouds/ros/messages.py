@@ -163,13 +163,18 @@ class SurveyMessages:
         sweeps = self._sweeps
         time_ns = self.sweep_start_ns(sweep)
         yield _sent("/tf", self._make.transforms(self._frames_in_world(sweep), time_ns), time_ns)
-        topic = sweep_topic(sweeps, sweep)
-        for name, content in self._measured(sweep, points).items():
-            yield _sent(f"{topic.removesuffix('points')}{name}", content, time_ns)
+        yield from self.sensor_messages(sweep, points)
         if self._actors:
             boxes = Boxes.from_points(sweeps, sweep, points)
             yield _sent("/actors", self._make.markers(boxes, self._actors, time_ns), time_ns)
         yield from self._frames_within(sweep)
+
+    def sensor_messages(self, sweep: int, points: Cloud) -> Iterator[RosMessage]:
+        """Yield the messages of a sweep that contain measurements."""
+        time_ns = self.sweep_start_ns(sweep)
+        topic = sweep_topic(self._sweeps, sweep)
+        for name, content in self._measured(sweep, points).items():
+            yield _sent(f"{topic.removesuffix('points')}{name}", content, time_ns)
 
     def _measured(self, sweep: int, points: Cloud) -> dict[str, Any]:
         """Return the sensor messages of a sweep, keyed by the last part of their topics."""
@@ -289,6 +294,12 @@ def _instruments(sweeps: Sweeps) -> list[tuple[str, str, SweepPoses, int]]:
         for frame, instrument in frames
         if instrument is not None
     ]
+
+
+def static_frame(parent: str, frame: str, pose: SweepPoses, time_ns: int) -> RosMessage:
+    """Return a message that states the constant pose of a frame in its parent frame."""
+    make = _Messages(message_store().types)
+    return _sent("/tf_static", make.transforms([(parent, frame, pose, 0)], time_ns), time_ns)
 
 
 def sweep_topic(sweeps: Sweeps, sweep: int) -> str:

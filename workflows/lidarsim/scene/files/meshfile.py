@@ -11,7 +11,7 @@ import logging
 import re
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from itertools import product
+from itertools import product, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,14 +31,14 @@ from ...motion.rotations import quaternions_of
 from ...motion.trajectory import Track
 from ...numerics.arrays import Floats
 from ...numerics.elementary import cbrt
-from ...numerics.vectors import determinant, matmul, rotate
+from ...numerics.vectors import determinant, inverse, matmul, matvec, rotate
 from ...schema.vocabulary import UNITS_M
 from ...words import format_as_python, format_rounded, list_names, plural, printable
 from ..actors import Actor, join_meshes
 from ..colors import colors_summary
-from ..scene_instances import MAX_COORDINATE_M, SceneInstance
+from ..scene_instances import MAX_COORDINATE_M, SceneInstance, polar_scales
 from ..scene_mesh import SceneMesh
-from ..transform import UP_AXES, Transform
+from ..transform import UP_AXES, Transform, affine
 from .cloud_formats import SCAN_READERS
 from .mesh_formats import (
     MeshFormat,
@@ -53,7 +53,9 @@ from .scene_graph import (
     GENERATOR,
     Content,
     MeshFileError,
+    NamedFrames,
     ObjectClass,
+    ObjectFrame,
     Raster,
     ReadOptions,
     RigidPart,
@@ -64,6 +66,7 @@ from .text_cloud import is_text_raster
 FORMAT_COMMENT = "lidarpool: meters, Z-up"
 
 _MAX_UNEVENNESS = 1e-6  # maximum difference between the squared scale factors of the axes
+_MAX_ROUNDING = 1e-12  # maximum deviation of a rotation matrix from orthonormality
 _ZIP = b"PK\x03\x04"  # signature at the start of an archive
 _ZIP_END = b"PK\x05\x06"  # signature of the end of an archive
 _HEAD_BYTES = 200  # bytes at the start of a file that are searched for the comment
@@ -74,6 +77,49 @@ _log = logging.getLogger(__name__)
 def warn(note: str) -> None:
     """Log a note as a warning, with option names as in Python."""
     _log.warning(format_as_python(note))
+
+
+class ObjectFrames(NamedTuple):
+    """Frames of objects, and the transforms from file coordinates to world coordinates."""
+
+    in_file: Sequence[ObjectFrame]
+    empty_in_file: Sequence[NamedFrames]  # frames without an object
+    root: str  # name of the world frame, or an empty string
+    upright: Transform  # converts the unit and the axes of the file, and is applied first
+    placement: Transform
+
+    def in_world(self) -> list[ObjectFrame]:
+        """Return the frames as rigid transforms to world coordinates, in meters.
+
+        As for actors, the axes of the frames are rotated like the axes of the file.
+        """
+        return [
+            ObjectFrame(
+                self._place(frame.matrix), self._place_all(frame.enclosing), frame.is_static
+            )
+            for frame in self.in_file
+        ]
+
+    def empty_in_world(self) -> list[NamedFrames]:
+        """Return the frames without an object, like `in_world`."""
+        return [self._place_all(frames) for frames in self.empty_in_file]
+
+    def _place_all(self, frames: NamedFrames) -> NamedFrames:
+        return tuple((printable(name), self._place(matrix)) for name, matrix in frames)
+
+    def _place(self, matrix: Floats) -> Floats:
+        """Convert the matrix of a frame to world coordinates, and remove its scale."""
+        transforms = (self.upright, self.placement)
+        if all(map(_is_identity, transforms)) and _is_rotation(matrix[:3, :3]):
+            return matrix
+        offset = matrix[:3, 3]
+        for transform in transforms:
+            offset = matvec(transform.linear, offset) + transform.offset
+        axes, turn, rotation = (
+            linear if _is_rotation(linear) else _rotation_part(linear)
+            for linear in (self.upright.linear, self.placement.linear, matrix[:3, :3])
+        )
+        return affine(matmul(matmul(matmul(turn, axes), rotation), axes.T), offset)
 
 
 class Objects(NamedTuple):
@@ -88,6 +134,7 @@ class Objects(NamedTuple):
     ] = {}  # {ASPRS LAS class number: class}, if objects have types
     is_landscape: bool = False  # whether the file represents terrain rather than an object
     epsg: int | None = None  # code of the coordinate system of x and y, if the file states it
+    frames: ObjectFrames | None = None  # frames of `static`, or None if the format has none
 
     def at_start(self, report: Callable[[str], None]) -> tuple[SceneMesh | SceneInstance, ...]:
         """Convert actors at their first pose to static objects, and return all objects.
@@ -201,15 +248,18 @@ def _place_in_world(
     transforms = [upright] if transform is None else [upright, transform]
     placement = Transform(np.eye(3), np.zeros(3)) if transform is None else transform
     static = []
+    frames = []
     actors = []
     reaches_m: dict[str, float] = {}  # {name of a remote object: meters from the origin}
     with prefix_errors(path):
-        for mesh in content.meshes:
+        for mesh, frame in zip_longest(content.meshes, content.frames):
             item, reach_m = _place_object(mesh, path.stem, transforms)
             if item is None:
                 reaches_m[printable(mesh.name) or printable(path.stem)] = reach_m
-            else:
-                static.append(item)
+                continue
+            static.append(item)
+            if frame is not None:
+                frames.append(frame)
         for part in content.moving:
             actor, reach_m = _actor_of_part(part, path.stem, upright, placement)
             if actor is None:
@@ -228,7 +278,11 @@ def _place_in_world(
             f"the origin), which were skipped: {list_names([*reaches_m])}. Check their units and "
             "placement"
         )
-    return Objects(tuple(static), tuple(actors))
+    placed_frames = None
+    if frames:
+        root = printable(content.root_frame)
+        placed_frames = ObjectFrames(frames, content.empty_frames, root, upright, placement)
+    return Objects(tuple(static), tuple(actors), frames=placed_frames)
 
 
 def _report_notes(
@@ -472,6 +526,17 @@ def _place_object(
             item = item.affine_transform(name, transform.linear, transform.offset)
     reach_m = float(np.abs(_corners(item)).max())
     return (item if reach_m <= MAX_COORDINATE_M else None), reach_m
+
+
+def _is_rotation(linear: Floats) -> bool:
+    is_orthonormal = np.abs(matmul(linear, linear.T) - np.eye(3)).max() <= _MAX_ROUNDING
+    return bool(is_orthonormal) and float(determinant(linear)) > 0
+
+
+def _rotation_part(linear: Floats) -> Floats:
+    """Return the rotation in a matrix that also scales or mirrors."""
+    (scale,) = polar_scales(linear[None])
+    return matmul(linear, inverse(scale))
 
 
 def _is_identity(transform: Transform) -> bool:

@@ -77,6 +77,17 @@ class ReadOptions(NamedTuple):
         return is_inside(file, self.folders)
 
 
+NamedFrames = tuple[tuple[str, Floats], ...]  # names and (4, 4) matrices, outermost first
+
+
+class ObjectFrame(NamedTuple):
+    """Frame of an object, to which the poses from a program that controls the world refer."""
+
+    matrix: Floats  # (4, 4), from the frame to file coordinates; it may contain a scale
+    enclosing: NamedFrames = ()  # frames that carry the object
+    is_static: bool | None = None  # whether the object never moves, or None if it is not stated
+
+
 class RigidPart(NamedTuple):
     """Objects that move as a rigid body, and the poses of this body."""
 
@@ -100,6 +111,11 @@ class Content:
 
     meshes: Sequence[SceneMesh | SceneInstance]
     moving: list[RigidPart] = field(default_factory=list)
+    # Frames of `meshes`, or empty if the format has none. The frames are in file coordinates.
+    frames: Sequence[ObjectFrame] = ()
+    # Frames without an object, each after the frames that carry it.
+    empty_frames: Sequence[NamedFrames] = ()
+    root_frame: str = ""  # name of the frame of the file, if the file states it
     unit_m: float | None = None  # length unit of the file in meters, or None if unknown
     up_axis: str | None = None  # 'x', 'y' or 'z', or None if neither file nor format specifies it
     generator: str = ""  # program that wrote the file, if known
@@ -135,6 +151,7 @@ class PlacedNode(NamedTuple):
     matrix: Floats  # (4, 4), from mesh coordinates to file coordinates
     name: str
     path: tuple[str, ...] = ()  # names of the closest ancestors and of the node, which is last
+    frame: ObjectFrame | None = None  # None for the frame of the mesh, without enclosing frames
 
 
 def placed_nodes(
@@ -163,9 +180,10 @@ def placed_nodes(
     node_of = cache(node_of)
     placed = []
     visited = 0
+    # Keys of nodes, with the matrix of the parent, and the names and matrices of the ancestors.
     stack: list[Any] = [(key, np.eye(4), ()) for key in reversed(list(roots))]
     while stack:
-        key, parent_matrix, path = stack.pop()
+        key, parent_matrix, ancestors = stack.pop()
         node = node_of(key)
         visited += 1 if node.copies is None else 1 + len(node.copies)
         # A small file can declare any number of nodes.
@@ -175,15 +193,23 @@ def placed_nodes(
                 "Export it in parts"
             )
         matrix = matmul(parent_matrix, node.matrix)
-        path = (*path[1 - _MAX_PATH_NAMES :], node.name) if node.name else path
+        if node.name:
+            ancestors = (*ancestors[1 - _MAX_PATH_NAMES :], (node.name, matrix))
+        path = tuple(name for name, _ in ancestors)
         matrices = [matrix] if node.copies is None else matmul(matrix, node.copies)
         matrices = [np.eye(4)] if node.skinned else matrices
         placed += [
-            PlacedNode(mesh, mesh_matrix, path[-1] if path else mesh.name or stem, path)
+            PlacedNode(
+                mesh,
+                mesh_matrix,
+                path[-1] if path else mesh.name or stem,
+                path,
+                ObjectFrame(mesh_matrix, ancestors[:-1] if node.name else ancestors),
+            )
             for mesh_matrix in matrices
             for mesh in node.meshes
         ]
-        stack += [(child, matrix, path) for child in reversed(list(node.children))]
+        stack += [(child, matrix, ancestors) for child in reversed(list(node.children))]
     return placed
 
 
@@ -201,15 +227,18 @@ def placed_content(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> C
         would require more than a quarter of the memory.
     """
     objects: list[SceneMesh | SceneInstance] = []
-    content = Content(objects)
-    uses = Counter(mesh for mesh, *_ in placed)
+    frames: list[ObjectFrame] = []
+    content = Content(objects, frames=frames)
+    uses = Counter(node.mesh for node in placed)
     shared_meshes = {
         mesh
         for mesh, n in uses.items()
         if not copy_all and (n - 1) * len(mesh.faces) >= (1 if mesh.cutouts else SHARED_TRIANGLES)
     }
     copied_bytes = [
-        mesh.vertices.nbytes + mesh.faces.nbytes for mesh, *_ in placed if mesh not in shared_meshes
+        node.mesh.vertices.nbytes + node.mesh.faces.nbytes
+        for node in placed
+        if node.mesh not in shared_meshes
     ]
     if (total := sum(copied_bytes)) > memory_share():
         raise MeshFileError(
@@ -225,15 +254,18 @@ def placed_content(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> C
     matrices = np.array([node.matrix for node in placed]).reshape(-1, 4, 4)
     valid = np.isfinite(matrices).all(axis=(1, 2)) & (matrices[:, 3] == [0, 0, 0, 1]).all(axis=1)
     if not valid.all():
-        _, matrix, name, _ = placed[int(valid.argmin())]
+        node = placed[int(valid.argmin())]
         raise MeshFileError(
-            f"places {name[:80]!r} with a matrix that is not a valid transform: {matrix.tolist()}"
+            f"places {node.name[:80]!r} with a matrix that is not a valid transform: "
+            f"{node.matrix.tolist()}"
         )
     ranks = rank(matrices[:, :3, :3]).tolist()
-    for (mesh, matrix, name, _), dimensions in zip(placed, ranks, strict=True):
+    for (mesh, matrix, name, _, frame), dimensions in zip(placed, ranks, strict=True):
         if (dimensions < 2 or (mesh in shared_meshes and not mesh.has_area)) and not copy_all:
             content.skipped.append(name)
-        elif (
+            continue
+        frames.append(frame or ObjectFrame(matrix))
+        if (
             mesh in shared_meshes
             and dimensions == 3
             and (np.abs(matrix[:3, 3]) <= MAX_COORDINATE_M).all()

@@ -1,0 +1,1 @@
+"""Follow simulators that are running, and publish simulated sensors next to them."""

@@ -1,0 +1,379 @@
+"""A node that follows a running simulator through ROS 2 topics and publishes simulated sensors."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarsim.errors import LidarError
+from lidarsim.words import join_names, list_names, plural
+from lidarsim.worlds.frame_tree import FrameTree
+
+from ..playback.dds import CLOCK_TOPIC, RosPublisher, RosSubscriber
+from .followed_sensor import FollowedSensor
+from .notices import MAX_NAMES, Notices
+from .pose_input import PoseInput, is_wanted
+from .world_files import FollowedWorld, ModelFolder
+
+_MAX_SPEED_M_S = 100.0  # frames that move faster jump
+_MAX_CLOCK_STEP_NS = 1_000_000_000  # a larger step of the clock is a jump
+_SETTLE_NS = 2_000_000_000  # simulation time after which missing poses are reported
+_QUIET_S = 5.0  # time without a clock message after which a notice is shown
+_POLL_S = 0.05
+
+
+@dataclass(frozen=True)
+class FollowOptions:
+    """Options of `FollowNode`.
+
+    Attributes
+    ----------
+    world_frames
+        Names of frames that coincide with the world frame.
+    vanish_after_s
+        Simulation time in seconds after which a body vanishes if the poses of its frames are no
+        longer received. If it is 0, bodies never vanish.
+    """
+
+    world_frames: tuple[str, ...] = ("world", "map")
+    vanish_after_s: float = 1.0
+
+
+class FollowNode:
+    """Publishes the sweeps of sensors in a world that a simulator moves.
+
+    The node receives the clock and the poses of frames. A sweep is simulated as soon as the clock
+    has passed its end, and the poses of all frames that move have been received up to its end. If
+    poses are missing, the sweep is simulated one sweep later with the last poses.
+
+    Parameters
+    ----------
+    followed
+        World and robots.
+    models
+        Models that the simulator can spawn.
+    sensors
+        Sensors, all of which have the same world.
+    publisher
+        Connection to the network.
+    note
+        Function that shows a notice.
+    options
+        Further options.
+    """
+
+    def __init__(
+        self,
+        followed: FollowedWorld,
+        models: ModelFolder,
+        sensors: Sequence[FollowedSensor],
+        publisher: RosPublisher,
+        note: Callable[[str], None],
+        options: FollowOptions = FollowOptions(),  # noqa: B008 - immutable
+    ) -> None:
+        self._world = followed.world
+        self._models = models
+        self._sensors = sensors
+        self._publisher = publisher
+        self._options = options
+        self._notices = Notices(note)
+        roots = {*options.world_frames, *followed.world.roots}
+        self._tree = FrameTree(followed.world.frames, roots, _MAX_SPEED_M_S)
+        self._poses = PoseInput(self._tree, self._notices)
+        self._poses.add_robots(followed.robots)
+        self._subscriber = RosSubscriber(publisher, is_wanted)
+        self._absent: set[str] = set()
+        self._examined: set[str] = set()  # received frames that were compared with the models
+        self._start_ns = 0  # simulation time at which the node started, or time jumped
+        self._clock_s = time.monotonic()  # when the last clock message arrived
+        self._ends_s: dict[FollowedSensor, float] = {}  # when the end of its sweep was reached
+        self.delays_s: list[float] = []  # time between the end of each sweep and its publication
+
+    @property
+    def description(self) -> str:
+        """Topics of the sensors, and the network. It is part of the "ready" message."""
+        topics = list_names([sensor.topic for sensor in self._sensors], MAX_NAMES)
+        network = self._publisher.network
+        return f"{topics} in ROS 2 domain {network.domain} on {network.address}"
+
+    @property
+    def summary(self) -> str:
+        """Number of published and skipped sweeps, and their delays."""
+        published = len(self.delays_s)
+        skipped = sum(sensor.skipped for sensor in self._sensors)
+        verb = "was" if published == 1 else "were"
+        text = f"{plural(published, 'sweep')} {verb} published"
+        if skipped:
+            text += f" and {skipped:,} skipped"
+        if published:
+            median, last = np.percentile(self.delays_s, (50, 99)) * 1e3
+            text += (
+                f". The delay after the end of a sweep was {median:.0f} ms (median) and "
+                f"{last:.0f} ms (99th percentile)"
+            )
+        return f"{text}."
+
+    def start(self) -> None:
+        """Build the scanners, and publish the frames of the sensors."""
+        for sensor in self._sensors:
+            sensor.prepare()
+            message = sensor.static_frame()
+            if message is not None:
+                self._publisher.publish(message)
+
+    def run(self, stopped: threading.Event) -> None:
+        """Follow the simulator until the event is set."""
+        while not stopped.is_set():
+            self.step()
+
+    def step(self, wait_s: float = _POLL_S) -> None:
+        """Receive messages, and simulate at most one sweep.
+
+        Parameters
+        ----------
+        wait_s
+            Time in seconds to wait for a message if no sweep is due.
+        """
+        for message in self._subscriber.receive(wait_s):
+            time_ns = self._poses.read(message)
+            if time_ns is not None:
+                self._set_clock(time_ns)
+        self._check_publishers()
+        if self._poses.clock_ns is None:
+            return
+        self._check_frames()
+        sensor = self._next_due()
+        if sensor is not None:
+            self._simulate(sensor)
+
+    def _set_clock(self, time_ns: int) -> None:
+        """Set the simulation time. Sweeps start again if it has jumped."""
+        last_ns = self._poses.clock_ns
+        self._poses.clock_ns = time_ns
+        self._clock_s = time.monotonic()
+        self._notices.clear("quiet")
+        if last_ns is None:
+            self._restart(time_ns)
+        elif time_ns < last_ns or time_ns > last_ns + _MAX_CLOCK_STEP_NS:
+            self._tree.restart(time_ns)
+            self._restart(time_ns)
+            direction = "back" if time_ns < last_ns else "ahead"
+            self._notices.show_event(
+                "time",
+                f"The simulation time jumped {direction} from {last_ns / 1e9:.3f} to "
+                f"{time_ns / 1e9:.3f} s. Sweeps start again.",
+            )
+        for sensor in self._sensors:
+            if sensor not in self._ends_s and time_ns >= sensor.span(sensor.number).end_ns:
+                self._ends_s[sensor] = self._clock_s
+
+    def _restart(self, time_ns: int) -> None:
+        """Let the sweeps of all sensors start at a time."""
+        self._start_ns = time_ns
+        self._absent.clear()
+        self._ends_s.clear()
+        for sensor in self._sensors:
+            sensor.restart(time_ns)
+
+    def _check_publishers(self) -> None:
+        """Show a notice if no clock, or more than one, is published."""
+        publishers = self._subscriber.publishers(CLOCK_TOPIC)
+        if publishers > 1:
+            self._notices.show(
+                "clocks",
+                f"{publishers} programs publish /clock. Stop all simulators but one, because the "
+                "time would jump between their clocks.",
+            )
+        else:
+            self._notices.clear("clocks")
+        if time.monotonic() - self._clock_s > _QUIET_S:
+            reason = "The simulator seems to be paused"
+            if not publishers:
+                reason = "No program publishes it. Start the simulator, and bridge its clock"
+            self._notices.show(
+                "quiet", f"No message on /clock for {_QUIET_S:g} s. {reason}. Waiting."
+            )
+
+    def _next_due(self) -> FollowedSensor | None:
+        """Return the sensor whose sweep ended first and can be simulated, or None.
+
+        Sweeps that are too late are skipped.
+        """
+        due = [sensor for sensor in self._sensors if self._is_due(sensor)]
+        return min(due, key=lambda sensor: sensor.span(sensor.number).end_ns, default=None)
+
+    def _is_due(self, sensor: FollowedSensor) -> bool:
+        """Return whether the next sweep of a sensor can be simulated."""
+        clock_ns = self._poses.clock_ns
+        assert clock_ns is not None
+        next_span = sensor.span(sensor.number + 1)
+        while clock_ns >= next_span.end_ns + (next_span.end_ns - next_span.start_ns):
+            sensor.number += 1
+            sensor.skipped += 1
+            self._ends_s.pop(sensor, None)
+            self._notices.show(
+                ("slow", sensor.name),
+                f"Sweeps of {sensor.name} are skipped, because the simulator runs faster than "
+                "they can be simulated. Reduce the real-time factor or the number of rays.",
+            )
+            next_span = sensor.span(sensor.number + 1)
+        span = sensor.span(sensor.number)
+        if clock_ns < span.end_ns:
+            return False
+        self._ends_s.setdefault(sensor, self._clock_s)
+        behind = self._behind(sensor)
+        deadline_ns = span.end_ns + (next_span.start_ns - span.start_ns)
+        if behind and clock_ns < deadline_ns:
+            return False
+        self._notices.show_names(
+            "rare",
+            behind,
+            "Poses of {names} arrive later than the end of the next sweep. The last poses are "
+            "used instead. Publish poses at least once per sweep.",
+        )
+        return True
+
+    def _behind(self, sensor: FollowedSensor) -> list[str]:
+        """Return the frames whose poses have not been received up to the end of a sweep.
+
+        Frames whose poses were not received during a whole sweep are omitted, because they no
+        longer move.
+        """
+        span = sensor.span(sensor.number)
+        length_ns = span.end_ns - span.start_ns
+        frames = {body.frame for body in self._world.bodies if body.name not in self._absent}
+        live = self._tree.live(self._carriers([*frames, sensor.frame]))
+        return [
+            name
+            for name, last_ns in live.items()
+            if span.start_ns - length_ns <= last_ns < span.end_ns
+        ]
+
+    def _carriers(self, frames: Iterable[str]) -> set[str]:
+        """Return frames together with all frames that carry them."""
+        return {name for frame in frames for name in self._tree.chain(frame) or ()}
+
+    def _simulate(self, sensor: FollowedSensor) -> None:
+        """Simulate and publish the next sweep of a sensor."""
+        end_s = self._ends_s.pop(sensor, self._clock_s)
+        if missing := sensor.missing_frame(self._tree):
+            sensor.number += 1
+            self._notices.show(
+                ("missing", sensor.name),
+                f"The frame {missing} of the sensor {sensor.name} has no pose. Nothing is "
+                "published until it is received.",
+            )
+            return
+        self._notices.clear(("missing", sensor.name))
+        try:
+            messages = sensor.simulate(self._tree, self._absent)
+        except LidarError as error:
+            sensor.number += 1
+            self._notices.show(
+                ("failed", str(error)),
+                f"A sweep of {sensor.name} could not be simulated. {error}",
+            )
+            return
+        for message in messages:
+            self._publisher.publish(message)
+        self.delays_s.append(time.monotonic() - end_s)
+        starts_ns = [other.span(other.number).start_ns for other in self._sensors]
+        self._tree.drop_before(min(starts_ns))
+
+    def _check_frames(self) -> None:
+        """Add models that were spawned, remove those that vanished, and report missing poses."""
+        new = [frame for frame in self._tree.received if frame not in self._examined]
+        for frame in new:
+            self._examined.add(frame)
+            if frame not in self._world.frames:
+                self._add_model(frame)
+        self._update_absent()
+        clock_ns = self._poses.clock_ns
+        assert clock_ns is not None
+        if clock_ns - self._start_ns > _SETTLE_NS:
+            self._report_frames()
+
+    def _add_model(self, frame: str) -> None:
+        """Add the model of an unknown frame to the world if there is one."""
+        try:
+            found = self._models.find(frame)
+            if found is None:
+                return
+            name, model = found
+            if name in self._world.frames:
+                return
+            world = self._world.with_world(model.world)
+        except (LidarError, OSError) as error:
+            self._notices.show(("model", frame), f"The model of {frame} cannot be added. {error}")
+            return
+        self._world = world
+        self._tree.add_frames(model.world.frames)
+        self._poses.add_robots(model.robots)
+        for sensor in self._sensors:
+            sensor.world = world
+        self._notices.show(("added", name), f"{name} was added to the world.")
+
+    def _update_absent(self) -> None:
+        """Determine the bodies whose frames are no longer received."""
+        limit_ns = self._options.vanish_after_s * 1e9
+        clock_ns = self._poses.clock_ns
+        last_ns = self._poses.last_ns
+        if not limit_ns or clock_ns is None or last_ns is None or clock_ns - last_ns > limit_ns / 2:
+            return  # no poses are received at all
+        absent = set()
+        for body in self._world.bodies:
+            live = self._tree.live(self._tree.chain(body.frame) or ())
+            if live and max(live.values()) < clock_ns - limit_ns:
+                absent.add(body.name)
+        for name in sorted(absent - self._absent):
+            self._notices.clear(("back", name))
+            self._notices.show(
+                ("gone", name),
+                f"{name} vanished, because no poses were received for "
+                f"{self._options.vanish_after_s:g} s.",
+            )
+        for name in sorted(self._absent - absent):
+            self._notices.clear(("gone", name))
+            self._notices.show(("back", name), f"{name} is back.")
+        self._absent = absent
+
+    def _report_frames(self) -> None:
+        """Show notices about bodies without poses, and about frames that are unknown."""
+        received = self._tree.received
+        without = [
+            body.name
+            for body in self._world.bodies
+            if body.is_static is False
+            and not any(name in received for name in self._world.carriers(body.frame))
+        ]
+        self._notices.show_names(
+            "still",
+            without,
+            "No poses were received for {names}. They stay at their poses in the file.",
+        )
+        own = {sensor.published_frame for sensor in self._sensors}
+        unknown = [name for name in received if self._tree.chain(name) is None and name not in own]
+        if unknown:
+            roots = sorted(self._tree.parents - {*received} - {*self._world.frames})
+            self._notices.show_names(
+                "loose",
+                unknown,
+                "These frames are not connected to the world: {names}. Their outermost frames are "
+                f"{join_names(roots[:MAX_NAMES])}. If one of them coincides with the world, pass "
+                f"`--world-frame {roots[0] if roots else 'NAME'}`.",
+            )
+        known = {*self._world.frames, *own, *self._tree.parents}
+        known |= {sensor.frame for sensor in self._sensors}
+        without_mesh = [
+            name for name in received if name not in known and name not in unknown
+        ]
+        self._notices.show_names(
+            "unknown",
+            without_mesh,
+            "The world has no objects for these frames, so the sensors do not see them: {names}. "
+            "If they are models, pass their folder as `--models`.",
+        )

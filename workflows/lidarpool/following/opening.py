@@ -1,0 +1,90 @@
+"""Open the node that follows a simulator, given the files of its world and its sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from lidarsim.errors import LidarError
+
+from ..clouds.frame_names import frame_names
+from ..clouds.writing import ExportSpec
+from ..playback.dds import Network, RosPublisher
+from ..scenario.sensors_file import SensorOnFrame, SensorsFile
+from .followed_sensor import FollowedSensor
+from .node import FollowNode, FollowOptions
+from .world_files import FollowedWorld, ModelFolder, load_followed_world
+
+
+class FollowSources(NamedTuple):
+    """Files of a world and its sensors, and the layout of the messages."""
+
+    world: Path
+    sensors: Path | None  # None for the sensors of a scenario
+    models: Path | None = None  # folder of the models that can be spawned
+    assets: Path | None = None  # additional folder with files of the world
+    layout: str = "velodyne"
+    organized: bool = False
+
+
+@contextmanager
+def open_node(
+    sources: FollowSources,
+    to: Sequence[str],
+    options: FollowOptions,
+    note: Callable[[str], None],
+) -> Iterator[FollowNode]:
+    """Read the files, connect to the network, and yield the node.
+
+    Parameters
+    ----------
+    sources
+        Files and layout.
+    to
+        Addresses of other machines with the simulator or subscribers.
+    options
+        Options of the node.
+    note
+        Function that shows a notice.
+
+    Raises
+    ------
+    LidarError
+        If a file cannot be read, or if the network cannot be used.
+    """
+    followed = load_followed_world(sources.world, sources.assets, note)
+    models = ModelFolder(sources.models, note)
+    spec = ExportSpec("mcap", sources.layout, organized=sources.organized)
+    sensors = _open_sensors(sources, followed, spec)
+    with RosPublisher(Network.for_hosts(to)) as publisher:
+        yield FollowNode(followed, models, sensors, publisher, note, options)
+
+
+def _open_sensors(
+    sources: FollowSources, followed: FollowedWorld, spec: ExportSpec
+) -> list[FollowedSensor]:
+    """Return the sensors of the sensor file or of the scenario."""
+    if sources.sensors is not None:
+        file = SensorsFile.load(sources.sensors)
+    elif followed.sensors is not None:
+        file = followed.sensors
+    else:
+        raise LidarError(
+            f"{sources.world} contains no sensors of lidarpool. Pass a file with sensors as "
+            "`--sensors`."
+        )
+    sensors = [_with_materials(sensor, followed) for sensor in file.sensors_on_frames()]
+    frames = frame_names([sensor.mounted.name for sensor in sensors], ())
+    return [
+        FollowedSensor(sensor, frame, followed.world, spec)
+        for sensor, frame in zip(sensors, frames, strict=False)
+    ]
+
+
+def _with_materials(sensor: SensorOnFrame, followed: FollowedWorld) -> SensorOnFrame:
+    """Return a sensor whose materials are followed by those of the world."""
+    own = sensor.options["materials"]
+    materials = own if own == followed.materials else (*own, *followed.materials)
+    return sensor._replace(options={**sensor.options, "materials": materials})

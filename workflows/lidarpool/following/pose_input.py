@@ -1,0 +1,212 @@
+"""Poses of frames, as received from a simulator."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Sequence
+from typing import Any
+
+from rosbags.serde import SerdeError
+
+from lidarscenes.robots.robot_world import joint_matrix
+from lidarsim.words import format_rounded
+from lidarsim.worlds.frame_tree import FrameTree, pose_of
+from lidarsim.worlds.world import WORLD
+
+from ..clouds.ros.messages import message_store
+from ..playback.dds import CLOCK_TOPIC, ReceivedMessage
+from .notices import Notices
+from .world_files import RobotFrames
+
+CLOCK = "rosgraph_msgs/msg/Clock"
+_TRANSFORMS = "tf2_msgs/msg/TFMessage"
+_JOINTS = "sensor_msgs/msg/JointState"
+_STAMPED_TRANSFORM = "geometry_msgs/msg/TransformStamped"
+_STAMPED_POSE = "geometry_msgs/msg/PoseStamped"
+_POSE = "geometry_msgs/msg/Pose"
+_MODEL_POSE = re.compile(r"/model/(.+)/pose(_static)?")
+_TOPICS = {
+    CLOCK_TOPIC: CLOCK,
+    "/tf": _TRANSFORMS,
+    "/tf_static": _TRANSFORMS,
+    "/joint_states": _JOINTS,
+}
+_MODEL_POSES = (_TRANSFORMS, _STAMPED_TRANSFORM, _STAMPED_POSE, _POSE)
+# Poses whose time differs more from the clock are ignored.
+_MAX_AHEAD_NS = 1_000_000_000
+_MAX_BEHIND_NS = 10_000_000_000
+
+
+def is_wanted(topic: str, kind: str) -> bool:
+    """Return whether messages of a topic contain the time or poses."""
+    if topic in _TOPICS:
+        return kind == _TOPICS[topic]
+    return kind in _MODEL_POSES and _MODEL_POSE.fullmatch(topic) is not None
+
+
+def nanoseconds(time: Any) -> int:
+    """Convert a time message to nanoseconds."""
+    return int(time.sec) * 1_000_000_000 + int(time.nanosec)
+
+
+def frame_name(name: str) -> str:
+    """Convert a frame name to the form in which worlds state it.
+
+    Examples
+    --------
+    >>> frame_name("/robot::base_link")
+    'robot/base_link'
+    """
+    return name.replace("::", "/").strip("/")
+
+
+class PoseInput:
+    """Adds the poses in messages to a frame tree.
+
+    Parameters
+    ----------
+    tree
+        Frame tree to which poses are added.
+    notices
+        Notices about messages that cannot be used.
+    """
+
+    def __init__(self, tree: FrameTree, notices: Notices) -> None:
+        self._tree = tree
+        self._notices = notices
+        self._robots: list[RobotFrames] = []
+        self.clock_ns: int | None = None  # last time that was received
+        self.last_ns: int | None = None  # time of the last pose over time
+
+    def add_robots(self, robots: Sequence[RobotFrames]) -> None:
+        """Let joint values control the links of further robots."""
+        self._robots += robots
+
+    def read(self, message: ReceivedMessage) -> int | None:
+        """Add the poses in a message. Return the time if it is a clock message.
+
+        Messages that cannot be read cause a notice.
+        """
+        try:
+            content = message_store().deserialize_cdr(message.cdr, message.kind)
+        except (SerdeError, struct.error, ValueError, IndexError) as error:
+            self._notices.show(
+                ("damaged", message.topic),
+                f"A message on {message.topic} is damaged and was ignored ({error}).",
+            )
+            return None
+        if message.kind == CLOCK:
+            return nanoseconds(content.clock)
+        model = _MODEL_POSE.fullmatch(message.topic)
+        is_static = message.topic == "/tf_static"
+        if message.kind == _JOINTS:
+            self._add_joints(content)
+        elif message.kind == _TRANSFORMS:
+            for transform in content.transforms:
+                self._add_transform(transform, message.topic, "", is_static=is_static)
+        elif message.kind == _STAMPED_TRANSFORM and model is not None:
+            self._add_transform(content, message.topic, model[1])
+        elif model is not None:
+            header = content.header if message.kind == _STAMPED_POSE else None
+            pose = content if header is None else content.pose
+            parent = WORLD if header is None else frame_name(header.frame_id)
+            time_ns = 0 if header is None else nanoseconds(header.stamp)
+            self._add(
+                frame_name(model[1]), parent, time_ns, _values(pose.position, pose.orientation)
+            )
+        return None
+
+    def _add_transform(
+        self, stamped: Any, topic: str, default: str, *, is_static: bool = False
+    ) -> None:
+        """Add the pose in a TransformStamped."""
+        frame = frame_name(stamped.child_frame_id or default)
+        if not frame:
+            self._notices.show(
+                ("unnamed", topic),
+                f"Transforms on {topic} have no child_frame_id and are ignored. Bridge a topic of "
+                "Gazebo's PosePublisher, because pose/info contains no frame names.",
+            )
+            return
+        transform = stamped.transform
+        self._add(
+            frame,
+            frame_name(stamped.header.frame_id),
+            nanoseconds(stamped.header.stamp),
+            _values(transform.translation, transform.rotation),
+            is_static=is_static,
+        )
+
+    def _add_joints(self, state: Any) -> None:
+        """Convert joint values to poses of links."""
+        values = dict(zip(state.name, state.position, strict=False))
+        known = set()
+        for robot, prefix in ((item.robot, item.prefix) for item in self._robots):
+            for link, joint in robot.joints.items():
+                source, factor, offset = joint.name, 1.0, 0.0
+                if source not in values and joint.mimic is not None:
+                    source, factor, offset = joint.mimic
+                if source not in values or not joint.is_movable:
+                    continue
+                known.add(source)
+                matrix = joint_matrix(joint, factor * float(values[source]) + offset)
+                time_ns = nanoseconds(state.header.stamp)
+                self._add(prefix + link, prefix + joint.parent, time_ns, pose_of(matrix))
+        self._notices.show_names(
+            "joints",
+            [name for name in values if name not in known],
+            "These joints on /joint_states belong to no robot in a .urdf file, so they are "
+            "ignored: {names}.",
+        )
+
+    def _add(
+        self,
+        frame: str,
+        parent: str,
+        time_ns: int,
+        pose: Sequence[float],
+        *,
+        is_static: bool = False,
+    ) -> None:
+        """Add a pose, and show a notice if it is invalid or if the frame jumps."""
+        clock_ns = self.clock_ns
+        if not is_static and clock_ns is not None:
+            time_ns = time_ns or clock_ns
+            if not clock_ns - _MAX_BEHIND_NS <= time_ns <= clock_ns + _MAX_AHEAD_NS:
+                self._notices.show(
+                    ("clock", frame),
+                    f"Poses of {frame} are ignored, because their time differs from /clock by "
+                    f"{format_rounded((time_ns - clock_ns) / 1e9)} s. Set use_sim_time in the "
+                    "node that publishes them.",
+                )
+                return
+        try:
+            jump = self._tree.add(frame, parent, time_ns, pose, is_static=is_static)
+        except ValueError as error:
+            self._notices.show(
+                ("invalid", frame), f"A pose of {frame} is ignored, because {error}."
+            )
+            return
+        if not is_static:
+            self.last_ns = time_ns
+        if jump is not None:
+            self._notices.show(
+                ("jump", frame),
+                f"{frame} jumped by {format_rounded(jump.distance_m)} m within "
+                f"{format_rounded(jump.duration_s)} s. It is not moved in between. Further jumps "
+                "of this frame are not reported.",
+            )
+
+
+def _values(position: Any, rotation: Any) -> tuple[float, ...]:
+    """Return a position and a quaternion as seven numbers."""
+    return (
+        position.x,
+        position.y,
+        position.z,
+        rotation.x,
+        rotation.y,
+        rotation.z,
+        rotation.w,
+    )
