@@ -75,6 +75,7 @@ from .first_step import print_first_step
     help="Remove a model if no poses were received for this simulation time; 0 keeps it.",
 )
 def follow(
+    *,
     world: Path,
     sensors_file: Path | None,
     bridge_name: str,

@@ -27,6 +27,9 @@ from ..clouds.writing import ExportSpec, with_format_columns
 from ..scenario.sensors_file import SensorOnFrame
 
 
+_MAX_SPANS = 8  # spans that are kept
+
+
 class SweepSpan(NamedTuple):
     """Times of the first and the last beam of a sweep in simulation time."""
 
@@ -67,6 +70,8 @@ class FollowedSensor:
         self._options = {**options, "coordinates": "sensor"}
         self._scanner = WorldScanner(world, mounted, **self._options)
         self._sweeps: Sweeps | None = None  # placeholder whose times are replaced
+        # Spans of sweeps, relative to the origin. They are requested for each clock message.
+        self._spans: dict[int, SweepSpan] = {}
         self.origin_ns = 0  # simulation time at which sweep 0 starts
         self.number = 0  # index of the next sweep
         self.skipped = 0  # sweeps that were not simulated
@@ -99,10 +104,13 @@ class FollowedSensor:
 
     def span(self, number: int) -> SweepSpan:
         """Return the time span of a sweep."""
-        start_s, end_s = self._scanner.scanner.span_s(number)
-        return SweepSpan(
-            self.origin_ns + math.floor(start_s * 1e9), self.origin_ns + math.ceil(end_s * 1e9)
-        )
+        if number not in self._spans:
+            if len(self._spans) >= _MAX_SPANS:
+                self._spans.clear()
+            start_s, end_s = self._scanner.scanner.span_s(number)
+            self._spans[number] = SweepSpan(math.floor(start_s * 1e9), math.ceil(end_s * 1e9))
+        start_ns, end_ns = self._spans[number]
+        return SweepSpan(self.origin_ns + start_ns, self.origin_ns + end_ns)
 
     def static_frame(self) -> RosMessage | None:
         """Return a message with the pose of the sensor on its frame.

@@ -73,7 +73,7 @@ class FollowNode:
         sensors: Sequence[FollowedSensor],
         publisher: RosPublisher,
         note: Callable[[str], None],
-        options: FollowOptions = FollowOptions(),  # noqa: B008 - immutable
+        options: FollowOptions = FollowOptions(),
     ) -> None:
         self._world = followed.world
         self._models = models
@@ -368,9 +368,7 @@ class FollowNode:
             )
         known = {*self._world.frames, *own, *self._tree.parents}
         known |= {sensor.frame for sensor in self._sensors}
-        without_mesh = [
-            name for name in received if name not in known and name not in unknown
-        ]
+        without_mesh = [name for name in received if name not in known and name not in unknown]
         self._notices.show_names(
             "unknown",
             without_mesh,

@@ -88,6 +88,7 @@ class PoseInput:
 
         Messages that cannot be read cause a notice.
         """
+        content: Any
         try:
             content = message_store().deserialize_cdr(message.cdr, message.kind)
         except (SerdeError, struct.error, ValueError, IndexError) as error:

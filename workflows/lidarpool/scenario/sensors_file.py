@@ -122,9 +122,7 @@ class SensorsFile(Section):
             with mistakes.collect(), prefix_errors(self._source):
                 mount = self.mount if section is self.sensor else getattr(section, "mount", None)
                 pose = CENTER if mount is None else mount.pose()
-                mounted = section.mounted_sensor(
-                    self._path, pose, self.noise, self.returns, name
-                )
+                mounted = section.mounted_sensor(self._path, pose, self.noise, self.returns, name)
                 frame = mount.link if mount is not None and mount.link is not None else ""
                 sensors.append(SensorOnFrame(mounted, frame.strip("/"), self._options(mounted)))
         mistakes.raise_if_any()
@@ -149,4 +147,3 @@ class SensorsFile(Section):
             "returns": Returns(**dict(self.returns)),
             **declared_values(self.weather, Weather),
         }
-

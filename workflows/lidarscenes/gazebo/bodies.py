@@ -18,7 +18,7 @@ from lidarsim.scene.files.scene_graph import MAX_NODES
 from lidarsim.words import printable
 
 from ..files.lenient_xml import parse_lenient_xml
-from .frames import FrameGraph, RelativePose, placement_matrix, read_pose
+from .frames import FrameGraph, placement_matrix, read_pose
 from .notes import Notes
 from .resources import ResourceNotFoundError, Resources, Source, short_name
 
@@ -136,8 +136,8 @@ class BodyReader:
         nested = [*self._nested(body, element, source)]
         for name, child_body, is_static in nested:
             with prefix_errors(f"model {name!r}"):
-                child = PlacedModel(name, child_body, frames.matrix(name), is_static)
-                body.children.append(child)
+                placed = PlacedModel(name, child_body, frames.matrix(name), is_static)
+                body.children.append(placed)
 
     def _nested(
         self, body: GazeboBody, element: Element, source: Source
@@ -179,8 +179,9 @@ class BodyReader:
     ) -> tuple[str, GazeboBody, bool]:
         """Define the frame of a nested model.
 
-        Return the model's name, its body, and whether it is static. `posed` is the element whose <pose> applies, and `placing` may name the placement frame. If
-        the name is already used, the returned name has a number.
+        Return the model's name, its body, and whether it is static. `posed` is the element whose
+        <pose> applies, and `placing` may name the placement frame. If the name is already used, the
+        returned name has a number.
         """
         placement = _placement_frame(placing, posed)
         pose = read_pose(posed)

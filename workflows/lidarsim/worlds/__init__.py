@@ -4,5 +4,6 @@ The programs themselves are not imported.
 """
 
 from .mujoco_scanner import MujocoScanner
+from .world_follower import WorldFollower
 
-__all__ = ["MujocoScanner"]
+__all__ = ["MujocoScanner", "WorldFollower"]

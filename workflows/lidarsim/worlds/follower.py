@@ -6,8 +6,10 @@ The program passes the meshes of the bodies once, and their transformation matri
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +28,8 @@ from ..schema.checks import check_items
 from ..sensor import Sensor
 from ..simulator.scanner import Scanner
 from ..survey.survey import Mounted
+from .world import World
+from .world_follower import WorldFollower
 
 _SLACK_S = 1e-9  # tolerance for the time of the last beam of a sweep
 
@@ -109,6 +113,51 @@ class Follower:
         self._number = 0  # index of the current sweep
         # Times of the first and last beam of the current sweep, in seconds since the first step.
         self._span_s: tuple[float, float] | None = None
+
+    @classmethod
+    def from_world(
+        cls,
+        path: str | Path,
+        sensor: Sensor | Mounted,
+        *,
+        frame: str | None = None,
+        reading: Mapping[str, Any] = MappingProxyType({}),
+        **options: Any,
+    ) -> WorldFollower:
+        """Create a follower for a world file, whose bodies are moved by name.
+
+        Parameters
+        ----------
+        path
+            World or scene file that `Scene.load` reads, such as a Gazebo world (.sdf), a MuJoCo
+            model (.xml), or a .glb or .usd file.
+        sensor
+            The lidar, or a `Mounted` lidar on a frame.
+        frame
+            Name of the frame that carries the sensor, such as ``robot/lidar_link``. The sensor does
+            not see the body of this frame. By default, the sensor does not move.
+        reading
+            Options of `Scene.load`, such as ``{"assets": "models"}``.
+        **options
+            Options of `Scanner`, such as columns, noise, threads, and the names of `unseen` bodies.
+
+        Raises
+        ------
+        LidarError
+            If the file cannot be read, if the frame does not exist, or if an option of `Scanner` is
+            invalid.
+
+        Examples
+        --------
+        >>> from lidarpool import Follower, load_sensor
+        >>> sensor = load_sensor("velodyne/vlp16")
+        >>> follower = Follower.from_world(
+        ...     "house.sdf", sensor, frame="robot/lidar_link"
+        ... )  # doctest: +SKIP
+        >>> for time_s, poses in simulation:  # doctest: +SKIP
+        ...     clouds = follower.update(time_s, {"robot": poses["robot"]})
+        """
+        return WorldFollower(World.load(path, **reading), sensor, frame, **options)
 
     def __repr__(self) -> str:
         return f"<Follower of {len(self._bodies)} bodies: {self._frozen!r}>"

@@ -193,9 +193,7 @@ class FrameTree:
         """Return whether only the first of two parents leads to the world."""
         return self._leads(parent) and not self._leads(other)
 
-    def _jump(
-        self, frame: str, link: _Link, time_ns: int, pose: tuple[float, ...]
-    ) -> Jump | None:
+    def _jump(self, frame: str, link: _Link, time_ns: int, pose: tuple[float, ...]) -> Jump | None:
         """Return the jump between the last pose of a frame and a new one."""
         if self._max_speed_m_s is None or not link.times_ns:
             return None

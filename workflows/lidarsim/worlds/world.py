@@ -204,9 +204,7 @@ class World:
     def without_bodies(self, names: Iterable[str]) -> World:
         """Return a world that lacks some bodies. Their frames are kept."""
         removed = set(names)
-        return replace(
-            self, bodies=tuple(body for body in self.bodies if body.name not in removed)
-        )
+        return replace(self, bodies=tuple(body for body in self.bodies if body.name not in removed))
 
     def carriers(self, frame: str) -> tuple[str, ...]:
         """Return the names of a frame and of all frames that carry it in the file."""

@@ -128,7 +128,7 @@ class WorldFollower:
         if name in world.ambiguous:
             raise LidarError(f"The world has several frames with the name {name!r}. Rename them.")
         if name not in world.frames:
-            raise LidarError(f"The world has no frame {name!r}.{name_hint(name, world.frames)}")
+            raise LidarError(f"The world has no frame {name!r}.{name_hint(name, [*world.frames])}")
 
     def _checked_matrix(self, name: str, pose: ArrayLike) -> Floats:
         self._check_name(name, self._scanner.world)

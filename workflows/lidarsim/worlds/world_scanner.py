@@ -133,10 +133,7 @@ class WorldScanner:
         if moving:
             held = (len(times_s), 4, 4)
             matrices = np.array(
-                [
-                    body_poses.get(body.name, np.broadcast_to(body.matrix, held))
-                    for body in moving
-                ]
+                [body_poses.get(body.name, np.broadcast_to(body.matrix, held)) for body in moving]
             )
             matrices[..., :3, 3] -= origin
             scanner.move([body.name for body in moving], matrices, times_s=times_s)
@@ -218,9 +215,7 @@ def _matches_any(pattern: str, names: Collection[str]) -> bool:
     return pattern in names or any(fnmatchcase(name, pattern) for name in names)
 
 
-def _matching_materials(
-    materials: Collection[Material], names: Collection[str]
-) -> list[Material]:
+def _matching_materials(materials: Collection[Material], names: Collection[str]) -> list[Material]:
     """Return the materials that apply to at least one object, without their other patterns."""
     matching = []
     for material in materials:
@@ -232,4 +227,3 @@ def _matching_materials(
         if used:
             matching.append(replace(material, objects=used))
     return matching
-

@@ -1,0 +1,520 @@
+"""`lidarpool follow` beside a stand-in for a simulator; tests skip without cyclonedds."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from tests import simulators
+from tests.simulators import clock, joint_states, transforms
+
+from lidarpool import LidarError, Pose, Scanner, Scene, Sensor, load_sensor
+from lidarpool.cli.follow_command import follow
+from lidarpool.clouds.ros.messages import RosMessage, message_store
+from lidarpool.scenario.sensors_file import SensorsFile
+
+DOMAIN = 100 + os.getpid() % 100  # so that tests at the same time do not meet
+ROOM = """
+<sdf version="1.9"><world name="room">
+  <include><uri>model://ground_plane</uri></include>
+  <model name="crate"><pose>3 0 0.5 0 0 0</pose>
+    <link name="link"><visual name="visual"><geometry><box><size>1 2 1</size></box></geometry>
+    </visual></link></model>
+  <model name="robot"><pose>0 0 0.2 0 0 0</pose>
+    <link name="base"><visual name="visual"><geometry><box><size>.4 .4 .2</size></box></geometry>
+    </visual></link>
+    <link name="lidar"><pose>0 0 0.3 0 0 0</pose></link></model>
+</world></sdf>
+"""
+SENSORS = """
+sensors:
+  roof:
+    model: velodyne/vlp16
+    mount: {link: robot/lidar}
+"""
+STILL = [("robot", "room", (0, 0, 0.2), 0.0), ("crate", "room", (3, 0, 0.5), 0.0)]
+
+
+@pytest.fixture(autouse=True)
+def dds(monkeypatch) -> Any:
+    """The module that publishes; tests skip without cyclonedds."""
+    pytest.importorskip("cyclonedds.core")
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(DOMAIN))
+    from lidarpool.playback import dds
+
+    return dds
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    (tmp_path / "room.sdf").write_text(ROOM)
+    (tmp_path / "sensors.yaml").write_text(SENSORS)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+class Loop:
+    """A node and a simulator in one process, in step with each other."""
+
+    def __init__(self, world: str, sensors: str | None = "sensors.yaml", **settings: Any) -> None:
+        from lidarpool.following.node import FollowOptions
+        from lidarpool.following.opening import FollowSources, open_node
+
+        options = {name: settings.pop(name) for name in [*settings] if name in FOLLOW_OPTIONS}
+        files = {name: Path(settings.pop(name)) for name in ("models",) if name in settings}
+        sources = FollowSources(
+            Path(world), None if sensors is None else Path(sensors), **files, **settings
+        )
+        self.notes: list[str] = []
+        self._context = open_node(sources, (), FollowOptions(**options), self.notes.append)
+        self.node = self._context.__enter__()
+        self.publisher = self.node._publisher
+        self.sweeps: list[Sweep] = []
+        self._publish = self.publisher.publish
+        self.publisher.publish = self._record
+        self.node.start()
+
+    def __enter__(self) -> Loop:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._context.__exit__(None, None, None)
+
+    def send(self, *messages: RosMessage) -> None:
+        for message in messages:
+            self.publisher.publish(message)
+            if not self.node._subscriber.publishers(message.topic):  # nobody has read it
+                while not self.node._subscriber.publishers(message.topic):
+                    self.node.step(0.01)
+                self.publisher.publish(message)
+
+    def play(self, frames: Any, start_s: float, stop_s: float, rate_hz: float = 50) -> None:
+        """Publish poses and the clock, and let the node do what is due after each step."""
+        for number in range(round((stop_s - start_s) * rate_hz) + 1):
+            time_s = start_s + number / rate_hz
+            self.send(transforms(time_s, frames(time_s)), clock(time_s))
+            self.until_clock(time_s)
+
+    def until_clock(self, time_s: float) -> None:
+        """Wait until the node knows a time, and has published what was due."""
+        stop = time.monotonic() + 60
+        while self.node._poses.clock_ns != round(time_s * 1e9):
+            self.step()
+            assert time.monotonic() < stop, "the clock did not arrive"
+        sent = -1
+        while sent != len(self.node.delays_s):
+            sent = len(self.node.delays_s)
+            self.step()
+
+    def step(self) -> None:
+        self.node.step(0.01)
+
+    def _record(self, message: RosMessage) -> None:
+        """Publish a message, and keep it if it is that of a sensor."""
+        self._publish(message)
+        if message.topic.endswith(("points", "scan", "livox")):
+            content = message_store().deserialize_cdr(message.cdr, message.kind)
+            self.sweeps.append(Sweep(message.topic, content, self.node._poses.clock_ns))
+
+    def clouds(self, topic: str = "/roof/points") -> list[Sweep]:
+        return [sweep for sweep in self.sweeps if sweep.topic == topic]
+
+
+FOLLOW_OPTIONS = ("world_frames", "vanish_after_s")
+
+
+class Sweep:
+    """A received message of a sensor."""
+
+    def __init__(self, topic: str, content: Any, clock_ns: int) -> None:
+        self.topic = topic
+        self.content = content
+        self.clock_s = clock_ns / 1e9
+        stamp = content.header.stamp
+        self.stamp_s = stamp.sec + stamp.nanosec / 1e9
+
+    def column(self, name: str) -> Any:
+        (field,) = (field for field in self.content.fields if field.name == name)
+        rows = np.frombuffer(self.content.data, np.uint8).reshape(-1, self.content.point_step)
+        kind = {4: "<u2", 6: "<u4", 7: "<f4", 8: "<f8"}[field.datatype]
+        size = np.dtype(kind).itemsize
+        return rows[:, field.offset : field.offset + size].copy().view(kind)[:, 0]
+
+    @property
+    def points(self) -> Any:
+        return np.stack([self.column(name) for name in "xyz"], axis=1)
+
+
+def test_a_still_world_is_that_of_a_scanner_bit_for_bit(folder):
+    with Loop("room.sdf") as loop:
+        loop.play(lambda _: STILL, 20, 20.5)
+        notes = loop.notes
+    clouds = loop.clouds()
+    assert len(clouds) == 4 and notes == []
+    scanner = Scanner(
+        Scene.load("room.sdf"),
+        load_sensor("velodyne/vlp16"),
+        name="roof",
+        coordinates="sensor",
+        columns=["intensity", "time"],
+    )
+    for number, cloud in enumerate(clouds):
+        expected = scanner.sweep(Pose((0, 0, 0.5)), number=number)
+        assert len(expected) > 10_000
+        assert cloud.points.tobytes() == expected.positions.astype("<f4").tobytes()
+        assert cloud.column("intensity").tobytes() == expected["intensity"].tobytes()
+        assert cloud.column("ring").tolist() == expected["channel"].tolist()
+        assert cloud.content.header.frame_id == "roof"
+        start_s, end_s = scanner.span_s(number)
+        assert abs(cloud.stamp_s - (20 + start_s)) < 1e-6
+        assert cloud.clock_s - (20 + end_s) < 0.1  # at most one sweep late
+
+
+def test_points_are_on_a_moving_body_where_it_is_when_they_are_measured(folder):
+    def frames(time_s):
+        return [*STILL[:1], ("crate", "room", (3 + 2 * (time_s - 10), 0, 0.5), 0.0)]
+
+    with Loop("room.sdf") as loop:
+        loop.play(frames, 10, 10.5)
+    assert len(loop.clouds()) == 4
+    for cloud in loop.clouds():
+        x, y, z = cloud.points.T.astype(float)
+        since_s = cloud.stamp_s - 10 + cloud.column("time")
+        front = (np.abs(y) < 0.95) & (x > 1) & (np.abs(z) < 0.45)
+        front &= x < 2.5 + 2 * since_s + 0.5
+        assert front.sum() > 200
+        assert np.abs(x[front] - (2.5 + 2 * since_s[front])).max() < 0.002
+
+
+def test_points_are_in_the_frame_of_the_sensor_at_their_firing_times(folder):
+    (folder / "room.sdf").write_text(
+        ROOM.replace(
+            '<model name="crate">',
+            '<model name="wall"><static>true</static><pose>8 0 0 0 0 0</pose><link name="link">'
+            '<visual name="visual"><geometry><box><size>0.2 60 20</size></box></geometry></visual>'
+            '</link></model><model name="crate">',
+        )
+    )
+
+    def frames(time_s):
+        moved = ("robot", "room", (3 * (time_s - 5), 0, 0.2), 60 * (time_s - 5))
+        return [moved, ("crate", "room", (0, 50, 0.5), 0.0)]
+
+    with Loop("room.sdf") as loop:
+        loop.play(frames, 5, 5.5)
+    assert len(loop.clouds()) == 4
+    for cloud in loop.clouds():
+        since_s = cloud.stamp_s - 5 + cloud.column("time").astype(float)
+        yaw = np.radians(60 * since_s)
+        x, y, z = cloud.points.T.astype(float)
+        world_x = np.cos(yaw) * x - np.sin(yaw) * y + 3 * since_s
+        world_y = np.sin(yaw) * x + np.cos(yaw) * y
+        on_wall = (np.abs(world_y) < 20) & (world_x > 4) & (z > -0.3)
+        assert on_wall.sum() > 1000
+        assert np.abs(world_x[on_wall] - 7.9).max() < 0.003
+
+
+def test_pause_reset_and_jumps_of_time(folder):
+    with Loop("room.sdf") as loop:
+        loop.play(lambda _: STILL, 30, 30.3)
+        for _ in range(20):  # a pause: nothing is due
+            loop.step()
+        assert len(loop.clouds()) == 2
+        loop.play(lambda _: STILL, 30.32, 30.5)
+        assert len(loop.clouds()) == 4
+        moved = [STILL[0], ("crate", "room", (2, 0, 0.5), 0.0)]
+        loop.play(lambda _: moved, 0.1, 0.4)  # the world is reset
+        assert len(loop.clouds()) == 6
+        loop.play(lambda _: moved, 50, 50.3)  # and jumps ahead
+        clouds = loop.clouds()
+    assert [round(cloud.stamp_s, 1) for cloud in clouds[4:]] == [0.1, 0.2, 50.0, 50.1]
+    for cloud in clouds[4:]:
+        x, y, z = cloud.points.T
+        front = (np.abs(y) < 0.9) & (x > 1) & (np.abs(z) < 0.4)
+        assert np.allclose(x[front], 1.5, atol=0.002) and front.sum() > 200
+    assert sum("jumped back from 30.500 to 0.100 s" in note for note in loop.notes) == 1
+
+
+def crate_model(folder: Path) -> None:
+    (folder / "models" / "box").mkdir(parents=True)
+    (folder / "models" / "box" / "model.sdf").write_text(
+        '<sdf version="1.9"><model name="box"><link name="link"><pose>0 0 0.5 0 0 0</pose>'
+        '<visual name="visual"><geometry><box><size>1 1 1</size></box></geometry></visual>'
+        "</link></model></sdf>"
+    )
+
+
+def test_models_that_are_spawned_and_deleted(folder):
+    crate_model(folder)
+
+    def frames(time_s):
+        spawned = [("box_7", "room", (0, 4, 0), 0.0), ("pallet", "room", (0, -4, 0), 0.0)]
+        return STILL + spawned * (12 <= time_s < 14 or time_s >= 16)
+
+    with Loop("room.sdf", models="models") as loop:
+        loop.play(frames, 11, 17)
+        notes = loop.notes
+    hits = {}
+    for cloud in loop.clouds():
+        x, y, z = cloud.points.T
+        face = (np.abs(x) < 0.45) & (y > 3) & (y < 4) & (z > -0.4)
+        assert np.allclose(y[face], 3.5, atol=0.002)
+        hits[round(cloud.stamp_s, 1)] = face.sum()
+    assert len(hits) >= 55
+    assert all(count == 0 for stamp, count in hits.items() if stamp < 11.9 or 15.1 < stamp < 15.9)
+    assert all(count > 50 for stamp, count in hits.items() if 12.1 < stamp < 14 or stamp > 16.1)
+    assert "box_7 was added to the world." in notes
+    assert any(note.startswith("box_7/link vanished, because") for note in notes)
+    assert "box_7/link is back." in notes
+    assert any("no objects for these frames" in note and "pallet" in note for note in notes)
+
+
+ROBOT = """
+<robot name="arm">
+  <link name="base"/>
+  <link name="plate"><visual><origin xyz="2 0 0"/><geometry><box size="0.1 1 1"/></geometry>
+  </visual></link>
+  <link name="mast"/>
+  <joint name="turn" type="continuous"><parent link="base"/><child link="plate"/>
+    <origin xyz="0 0 1"/><axis xyz="0 0 1"/></joint>
+  <joint name="lift" type="prismatic"><parent link="base"/><child link="mast"/>
+    <axis xyz="0 0 1"/><limit lower="0" upper="2" effort="1" velocity="1"/></joint>
+</robot>
+"""
+
+
+def test_joint_states_move_the_links_of_a_robot(folder):
+    (folder / "arm.urdf").write_text(ROBOT)
+    (folder / "sensors.yaml").write_text(SENSORS.replace("robot/lidar", "mast"))
+    with Loop("arm.urdf") as loop:
+        for number in range(26):
+            time_s = 3 + number / 50
+            joints = {"turn": 0.8 * (time_s - 3), "lift": 1.0, "wheel": 3.0}
+            loop.send(joint_states(time_s, joints), clock(time_s))
+            loop.until_clock(time_s)
+    assert len(loop.clouds()) == 4
+    for cloud in loop.clouds():
+        angle = 0.8 * (cloud.stamp_s - 3 + cloud.column("time").astype(float))
+        x, y, z = cloud.points.T.astype(float)
+        assert len(x) > 100
+        depth = np.cos(angle) * x + np.sin(angle) * y
+        assert np.abs(depth - 1.95).max() < 0.003
+        assert np.abs(z).max() < 0.51
+    assert any("belong to no robot in a .urdf file" in note and "wheel" in note
+               for note in loop.notes)  # fmt: skip
+
+
+def test_the_actors_of_a_scenario_follow_their_frames(folder):
+    (folder / "scan.yaml").write_text("""
+scene: {ground: {}, files: [room.sdf]}
+actors: [{name: van, box: [4, 2, 2], at: [10, 0, 0]}]
+sensor: velodyne/vlp16
+mount: [0, 0, 1]
+""")
+
+    def frames(time_s):
+        return [("van", "map", (10 + time_s, 8, 0), 90.0)]
+
+    with Loop("scan.yaml", sensors=None) as loop:
+        loop.play(frames, 0, 0.3)
+    clouds = loop.clouds("/points")
+    assert len(clouds) == 2
+    x, y, z = clouds[1].points.T
+    face = (np.abs(x - 10.2) < 0.5) & (y > 5) & (np.abs(z) < 0.5)
+    assert face.sum() > 10 and np.allclose(y[face], 6, atol=0.002)
+
+
+def test_planar_and_livox_sensors_have_their_messages(folder):
+    (folder / "sensors.yaml").write_text("""
+sensors:
+  nose: {rays_per_revolution: 90, layers: 1, vertical_fov_deg: 0, rate_hz: 10, max_range_m: 30}
+  top: {model: livox/mid360, mount: [0, 0, 1]}
+""")
+    with Loop("room.sdf", layout="livox") as loop:
+        loop.play(lambda _: STILL, 0, 0.3)
+    scans = [sweep.content for sweep in loop.sweeps if sweep.topic == "/nose/scan"]
+    custom = [sweep.content for sweep in loop.sweeps if sweep.topic == "/top/livox"]
+    assert len(scans[0].ranges) == 90 and 2.4 < min(scans[0].ranges) < 2.6
+    assert custom[0].point_num == len(custom[0].points) > 1000
+    assert custom[0].__msgtype__ == "livox_ros_driver2/msg/CustomMsg"
+
+
+def notes_of(loop: Loop, part: str) -> list[str]:
+    return [note for note in loop.notes if part in note]
+
+
+def test_what_is_missing_or_wrong_is_stated_once_and_the_node_goes_on(folder):
+    def frames(time_s):
+        far = 500.0 if time_s > 41 else 0.0
+        return [
+            ("robot", "room", (far, 0, 0.2), 0.0),
+            ("base_link", "odom", (1, 0, 0), 0.0),
+            ("", "room", (1, 0, 0), 0.0),
+        ]
+
+    from lidarpool.playback.dds import ReceivedMessage
+
+    with Loop("room.sdf") as loop:
+        # cyclonedds does not pass on damaged messages, but other versions might.
+        damaged = ReceivedMessage("/tf", "tf2_msgs/msg/TFMessage", b"\0\1\0\0\xff\0\0\0")
+        loop.node._poses.read(damaged)
+        loop.send(transforms(1.7e9, [("wheel", "robot", (1, 0, 0), 0.0)]))
+        loop.send(transforms(0, [("plate", "robot", (np.nan, 0, 0), 0.0)]))
+        loop.play(frames, 40, 43)
+        ignored = notes_of(loop, "is damaged and was ignored")
+        still = notes_of(loop, "No poses were received for crate/link")
+        loose = notes_of(loop, "not connected to the world: base_link")
+        jumps = notes_of(loop, "robot jumped by 500 m within 0.02 s")
+        unnamed = notes_of(loop, "no child_frame_id")
+        invalid = notes_of(loop, "A pose of plate is ignored")
+    assert [len(x) for x in (ignored, still, loose, jumps, unnamed, invalid)] == [1] * 6, loop.notes
+    assert "`--world-frame odom`" in loose[0]
+    assert len(loop.clouds()) >= 28
+    lengths = [len(cloud.points) for cloud in loop.clouds()]
+    assert lengths[0] > 10_000 and lengths[-1] == 0  # the ground ends after 50 m
+
+
+def test_poses_of_another_clock_are_stated(folder):
+    with Loop("room.sdf") as loop:
+        loop.play(lambda _: STILL, 0, 0.1)
+        loop.send(transforms(1.7e9, [("crate", "room", (2, 0, 0.5), 0.0)]))
+        loop.play(lambda _: STILL, 0.12, 0.3)
+    assert notes_of(loop, "Poses of crate are ignored, because their time differs from /clock by")
+
+
+def test_poses_that_are_rare_are_stated_and_held(folder):
+    with Loop("room.sdf") as loop:
+        for number in range(60):
+            time_s = 5 + number / 50
+            if number % 14 == 0:
+                loop.send(transforms(time_s, STILL))
+            loop.send(clock(time_s))
+            loop.until_clock(time_s)
+    assert notes_of(loop, "Poses of")
+    assert "arrive later than the end of the next sweep" in notes_of(loop, "Poses of")[0]
+    assert len(loop.clouds()) >= 9
+
+
+def test_a_sensor_whose_frame_is_not_known_waits(folder):
+    (folder / "sensors.yaml").write_text(SENSORS.replace("robot/lidar", "drone/lidar"))
+    with Loop("room.sdf") as loop:
+        loop.play(lambda _: STILL, 0, 0.3)
+        assert not loop.clouds()
+        assert notes_of(loop, "The frame drone/lidar of the sensor roof has no pose")
+        loop.play(lambda _: [*STILL, ("drone/lidar", "room", (0, 0, 2), 0.0)], 0.32, 0.7)
+        assert loop.clouds()
+
+
+def test_a_model_topic_and_a_flood_of_poses(folder):
+    types = message_store().types
+    with Loop("room.sdf") as loop:
+        for number in range(16):
+            time_s = 1 + number / 50
+            point = types["geometry_msgs/msg/Point"](2.0, 0.0, 0.5)
+            pose = types["geometry_msgs/msg/Pose"](point, simulators.quaternion(0))
+            loop.send(simulators.message("/model/crate/pose", pose))
+            for k in range(300):
+                loop.send(transforms(time_s + k * 5e-5, STILL[:1]))
+            loop.send(clock(time_s))
+            loop.until_clock(time_s)
+    assert len(loop.clouds()) >= 2
+    x, y, z = loop.clouds()[-1].points.T
+    front = (np.abs(y) < 0.9) & (x > 1) & (np.abs(z) < 0.4)
+    assert np.allclose(x[front], 1.5, atol=0.002) and front.sum() > 200
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("sensors: {roof: {model: velodyne/vlp16, steps: 3}}", "sensors.roof.steps` cannot be"),
+        ("sensor: velodyne/vlp17", "velodyne/vlp16"),
+        ("scene: seed", "scene"),
+        ("sensor: velodyne/vlp16\ncloud: {keep_every: 2}", "`cloud.keep_every` cannot be used"),
+        ("sensor: velodyne/vlp16\nsensors: {a: velodyne/vlp16}", "cannot be combined"),
+    ],
+)
+def test_sensor_files_that_cannot_be_used(tmp_path, text, message):
+    (tmp_path / "sensors.yaml").write_text(text)
+    with pytest.raises(LidarError) as caught:
+        SensorsFile.load(tmp_path / "sensors.yaml").sensors_on_frames()
+    assert message in str(caught.value) and "sensors.yaml" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["room.sdf"], "contains no sensors of lidarpool"),
+        (["hall.sdf", "--sensors", "sensors.yaml"], "hall.sdf"),
+        (["room.sdf", "--sensors", "none.yaml"], "none.yaml"),
+        (["room.sdf", "--sensors", "sensors.yaml", "--models", "none"], "none is not a folder"),
+        (["room.sdf", "--sensors", "sensors.yaml", "--to", "::1"], "--to"),
+    ],
+)
+def test_options_that_cannot_be_used_are_one_line(folder, arguments, message):
+    result = CliRunner().invoke(follow, [*arguments, "--as", "ros2"])
+    assert isinstance(result.exception, LidarError) and message in str(result.exception)
+
+
+@pytest.mark.extended
+def test_the_node_outlives_a_simulator_that_is_killed_and_paused(folder, dds):
+    """The command in a process of its own, and the simulator in another one."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-m", "lidarpool", "follow", "room.sdf", "--as", "ros2",
+               "--sensors", "sensors.yaml"]  # fmt: skip
+    node = subprocess.Popen(
+        command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    started = []
+
+    def simulator(start_s: float) -> subprocess.Popen[bytes]:
+        arguments = ["-m", "tests.simulators", str(DOMAIN), str(start_s), "50"]
+        started.append(subprocess.Popen([sys.executable, *arguments], env=environment))
+        return started[-1]
+
+    try:
+        assert node.stdout.readline().startswith("ready: /roof/points in ROS 2 domain")
+        with dds.RosPublisher(dds.Network(domain=DOMAIN)) as publisher:
+            subscriber = dds.RosSubscriber(publisher, lambda topic, _: topic == "/roof/points")
+
+            def wait_for(after_s: float, before_s: float) -> None:
+                """Wait for a cloud with a stamp within limits."""
+                stop = time.monotonic() + 120
+                while time.monotonic() < stop:
+                    for message in subscriber.receive(0.1):
+                        cloud = message_store().deserialize_cdr(message.cdr, message.kind)
+                        if after_s < cloud.header.stamp.sec < before_s:
+                            return
+                raise AssertionError("no cloud arrived")
+
+            first = simulator(100)
+            wait_for(100, 1e5)
+            first.kill()
+            second = simulator(10)
+            wait_for(9, 99)
+            second.send_signal(signal.SIGSTOP)
+            time.sleep(1)
+            second.send_signal(signal.SIGCONT)
+            wait_for(11, 99)
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+        node.send_signal(signal.SIGINT)
+        _, errors = node.communicate(timeout=60)
+    assert "Traceback" not in errors
+    assert "jumped back" in errors and "were published" in errors
+
+
+def test_a_grid_sensor_in_a_sensor_file_is_that_of_python(tmp_path):
+    (tmp_path / "sensors.yaml").write_text("sensor: {layers: 4, rays_per_revolution: 90}")
+    ((mounted, frame, options),) = SensorsFile.load(tmp_path / "sensors.yaml").sensors_on_frames()
+    assert mounted.sensor.channels == Sensor.grid(90, 4).channels and frame == ""
+    assert options["precision_m"] == 0.001
