@@ -23,6 +23,7 @@ _MAX_SPEED_M_S = 100.0  # frames that move faster jump
 _MAX_CLOCK_STEP_NS = 1_000_000_000  # a larger step of the clock is a jump
 _SETTLE_NS = 2_000_000_000  # simulation time after which missing poses are reported
 _QUIET_S = 5.0  # time without a clock message after which a notice is shown
+_CHECK_NS = 50_000_000  # simulation time between checks of bodies and frames
 _POLL_S = 0.05
 
 
@@ -88,6 +89,7 @@ class FollowNode:
         self._subscriber = RosSubscriber(publisher, is_wanted)
         self._absent: set[str] = set()
         self._examined: set[str] = set()  # received frames that were compared with the models
+        self._checked_ns = 0  # simulation time at which bodies and frames were last checked
         self._start_ns = 0  # simulation time at which the node started, or time jumped
         self._clock_s = time.monotonic()  # when the last clock message arrived
         self._ends_s: dict[FollowedSensor, float] = {}  # when the end of its sweep was reached
@@ -143,9 +145,16 @@ class FollowNode:
             if time_ns is not None:
                 self._set_clock(time_ns)
         self._check_publishers()
-        if self._poses.clock_ns is None:
+        clock_ns = self._poses.clock_ns
+        if clock_ns is None:
             return
-        self._check_frames()
+        if len(self._tree.received) > len(self._examined):
+            self._add_models()
+        if abs(clock_ns - self._checked_ns) >= _CHECK_NS:
+            self._checked_ns = clock_ns
+            self._update_absent(clock_ns)
+            if clock_ns - self._start_ns > _SETTLE_NS:
+                self._report_frames()
         sensor = self._next_due()
         if sensor is not None:
             self._simulate(sensor)
@@ -284,18 +293,13 @@ class FollowNode:
         starts_ns = [other.span(other.number).start_ns for other in self._sensors]
         self._tree.drop_before(min(starts_ns))
 
-    def _check_frames(self) -> None:
-        """Add models that were spawned, remove those that vanished, and report missing poses."""
-        new = [frame for frame in self._tree.received if frame not in self._examined]
-        for frame in new:
-            self._examined.add(frame)
-            if frame not in self._world.frames:
-                self._add_model(frame)
-        self._update_absent()
-        clock_ns = self._poses.clock_ns
-        assert clock_ns is not None
-        if clock_ns - self._start_ns > _SETTLE_NS:
-            self._report_frames()
+    def _add_models(self) -> None:
+        """Add models that were spawned."""
+        for frame in [*self._tree.received]:
+            if frame not in self._examined:
+                self._examined.add(frame)
+                if frame not in self._world.frames:
+                    self._add_model(frame)
 
     def _add_model(self, frame: str) -> None:
         """Add the model of an unknown frame to the world if there is one."""
@@ -317,12 +321,11 @@ class FollowNode:
             sensor.world = world
         self._notices.show(("added", name), f"{name} was added to the world.")
 
-    def _update_absent(self) -> None:
+    def _update_absent(self, clock_ns: int) -> None:
         """Determine the bodies whose frames are no longer received."""
         limit_ns = self._options.vanish_after_s * 1e9
-        clock_ns = self._poses.clock_ns
         last_ns = self._poses.last_ns
-        if not limit_ns or clock_ns is None or last_ns is None or clock_ns - last_ns > limit_ns / 2:
+        if not limit_ns or last_ns is None or clock_ns - last_ns > limit_ns / 2:
             return  # no poses are received at all
         absent = set()
         for body in self._world.bodies:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 import os
 import socket
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -69,6 +70,8 @@ _DEPTHS = {"/clock": 1, "/tf": 100}
 _DEPTH = 10
 _RECEIVED_DEPTH = 5000  # messages of a topic that are kept until they are read
 _TAKEN = 1000  # messages that are taken at once
+# Time to wait for further messages, since /clock alone can have a thousand per second.
+_GATHER_S = 0.003
 
 
 @dataclass(frozen=True)
@@ -265,6 +268,7 @@ class RosSubscriber:
         """Yield the messages that have arrived. Wait for messages if there are none."""
         with suppress(DDSException):  # the time has passed
             self._wait_set.wait(duration(seconds=wait_s))
+        time.sleep(_GATHER_S)
         self._discover()
         # The clock comes first, because it determines which other messages are up to date.
         readers = sorted(self._readers.items(), key=lambda item: item[0][0] != CLOCK_TOPIC)

@@ -11,8 +11,8 @@ import numpy as np
 
 from ..motion.rotations import matrices as rotations_of_quaternions
 from ..motion.rotations import quaternions_of
-from ..motion.trajectory import Track
 from ..numerics.arrays import Floats, Ints
+from ..numerics.elementary import arctan2, sin_cos
 from ..numerics.vectors import matmul, norm
 from ..scene.transform import affine
 from .world import WORLD, WorldFrame
@@ -22,6 +22,7 @@ MAX_SAMPLES = 4096  # samples of a frame that are kept
 _BEFORE_JUMP_NS = 1_000  # how long before a jump a frame is held at its earlier pose
 _MAX_DISORDER_NS = 50_000_000  # older samples than the last one by more mean that time jumped
 _MIN_JUMP_M = 0.2  # shorter movements are never jumps
+_MIN_SINE = 1e-9  # smaller rotations are interpolated linearly
 _MAX_NORM_ERROR = 1e-2  # tolerated error of the norm of a quaternion
 
 
@@ -85,12 +86,7 @@ class _Link:
         poses = self.poses[rows]
         if all(pose == poses[0] for pose in poses):
             return np.tile(_matrix_of(poses[0]), (len(times_ns), 1, 1))
-        start_ns = self.times_ns[rows][0]
-        values = np.array(poses)
-        since_s = (np.array(self.times_ns[rows]) - start_ns) / 1e9
-        track = Track(since_s, values[:, :3], values[:, 3:], beyond="hold")
-        positions, rotations = track.poses(0, (times_ns - start_ns).astype(np.float64))
-        return affine(rotations, positions)
+        return _interpolate(np.array(self.times_ns[rows]), np.array(poses), times_ns)
 
 
 class FrameTree:
@@ -341,3 +337,32 @@ def _checked_pose(pose: Sequence[float]) -> tuple[float, ...]:
 def _matrix_of(pose: tuple[float, ...]) -> Floats:
     (rotation,) = rotations_of_quaternions(np.array([pose[3:]]))
     return affine(rotation, np.array(pose[:3]))
+
+
+def _interpolate(sample_times_ns: Ints, samples: Floats, times_ns: Ints) -> Floats:
+    """Interpolate poses linearly, with a constant angular velocity between two samples.
+
+    The samples have shape (s, 7), with s of at least 2, and the result has shape (k, 4, 4).
+    """
+    rows = np.searchsorted(sample_times_ns, times_ns, "right") - 1
+    rows = np.clip(rows, 0, len(samples) - 2)
+    steps_ns = sample_times_ns[rows + 1] - sample_times_ns[rows]
+    share = np.clip((times_ns - sample_times_ns[rows]) / steps_ns, 0, 1)[:, None]
+    first = samples[rows]
+    last = samples[rows + 1]
+    positions = first[:, :3] + share * (last[:, :3] - first[:, :3])
+    start = first[:, 3:]
+    end = last[:, 3:]
+    if (start == end).all():
+        return affine(rotations_of_quaternions(start), positions)
+    # Spherical interpolation (Shoemake, 1985) by the shorter rotation
+    end = np.where((start * end).sum(axis=1, keepdims=True) < 0, -end, end)
+    angle = 2 * arctan2(norm(end - start), norm(end + start))[:, None]
+    sine = sin_cos(angle)[0]
+    is_small = sine < _MIN_SINE
+    weights = [
+        np.where(is_small, part, sin_cos(part * angle)[0] / np.where(is_small, 1, sine))
+        for part in (1 - share, share)
+    ]
+    quaternions = weights[0] * start + weights[1] * end
+    return affine(rotations_of_quaternions(quaternions / norm(quaternions)[:, None]), positions)
