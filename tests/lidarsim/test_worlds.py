@@ -178,7 +178,7 @@ def test_poses_that_cannot_be_are_errors(room, poses, message):
 
 
 def test_a_sensor_on_an_unknown_frame_is_an_error(room):
-    with pytest.raises(LidarError, match="no frame 'robot/lidr'. Did you mean 'robot/lidar'"):
+    with pytest.raises(LidarError, match=r"no frame 'robot/lidr'\. Did you mean"):
         Follower.from_world(room, VLP16, frame="robot/lidr")
 
 

@@ -50,6 +50,7 @@ from lidarpool.scenario.plausibility import plausibility_warnings
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.schema import campaign_schema, scenario_schema
+from lidarpool.scenario.sensors_file import SensorsFile
 from lidarsim.columns.table import TABLE
 from lidarsim.scene.files.mesh_formats import endings, option_names
 from lidarsim.schema.model_names import model_names
@@ -454,6 +455,8 @@ def test_yaml_is_what_it_is_for(block):
             dask.config.get(re.sub(r"(?<=\.pre-spawn-environ)\..*", "", key))
     elif "cluster" in data:
         assert (ROOT / block.title).read_text("utf-8").endswith(f"\n{block.code}")
+    elif block.title == "sensors.yaml":
+        assert SensorsFile.model_validate(data).sensors_on_frames()
     elif data.keys() & {"base", "vary"}:
         CampaignSection.model_validate({"base": "base.yaml"} | data)
     elif "beams" in data:

@@ -26,7 +26,6 @@ from ..clouds.ros.messages import RosMessage, SurveyMessages, static_frame
 from ..clouds.writing import ExportSpec, with_format_columns
 from ..scenario.sensors_file import SensorOnFrame
 
-
 _MAX_SPANS = 8  # spans that are kept
 
 

@@ -224,10 +224,10 @@ class FollowNode:
             sensor.number += 1
             sensor.skipped += 1
             self._ends_s.pop(sensor, None)
-            self._notices.show(
+            self._notices.show_event(
                 ("slow", sensor.name),
-                f"Sweeps of {sensor.name} are skipped, because the simulator runs faster than "
-                "they can be simulated. Reduce the real-time factor or the number of rays.",
+                f"A sweep of {sensor.name} was skipped, because it could not be simulated in time. "
+                "If this is repeated, reduce the real-time factor or the number of rays.",
             )
             next_span = sensor.span(sensor.number + 1)
         span = sensor.span(sensor.number)
@@ -371,7 +371,9 @@ class FollowNode:
             )
         known = {*self._world.frames, *own, *self._tree.parents}
         known |= {sensor.frame for sensor in self._sensors}
-        without_mesh = [name for name in received if name not in known and name not in unknown]
+        # Other frames on a model, such as those of cameras, usually have no objects.
+        in_world = [name for name in received if len(self._tree.chain(name) or ()) == 1]
+        without_mesh = [name for name in in_world if name not in known]
         self._notices.show_names(
             "unknown",
             without_mesh,

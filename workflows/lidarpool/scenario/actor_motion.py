@@ -65,7 +65,8 @@ class MountSection(Section, InstrumentPose):
         Text | None,
         about(
             "robot link in whose axes the mount is defined, for a robot on the platform; the "
-            "visible shape of the link is omitted from the scene",
+            "visible shape of the link is omitted from the scene; in the sensor file of lidarpool "
+            "follow, the name of a frame",
             "top_lidar_link",
         ),
     ] = None
