@@ -1,4 +1,6 @@
-"""`lidarpool follow` beside a stand-in for a simulator; tests skip without cyclonedds."""
+"""`lidarpool follow` beside a stand-in for a simulator.
+
+Most tests pass messages to the node directly. Tests of the command skip without cyclonedds."""
 
 from __future__ import annotations
 
@@ -7,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,9 @@ from tests.simulators import clock, joint_states, transforms
 from lidarpool import LidarError, Pose, Scanner, Scene, Sensor, load_sensor
 from lidarpool.cli.follow_command import follow
 from lidarpool.clouds.ros.messages import RosMessage, message_store
+from lidarpool.following.node import FollowOptions
+from lidarpool.following.opening import FollowSources, create_node
+from lidarpool.following.pose_input import is_wanted
 from lidarpool.scenario.sensors_file import SensorsFile
 
 DOMAIN = 100 + os.getpid() % 100  # so that tests at the same time do not meet
@@ -43,7 +49,7 @@ sensors:
 STILL = [("robot", "room", (0, 0, 0.2), 0.0), ("crate", "room", (3, 0, 0.5), 0.0)]
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def dds(monkeypatch) -> Any:
     """The module that publishes; tests skip without cyclonedds."""
     pytest.importorskip("cyclonedds.core")
@@ -62,67 +68,62 @@ def folder(tmp_path, monkeypatch) -> Path:
 
 
 class Loop:
-    """A node and a simulator in one process, in step with each other."""
+    """A node and the connections through which it receives and publishes messages."""
 
     def __init__(self, world: str, sensors: str | None = "sensors.yaml", **settings: Any) -> None:
-        from lidarpool.following.node import FollowOptions
-        from lidarpool.following.opening import FollowSources, open_node
-
         options = {name: settings.pop(name) for name in [*settings] if name in FOLLOW_OPTIONS}
         files = {name: Path(settings.pop(name)) for name in ("models",) if name in settings}
         sources = FollowSources(
             Path(world), None if sensors is None else Path(sensors), **files, **settings
         )
         self.notes: list[str] = []
-        self._context = open_node(sources, (), FollowOptions(**options), self.notes.append)
-        self.node = self._context.__enter__()
-        self.publisher = self.node._publisher
         self.sweeps: list[Sweep] = []
-        self._publish = self.publisher.publish
-        self.publisher.publish = self._record
+        self.frames: list[Any] = []
+        self._arrived: list[RosMessage] = []
+        self.node = create_node(sources, (self, self), FollowOptions(**options), self.notes.append)
         self.node.start()
 
     def __enter__(self) -> Loop:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._context.__exit__(None, None, None)
+        pass
+
+    def publish(self, message: RosMessage) -> None:
+        content = message_store().deserialize_cdr(message.cdr, message.kind)
+        if message.topic == "/tf_static":
+            self.frames += content.transforms
+        else:
+            self.sweeps.append(Sweep(message.topic, content, self.node._poses.clock_ns))
+
+    def receive(self, wait_s: float) -> Iterator[RosMessage]:
+        del wait_s
+        arrived = sorted(self._arrived, key=lambda message: message.topic != "/clock")
+        self._arrived = []
+        yield from arrived
+
+    def publishers(self, topic: str) -> int:
+        del topic
+        return 1
 
     def send(self, *messages: RosMessage) -> None:
-        for message in messages:
-            self.publisher.publish(message)
-            if not self.node._subscriber.publishers(message.topic):  # nobody has read it
-                while not self.node._subscriber.publishers(message.topic):
-                    self.node.step(0.01)
-                self.publisher.publish(message)
+        assert all(is_wanted(message.topic, message.kind) for message in messages)
+        self._arrived += messages
 
     def play(self, frames: Any, start_s: float, stop_s: float, rate_hz: float = 50) -> None:
         """Publish poses and the clock, and let the node do what is due after each step."""
         for number in range(round((stop_s - start_s) * rate_hz) + 1):
             time_s = start_s + number / rate_hz
             self.send(transforms(time_s, frames(time_s)), clock(time_s))
-            self.until_clock(time_s)
+            self.do_what_is_due()
 
-    def until_clock(self, time_s: float) -> None:
-        """Wait until the node knows a time, and has published what was due."""
-        stop = time.monotonic() + 60
-        while self.node._poses.clock_ns != round(time_s * 1e9):
-            self.step()
-            assert time.monotonic() < stop, "the clock did not arrive"
-        sent = -1
-        while sent != len(self.node.delays_s):
-            sent = len(self.node.delays_s)
-            self.step()
-
-    def step(self) -> None:
-        self.node.step(0.01)
-
-    def _record(self, message: RosMessage) -> None:
-        """Publish a message, and keep it if it is that of a sensor."""
-        self._publish(message)
-        if message.topic.endswith(("points", "scan", "livox")):
-            content = message_store().deserialize_cdr(message.cdr, message.kind)
-            self.sweeps.append(Sweep(message.topic, content, self.node._poses.clock_ns))
+    def do_what_is_due(self) -> None:
+        """Let the node read the messages, and publish what is due."""
+        self.node.step()
+        count = -1
+        while count != len(self.node.delays_s):
+            count = len(self.node.delays_s)
+            self.node.step()
 
     def clouds(self, topic: str = "/roof/points") -> list[Sweep]:
         return [sweep for sweep in self.sweeps if sweep.topic == topic]
@@ -159,6 +160,8 @@ def test_a_still_world_is_that_of_a_scanner_bit_for_bit(folder):
         notes = loop.notes
     clouds = loop.clouds()
     assert len(clouds) == 4 and notes == []
+    (frame,) = loop.frames
+    assert (frame.header.frame_id, frame.child_frame_id) == ("robot/lidar", "roof")
     scanner = Scanner(
         Scene.load("room.sdf"),
         load_sensor("velodyne/vlp16"),
@@ -226,7 +229,7 @@ def test_pause_reset_and_jumps_of_time(folder):
     with Loop("room.sdf") as loop:
         loop.play(lambda _: STILL, 30, 30.3)
         for _ in range(20):  # a pause: nothing is due
-            loop.step()
+            loop.node.step()
         assert len(loop.clouds()) == 2
         loop.play(lambda _: STILL, 30.32, 30.5)
         assert len(loop.clouds()) == 4
@@ -299,7 +302,7 @@ def test_joint_states_move_the_links_of_a_robot(folder):
             time_s = 3 + number / 50
             joints = {"turn": 0.8 * (time_s - 3), "lift": 1.0, "wheel": 3.0}
             loop.send(joint_states(time_s, joints), clock(time_s))
-            loop.until_clock(time_s)
+            loop.do_what_is_due()
     assert len(loop.clouds()) == 4
     for cloud in loop.clouds():
         angle = 0.8 * (cloud.stamp_s - 3 + cloud.column("time").astype(float))
@@ -360,12 +363,9 @@ def test_what_is_missing_or_wrong_is_stated_once_and_the_node_goes_on(folder):
             ("", "room", (1, 0, 0), 0.0),
         ]
 
-    from lidarpool.playback.dds import ReceivedMessage
-
     with Loop("room.sdf") as loop:
-        # cyclonedds does not pass on damaged messages, but other versions might.
-        damaged = ReceivedMessage("/tf", "tf2_msgs/msg/TFMessage", b"\0\1\0\0\xff\0\0\0")
-        loop.node._poses.read(damaged)
+        damaged = RosMessage("/tf", "tf2_msgs/msg/TFMessage", 0, b"\0\1\0\0\xff\0\0\0")
+        loop.send(damaged)
         loop.send(transforms(1.7e9, [("wheel", "robot", (1, 0, 0), 0.0)]))
         loop.send(transforms(0, [("plate", "robot", (np.nan, 0, 0), 0.0)]))
         loop.play(frames, 40, 43)
@@ -397,7 +397,7 @@ def test_poses_that_are_rare_are_stated_and_held(folder):
             if number % 14 == 0:
                 loop.send(transforms(time_s, STILL))
             loop.send(clock(time_s))
-            loop.until_clock(time_s)
+            loop.do_what_is_due()
     assert notes_of(loop, "Poses of")
     assert "arrive later than the end of the next sweep" in notes_of(loop, "Poses of")[0]
     assert len(loop.clouds()) >= 9
@@ -424,7 +424,7 @@ def test_a_model_topic_and_a_flood_of_poses(folder):
             for k in range(300):
                 loop.send(transforms(time_s + k * 5e-5, STILL[:1]))
             loop.send(clock(time_s))
-            loop.until_clock(time_s)
+            loop.do_what_is_due()
     assert len(loop.clouds()) >= 2
     x, y, z = loop.clouds()[-1].points.T
     front = (np.abs(y) < 0.9) & (x > 1) & (np.abs(z) < 0.4)
@@ -458,7 +458,7 @@ def test_sensor_files_that_cannot_be_used(tmp_path, text, message):
         (["room.sdf", "--sensors", "sensors.yaml", "--to", "::1"], "--to"),
     ],
 )
-def test_options_that_cannot_be_used_are_one_line(folder, arguments, message):
+def test_options_that_cannot_be_used_are_one_line(folder, dds, arguments, message):
     result = CliRunner().invoke(follow, [*arguments, "--as", "ros2"])
     assert isinstance(result.exception, LidarError) and message in str(result.exception)
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import CliRunner
+from tests import simulators
 from tests.shapes import room
 
 from lidarpool import Cloud, LidarError, Sensor, Survey
@@ -188,6 +189,35 @@ def test_messages_of_all_types_are_read(dds):
                 assert read.position_covariance_ == [*range(9)]
 
 
+def test_a_subscriber_reads_what_publishers_offer(dds):
+    """Reliable or not, and messages of the past if they are kept."""
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.qos import Policy, Qos
+    from cyclonedds.topic import Topic
+
+    kind = "rosgraph_msgs/msg/Clock"
+    sent = simulators.clock(7.5)
+    with dds.RosPublisher(dds.Network(domain=DOMAIN + 4)) as publisher:
+        topic = Topic(publisher._participant, "rt/clock", dds.message_class(kind))
+        qos = Qos(
+            Policy.Reliability.BestEffort,
+            Policy.DataRepresentation(use_cdrv0_representation=True),
+        )
+        writer = DataWriter(publisher._participant, topic, qos=qos)
+        publisher.publish(simulators.transforms(3, [("a", "b", (1, 2, 3), 0)], "/tf_static"))
+        subscriber = dds.RosSubscriber(publisher, lambda topic, _: topic != "/tf")
+        received: dict[str, RosMessage] = {}
+        stop = time.monotonic() + 60
+        while {*received} != {"/clock", "/tf_static"}:
+            publisher.publish(simulators.transforms(3, [("a", "b", (1, 2, 3), 0)]))
+            writer.write(dds._serialized(writer.data_type, bytes(sent.cdr)))
+            received |= {message.topic: message for message in subscriber.receive(0.05)}
+            assert time.monotonic() < stop, received
+        assert received["/clock"].kind == kind
+        assert bytes(received["/clock"].cdr) == bytes(sent.cdr)
+        assert subscriber.publishers("/clock") == 1 and subscriber.publishers("/tf") == 0
+
+
 @pytest.mark.parametrize(
     ("hosts", "environment", "message"),
     [
@@ -196,7 +226,7 @@ def test_messages_of_all_types_are_read(dds):
         ((), {"ROS_DOMAIN_ID": "9" * 5000}, "ROS_DOMAIN_ID is '9999.*; it must be a number"),
         (("127.0.0.1:7400",), {}, "The host 127.0.0.1:7400 of `--to` cannot be resolved"),
         (("239.255.0.1",), {}, "239.255.0.1 of `--to` is a multicast address"),
-        (("::1",), {}, "--to ::1: no such host"),
+        (("::1",), {}, "The host ::1 of `--to` cannot be resolved"),
     ],
 )
 def test_a_network_that_cannot_be_is_one_line(dds, hosts, environment, message):
@@ -220,7 +250,7 @@ def test_a_domain_whose_ports_are_taken_is_one_line(dds):
             sockets.append(taken)
             taken.bind(("", 7400 + 250 * domain + 10 + 2 * participant))
         with pytest.raises(
-            LidarError, match=rf"in domain {domain} on 127.0.0.1: its ports are tak"
+            LidarError, match=rf"in domain {domain} on 127.0.0.1\. Its ports are in use"
         ):
             dds.RosPublisher(dds.Network(domain=domain))
     finally:
@@ -236,7 +266,7 @@ def test_a_domain_whose_ports_are_taken_is_one_line(dds):
             ["--as", "ros2", "--layout", "hesai", "--organized"],
             "does not support `organized`",
         ),
-        (["--as", "packets", "--layout", "hesai"], "--layout is not for --as packets"),
+        (["--as", "packets", "--layout", "hesai"], "`--layout` cannot be used with `--as packets`"),
     ],
 )
 def test_options_that_do_not_fit_are_one_line(folder, dds, arguments, message):
@@ -254,7 +284,7 @@ def test_a_cloud_without_the_columns_of_a_layout_is_one_line(dds, monkeypatch):
     options = BridgeOptions(settings={"layout": "livox"})
     with (
         Ros2Bridge(sweeps, Schedule(), options, print) as bridge,
-        pytest.raises(LidarError, match=r"layout livox needs reflectivity, which the cloud lacks"),
+        pytest.raises(LidarError, match="the layout livox requires the column reflectivity"),
     ):
         bridge.prepare(0, points)
 

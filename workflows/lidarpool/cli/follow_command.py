@@ -105,18 +105,24 @@ def follow(
 
     bridge_class(bridge_name)  # raises an error if its packages are not installed
     from ..following.node import FollowOptions
-    from ..following.opening import FollowSources, open_node
+    from ..following.opening import FollowSources, create_node
+    from ..following.pose_input import is_wanted
+    from ..playback.dds import Network, RosPublisher, RosSubscriber
     from ..processes.fork_server import keep_freed_memory
     from .terminal import Terminal
 
     keep_freed_memory()
-    terminal = Terminal()
+    report = Terminal().report
     sources = FollowSources(world, sensors_file, models, assets, layout, organized)
     follow_options = FollowOptions(("world", "map", *world_frames), vanish_after_s)
-    with (
-        open_node(sources, to, follow_options, terminal.report) as node,
-        options.summary_at_end(lambda: node.summary),
-    ):
-        node.start()
-        click.echo(f"ready: {node.description}. Press Ctrl-C to stop.")
-        node.run(threading.Event())
+    network = Network.for_hosts(to)
+    with RosPublisher(network) as publisher:
+        connections = publisher, RosSubscriber(publisher, is_wanted)
+        node = create_node(sources, connections, follow_options, report)
+        with options.summary_at_end(lambda: node.summary):
+            node.start()
+            click.echo(
+                f"ready: {node.description} in ROS 2 domain {network.domain} on {network.address}. "
+                "Press Ctrl-C to stop."
+            )
+            node.run(threading.Event())

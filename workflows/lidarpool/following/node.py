@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -13,10 +14,10 @@ from lidarsim.errors import LidarError
 from lidarsim.words import join_names, list_names, plural
 from lidarsim.worlds.frame_tree import FrameTree
 
-from ..playback.dds import CLOCK_TOPIC, RosPublisher, RosSubscriber
+from ..clouds.ros.messages import CLOCK_TOPIC, RosMessage
 from .followed_sensor import FollowedSensor
 from .notices import MAX_NAMES, Notices
-from .pose_input import PoseInput, is_wanted
+from .pose_input import PoseInput
 from .world_files import FollowedWorld, ModelFolder
 
 _MAX_SPEED_M_S = 100.0  # frames that move faster jump
@@ -44,6 +45,23 @@ class FollowOptions:
     vanish_after_s: float = 1.0
 
 
+class Publishing(Protocol):
+    """Connection through which messages are published, such as `RosPublisher`."""
+
+    def publish(self, message: RosMessage) -> None:
+        """Publish a message."""
+
+
+class Receiving(Protocol):
+    """Connection through which messages are received, such as `RosSubscriber`."""
+
+    def receive(self, wait_s: float) -> Iterator[RosMessage]:
+        """Yield the messages that have arrived, starting with those of the clock."""
+
+    def publishers(self, topic: str) -> int:
+        """Return the number of programs that publish a topic."""
+
+
 class FollowNode:
     """Publishes the sweeps of sensors in a world that a simulator moves.
 
@@ -59,8 +77,8 @@ class FollowNode:
         Models that the simulator can spawn.
     sensors
         Sensors, all of which have the same world.
-    publisher
-        Connection to the network.
+    publisher, subscriber
+        Connections to the simulator and to those who read the sensors.
     note
         Function that shows a notice.
     options
@@ -72,7 +90,8 @@ class FollowNode:
         followed: FollowedWorld,
         models: ModelFolder,
         sensors: Sequence[FollowedSensor],
-        publisher: RosPublisher,
+        publisher: Publishing,
+        subscriber: Receiving,
         note: Callable[[str], None],
         options: FollowOptions = FollowOptions(),
     ) -> None:
@@ -86,7 +105,7 @@ class FollowNode:
         self._tree = FrameTree(followed.world.frames, roots, _MAX_SPEED_M_S)
         self._poses = PoseInput(self._tree, self._notices)
         self._poses.add_robots(followed.robots)
-        self._subscriber = RosSubscriber(publisher, is_wanted)
+        self._subscriber = subscriber
         self._absent: set[str] = set()
         self._examined: set[str] = set()  # received frames that were compared with the models
         self._checked_ns = 0  # simulation time at which bodies and frames were last checked
@@ -97,10 +116,8 @@ class FollowNode:
 
     @property
     def description(self) -> str:
-        """Topics of the sensors, and the network. It is part of the "ready" message."""
-        topics = list_names([sensor.topic for sensor in self._sensors], MAX_NAMES)
-        network = self._publisher.network
-        return f"{topics} in ROS 2 domain {network.domain} on {network.address}"
+        """Topics of the sensors. It is part of the "ready" message."""
+        return list_names([sensor.topic for sensor in self._sensors], MAX_NAMES)
 
     @property
     def summary(self) -> str:

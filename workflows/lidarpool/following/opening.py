@@ -1,9 +1,8 @@
-"""Open the node that follows a simulator, given the files of its world and its sensors."""
+"""Create the node that follows a simulator, given the files of its world and its sensors."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,10 +10,9 @@ from lidarsim.errors import LidarError
 
 from ..clouds.frame_names import frame_names
 from ..clouds.writing import ExportSpec
-from ..playback.dds import Network, RosPublisher
 from ..scenario.sensors_file import SensorOnFrame, SensorsFile
 from .followed_sensor import FollowedSensor
-from .node import FollowNode, FollowOptions
+from .node import FollowNode, FollowOptions, Publishing, Receiving
 from .world_files import FollowedWorld, ModelFolder, load_followed_world
 
 
@@ -29,21 +27,20 @@ class FollowSources(NamedTuple):
     organized: bool = False
 
 
-@contextmanager
-def open_node(
+def create_node(
     sources: FollowSources,
-    to: Sequence[str],
+    connections: tuple[Publishing, Receiving],
     options: FollowOptions,
     note: Callable[[str], None],
-) -> Iterator[FollowNode]:
-    """Read the files, connect to the network, and yield the node.
+) -> FollowNode:
+    """Read the files, and return the node.
 
     Parameters
     ----------
     sources
         Files and layout.
-    to
-        Addresses of other machines with the simulator or subscribers.
+    connections
+        Connections through which messages are published and received.
     options
         Options of the node.
     note
@@ -52,14 +49,13 @@ def open_node(
     Raises
     ------
     LidarError
-        If a file cannot be read, or if the network cannot be used.
+        If a file cannot be read.
     """
     followed = load_followed_world(sources.world, sources.assets, note)
     models = ModelFolder(sources.models, note)
     spec = ExportSpec("mcap", sources.layout, organized=sources.organized)
     sensors = _open_sensors(sources, followed, spec)
-    with RosPublisher(Network.for_hosts(to)) as publisher:
-        yield FollowNode(followed, models, sensors, publisher, note, options)
+    return FollowNode(followed, models, sensors, *connections, note, options)
 
 
 def _open_sensors(

@@ -14,8 +14,7 @@ from lidarsim.words import format_rounded
 from lidarsim.worlds.frame_tree import FrameTree, pose_of
 from lidarsim.worlds.world import WORLD
 
-from ..clouds.ros.messages import message_store
-from ..playback.dds import CLOCK_TOPIC, ReceivedMessage
+from ..clouds.ros.messages import CLOCK_TOPIC, RosMessage, message_store
 from .notices import Notices
 from .world_files import RobotFrames
 
@@ -83,7 +82,7 @@ class PoseInput:
         """Let joint values control the links of further robots."""
         self._robots += robots
 
-    def read(self, message: ReceivedMessage) -> int | None:
+    def read(self, message: RosMessage) -> int | None:
         """Add the poses in a message. Return the time if it is a clock message.
 
         Messages that cannot be read cause a notice.

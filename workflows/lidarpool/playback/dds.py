@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import (
@@ -34,10 +34,9 @@ from lidarsim.environment.ports import port_number
 from lidarsim.errors import LidarError
 from lidarsim.words import join_names, shorten_name
 
-from ..clouds.ros.messages import LATCHED_TOPICS, RosMessage, message_store
+from ..clouds.ros.messages import CLOCK_TOPIC, LATCHED_TOPICS, RosMessage, message_store
 
 LOOPBACK = "127.0.0.1"
-CLOCK_TOPIC = "/clock"
 DOMAIN_VARIABLE = "ROS_DOMAIN_ID"
 _MAX_DOMAIN = 232  # ports of higher domains would exceed 65,535
 _PARTICIPANTS = 32  # maximum number of participants per machine, as in ROS 2
@@ -66,7 +65,7 @@ _BASE_TYPES = {
     **{f"float{bits}": getattr(types, f"float{bits}") for bits in (32, 64)},
 }
 # Number of messages that are kept per topic, as in ROS 2 nodes.
-_DEPTHS = {"/clock": 1, "/tf": 100}
+_DEPTHS = {CLOCK_TOPIC: 1, "/tf": 100}
 _DEPTH = 10
 _RECEIVED_DEPTH = 5000  # messages of a topic that are kept until they are read
 _TAKEN = 1000  # messages that are taken at once
@@ -214,14 +213,6 @@ class RosPublisher:
         return DataWriter(self._participant, dds_topic, qos=qos)
 
 
-class ReceivedMessage(NamedTuple):
-    """A message that another program has published."""
-
-    topic: str
-    kind: str  # type of the message
-    cdr: bytes  # serialized message with its encapsulation header
-
-
 class _SerializedMessage:
     """A message that cyclonedds leaves serialized, because deserialization by rosbags is faster."""
 
@@ -264,8 +255,11 @@ class RosSubscriber:
         """Return the number of programs that publish a topic."""
         return sum(published == topic for published in self._writers.values())
 
-    def receive(self, wait_s: float) -> Iterator[ReceivedMessage]:
-        """Yield the messages that have arrived. Wait for messages if there are none."""
+    def receive(self, wait_s: float) -> Iterator[RosMessage]:
+        """Yield the messages that have arrived, starting with those of the clock.
+
+        Wait at most `wait_s` seconds for messages if there are none.
+        """
         with suppress(DDSException):  # the time has passed
             self._wait_set.wait(duration(seconds=wait_s))
         time.sleep(_GATHER_S)
@@ -276,7 +270,8 @@ class RosSubscriber:
             while samples := reader.take(_TAKEN):
                 for sample in samples:
                     if isinstance(sample, _SerializedMessage):
-                        yield ReceivedMessage(topic, kind, sample.cdr)
+                        time_ns = sample.sample_info.source_timestamp
+                        yield RosMessage(topic, kind, time_ns, sample.cdr)
                 if len(samples) < _TAKEN:
                     break
 

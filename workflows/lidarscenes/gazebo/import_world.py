@@ -22,7 +22,7 @@ from ..writers.lidar_scenario import write_scenario
 from .frames import child_numbers
 from .lidars import find_lidars, unknown_sensors
 from .visibility_flags import ALL_BITS, read_flags
-from .world import GazeboOptions, World, build_content, load_world
+from .world import GazeboOptions, GazeboWorld, build_content, load_world
 
 
 def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
@@ -65,7 +65,7 @@ def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]
 
 
 def _unseen_objects(
-    world: World, masks: Sequence[int], folders: tuple[Path, ...]
+    world: GazeboWorld, masks: Sequence[int], folders: tuple[Path, ...]
 ) -> dict[int, list[str]]:
     """Return name patterns for the objects that lidars do not see, by <visibility_mask>.
 
@@ -117,7 +117,7 @@ def _folders(world: Path, assets: Sequence[Path]) -> tuple[Path, ...]:
     return world.parent.resolve(), *(folder.resolve() for folder in assets)
 
 
-def _loaded(world: Path, assets: Sequence[Path]) -> World:
+def _loaded(world: Path, assets: Sequence[Path]) -> GazeboWorld:
     """Load the world that is to be converted.
 
     Raises LidarError if the file cannot be read.
@@ -132,7 +132,7 @@ def _loaded(world: Path, assets: Sequence[Path]) -> World:
         raise LidarError(unreadable_message("it", error)) from error
 
 
-def _materials(world: World) -> dict[str, Any]:
+def _materials(world: GazeboWorld) -> dict[str, Any]:
     """Return a `materials` section if any shape has a <laser_retro>, otherwise no section."""
     if not any(_has_retro(link.link.element) for link in world.links):
         return {}

@@ -18,7 +18,7 @@ from .bodies import scoped_name
 from .frames import child_numbers, parse_numbers, read_pose
 from .notes import unknown_children
 from .visibility_flags import LIDARS, lidar_elements, lidar_settings, read_mask
-from .world import PlacedLink, World
+from .world import GazeboWorld, PlacedLink
 
 _COLLISION_LIDARS = ("ray", "lidar")  # their rays hit collision shapes
 # Sensor types in SDFormat 1.0 to 1.12 that are not lidars.
@@ -52,7 +52,7 @@ class GazeboLidar(NamedTuple):
     mask: int
 
 
-def find_lidars(world: World) -> Iterator[GazeboLidar]:
+def find_lidars(world: GazeboWorld) -> Iterator[GazeboLidar]:
     """Yield all lidars in a world.
 
     Raises LidarError if a lidar has invalid values.
@@ -65,7 +65,7 @@ def find_lidars(world: World) -> Iterator[GazeboLidar]:
                 yield GazeboLidar(_lidar(element, link, name, full_name), read_mask(element))
 
 
-def unknown_sensors(world: World) -> Iterator[str]:
+def unknown_sensors(world: GazeboWorld) -> Iterator[str]:
     """Yield a clause for each sensor whose type SDFormat does not define."""
     for link in world.links:
         for element in link.link.element.findall("sensor"):

@@ -109,7 +109,7 @@ class _State:
 
 
 @dataclass(eq=False)
-class World:
+class GazeboWorld:
     """A world, or a file that only contains models, with the links of all models."""
 
     element: Element
@@ -191,7 +191,7 @@ def read_sdf(data: bytes, path: Path, options: ReadOptions) -> Content:
     return content
 
 
-def build_content(world: World, options: ReadOptions) -> tuple[Content, list[PlacedObject]]:
+def build_content(world: GazeboWorld, options: ReadOptions) -> tuple[Content, list[PlacedObject]]:
     """Convert a world to scene content, and also return its stationary objects.
 
     The objects include those without an area, which the content lacks.
@@ -220,7 +220,7 @@ def build_content(world: World, options: ReadOptions) -> tuple[Content, list[Pla
     return content, objects
 
 
-def load_world(data: bytes, path: Path, folders: tuple[Path, ...]) -> World:
+def load_world(data: bytes, path: Path, folders: tuple[Path, ...]) -> GazeboWorld:
     """Read an SDFormat file and the models that it includes.
 
     Parameters
@@ -255,7 +255,7 @@ def load_world(data: bytes, path: Path, folders: tuple[Path, ...]) -> World:
     for model in state.inserted:
         element.append(model)
     body = BodyReader(resources, notes, allowance).world(element, resources.world)
-    return World(
+    return GazeboWorld(
         element=element,
         source=resources.world,
         body=body,
@@ -282,7 +282,7 @@ def _world_element(root: Element, notes: Notes) -> Element:
     return element
 
 
-def _roads(world: World, meshes: LinkMeshes) -> Iterator[PlacedNode]:
+def _roads(world: GazeboWorld, meshes: LinkMeshes) -> Iterator[PlacedNode]:
     """Yield the roads in a world that have a surface."""
     for road in world.element.findall("road"):
         world.notes.check_children(road)

@@ -44,6 +44,7 @@ class Serialized(NamedTuple):
 
 # Time between the last point and the last frame, because some layouts round up times.
 _ROUNDING_NS = 1000
+CLOCK_TOPIC = "/clock"
 LATCHED_TOPICS = ("/tf_static", "/label_info", "/material_info")  # also sent to late subscribers
 # Messages of vision_msgs, which rosbags does not provide.
 _LABEL_INFO = "std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold\n"
