@@ -121,8 +121,8 @@ class Loop:
         """Let the node read the messages, and publish what is due."""
         self.node.step()
         count = -1
-        while count != len(self.node.delays_s):
-            count = len(self.node.delays_s)
+        while count != self.node.published:
+            count = self.node.published
             self.node.step()
 
     def clouds(self, topic: str = "/roof/points") -> list[Sweep]:
@@ -408,7 +408,9 @@ def test_a_sensor_whose_frame_is_not_known_waits(folder):
     with Loop("room.sdf") as loop:
         loop.play(lambda _: STILL, 0, 0.3)
         assert not loop.clouds()
-        assert notes_of(loop, "The frame drone/lidar of the sensor roof has no pose")
+        assert notes_of(
+            loop, "The pose of drone/lidar, the frame of the sensor roof, is not received"
+        )
         loop.play(lambda _: [*STILL, ("drone/lidar", "room", (0, 0, 2), 0.0)], 0.32, 0.7)
         assert loop.clouds()
 
@@ -518,3 +520,31 @@ def test_a_grid_sensor_in_a_sensor_file_is_that_of_python(tmp_path):
     ((mounted, frame, options),) = SensorsFile.load(tmp_path / "sensors.yaml").sensors_on_frames()
     assert mounted.sensor.channels == Sensor.grid(90, 4).channels and frame == ""
     assert options["precision_m"] == 0.001
+
+
+def test_a_sensor_on_a_model_that_was_deleted_publishes_nothing(folder):
+    def frames(time_s):
+        return STILL[1:] if 2 < time_s < 4.5 else STILL
+
+    with Loop("room.sdf") as loop:
+        loop.play(frames, 1, 6)
+    stamps = [cloud.stamp_s for cloud in loop.clouds()]
+    assert not [stamp for stamp in stamps if 3.2 < stamp < 4.3]
+    assert [stamp for stamp in stamps if 2 < stamp < 3] and stamps[-1] > 5.7
+    assert notes_of(loop, "The pose of robot/lidar, the frame of the sensor roof, is not received")
+
+
+def test_a_sensor_that_fires_all_rays_at_once(folder):
+    (folder / "flash.yaml").write_text(
+        "name: flash\nsources: {all: none}\nrate_hz: 10\nfirings_per_turn: 1\n"
+        "mirror: {motion: sawtooth, width_deg: 1}\nbeams: {elevation_deg: [-5, 0, 5]}\n"
+    )
+    (folder / "sensors.yaml").write_text(
+        "sensor: {model: flash.yaml, step_deg: 360}\nmount: [0, 0, 0.5]\n"
+    )
+    with Loop("room.sdf") as loop:
+        loop.play(lambda t: [("crate", "room", (3 + t, 0, 0.5), 0.0)], 0, 0.5)
+    clouds = loop.clouds("/points")
+    assert len(clouds) >= 3
+    expected = [2.5 + cloud.stamp_s for cloud in clouds]
+    assert np.allclose([cloud.points[:, 0].min() for cloud in clouds], expected, atol=0.002)

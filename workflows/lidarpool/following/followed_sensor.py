@@ -27,6 +27,7 @@ from ..clouds.writing import ExportSpec, with_format_columns
 from ..scenario.sensors_file import SensorOnFrame
 
 _MAX_SPANS = 8  # spans that are kept
+_MIN_SPAN_S = 1e-6  # a sensor that fires all rays at once has no duration
 
 
 class SweepSpan(NamedTuple):
@@ -136,7 +137,7 @@ class FollowedSensor:
     def prepare(self) -> None:
         """Build the scanner, and compile the loops for static and for moving bodies."""
         held = np.tile(np.eye(4), (2, 1, 1))
-        times_s = np.array([0.0, self._scanner.scanner.span_s()[1]])
+        times_s = np.array([0.0, max(self._scanner.scanner.span_s()[1], _MIN_SPAN_S)])
         cloud = self._scanner.sweep(0, times_s, held, {})
         for _ in self._messages(0, cloud):
             pass

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -26,6 +27,7 @@ _SETTLE_NS = 2_000_000_000  # simulation time after which missing poses are repo
 _QUIET_S = 5.0  # time without a clock message after which a notice is shown
 _CHECK_NS = 50_000_000  # simulation time between checks of bodies and frames
 _POLL_S = 0.05
+_MAX_DELAYS = 10_000  # delays that are kept for the summary
 
 
 @dataclass(frozen=True)
@@ -106,13 +108,16 @@ class FollowNode:
         self._poses = PoseInput(self._tree, self._notices)
         self._poses.add_robots(followed.robots)
         self._subscriber = subscriber
-        self._absent: set[str] = set()
+        self._absent: set[str] = set()  # names of bodies
+        self._lost: set[FollowedSensor] = set()  # sensors whose frames vanished
         self._examined: set[str] = set()  # received frames that were compared with the models
         self._checked_ns = 0  # simulation time at which bodies and frames were last checked
         self._start_ns = 0  # simulation time at which the node started, or time jumped
         self._clock_s = time.monotonic()  # when the last clock message arrived
         self._ends_s: dict[FollowedSensor, float] = {}  # when the end of its sweep was reached
-        self.delays_s: list[float] = []  # time between the end of each sweep and its publication
+        self.published = 0  # number of sweeps
+        # Times between the end of the last sweeps and their publication
+        self._delays_s = deque[float](maxlen=_MAX_DELAYS)
 
     @property
     def description(self) -> str:
@@ -122,14 +127,14 @@ class FollowNode:
     @property
     def summary(self) -> str:
         """Number of published and skipped sweeps, and their delays."""
-        published = len(self.delays_s)
+        published = self.published
         skipped = sum(sensor.skipped for sensor in self._sensors)
         verb = "was" if published == 1 else "were"
         text = f"{plural(published, 'sweep')} {verb} published"
         if skipped:
             text += f" and {skipped:,} skipped"
         if published:
-            median, last = np.percentile(self.delays_s, (50, 99)) * 1e3
+            median, last = np.percentile(self._delays_s, (50, 99)) * 1e3
             text += (
                 f". The delay after the end of a sweep was {median:.0f} ms (median) and "
                 f"{last:.0f} ms (99th percentile)"
@@ -200,7 +205,8 @@ class FollowNode:
     def _restart(self, time_ns: int) -> None:
         """Let the sweeps of all sensors start at a time."""
         self._start_ns = time_ns
-        self._absent.clear()
+        self._absent = set()
+        self._lost = set()
         self._ends_s.clear()
         for sensor in self._sensors:
             sensor.restart(time_ns)
@@ -286,12 +292,14 @@ class FollowNode:
     def _simulate(self, sensor: FollowedSensor) -> None:
         """Simulate and publish the next sweep of a sensor."""
         end_s = self._ends_s.pop(sensor, self._clock_s)
-        if missing := sensor.missing_frame(self._tree):
+        missing = sensor.missing_frame(self._tree)
+        if missing or sensor in self._lost:
+            missing = sensor.frame
             sensor.number += 1
             self._notices.show(
                 ("missing", sensor.name),
-                f"The frame {missing} of the sensor {sensor.name} has no pose. Nothing is "
-                "published until it is received.",
+                f"The pose of {missing}, the frame of the sensor {sensor.name}, is not received. "
+                "Nothing is published until it is.",
             )
             return
         self._notices.clear(("missing", sensor.name))
@@ -306,7 +314,8 @@ class FollowNode:
             return
         for message in messages:
             self._publisher.publish(message)
-        self.delays_s.append(time.monotonic() - end_s)
+        self.published += 1
+        self._delays_s.append(time.monotonic() - end_s)
         starts_ns = [other.span(other.number).start_ns for other in self._sensors]
         self._tree.drop_before(min(starts_ns))
 
@@ -344,11 +353,10 @@ class FollowNode:
         last_ns = self._poses.last_ns
         if not limit_ns or last_ns is None or clock_ns - last_ns > limit_ns / 2:
             return  # no poses are received at all
-        absent = set()
-        for body in self._world.bodies:
-            live = self._tree.live(self._tree.chain(body.frame) or ())
-            if live and max(live.values()) < clock_ns - limit_ns:
-                absent.add(body.name)
+        oldest_ns = clock_ns - limit_ns
+        bodies = self._world.bodies
+        absent = {body.name for body in bodies if self._is_lost(body.frame, oldest_ns)}
+        self._lost = {item for item in self._sensors if self._is_lost(item.frame, oldest_ns)}
         for name in sorted(absent - self._absent):
             self._notices.clear(("back", name))
             self._notices.show(
@@ -360,6 +368,11 @@ class FollowNode:
             self._notices.clear(("gone", name))
             self._notices.show(("back", name), f"{name} is back.")
         self._absent = absent
+
+    def _is_lost(self, frame: str, oldest_ns: float) -> bool:
+        """Return whether all poses of a frame and of its carriers are older than a time."""
+        live = self._tree.live(self._tree.chain(frame) or ())
+        return bool(live) and max(live.values()) < oldest_ns
 
     def _report_frames(self) -> None:
         """Show notices about bodies without poses, and about frames that are unknown."""

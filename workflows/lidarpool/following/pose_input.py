@@ -35,6 +35,7 @@ _MODEL_POSES = (_TRANSFORMS, _STAMPED_TRANSFORM, _STAMPED_POSE, _POSE)
 # Poses whose time differs more from the clock are ignored.
 _MAX_AHEAD_NS = 1_000_000_000
 _MAX_BEHIND_NS = 10_000_000_000
+_MAX_FRAMES = 10_000
 
 
 def is_wanted(topic: str, kind: str) -> bool:
@@ -174,28 +175,30 @@ class PoseInput:
         if not is_static and clock_ns is not None:
             time_ns = time_ns or clock_ns
             if not clock_ns - _MAX_BEHIND_NS <= time_ns <= clock_ns + _MAX_AHEAD_NS:
-                self._notices.show(
-                    ("clock", frame),
+                self._notices.show_event(
+                    "clock",
                     f"Poses of {frame} are ignored, because their time differs from /clock by "
                     f"{format_rounded((time_ns - clock_ns) / 1e9)} s. Set use_sim_time in the "
                     "node that publishes them.",
                 )
                 return
+        if len(self._tree.received) >= _MAX_FRAMES and frame not in self._tree.received:
+            self._notices.show(
+                "frames", f"More than {_MAX_FRAMES:,} frames were received. Others are ignored."
+            )
+            return
         try:
             jump = self._tree.add(frame, parent, time_ns, pose, is_static=is_static)
         except ValueError as error:
-            self._notices.show(
-                ("invalid", frame), f"A pose of {frame} is ignored, because {error}."
-            )
+            self._notices.show_event("invalid", f"A pose of {frame} is ignored, because {error}.")
             return
         if not is_static:
             self.last_ns = time_ns
         if jump is not None:
-            self._notices.show(
-                ("jump", frame),
+            self._notices.show_event(
+                "jump",
                 f"{frame} jumped by {format_rounded(jump.distance_m)} m within "
-                f"{format_rounded(jump.duration_s)} s. It is not moved in between. Further jumps "
-                "of this frame are not reported.",
+                f"{format_rounded(jump.duration_s)} s. It is not moved in between.",
             )
 
 

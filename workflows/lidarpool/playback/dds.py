@@ -267,13 +267,10 @@ class RosSubscriber:
         # The clock comes first, because it determines which other messages are up to date.
         readers = sorted(self._readers.items(), key=lambda item: item[0][0] != CLOCK_TOPIC)
         for (topic, kind, *_), reader in readers:
-            while samples := reader.take(_TAKEN):
-                for sample in samples:
-                    if isinstance(sample, _SerializedMessage):
-                        time_ns = sample.sample_info.source_timestamp
-                        yield RosMessage(topic, kind, time_ns, sample.cdr)
-                if len(samples) < _TAKEN:
-                    break
+            for sample in reader.take(_TAKEN):  # not all, since a flood of messages never ends
+                if isinstance(sample, _SerializedMessage):
+                    time_ns = sample.sample_info.source_timestamp
+                    yield RosMessage(topic, kind, time_ns, sample.cdr)
 
     def _attach(self, reader: Any) -> None:
         """Let messages of a reader end waiting."""

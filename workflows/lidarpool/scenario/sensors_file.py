@@ -124,7 +124,11 @@ class SensorsFile(Section):
                 pose = CENTER if mount is None else mount.pose()
                 mounted = section.mounted_sensor(self._path, pose, self.noise, self.returns, name)
                 frame = mount.link if mount is not None and mount.link is not None else ""
-                sensors.append(SensorOnFrame(mounted, frame.strip("/"), self._options(mounted)))
+                sensors.append(
+                    SensorOnFrame(
+                        mounted, frame.replace("::", "/").strip("/"), self._options(mounted)
+                    )
+                )
         mistakes.raise_if_any()
         return sensors
 

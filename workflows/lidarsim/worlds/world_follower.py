@@ -164,7 +164,8 @@ def knots_ns(tree: FrameTree, frames: set[str], start_ns: int, stop_ns: int) -> 
     """
     moving = {name for frame in frames for name in tree.chain(frame) or ()}
     between = tree.sample_times(moving, start_ns, stop_ns)
-    return np.array([start_ns, *between, stop_ns], np.int64)
+    # A sensor that fires all its rays at once has no duration.
+    return np.array([start_ns, *between, max(stop_ns, start_ns + 1)], np.int64)
 
 
 def unseen_by(sensor: Sensor | Mounted, world: World, frame: str) -> Mounted:
