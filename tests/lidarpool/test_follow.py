@@ -548,3 +548,16 @@ def test_a_sensor_that_fires_all_rays_at_once(folder):
     assert len(clouds) >= 3
     expected = [2.5 + cloud.stamp_s for cloud in clouds]
     assert np.allclose([cloud.points[:, 0].min() for cloud in clouds], expected, atol=0.002)
+
+
+def test_a_model_that_a_sensor_file_does_not_cover_is_not_added(folder):
+    crate_model(folder)
+    (folder / "models" / "ball.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
+    names = "[ground_plane*, robot*, crate*]"
+    (folder / "sensors.yaml").write_text(f"{SENSORS}materials: [{{objects: {names}}}]\n")
+    spawned = [("box_1", "room", (0, 4, 0), 0.0), ("ball_3", "room", (0, 4, 0), 0.0)]
+    with Loop("room.sdf", models="models") as loop:
+        loop.play(lambda _: STILL + spawned, 0, 0.5)
+    assert len(loop.clouds()) == 4
+    assert len(notes_of(loop, "box_1 was not added to the world. materials: no entry")) == 1
+    assert len(notes_of(loop, "The model of ball_3 cannot be read.")) == 1

@@ -97,6 +97,16 @@ class FollowedSensor:
             self._scanner.sensor = unseen_by(self._own, world, self.frame)
         self._scanner.world = world
 
+    def build(self) -> None:
+        """Build the scanner for the world.
+
+        Raises
+        ------
+        LidarError
+            If the options of the scanner do not suit the world.
+        """
+        self._scanner.scanner  # noqa: B018 - the property builds it
+
     def restart(self, time_ns: int) -> None:
         """Let sweep 0 start at a time."""
         self.origin_ns = time_ns
@@ -158,11 +168,15 @@ class FollowedSensor:
         """
         number = self.number
         start_ns, end_ns = self.span(number)
-        bodies = self.world.bodies
-        frames = {body.frame for body in bodies if body.name not in absent} | {self.frame}
+        bodies = [
+            body
+            for body in self.world.bodies
+            if body.can_move and body.name not in absent and tree.follows(body.frame)
+        ]
+        frames = {body.frame for body in bodies} | {self.frame}
         times_ns = knots_ns(tree, frames, start_ns, end_ns)
         poses = tree.poses(frames, times_ns)
-        body_poses = {body.name: poses[body.frame] for body in bodies if body.frame in poses}
+        body_poses = {body.name: poses[body.frame] for body in bodies}
         times_s = (times_ns - self.origin_ns) / 1e9
         cloud = self._scanner.sweep(number, times_s, poses[self.frame], body_poses, absent)
         self.number += 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -321,31 +321,49 @@ class FollowNode:
 
     def _add_models(self) -> None:
         """Add models that were spawned."""
+        found: dict[str, FollowedWorld] = {}
         for frame in [*self._tree.received]:
-            if frame not in self._examined:
-                self._examined.add(frame)
-                if frame not in self._world.frames:
-                    self._add_model(frame)
+            if frame in self._examined:
+                continue
+            self._examined.add(frame)
+            known = {*self._world.frames, *found}
+            if not {frame, frame.partition("/")[0]} & known:
+                found |= self._find_model(frame)
+        if found and not self._add(found) and len(found) > 1:
+            for name, model in found.items():
+                self._add({name: model})
 
-    def _add_model(self, frame: str) -> None:
-        """Add the model of an unknown frame to the world if there is one."""
+    def _find_model(self, frame: str) -> dict[str, FollowedWorld]:
+        """Return the model of an unknown frame by its name, or an empty mapping."""
         try:
             found = self._models.find(frame)
-            if found is None:
-                return
-            name, model = found
-            if name in self._world.frames:
-                return
-            world = self._world.with_world(model.world)
         except (LidarError, OSError) as error:
-            self._notices.show(("model", frame), f"The model of {frame} cannot be added. {error}")
-            return
+            self._notices.show(("model", frame), f"The model of {frame} cannot be read. {error}")
+            return {}
+        return {} if found is None else dict([found])
+
+    def _add(self, models: Mapping[str, FollowedWorld]) -> bool:
+        """Add models to the world. Return False if the sensors cannot see the new world."""
+        world = self._world
+        try:
+            for model in models.values():
+                world = world.with_world(model.world)
+            for sensor in self._sensors:
+                sensor.world = world
+                sensor.build()
+        except LidarError as error:
+            for sensor in self._sensors:
+                sensor.world = self._world
+            if len(models) == 1:
+                (name,) = models
+                self._notices.show(("model", name), f"{name} was not added to the world. {error}")
+            return False
         self._world = world
-        self._tree.add_frames(model.world.frames)
-        self._poses.add_robots(model.robots)
-        for sensor in self._sensors:
-            sensor.world = world
-        self._notices.show(("added", name), f"{name} was added to the world.")
+        for name, model in models.items():
+            self._tree.add_frames(model.world.frames)
+            self._poses.add_robots(model.robots)
+            self._notices.show(("added", name), f"{name} was added to the world.")
+        return True
 
     def _update_absent(self, clock_ns: int) -> None:
         """Determine the bodies whose frames are no longer received."""
@@ -387,6 +405,14 @@ class FollowNode:
             "still",
             without,
             "No poses were received for {names}. They stay at their poses in the file.",
+        )
+        rigid = [
+            body.name
+            for body in self._world.bodies
+            if not body.can_move and self._tree.follows(body.frame)
+        ]
+        self._notices.show_names(
+            "voxels", rigid, "{names} contain voxels, so they stay at their poses in the file."
         )
         own = {sensor.published_frame for sensor in self._sensors}
         unknown = [name for name in received if self._tree.chain(name) is None and name not in own]

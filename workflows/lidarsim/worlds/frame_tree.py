@@ -117,10 +117,12 @@ class FrameTree:
         self._roots = {WORLD, *roots}
         self._max_speed_m_s = max_speed_m_s
         self._links: dict[str, _Link] = {}
+        self._chains: dict[str, tuple[str, ...] | None] = {}  # cache of `chain`
 
     def add_frames(self, frames: Mapping[str, WorldFrame]) -> None:
         """Add frames of a file."""
         self._in_file |= frames
+        self._chains.clear()
 
     @property
     def received(self) -> Collection[str]:
@@ -169,6 +171,8 @@ class FrameTree:
             return None
         if link is None or link.parent != parent or is_static or link.is_static:
             self._links[frame] = _Link(parent, is_static, False, [time_ns], [values])
+            if link is None or link.parent != parent:
+                self._chains.clear()
             return None
         if link.is_outdated:
             link.is_outdated = False
@@ -211,11 +215,6 @@ class FrameTree:
                 link.times_ns = [time_ns]
                 link.poses = link.poses[-1:]
 
-    def forget(self, frames: Iterable[str]) -> None:
-        """Forget all poses of some frames."""
-        for frame in frames:
-            self._links.pop(frame, None)
-
     def drop_before(self, time_ns: int) -> None:
         """Delete samples that are not required for poses at `time_ns` or later."""
         for link in self._links.values():
@@ -227,6 +226,11 @@ class FrameTree:
         Poses that were added take precedence over those of the file. If the received frames do not
         lead to the world, the frame is at its pose in the file.
         """
+        if frame not in self._chains:
+            self._chains[frame] = self._find_chain(frame)
+        return self._chains[frame]
+
+    def _find_chain(self, frame: str) -> tuple[str, ...] | None:
         names: list[str] = []
         while frame not in self._roots:
             if frame in names:
@@ -256,6 +260,10 @@ class FrameTree:
             link = self._links.get(frame)
             frame = self._in_file[frame].parent if link is None else link.parent
         return True
+
+    def follows(self, frame: str) -> bool:
+        """Return whether poses were received for a frame, or for one that carries it."""
+        return any(name in self._links for name in self.chain(frame) or ())
 
     def uses_received(self, frame: str) -> bool:
         """Return whether the pose of a frame relative to its parent was received."""

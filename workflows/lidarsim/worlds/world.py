@@ -56,6 +56,12 @@ class WorldBody:
         """Name of the body, which is unique in its world."""
         return self.item.name
 
+    @property
+    def can_move(self) -> bool:
+        """Whether the body can be an actor. Voxels cannot move."""
+        mesh = self.item.mesh if isinstance(self.item, SceneInstance) else self.item
+        return mesh.voxels is None
+
     def mesh(self) -> SceneMesh:
         """Return the mesh in the frame that carries the body."""
         back = inverse_pose(self.matrix)

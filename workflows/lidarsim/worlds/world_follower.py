@@ -148,11 +148,12 @@ class WorldFollower:
             stop_ns = int(np.ceil(stop_s * 1e9))
             if stop_ns > self._last_ns + _SLACK_NS:
                 return
-            frames = {body.frame for body in scanner.world.bodies} | {self._frame}
+            bodies = [body for body in scanner.world.bodies if self._tree.follows(body.frame)]
+            frames = {body.frame for body in bodies} | {self._frame}
             times_ns = knots_ns(self._tree, frames, start_ns, stop_ns)
             poses = self._tree.poses(frames, times_ns)
-            bodies = {body.name: poses[body.frame] for body in scanner.world.bodies}
-            yield scanner.sweep(self._number, times_ns / 1e9, poses[self._frame], bodies)
+            body_poses = {body.name: poses[body.frame] for body in bodies}
+            yield scanner.sweep(self._number, times_ns / 1e9, poses[self._frame], body_poses)
             self._number += 1
             self._tree.drop_before(stop_ns)
 

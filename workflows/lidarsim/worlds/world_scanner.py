@@ -25,6 +25,7 @@ from .world import World, WorldBody
 # A body that deviates less from its pose in the file is static, so that the rounding of published
 # poses does not change any range. The unit is meters, or radians for rotations.
 _MAX_DEVIATION = 1e-6
+_MAX_ROUNDING = 1e-9  # deviation that rounding can cause
 _NOTHING = "(nothing)"  # name of an invisible object in scenes without static objects
 
 
@@ -144,15 +145,16 @@ class WorldScanner:
 
     def _update_bodies(self, body_poses: Mapping[str, Floats], absent: frozenset[str]) -> None:
         """Discard the scanner if a body has started to move, has appeared or has vanished."""
-        started = {
-            body.name
+        deviations = {
+            body.name: float(np.abs(body_poses[body.name] - body.matrix).max())
             for body in self._world.bodies
-            if body.name in body_poses
-            and body.name not in self._moved
-            and np.abs(body_poses[body.name] - body.matrix).max() > _MAX_DEVIATION
+            if body.name in body_poses and body.name not in self._moved
         }
-        if started or absent != self._absent:
-            self._moved |= started
+        if max(deviations.values(), default=0.0) > _MAX_DEVIATION:
+            # Bodies that settle start to move soon after each other. Rebuild once for all of them.
+            self._moved |= {name for name, value in deviations.items() if value > _MAX_ROUNDING}
+            self._scanner = None
+        if absent != self._absent:
             self._absent = absent
             self._scanner = None
 
@@ -188,12 +190,11 @@ class WorldScanner:
 
 
 def _actor(body: WorldBody) -> Actor:
-    mesh = body.mesh()
-    if mesh.voxels is not None:
+    if not body.can_move:
         raise LidarError(
             f"{body.name!r} contains voxels, so it cannot move. Keep it at its pose in the file."
         )
-    return Actor(mesh, spray=False)
+    return Actor(body.mesh(), spray=False)
 
 
 def _local_pose(body: WorldBody, origin: Floats) -> StaticPose:
