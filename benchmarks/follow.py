@@ -1,5 +1,7 @@
 """CPU time and delay of `lidarpool follow` beside a stand-in for a simulator.
 
+    python -m benchmarks.follow [--seconds 20]
+
 The stand-in is a process that publishes /clock at 1 kHz and the poses of a robot and of 20 crates
 at 100 Hz, in real time. For each sensor, the CPU time of the node is measured over the last part of
 the run, after the loops have been compiled.

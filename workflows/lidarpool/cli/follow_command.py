@@ -62,8 +62,8 @@ from .first_step import print_first_step
     "world_frames",
     metavar="NAME",
     multiple=True,
-    help="Frame that coincides with the world; can be repeated (default: world, map, and the name "
-    "of the world in WORLD).",
+    help="Frame that coincides with the world, in addition to world, map, and the name of the world "
+    "in WORLD; can be repeated.",
 )
 @click.option(
     "--vanish-after",
