@@ -62,8 +62,8 @@ from .first_step import print_first_step
     "world_frames",
     metavar="NAME",
     multiple=True,
-    help="Frame that coincides with the world, in addition to world, map, and the name of the world "
-    "in WORLD; can be repeated.",
+    help="Frame that coincides with the world, in addition to world, map, and the name of a Gazebo "
+    "world; can be repeated.",
 )
 @click.option(
     "--vanish-after",
