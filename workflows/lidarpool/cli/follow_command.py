@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 
 import click
@@ -125,4 +124,4 @@ def follow(
                 f"ready: {node.description} in ROS 2 domain {network.domain} on {network.address}. "
                 "Press Ctrl-C to stop."
             )
-            node.run(threading.Event())
+            node.run()

@@ -208,9 +208,9 @@ class FollowedSensor:
             fired=fired and replace(fired, steps=np.array([steps[0]])),
         )
 
-    def missing_frame(self, tree: FrameTree) -> str:
-        """Return the name of the frame of the sensor if its pose is unknown, or an empty string."""
-        return "" if self.frame == WORLD or tree.chain(self.frame) is not None else self.frame
+    def has_pose(self, tree: FrameTree) -> bool:
+        """Return whether the pose of the sensor is known."""
+        return self.frame == WORLD or tree.chain(self.frame) is not None
 
 
 def _small_world() -> World:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NoReturn, Protocol
 
 import numpy as np
 
@@ -47,14 +46,14 @@ class FollowOptions:
     vanish_after_s: float = 1.0
 
 
-class Publishing(Protocol):
+class MessageSink(Protocol):
     """Connection through which messages are published, such as `RosPublisher`."""
 
     def publish(self, message: RosMessage) -> None:
         """Publish a message."""
 
 
-class Receiving(Protocol):
+class MessageSource(Protocol):
     """Connection through which messages are received, such as `RosSubscriber`."""
 
     def receive(self, wait_s: float) -> Iterator[RosMessage]:
@@ -92,8 +91,8 @@ class FollowNode:
         followed: FollowedWorld,
         models: ModelFolder,
         sensors: Sequence[FollowedSensor],
-        publisher: Publishing,
-        subscriber: Receiving,
+        publisher: MessageSink,
+        subscriber: MessageSource,
         note: Callable[[str], None],
         options: FollowOptions = FollowOptions(),
     ) -> None:
@@ -149,9 +148,9 @@ class FollowNode:
             if message is not None:
                 self._publisher.publish(message)
 
-    def run(self, stopped: threading.Event) -> None:
-        """Follow the simulator until the event is set."""
-        while not stopped.is_set():
+    def run(self) -> NoReturn:
+        """Follow the simulator until an exception is raised, such as KeyboardInterrupt."""
+        while True:
             self.step()
 
     def step(self, wait_s: float = _POLL_S) -> None:
@@ -191,6 +190,7 @@ class FollowNode:
             self._restart(time_ns)
         elif time_ns < last_ns or time_ns > last_ns + _MAX_CLOCK_STEP_NS:
             self._tree.restart(time_ns)
+            self._poses.jumped_s = self._clock_s
             self._restart(time_ns)
             direction = "back" if time_ns < last_ns else "ahead"
             self._notices.show_event(
@@ -292,14 +292,12 @@ class FollowNode:
     def _simulate(self, sensor: FollowedSensor) -> None:
         """Simulate and publish the next sweep of a sensor."""
         end_s = self._ends_s.pop(sensor, self._clock_s)
-        missing = sensor.missing_frame(self._tree)
-        if missing or sensor in self._lost:
-            missing = sensor.frame
+        if sensor in self._lost or not sensor.has_pose(self._tree):
             sensor.number += 1
             self._notices.show(
                 ("missing", sensor.name),
-                f"The pose of {missing}, the frame of the sensor {sensor.name}, is not received. "
-                "Nothing is published until it is.",
+                f"The pose of {sensor.frame}, the frame of the sensor {sensor.name}, is not "
+                "received. Nothing is published until it is.",
             )
             return
         self._notices.clear(("missing", sensor.name))

@@ -12,7 +12,7 @@ from ..clouds.frame_names import frame_names
 from ..clouds.writing import ExportSpec
 from ..scenario.sensors_file import SensorOnFrame, SensorsFile
 from .followed_sensor import FollowedSensor
-from .node import FollowNode, FollowOptions, Publishing, Receiving
+from .node import FollowNode, FollowOptions, MessageSink, MessageSource
 from .world_files import FollowedWorld, ModelFolder, load_followed_world
 
 
@@ -29,7 +29,7 @@ class FollowSources(NamedTuple):
 
 def create_node(
     sources: FollowSources,
-    connections: tuple[Publishing, Receiving],
+    connections: tuple[MessageSink, MessageSource],
     options: FollowOptions,
     note: Callable[[str], None],
 ) -> FollowNode:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -36,6 +37,7 @@ _MODEL_POSES = (_TRANSFORMS, _STAMPED_TRANSFORM, _STAMPED_POSE, _POSE)
 _MAX_AHEAD_NS = 1_000_000_000
 _MAX_BEHIND_NS = 10_000_000_000
 _MAX_FRAMES = 10_000
+_SETTLE_S = 1.0  # how long poses from before a jump of the clock may still arrive
 
 
 def is_wanted(topic: str, kind: str) -> bool:
@@ -45,9 +47,9 @@ def is_wanted(topic: str, kind: str) -> bool:
     return kind in _MODEL_POSES and _MODEL_POSE.fullmatch(topic) is not None
 
 
-def nanoseconds(time: Any) -> int:
+def nanoseconds(stamp: Any) -> int:
     """Convert a time message to nanoseconds."""
-    return int(time.sec) * 1_000_000_000 + int(time.nanosec)
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def frame_name(name: str) -> str:
@@ -78,6 +80,7 @@ class PoseInput:
         self._robots: list[RobotFrames] = []
         self.clock_ns: int | None = None  # last time that was received
         self.last_ns: int | None = None  # time of the last pose over time
+        self.jumped_s = -_SETTLE_S  # when the clock last jumped, as `time.monotonic`
 
     def add_robots(self, robots: Sequence[RobotFrames]) -> None:
         """Let joint values control the links of further robots."""
@@ -175,12 +178,13 @@ class PoseInput:
         if not is_static and clock_ns is not None:
             time_ns = time_ns or clock_ns
             if not clock_ns - _MAX_BEHIND_NS <= time_ns <= clock_ns + _MAX_AHEAD_NS:
-                self._notices.show_event(
-                    "clock",
-                    f"Poses of {frame} are ignored, because their time differs from /clock by "
-                    f"{format_rounded((time_ns - clock_ns) / 1e9)} s. Set use_sim_time in the "
-                    "node that publishes them.",
-                )
+                if time.monotonic() - self.jumped_s > _SETTLE_S:
+                    self._notices.show_event(
+                        "clock",
+                        f"Poses of {frame} are ignored, because their time differs from /clock by "
+                        f"{format_rounded((time_ns - clock_ns) / 1e9)} s. Set use_sim_time in the "
+                        "node that publishes them.",
+                    )
                 return
         if len(self._tree.received) >= _MAX_FRAMES and frame not in self._tree.received:
             self._notices.show(
