@@ -13,7 +13,7 @@ import asyncio
 import logging
 import math
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Collection, Coroutine, Hashable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -181,6 +181,7 @@ class GroupBalancer(SchedulerPlugin):
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
         self.groups: list[_Group] = []
+        self.move_counts: Counter[tuple[str, str]] = Counter()  # by source and destination
         self._loop: asyncio.Task[None] | None = None
 
     def find(self, names: Collection[str]) -> _Group | None:
@@ -337,6 +338,7 @@ class GroupBalancer(SchedulerPlugin):
             if record.partition == shift.source:
                 group.paused_until[record.key] = time.monotonic() + PAUSE_S
             elif record.partition == shift.destination:
+                self.move_counts[shift.source, shift.destination] += 1
                 group.moves.append(
                     WorkerMove(
                         datetime.now(UTC),
@@ -460,12 +462,15 @@ def _stats_of_group(names: Sequence[str], dask_scheduler: Any = None) -> Balance
     """Return the statistics of a group, which are empty if it does not exist."""
     balancer: GroupBalancer | None = dask_scheduler.plugins.get(NAME)
     group = balancer.find(names) if balancer is not None else None
-    if group is None:
-        return BalanceStats({})
-    partitions = {}
+    return BalanceStats({}) if group is None else BalanceStats(_loads(group), list(group.moves))
+
+
+def _loads(group: _Group) -> dict[str, DemandStats]:
+    """Return the load of each partition of a group at the last sample."""
+    loads = {}
     for name, sample in group.samples.items():
         demand = group.policy.demands[name]
-        partitions[name] = DemandStats(
+        loads[name] = DemandStats(
             workers=sample.workers,
             demand=demand.slots / sample.slots,
             backlog=sample.backlog,
@@ -473,7 +478,7 @@ def _stats_of_group(names: Sequence[str], dask_scheduler: Any = None) -> Balance
             task_s=demand.task_s,
             wait_s=demand.wait_s,
         )
-    return BalanceStats(partitions, list(group.moves))
+    return loads
 
 
 def _stop_group(names: Sequence[str], dask_scheduler: Any = None) -> None:
@@ -485,7 +490,22 @@ def _stop_group(names: Sequence[str], dask_scheduler: Any = None) -> None:
 
 def recent_moves(scheduler: Any, count: int) -> list[WorkerMove]:
     """Return the last moves within all balanced groups, newest first."""
-    balancer: GroupBalancer | None = scheduler.plugins.get(NAME)
-    groups = balancer.groups if balancer is not None else []
+    groups = _groups(scheduler)
     moves = sorted((move for group in groups for move in group.moves), key=lambda move: move.time)
     return moves[: -count - 1 : -1]
+
+
+def current_loads(scheduler: Any) -> list[dict[str, DemandStats]]:
+    """Return the load of each partition of each balanced group."""
+    return [_loads(group) for group in _groups(scheduler)]
+
+
+def move_counts(scheduler: Any) -> Counter[tuple[str, str]]:
+    """Return how many workers were moved so far, by source and destination."""
+    balancer: GroupBalancer | None = scheduler.plugins.get(NAME)
+    return Counter() if balancer is None else balancer.move_counts
+
+
+def _groups(scheduler: Any) -> list[_Group]:
+    balancer: GroupBalancer | None = scheduler.plugins.get(NAME)
+    return [] if balancer is None else balancer.groups

@@ -3,9 +3,11 @@
 import os
 import signal
 import time
+import urllib.request
 
 from distributed import Event, get_worker
 from distributed.core import Status
+from prometheus_client import parser
 
 from poolpart.workers import worker_identities
 
@@ -76,3 +78,19 @@ def leave(client, name):
     """Stop a worker for good."""
     del client.cluster.worker_spec[name]
     client.sync(client.cluster._correct_state)
+
+
+def metrics_of(client):
+    """Return the metrics of partitions at the scheduler's /metrics: {(name, *labels): value}.
+
+    The labels of a sample are sorted by their names.
+    """
+    port = client.cluster.scheduler.http_server.port
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=LONG_S) as answer:
+        families = parser.text_string_to_metric_families(answer.read().decode())
+    return {
+        (sample.name.removeprefix("dask_partition_"), *sample.labels.values()): sample.value
+        for family in families
+        for sample in family.samples
+        if sample.name.startswith("dask_partition_")
+    }

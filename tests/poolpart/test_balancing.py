@@ -12,7 +12,7 @@ from contextlib import contextmanager
 import pytest
 from distributed import Client, Nanny, Scheduler
 from tests.clusters import QUIET
-from tests.poolpart.helpers import LONG_S, addresses, leave, worker_name
+from tests.poolpart.helpers import LONG_S, addresses, leave, metrics_of, worker_name
 
 from poolpart import Partition, Pool, PoolError, n_workers
 from poolpart.balancing import NAME as BALANCER
@@ -306,6 +306,21 @@ def test_moves_are_shown_on_the_page_and_logged(eight, quickly, wait_until, capl
     for shown in (page, text, html, caplog.text):
         assert "workers and has 4, B needs " in shown
     assert len(b) < 4
+
+
+def test_prometheus_reads_the_shares_and_the_moves(eight, quickly, wait_until):
+    a, _ = parts = divide(eight, A=4, B=4)
+    with balance(eight, parts, min=2) as group:
+        with keep_busy(a):
+            wait_until(lambda: metrics_of(eight).get(("balance_moves_total", "A", "B")) == 2)
+            wait_until(lambda: metrics_of(eight)["balance_share", "A"] == 0.75)
+            metrics = metrics_of(eight)
+            assert metrics["balance_share", "B"] == 0.25
+            assert metrics["balance_demand", "A"] > 4 > metrics["balance_demand", "B"]
+            assert metrics["balance_backlog", "A"] > metrics["balance_backlog", "B"] == 0
+            assert metrics["balance_wait_seconds", "A"] > metrics["balance_wait_seconds", "B"] == 0
+        assert len(group.stats().moves) == 2
+    assert not any(name.startswith("balance") for name, *_ in metrics_of(eight))
 
 
 def process_cluster(count):

@@ -5,14 +5,12 @@ import re
 import signal
 import threading
 import time
-import urllib.request
 import uuid
 from datetime import UTC, datetime
 
 import pytest
 from distributed import Client, get_worker, worker_client
-from prometheus_client import parser
-from tests.poolpart.helpers import LONG_S
+from tests.poolpart.helpers import LONG_S, metrics_of
 
 from poolpart import Partition, Pool, StageStats, n_workers
 
@@ -106,22 +104,6 @@ def test_runs_that_are_lost_with_their_worker_are_counted(nannies, tmp_path):
     assert "1 lost task" in repr(stats)
 
 
-def metrics_of(client):
-    """Figures of partitions at the scheduler's /metrics: {(name, partition, state): value}."""
-    port = client.cluster.scheduler.http_server.port
-    text = (
-        urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=LONG_S).read().decode()
-    )
-    figures = {}
-    for family in parser.text_string_to_metric_families(text):
-        for sample in family.samples:
-            if sample.name.startswith("dask_partition_"):
-                labels = sample.labels
-                name = sample.name.removeprefix("dask_partition_")
-                figures[name, labels["partition"], labels.get("state")] = sample.value
-    return figures
-
-
 def test_prometheus_reads_the_demand_of_each_partition(client, wait_until):
     part = Partition("A", client)
     part.stats()  # counts from here on
@@ -129,8 +111,8 @@ def test_prometheus_reads_the_demand_of_each_partition(client, wait_until):
     last = part.submit(after, running)
     wait_until(lambda: part.stats().running == 2 and part.stats().waiting == 1)
     figures = metrics_of(client)
-    assert figures["slots", "A", None] == figures["busy_slots", "A", None] == 2
-    assert figures["workers", "A", None] == figures["workers", "B", None] == 1
+    assert figures["slots", "A"] == figures["busy_slots", "A"] == 2
+    assert figures["workers", "A"] == figures["workers", "B"] == 1
     states = ("running", "queued", "waiting")
     assert [figures["tasks", "A", state] for state in states] == [2, 3, 1]
     assert [figures["tasks", "B", state] for state in states] == [0, 0, 0]
@@ -139,8 +121,8 @@ def test_prometheus_reads_the_demand_of_each_partition(client, wait_until):
     last.result(LONG_S)
     figures = metrics_of(client)
     assert figures["tasks_ended_total", "A", "done"] == 6
-    assert figures["running_seconds_total", "A", None] == pytest.approx(part.stats().seconds)
-    waited_s = figures["waiting_seconds_total", "A", None]
+    assert figures["running_seconds_total", "A"] == pytest.approx(part.stats().seconds)
+    waited_s = figures["waiting_seconds_total", "A"]
     assert waited_s == pytest.approx(part.stats().queued_seconds)
     assert waited_s >= 3 * 0.2  # three tasks had to wait for slots
 

@@ -7,23 +7,23 @@ metrics of the whole cluster do not show.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import dask
 
+from ..balancing import current_loads, move_counts
 from ..features import FEATURES, Feature
-from ..partition_stats import PartitionStats
 
 _LABELS = ["partition"]
 
 
 class PartitionCollector:
-    """Prometheus collector that provides the statistics of all partitions."""
+    """Prometheus collector that provides the statistics of all partitions and balanced groups."""
 
-    def __init__(self, collect_stats: Callable[[], list[PartitionStats]]) -> None:
-        self._collect_stats = collect_stats
+    def __init__(self, statistics: Any) -> None:
+        self._statistics = statistics
 
     def describe(self) -> Iterator[Any]:
         """Return no metrics, because the scheduler may not be ready when the collector is added."""
@@ -31,10 +31,13 @@ class PartitionCollector:
 
     def collect(self) -> Iterator[Any]:
         """Yield all metric families. The label "" stands for tasks without a partition."""
+        namespace = dask.config.get("distributed.dashboard.prometheus.namespace", "dask")
+        yield from self._partition_families(f"{namespace}_partition")
+        yield from self._balance_families(f"{namespace}_partition_balance")
+
+    def _partition_families(self, prefix: str) -> Iterator[Any]:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-        namespace = dask.config.get("distributed.dashboard.prometheus.namespace", "dask")
-        prefix = f"{namespace}_partition"
         gauges = {
             "workers": GaugeMetricFamily(f"{prefix}_workers", "Workers", labels=_LABELS),
             "slots": GaugeMetricFamily(f"{prefix}_slots", "Slots on all workers", labels=_LABELS),
@@ -52,7 +55,10 @@ class PartitionCollector:
             "Time that finished tasks waited for a worker or a slot",
             labels=_LABELS,
         )
-        for stats in self._collect_stats():
+        piping = CounterMetricFamily(
+            f"{prefix}_pipe_seconds", "Time that tasks waited for pipes", labels=_LABELS
+        )
+        for stats in self._statistics.all_stats():
             for field, family in gauges.items():
                 family.add_metric([stats.name], getattr(stats, field))
             for state in ("waiting", "queued", "running"):
@@ -61,7 +67,39 @@ class PartitionCollector:
                 ended.add_metric([stats.name, state], getattr(stats, state))
             running.add_metric([stats.name], stats.seconds)
             waiting.add_metric([stats.name], stats.queued_seconds)
-        yield from (*gauges.values(), tasks, ended, running, waiting)
+            piping.add_metric([stats.name], stats.pipe_seconds)
+        yield from (*gauges.values(), tasks, ended, running, waiting, piping)
+
+    def _balance_families(self, prefix: str) -> Iterator[Any]:
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+        share = GaugeMetricFamily(
+            f"{prefix}_share", "Fraction of the workers of a balanced group", labels=_LABELS
+        )
+        gauges = {
+            "demand": GaugeMetricFamily(f"{prefix}_demand", "Workers demanded", labels=_LABELS),
+            "backlog": GaugeMetricFamily(
+                f"{prefix}_backlog", "Unfinished tasks and items in pipes", labels=_LABELS
+            ),
+            "wait_s": GaugeMetricFamily(
+                f"{prefix}_wait_seconds", "Expected waiting time of a new task", labels=_LABELS
+            ),
+        }
+        moves = CounterMetricFamily(
+            f"{prefix}_moves",
+            "Workers moved to another partition",
+            labels=["source", "destination"],
+        )
+        scheduler = self._statistics.scheduler
+        for loads in current_loads(scheduler):
+            total = sum(load.workers for load in loads.values())
+            for name, load in loads.items():
+                share.add_metric([name], load.workers / total if total else 0.0)
+                for field, family in gauges.items():
+                    family.add_metric([name], getattr(load, field))
+        for pair, count in move_counts(scheduler).items():
+            moves.add_metric(pair, count)
+        yield from (share, *gauges.values(), moves)
 
 
 class _Metrics(Feature):
@@ -76,7 +114,7 @@ class _Metrics(Feature):
             from prometheus_client import REGISTRY
         except ImportError:
             return
-        collector = PartitionCollector(statistics.all_stats)
+        collector = PartitionCollector(statistics)
         self._collectors[statistics] = collector
         REGISTRY.register(collector)
 
