@@ -39,7 +39,8 @@ class LoadSample:
     Parameters
     ----------
     workers
-        Number of workers, including those that are being moved into the partition.
+        Number of workers, including those that are being moved into the partition, but without
+        those that are being restarted.
     minimum, maximum
         Bounds on the number of workers.
     slots

@@ -49,7 +49,8 @@ class DemandStats:
     Parameters
     ----------
     workers
-        Number of workers, including those that are being moved into the partition.
+        Number of workers, including those that are being moved into the partition, but without
+        those that are being restarted.
     demand
         Number of workers that the work keeps busy, plus up to a quarter if tasks wait.
     backlog

@@ -18,7 +18,7 @@ from collections.abc import Collection, Coroutine, Hashable, Iterable, Mapping, 
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from itertools import islice
+from itertools import chain, islice
 from typing import Any, Self
 
 from distributed import Client
@@ -230,14 +230,12 @@ class GroupBalancer(SchedulerPlugin):
             self.remove(group)
             return
         sampled_at = time.monotonic()
-        members = {name: steward.members(name) for name in names}
-        self._ask_for_gpus(group, [record for group_ in members.values() for record in group_])
+        # Absent workers do no work, and may never return.
+        members = {name: steward.members(name, present=True) for name in names}
+        records = list(chain.from_iterable(members.values()))
+        self._ask_for_gpus(group, records)
         group.samples = self._take_samples(steward, group, members)
-        moving = sum(
-            not (record.is_absent or steward.is_settled(record))
-            for records in members.values()
-            for record in records
-        )
+        moving = sum(not steward.is_settled(record) for record in records)
         elapsed_s = sampled_at - group.sampled_at
         group.sampled_at = sampled_at
         for shift in group.policy.update(group.samples, elapsed_s, moving):
@@ -297,7 +295,7 @@ class GroupBalancer(SchedulerPlugin):
 
     def _ask_for_gpus(self, group: _Group, records: Sequence[WorkerRecord]) -> None:
         """Ask workers that have joined later whether they have GPUs."""
-        joined = [r for r in records if r.key not in group.gpus and not r.is_absent]
+        joined = [record for record in records if record.key not in group.gpus]
         if joined and group.spec.workers is None:
             group.gpus.update(dict.fromkeys((record.key for record in joined), None))
             _start(find_gpus(self.scheduler, joined, group.gpus), group.tasks)

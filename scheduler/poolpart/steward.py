@@ -238,6 +238,7 @@ class Steward(SchedulerPlugin):
         for record in list(self.records.values()):
             if record.info.address == worker and not record.is_absent:
                 record.is_absent = True
+                self._recount_slots(record.declared)
                 if record.reconciliation:
                     record.reconciliation.cancel()
                     record.reconciliation = None
@@ -384,11 +385,18 @@ class Steward(SchedulerPlugin):
             record.declared = target
             if self.target_resources(record) == target:
                 self._set_visible_resources(record, worker, target)
-                # Dask miscounts the slots of tasks that were moved to other members.
-                for name in leaving:
-                    for address in self.scheduler.resources.get(name, ()):
-                        recount_used_resources(self.scheduler.workers[address])
+                self._recount_slots(leaving)
         return True
+
+    def _recount_slots(self, names: Iterable[str]) -> None:
+        """Recount the slots in use after a worker has left the named partitions.
+
+        Dask attributes a task that was moved to another member to its first worker, so the counts
+        of all members are only correct together.
+        """
+        for name in names:
+            for address in self.scheduler.resources.get(name, ()):
+                recount_used_resources(self.scheduler.workers[address])
 
     def _has_released(
         self, record: WorkerRecord, worker: Any, leaving: Collection[str], requested_moves: set[Any]

@@ -236,6 +236,35 @@ def test_workers_that_leave_for_good_are_replaced_from_the_group(eight, quickly,
         assert eight.gather(tasks) == [None] * 120
 
 
+def move_a_waiting_task(dask_scheduler=None):
+    """Move the task that A's worker a would run last to worker b, like work stealing."""
+    a, b = (w for w in dask_scheduler.workers.values() if w.name in "ab")
+    [*_, task] = sorted(a.processing, key=lambda task: task.priority)
+    dask_scheduler.extensions["stealing"].move_task_request(task, a, b)
+
+
+def test_slots_are_counted_right_after_the_first_worker_of_a_stolen_task_has_left(
+    start, quickly, wait_until
+):
+    released.clear()
+    client = start({name: {} for name in "abcd"})
+    pool = Pool.from_client(client)
+    a, _ = pool.partition("A", workers=["a", "b"])
+    b, _ = pool.partition("B", workers=["c", "d"])
+    workers = {w.name: w for w in client.cluster.scheduler.workers.values()}
+    with balance(client, [a, b], min=2) as group:
+        tasks = [a.submit(hold) for _ in range(8)]
+        wait_until(lambda: len(workers["a"].processing) == len(workers["b"].processing) == 4)
+        client.run_on_scheduler(move_a_waiting_task)
+        wait_until(lambda: len(workers["b"].processing) == 5)
+        released.set()
+        assert client.gather(tasks) == [True] * 8
+        leave(client, "a")
+        wait_until(lambda: group.stats().partitions["A"].workers == 1)
+        # Tasks whose results have left with the worker run again.
+        wait_until(lambda: group.stats().partitions["A"].backlog == 0)
+
+
 def test_the_group_outlives_its_client_and_ends_with_its_partitions(start, quickly, wait_until):
     client = start({name: {} for name in "abcd"})
     scheduler = client.cluster.scheduler
@@ -316,7 +345,7 @@ def test_prometheus_reads_the_shares_and_the_moves(eight, quickly, wait_until):
             wait_until(lambda: metrics_of(eight)["balance_share", "A"] == 0.75)
             metrics = metrics_of(eight)
             assert metrics["balance_share", "B"] == 0.25
-            assert metrics["balance_demand", "A"] > 4 > metrics["balance_demand", "B"]
+            assert metrics["balance_demand", "A"] > metrics["balance_demand", "B"] == 0
             assert metrics["balance_backlog", "A"] > metrics["balance_backlog", "B"] == 0
             assert metrics["balance_wait_seconds", "A"] > metrics["balance_wait_seconds", "B"] == 0
         assert len(group.stats().moves) == 2
@@ -341,6 +370,19 @@ def slow_twice(item):
 def add_one(item):
     time.sleep(0.02)
     return item + 1
+
+
+@pytest.mark.extended
+def test_workers_that_may_still_return_are_replaced_meanwhile(patient, quickly, wait_until):
+    with process_cluster(3) as cluster, Client(cluster) as client:
+        client.wait_for_workers(3, timeout=LONG_S)
+        a, b = parts = divide(client, A=2, B=1)
+        with balance(client, parts) as group:
+            leave(client, int(b.workers[0].name))  # its nanny could start it again
+            assert b.submit(worker_name).result(LONG_S)
+            wait_until(lambda: sizes(parts) == [1, 1])
+            assert [move.source for move in group.stats().moves] == ["A"]
+        assert a.submit(worker_name).result(LONG_S)
 
 
 @pytest.mark.extended
