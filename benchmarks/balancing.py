@@ -1,18 +1,19 @@
 """Measure the throughput of two services whose workers `Pool.balance` divides.
 
-    python -m benchmarks.balancing [--workers N] [--scale FACTOR] [--case NAME …]
+    python -m benchmarks.balancing [--workers N] [--scale FACTOR] [--processes] [--case NAME …]
 
 Items pass through two services of 0.17 and 0.21 s, which share 126 workers. The best division is 56
-to 70 workers, with 332 items/s. The tasks sleep, and the workers are threads of one process. On a
-machine with few cores, `--scale 10` multiplies both times by ten, so that the scheduler is not the
-bottleneck. The cases are:
+to 70 workers, with 332 items/s. The tasks sleep, and the workers are threads of one process. With
+`--processes`, each worker is a process. On a machine with few cores, `--scale 10` multiplies both
+times by ten, so that the scheduler is not the bottleneck. The cases are:
 
 - `balanced`: partitions that begin with half of the workers each, with `Pool.balance`;
 - `halves`: the same without `Pool.balance`;
 - `best`: a fixed division into 56 and 70 workers;
 - `dask`: two Dask resources with half of the workers each. A client submits each item to both
   services, at most four items per worker at a time;
-- `step`: like `balanced`, but the first service becomes three times slower.
+- `step`: like `balanced`, but the first service becomes three times slower;
+- `step_halves`: the same without `Pool.balance`.
 
 Throughput is measured after a transient of 20 mean service times, for 30 mean service times. The
 results also contain the number of finished items and the workers of the first service every second.
@@ -38,7 +39,7 @@ DETECT_S = 0.21
 SLOWER = 3.0  # factor of the first service in the case `step`
 TRANSIENT = 20  # mean service times before a measurement
 MEASURED = 30  # mean service times of a measurement
-CASES = ("balanced", "halves", "best", "dask", "step")
+CASES = ("balanced", "halves", "best", "dask", "step", "step_halves")
 
 
 class Sample(NamedTuple):
@@ -81,16 +82,21 @@ class Load:
 
 
 @contextmanager
-def cluster_of(workers: int, resources: bool) -> Iterator[Client]:
+def cluster_of(workers: int, resources: bool, processes: bool) -> Iterator[Client]:
     """Start a scheduler and workers, optionally with a resource for each half of the workers."""
+    half = workers // 2
+    kinds: list[tuple[int, tuple[str, int] | None]] = [(workers, None)]
+    if resources:
+        kinds = [(half, ("DECODE", 1)), (workers - half, ("DETECT", 1))]
     with ExitStack() as stack:
         _, address = stack.enter_context(process(run_scheduler))
-        if resources:
-            half = workers // 2
-            stack.enter_context(process(run_workers, address, half, ("DECODE", 1)))
-            stack.enter_context(process(run_workers, address, workers - half, ("DETECT", 1), half))
-        else:
-            stack.enter_context(process(run_workers, address, workers))
+        first = 0
+        for count, slots in kinds:
+            per_process = 1 if processes else count
+            for _ in range(count // per_process):
+                arguments = address, per_process, slots, first
+                stack.enter_context(process(run_workers, *arguments))
+                first += per_process
         yield stack.enter_context(Client(address))
 
 
@@ -166,11 +172,11 @@ def throughput(samples: list[Sample]) -> float:
     return (last.done - first.done) / (last.time - first.time)
 
 
-def measure(case: str, workers: int, scale: float) -> dict[str, Any]:
+def measure(case: str, workers: int, scale: float, processes: bool) -> dict[str, Any]:
     """Run a case, and return its throughput relative to the best division."""
     load = Load(scale)
     half = workers // 2
-    with cluster_of(workers, resources=case == "dask") as client:
+    with cluster_of(workers, case == "dask", processes) as client:
         Partition("DETECT", client).stats()  # count from now on
         began_at = time.perf_counter()
         if case == "dask":
@@ -180,7 +186,7 @@ def measure(case: str, workers: int, scale: float) -> dict[str, Any]:
             decode_workers = round(workers * share) if case == "best" else half
             end = run_partitions(client, load, case in ("balanced", "step"), decode_workers)
         history = sample_for(client, TRANSIENT * load.mean_s, began_at)
-        if case == "step":
+        if case.startswith("step"):
             load.decode_s *= SLOWER
             history += sample_for(client, TRANSIENT * load.mean_s, began_at)
         measured = sample_for(client, MEASURED * load.mean_s, began_at)
@@ -201,16 +207,17 @@ def main() -> None:
     parser = argument_parser(__doc__, quick=True)
     parser.add_argument("--workers", type=int, default=126, metavar="N", help="(default: 126)")
     parser.add_argument("--scale", type=float, default=1.0, metavar="FACTOR", help="(default: 1)")
+    parser.add_argument("--processes", action="store_true", help="start a process for each worker")
     parser.add_argument("--case", choices=CASES, nargs="+", default=CASES)
     options = parser.parse_args()
     workers = 6 if options.quick else options.workers
     scale = 0.5 if options.quick else options.scale
     results = {}
     for case in options.case:
-        results[case] = measure(case, workers, scale)
+        results[case] = measure(case, workers, scale, options.processes)
         row = results[case]
         print(
-            f"{case:<10}{row['items_per_s']:8.2f} items/s, {row['of_best']:4.0%} of the best "
+            f"{case:<12}{row['items_per_s']:8.2f} items/s, {row['of_best']:4.0%} of the best "
             f"division, {row['decode_workers']} of {row['best_decode_workers']:.1f} workers",
             flush=True,
         )

@@ -26,45 +26,10 @@ TIME_TO_LIVE_S = 10
 CLOSING_S = 10.0
 
 
-class Arena:
-    """Local cluster with two casting workers, two LIDAR workers, another worker, and a board.
+class WorkerProcesses:
+    """Workers with nannies in a cluster of this process, which die and are started again."""
 
-    `pauses` maps points of the workers to the seconds per scan for which workers are held there.
-    The scheduler gives up on a worker that has sent no heartbeat for `time_to_live_s`.
-    """
-
-    def __init__(
-        self, pauses: Mapping[str, float] | None = None, time_to_live_s: int = TIME_TO_LIVE_S
-    ) -> None:
-        self._stack = ExitStack()
-        self._config = {
-            "logging.distributed": "critical",  # half of what is started here is killed
-            "distributed.scheduler.worker-ttl": f"{time_to_live_s}s",
-        }
-        self._pauses = dict(pauses or {})
-        self._withdrawn: dict[str, Any] = {}  # {name: how to start it}
-
-    def __enter__(self) -> Arena:
-        with ExitStack() as stack:
-            stack.enter_context(dask.config.set(self._config))
-            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="chaos-"))
-            self.board = Board(Path(folder))
-            start_fork_server()  # as the product does
-            stack.enter_context(forked_workers())
-            self.cluster: SpecCluster = stack.enter_context(
-                local_cluster(gpu_workers=2, other_workers=1)
-            )
-            spec = self.cluster.worker_spec
-            spec["LIDAR-1"] = spec["LIDAR-0"]
-            self.cluster.sync(self.cluster._correct_state)
-            self.client = stack.enter_context(Client(self.cluster, set_as_default=False))
-            stack.callback(trace_to, None)
-            self.client.register_plugin(ChaosPlugin(folder, self._pauses))
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
+    cluster: SpecCluster
 
     def names(self, partition: str) -> list[str]:
         """Return the names of a partition's workers, including those that are down."""
@@ -85,27 +50,6 @@ class Arena:
             return None
         address = getattr(nanny, "worker_address", None)
         return address if address in self.cluster.scheduler.workers else None
-
-    def withdraw(self, partition: str) -> None:
-        """Remove all workers of a partition until `give_up` is called."""
-        self.wait_until_whole()
-        for name in self.names(partition):
-            self._withdrawn[name] = self.cluster.worker_spec.pop(name)
-        self.cluster.sync(self.cluster._correct_state)
-
-    def give_up(self, pid: int) -> None:
-        """Make the scheduler treat a process's worker as one without heartbeats."""
-        scheduler = self.cluster.scheduler
-        workers = list(scheduler.workers.items())
-        self.cluster.sync(
-            scheduler.restart_workers,
-            [address for address, worker in workers if worker.pid == pid],
-            wait_for_workers=False,
-            stimulus_id="chaos",
-        )
-        self.cluster.worker_spec.update(self._withdrawn)
-        self._withdrawn.clear()
-        self.cluster.sync(self.cluster._correct_state)
 
     def revive(self, name: str) -> None:
         """Restart a worker whose nanny has exited."""
@@ -133,6 +77,70 @@ class Arena:
             if time.monotonic() > deadline:
                 raise TimeoutError(f"{', '.join(absent)} did not come back in {timeout_s} s.")
             time.sleep(0.02)
+
+    def give_up(self, pid: int) -> None:
+        """Make the scheduler treat a process's worker as one without heartbeats."""
+        scheduler = self.cluster.scheduler
+        workers = list(scheduler.workers.items())
+        self.cluster.sync(
+            scheduler.restart_workers,
+            [address for address, worker in workers if worker.pid == pid],
+            wait_for_workers=False,
+            stimulus_id="chaos",
+        )
+
+
+class Arena(WorkerProcesses):
+    """Local cluster with two casting workers, two LIDAR workers, another worker, and a board.
+
+    `pauses` maps points of the workers to the seconds per scan for which workers are held there.
+    The scheduler gives up on a worker that has sent no heartbeat for `time_to_live_s`.
+    """
+
+    def __init__(
+        self, pauses: Mapping[str, float] | None = None, time_to_live_s: int = TIME_TO_LIVE_S
+    ) -> None:
+        self._stack = ExitStack()
+        self._config = {
+            "logging.distributed": "critical",  # half of what is started here is killed
+            "distributed.scheduler.worker-ttl": f"{time_to_live_s}s",
+        }
+        self._pauses = dict(pauses or {})
+        self._withdrawn: dict[str, Any] = {}  # {name: how to start it}
+
+    def __enter__(self) -> Arena:
+        with ExitStack() as stack:
+            stack.enter_context(dask.config.set(self._config))
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="chaos-"))
+            self.board = Board(Path(folder))
+            start_fork_server()  # as the product does
+            stack.enter_context(forked_workers())
+            self.cluster = stack.enter_context(local_cluster(gpu_workers=2, other_workers=1))
+            spec = self.cluster.worker_spec
+            spec["LIDAR-1"] = spec["LIDAR-0"]
+            self.cluster.sync(self.cluster._correct_state)
+            self.client = stack.enter_context(Client(self.cluster, set_as_default=False))
+            stack.callback(trace_to, None)
+            self.client.register_plugin(ChaosPlugin(folder, self._pauses))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def withdraw(self, partition: str) -> None:
+        """Remove all workers of a partition until `give_up` is called."""
+        self.wait_until_whole()
+        for name in self.names(partition):
+            self._withdrawn[name] = self.cluster.worker_spec.pop(name)
+        self.cluster.sync(self.cluster._correct_state)
+
+    def give_up(self, pid: int) -> None:
+        """Make the scheduler treat a process's worker as one without heartbeats."""
+        super().give_up(pid)
+        self.cluster.worker_spec.update(self._withdrawn)
+        self._withdrawn.clear()
+        self.cluster.sync(self.cluster._correct_state)
 
 
 def _is_there(pid: int) -> bool:
