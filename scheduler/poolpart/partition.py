@@ -26,6 +26,7 @@ from .division import (
 from .errors import PoolError
 from .extras.background import run_in_background
 from .extras.cancelling import cancel_tasks
+from .extras.dashboard_page import open_page
 from .extras.notebook import table_of_partition
 from .for_each import ItemTasks
 from .internals.names import CANCELLING, CLIENTS, MAP, require_feature
@@ -155,6 +156,25 @@ class Partition:
         """
         stats: list[PartitionStats] = run_on_scheduler(self.client, stats_of, names=[self.name])
         return stats[0]
+
+    def page(self) -> str:
+        """Add a page to Dask's dashboard that shows this partition, and return its URL.
+
+        The page shows the load, stages and workers of the partition, and the workers that
+        `Pool.balance` has moved. See `Pool.page` for its visibility and lifetime.
+
+        Raises
+        ------
+        PoolError
+            If poolpart is not installed in the scheduler's environment, or if the scheduler has no
+            HTTP server.
+
+        Examples
+        --------
+        >>> gpu.page()                                                   # doctest: +SKIP
+        'http://127.0.0.1:8787/partitions?partition=GPU'
+        """
+        return open_page(self.client, self.name)
 
     def tasks(self) -> TaskTable:
         """Return a table of the partition's tasks, for all clients.

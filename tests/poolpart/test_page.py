@@ -60,6 +60,21 @@ def client(request):
         yield client
 
 
+def test_the_page_of_a_partition_shows_only_the_partition(client):
+    pool = Pool.from_client(client)
+    client.gather([pool["A"].submit(work, 1), client.submit(work, 2)])
+    with Pipe("to nobody", 1, client):
+        url = pool["A"].page()
+        rows = rows_of(url)
+        assert url == f"{pool.page()}?partition=A"
+        assert rows["A"][:2] == ["1", "2"]
+        assert rows[NASTY][0] == "A"
+        assert {*rows} == {"A", NASTY, "work"}
+        assert {"plain", "to nobody"} <= rows_of(pool.page()).keys()
+    assert rows_of(url.replace("=A", "=B"))["B"][0] == "0"
+    pool.leave_page()
+
+
 def test_it_is_served_and_taken_away(client):
     applications = client.cluster.scheduler.http_application.applications
     before = list(applications)

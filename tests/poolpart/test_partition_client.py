@@ -150,6 +150,15 @@ def test_closing_it_leaves_the_connection_open(client, a):
             call()
 
 
+def test_workers_that_leave_are_named(start):
+    client = start({name: {"resources": {"A": 1}} for name in "abc"})
+    view = Partition("A", client).as_client()
+    with pytest.raises(PoolError, match="'A' cannot let the scheduler choose the workers"):
+        view.retire_workers()
+    view.retire_workers([addresses(client)["a"]])
+    assert len(view.nthreads()) == 2
+
+
 def test_partitions_and_pipes_use_the_whole_client(client, a, make_pipe):
     with a.as_client() as view:
         assert len(Pool.from_client(view).names) == 4

@@ -10,7 +10,7 @@ import os
 from collections.abc import Collection
 from http import HTTPStatus
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import urlencode, urlsplit
 
 from distributed import Client
 from distributed.diagnostics.plugin import SchedulerPlugin
@@ -18,7 +18,7 @@ from tornado import web
 from tornado.template import Template
 
 from ..balance_stats import HEAD_OF_MOVES
-from ..balancing import recent_moves
+from ..balancing import MAX_MOVES, recent_moves
 from ..errors import PoolError
 from ..features import FEATURES, Feature
 from ..fence import fence_names
@@ -34,6 +34,7 @@ from ..stats import (
     slots_of,
     statistics_of,
     stats_of,
+    workers_of,
 )
 from ..steward import NAME as STEWARD
 from ..workers import check_client, run_on_scheduler
@@ -41,6 +42,7 @@ from .other_sites import names_of_machine, refusal
 
 NAME = "poolpart-page"
 PATH = "partitions"
+_ONLY = "partition"  # query parameter that selects a partition
 _SHOWN_MOVES = 20  # number of moves of balanced groups on the page
 _ANY_ADDRESS = "0.0.0.0"  # dashboards listen on all interfaces by default
 _HUB = "JUPYTERHUB_SERVICE_PREFIX"  # environment variable that JupyterHub sets behind its proxy
@@ -92,31 +94,40 @@ _FIGURES = (*COUNTS, "seconds")
 _OF_A_WORKER = ("worker", "partition", "slots", "busy", "assigned tasks", "status", "address")
 
 
-def render_page(scheduler: Any) -> bytes:
-    """Return the page as HTML, with the current state of the cluster."""
-    workers = list(scheduler.workers.values())
+def render_page(scheduler: Any, only: str = "") -> bytes:
+    """Return the page as HTML, with the current state of the cluster.
+
+    If the name of a partition is passed as `only`, the page shows this partition and no pipes.
+    """
+    workers = workers_of(scheduler, only) if only else list(scheduler.workers.values())
     names = {*partition_names(scheduler)} | fence_names(scheduler)
     names |= {name for name, _ in statistics_of(scheduler).ended if name}
+    shown = [only] if only else [*sorted(names), ""]
     partitions: list[list[object]] = []
     stages: list[list[object]] = []
     pipes: list[list[object]] = []
-    for p in stats_of([*sorted(names), ""], scheduler):
+    for p in stats_of(shown, scheduler):
         title = f"{_label(p.name)}{' (exclusive)' * p.exclusive}"
         partitions.append([title, p.workers, p.slots, p.busy, *_counts(p)])
         stages += [[name, _label(p.name), *_counts(stage)] for name, stage in p.stages.items()]
     rows_of_workers = sorted(
         (_worker_row(worker) for worker in workers), key=_by_partition_and_name
     )
-    for name, pipe in pipes_of(scheduler).items():
+    for name, pipe in pipes_of(scheduler).items() if not only else ():
         pipes.append([name, *pipe.summary])
+    moves = recent_moves(scheduler, MAX_MOVES if only else _SHOWN_MOVES)
+    if only:
+        moves = [move for move in moves if only in (move.source, move.destination)]
     tables = [
         ("Partitions", ["partition", "workers", "slots", "busy", *_FIGURES], partitions),
         ("Stages", ["stage", "partition", *_FIGURES], stages),
         ("Workers", _OF_A_WORKER, rows_of_workers),
         ("Pipes", ["pipe", "depth", "capacity", "state"], pipes),
-        ("Moves", HEAD_OF_MOVES, [move.cells for move in recent_moves(scheduler, _SHOWN_MOVES)]),
+        ("Moves", HEAD_OF_MOVES, [move.cells for move in moves[:_SHOWN_MOVES]]),
     ]
-    counts = f"workers {len(workers)}, partitions {len(partitions) - 1}, pipes {len(pipes)}"
+    counts = f"workers {len(workers)}"
+    if not only:
+        counts += f", partitions {len(partitions) - 1}, pipes {len(pipes)}"
     return _PAGE.generate(
         tables=tables, counts=counts, words=TEXT_COLUMNS, address=scheduler.address
     )
@@ -174,7 +185,7 @@ class _Handler(web.RequestHandler):
     def get(self) -> None:
         self.set_header("Cache-Control", "no-store")
         self.set_header("Content-Security-Policy", "default-src 'none'; style-src 'unsafe-inline'")
-        self.finish(render_page(self.scheduler))
+        self.finish(render_page(self.scheduler, self.get_query_argument(_ONLY, "")))
 
 
 class PageOwners(SchedulerPlugin):
@@ -211,8 +222,11 @@ class PageOwners(SchedulerPlugin):
                 release_statistics(scheduler)
 
 
-def open_page(client: Client) -> str:
-    """Add the page to the dashboard of the client's cluster, and return its URL."""
+def open_page(client: Client, only: str = "") -> str:
+    """Add the page to the dashboard of the client's cluster, and return its URL.
+
+    If the name of a partition is passed as `only`, the page at the URL shows this partition.
+    """
     check_client(client)
     run_on_scheduler(client, _open_page, owner=client.id, link=_dashboard_link(client))
     link = page_link(client)
@@ -221,7 +235,7 @@ def open_page(client: Client) -> str:
             f"The scheduler at {client.scheduler.address} has no HTTP server for the page. Start "
             "the scheduler with a dashboard address, for example 127.0.0.1:8787."
         )
-    return link
+    return f"{link}?{urlencode({_ONLY: only})}" if only else link
 
 
 def page_link(client: Client) -> str | None:

@@ -168,6 +168,16 @@ class PartitionClient(Client):
             "client of the pool."
         )
 
+    def retire_workers(self, workers: Any = None, *args: Any, **kw: Any) -> Any:
+        """Retire the given workers. Raise PoolError if the scheduler would choose them."""
+        if not workers:
+            raise PoolError(
+                f"The client of partition {self._partition!r} cannot let the scheduler choose the "
+                "workers to retire, because it could choose workers of other partitions. Pass the "
+                "addresses of the workers."
+            )
+        return self._whole.retire_workers(workers, *args, **kw)
+
     # -- tasks and data ----------------------------------------------------------------
 
     def submit(self, *args: Any, resources: Mapping[str, float] | None = None, **kw: Any) -> Any:
