@@ -183,6 +183,7 @@ class GroupBalancer(SchedulerPlugin):
         self.groups: list[_Group] = []
         self.move_counts: Counter[tuple[str, str]] = Counter()  # by source and destination
         self._loop: asyncio.Task[None] | None = None
+        self._has_lost_workers = False  # since the last samples
 
     def find(self, names: Collection[str]) -> _Group | None:
         """Return the group with exactly these partitions, or None."""
@@ -202,6 +203,10 @@ class GroupBalancer(SchedulerPlugin):
             self._stop()
             self.scheduler.remove_plugin(NAME)
 
+    def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
+        """Recount the slots in use before the next samples are taken."""
+        self._has_lost_workers = True
+
     async def close(self) -> None:
         """Stop when the scheduler closes."""
         for group in self.groups:
@@ -217,12 +222,14 @@ class GroupBalancer(SchedulerPlugin):
         """Balance all groups at regular intervals, until there are none."""
         while self.groups:
             await asyncio.sleep(INTERVAL_S)
+            has_lost_workers = self._has_lost_workers
+            self._has_lost_workers = False
             for group in list(self.groups):
-                self._balance(group)
+                self._balance(group, has_lost_workers)
 
     # -- decisions ---------------------------------------------------------------------
 
-    def _balance(self, group: _Group) -> None:
+    def _balance(self, group: _Group, has_lost_workers: bool) -> None:
         """Take samples of a group's partitions, and start to move workers if necessary."""
         steward: Steward | None = self.scheduler.plugins.get(STEWARD)
         names = [name for name in group.spec.names if steward and name in steward.rules]
@@ -230,6 +237,8 @@ class GroupBalancer(SchedulerPlugin):
             self.remove(group)
             return
         sampled_at = time.monotonic()
+        if has_lost_workers:
+            steward.recount_slots(names)
         # Absent workers do no work, and may never return.
         members = {name: steward.members(name, present=True) for name in names}
         records = list(chain.from_iterable(members.values()))

@@ -238,7 +238,6 @@ class Steward(SchedulerPlugin):
         for record in list(self.records.values()):
             if record.info.address == worker and not record.is_absent:
                 record.is_absent = True
-                self._recount_slots(record.declared)
                 if record.reconciliation:
                     record.reconciliation.cancel()
                     record.reconciliation = None
@@ -385,10 +384,10 @@ class Steward(SchedulerPlugin):
             record.declared = target
             if self.target_resources(record) == target:
                 self._set_visible_resources(record, worker, target)
-                self._recount_slots(leaving)
+                self.recount_slots(leaving)
         return True
 
-    def _recount_slots(self, names: Iterable[str]) -> None:
+    def recount_slots(self, names: Iterable[str]) -> None:
         """Recount the slots in use after a worker has left the named partitions.
 
         Dask attributes a task that was moved to another member to its first worker, so the counts
