@@ -293,6 +293,7 @@ def _row(
     counting = np.concatenate([submap.own_numbers for submap in submaps])
     held_out = np.setdiff1d(counting, mapped)
     compared = held_out[even_indices(len(held_out), _COMPARED_SWEEPS)]
+    coverage = AlignedSweeps(recorded, first, coverage).find_coverage(mapped)
     task = BuildTask(
         recorded, first, submaps[0], mapped, coverage, compared, DEFAULT_VOXEL_M, drawn_share=0.0
     )

@@ -136,8 +136,9 @@ def in_a_circle(end_s):
 def city_drive(model, options, sweeps, trajectory=left_turn, triangles=5_000):
     """Return the recorded sweeps of a drive through a city: a cloud in memory."""
     scene = city(triangles)
+    sensor = load_sensor(model, **options) if isinstance(model, str) else model
     survey = Survey(
-        sensors=[Mounted(load_sensor(model, **options), Pose((0, 0, 1.9)), "lidar")],
+        sensors=[Mounted(sensor, Pose((0, 0, 1.9)), "lidar")],
         trajectory=trajectory((sweeps + 1) * PERIOD_S),
         steps=36 * sweeps,
         columns=["time", "intensity", "class", "reflectivity", "ray", "range"],

@@ -322,7 +322,8 @@ def _matched_rays(pulses: RingDirections, sensor: Sensor) -> tuple[_Rays, Candid
     rays = []
     candidates = []
     for channel in range(sensor.channels):
-        matched = _match_channel(pulses, directions[:, channel], channel, limits_rad[channel])
+        passed = ~sensor.is_blocked(firings, np.full(len(firings), channel))
+        matched = _match_channel(pulses, directions[passed, channel], channel, limits_rad[channel])
         rays.append(matched[0])
         candidates.append(matched[1])
     width = max(part.expected.shape[1] for part in candidates)
@@ -365,7 +366,8 @@ def _match_channel(
     is_near = distance <= np.maximum(tolerance + pulses.spread_rad, offset)[:, None]
     first = is_near.argmax(axis=1)
     count = is_near.shape[1] - is_near[:, ::-1].argmax(axis=1) - first
-    listed = np.minimum(first[:, None] + np.arange(count.max()), is_near.shape[1] - 1)
+    most = count.max(initial=1)
+    listed = np.minimum(first[:, None] + np.arange(most), is_near.shape[1] - 1)
     expected = np.take_along_axis(rings, listed, axis=1)
     return rays, CandidateRings(first, count, expected, tolerance)
 

@@ -28,6 +28,7 @@ from lidarsim.numerics.even_samples import even_indices
 from lidarsim.sweeps.sweep_motion import FiringPoses
 
 from ..clouds.rings import MIN_RINGS
+from .blocked_directions import separated_sweeps
 from .lasers import RingLasers, unit_vectors
 from .lost_pulses import SensorCoverage, lost_pulses
 from .motion import Motion, MotionStep
@@ -234,6 +235,7 @@ class AlignedSweep(NamedTuple):
     intensities: Floats | None  # (n,)
     labels: Ints | None  # (n,), class and object
     gap_range_m: Floats | None = None  # (n,), ranges at the gaps of lost pulses, or NaN
+    is_blocked: Bools | None = None  # (n,), whether the vehicle blocks the pulse
 
     @property
     def range_m(self) -> Floats:
@@ -257,6 +259,22 @@ class AlignedSweeps:
         """Name of the recording, for use in messages."""
         return self.recorded.recording.name
 
+    def find_coverage(self, numbers: Ints) -> SensorCoverage:
+        """Return the coverage with the blocked directions that some sweeps show.
+
+        The directions are unknown if the points are motion-compensated, or if the sweeps were
+        recorded at too few positions.
+
+        Raises
+        ------
+        LidarError
+            If the recording cannot be read.
+        """
+        if self.alignment.motion is Motion.COMPENSATED:
+            return self.coverage
+        separated = separated_sweeps(numbers, self.alignment.poses[:, :3, 3])
+        return self.coverage.with_blocked(self.recorded, separated)
+
     def read(self, number: int) -> AlignedSweep:
         """Read a sweep and transform it to world coordinates.
 
@@ -268,20 +286,32 @@ class AlignedSweeps:
         return self.align(self.recorded.read(number), number)
 
     def read_with_lost(self, number: int) -> tuple[AlignedSweep, AlignedSweep]:
-        """Read a sweep, and determine which of its pulses were lost.
+        """Read a sweep, and determine which of its pulses were lost in the surroundings.
 
-        The lost pulses are represented by points one meter from their lasers.
+        The lost pulses are represented by points one meter from their lasers. Pulses that the
+        vehicle blocks did not reach the surroundings, so they are omitted.
         """
+        lost, gap_range_m = self._lost_pulses(number)
+        passed = ~self._are_blocked(lost)
+        aligned = self.align(lost.select(passed), number)
+        returned = self.align(self.recorded.read(number), number)
+        return returned, aligned._replace(gap_range_m=gap_range_m[passed])
+
+    def _lost_pulses(self, number: int) -> tuple[Sweep, Floats]:
+        """Return the results of `lost_pulses` for a sweep."""
         step, step_s = self.alignment.step(number)
         # Without motion compensation, motion does not cause gaps between points.
         is_compensated = self.alignment.motion is Motion.COMPENSATED
         fraction = self.alignment.sweep_s / step_s if is_compensated else 0.0
         moved_m = fraction * float(np.linalg.norm(step.translation))
         sweep = self.recorded.read(number)
-        lasers = self.recorded.lasers
-        lost, gap_range_m = lost_pulses(sweep, lasers, self.coverage, moved_m)
-        aligned = self.align(lost, number)._replace(gap_range_m=gap_range_m)
-        return self.align(sweep, number), aligned
+        return lost_pulses(sweep, self.recorded.lasers, self.coverage, moved_m)
+
+    def _are_blocked(self, sweep: Sweep) -> Bools:
+        """Return whether the vehicle blocks the pulses of a sweep, of shape (n,)."""
+        ring = sweep.columns["row"]
+        azimuth, _ = self.recorded.lasers.angles(sweep.points, ring)
+        return self.coverage.blocked.contains(azimuth, ring)
 
     def read_pulses(self, number: int) -> tuple[AlignedSweep, AlignedSweep]:
         """Read the pulses of a sweep as the sensor model fires them, and those that were lost.
@@ -289,13 +319,15 @@ class AlignedSweeps:
         A pulse starts at the laser of its ring, at the elevation of the ring. Of the recorded
         sweep, only the azimuths of the head remain in the directions. In sweeps whose rings have no
         constant elevations, such as motion-compensated ones, the recorded directions are used.
+        Pulses that the vehicle blocks are included and marked.
         """
-        returned, lost = self.read_with_lost(number)
+        sweep = self.recorded.read(number)
+        lost, gap_range_m = self._lost_pulses(number)
         lasers = self.recorded.lasers
-        if not lasers.have_constant_elevations:
-            return returned, lost
-        modeled = self.align(lasers.on_rings(self.recorded.read(number)), number)
-        return modeled, lost
+        modeled = lasers.on_rings(sweep) if lasers.have_constant_elevations else sweep
+        returned = self.align(modeled, number)._replace(is_blocked=self._are_blocked(sweep))
+        aligned = self.align(lost, number)._replace(is_blocked=self._are_blocked(lost))
+        return returned, aligned._replace(gap_range_m=gap_range_m)
 
     def align(self, sweep: Sweep, number: int) -> AlignedSweep:
         """Transform the points of a sweep to world coordinates."""

@@ -43,6 +43,7 @@ from ..report.page.rendering import render_template
 from ..run.cluster.worker_map import LostWorkersError, MapFunction, parallel_map
 from ..scenario.point_scene import CLASS_MATERIAL
 from .alignment import AlignedSweeps, Alignment, first_alignment
+from .blocked_directions import BlockedDirections
 from .charts import (
     STATIONARY_DOTS,
     SweepImages,
@@ -403,12 +404,13 @@ class _Building:
         submaps = split_into_submaps(first.poses[:, :3, 3])
         counting = np.concatenate([submap.own_numbers for submap in submaps])
         mapped, compared = _held_out_split(recorded, counting)
+        sweeps = AlignedSweeps(recorded, first, SensorCoverage.from_sweeps(recorded))
         task = BuildTask(
             recorded=recorded,
             alignment=first,
             submap=submaps[0],
             mapped=mapped,
-            coverage=SensorCoverage.from_sweeps(recorded),
+            coverage=sweeps.find_coverage(mapped),
             compared=compared,
             voxel_m=self.voxel_m,
             drawn_share=0.0,
@@ -704,16 +706,18 @@ class SweepTiming(NamedTuple):
             known = {"clockwise": self.rotation.is_clockwise, "zero_deg": zero_deg}
         return SensorModel(
             name="Recorded sensor",
-            sources={"angles": "median angles of the recorded points"} | _origin_sources(lasers),
+            sources={"angles": "median angles of the recorded points"}
+            | _origin_sources(lasers)
+            | _blocked_sources(sweeps.coverage.blocked),
             **known,
             firings_per_turn=firings_per_turn(recorded.read(number), recorded.lasers),
             rate_hz=self.rate_hz,
             range_m=(0.0, float(np.ceil(1.1 * sweeps.coverage.max_range_m))),
-            beams=_beam_table(lasers),
+            beams=_beam_table(lasers, sweeps.coverage.blocked),
         )
 
 
-def _beam_table(lasers: RingLasers) -> dict[str, Any]:
+def _beam_table(lasers: RingLasers, blocked: BlockedDirections) -> dict[str, Any]:
     """Return the `beams` of a sensor model, from the lowest ring to the highest."""
     order = np.arange(len(lasers))[::-1]
     table = {"elevation_deg": np.degrees(lasers.elevation_rad[order]).round(3).tolist()}
@@ -721,6 +725,10 @@ def _beam_table(lasers: RingLasers) -> dict[str, Any]:
         forward = np.zeros(len(lasers))
         origins_m = lasers.positions(forward, lasers.elevation_rad[order], order)
         table["origin_m"] = (origins_m.round(_ORIGIN_DECIMALS) + 0.0).tolist()
+    last = len(lasers) - 1
+    sectors = [(last - ring, start, stop) for ring, start, stop in blocked.sectors_deg()]
+    if sectors:
+        table["blocked_deg"] = sorted(sectors)
     return table
 
 
@@ -729,6 +737,13 @@ def _origin_sources(lasers: RingLasers) -> dict[str, str]:
     if lasers.is_at_origin:
         return {}
     return {"origins": "angles of the recorded points as a function of the range"}
+
+
+def _blocked_sources(blocked: BlockedDirections) -> dict[str, str]:
+    """Return the source of the blocked directions, if there are any."""
+    if not blocked.cells.any():
+        return {}
+    return {"blocked": "directions in which surfaces at close range are interrupted"}
 
 
 def fit_sensor(

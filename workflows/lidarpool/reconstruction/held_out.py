@@ -208,6 +208,8 @@ def _rays(
     simulated_m[hits.rays] = np.where(
         surface_map.surfels.dark[hits.surfel], np.nan, hits.distance_m
     )
+    if sweep.is_blocked is not None:
+        simulated_m[sweep.is_blocked] = np.nan
     unknown = np.full(len(sweep.points), np.nan)
     return HeldOutRays(
         sweep=np.full(len(sweep.points), number),

@@ -16,6 +16,7 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 
+from .blocked_directions import BlockedDirections, PulseCounts, azimuth_cells
 from .lasers import RingLasers
 from .recorded_sweeps import RecordedSweeps, ring_starts
 
@@ -79,7 +80,7 @@ def lost_pulses(
         columns["azimuth_rad"] = azimuth
     pulses = Sweep(lasers.ends(azimuth, elevation, ring, np.ones(len(ring))), columns)
     received = _received(gaps, len(lasers))[_sectors(azimuth)]
-    chosen = received & coverage.cells[_cells(azimuth, ring)]
+    chosen = received & coverage.cells[azimuth_cells(azimuth, ring, _COLUMNS)]
     return pulses.select(chosen), range_m[chosen]
 
 
@@ -194,6 +195,7 @@ class SensorCoverage(NamedTuple):
 
     cells: Bools  # (r, c), rings and azimuth cells that the vehicle does not block
     max_range_m: float  # maximum range of a return, meters
+    blocked: BlockedDirections = BlockedDirections.none()  # in which pulses never return
 
     @classmethod
     def from_sweeps(cls, sweeps: RecordedSweeps) -> SensorCoverage:
@@ -212,7 +214,7 @@ class SensorCoverage(NamedTuple):
             cells = np.zeros_like(returned, bool)
             ring = sweep.columns["row"]
             azimuth, _ = sweeps.lasers.angles(sweep.points, ring)
-            cells[_cells(azimuth, ring)] = True
+            cells[azimuth_cells(azimuth, ring, _COLUMNS)] = True
             returned += cells
             if len(sweep):
                 max_range_m = max(max_range_m, float(np.linalg.norm(sweep.points, axis=1).max()))
@@ -222,7 +224,29 @@ class SensorCoverage(NamedTuple):
         least = np.where(is_low, _MIN_RETURN_SHARE * len(numbers), 0)
         return cls(returned > least[:, None], max_range_m)
 
+    def with_blocked(self, sweeps: RecordedSweeps, numbers: Ints) -> SensorCoverage:
+        """Return a copy with the blocked directions that some sweeps show.
 
-def _cells(azimuth: Floats, ring: Ints) -> tuple[Ints, Ints]:
-    turns = azimuth / (2 * np.pi) + 0.5
-    return ring, np.floor(turns * _COLUMNS).astype(np.int64) % _COLUMNS
+        The points must not be motion-compensated. Without sweeps, nothing is blocked.
+
+        Raises
+        ------
+        LidarError
+            If the recording cannot be read.
+        """
+        lasers = sweeps.lasers
+        if not len(lasers) or not len(numbers):
+            return self
+        everything = self._replace(cells=np.ones_like(self.cells))
+        columns = firings_per_turn(sweeps.read(int(numbers[len(numbers) // 2])), lasers)
+        counts = PulseCounts.zeros(sweeps.ring_count, columns)
+        for number in numbers.tolist():
+            sweep = sweeps.read(number)
+            lost, range_m = lost_pulses(sweep, lasers, everything, 0.0)
+            ring = sweep.columns["row"]
+            azimuth, _ = lasers.angles(sweep.points, ring)
+            counts.add_returned(azimuth, ring, lasers.ranges(sweep.points, ring))
+            ring = lost.columns["row"]
+            azimuth, _ = lasers.angles(lost.points, ring)
+            counts.add_lost(azimuth, ring, range_m)
+        return self._replace(blocked=counts.blocked(lasers.elevation_rad))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from typing import Annotated, Literal, Protocol
@@ -12,13 +12,14 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from ..errors import LidarError
-from ..numerics.arrays import Floats, Ints
+from ..numerics.arrays import Bools, Floats, Ints
 from ..numerics.elementary import cos, sin_cos
 from ..schema.checks import as_array, check_fields, check_number
 from ..schema.declared import about
 from ..schema.value_texts import one_line
 
 MAX_CHANNELS = 65_535  # limit of the uint16 column `channel`
+_TURN_BITS = 40  # resolution of the azimuths in keys of directions, as a power of 2 per turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,17 +41,25 @@ class Beams:
     origin
         Start of each beam in the sensor frame with the head at azimuth 0, in meters. By default,
         all beams start at the sensor origin. Shape (c, 3), float64.
+    blocked
+        Directions in which the platform blocks a beam, so that its pulses have no return. Each row
+        contains the index of a beam and the azimuths in the sensor frame, in radians, between which
+        the beam is blocked, counterclockwise from the first to the second. The first azimuth is
+        included, and the second is excluded. By default, no direction is blocked. Shape (k, 3),
+        float64.
 
     Raises
     ------
     LidarError
-        If the lengths differ, a value is not finite, or there are no beams or too many beams.
+        If the lengths differ, a value is not finite, there are no beams or too many beams, or
+        `blocked` refers to a beam that does not exist.
     """
 
     elevation: Floats
     azimuth: Floats = field(default_factory=lambda: np.zeros(0))
     time_ns: Floats = field(default_factory=lambda: np.zeros(0))
     origin: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    blocked: Floats = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __post_init__(self) -> None:
         count = as_array("Beams.elevation", self.elevation).size
@@ -63,6 +72,16 @@ class Beams:
             ("origin", (count, 3)),
         ):
             object.__setattr__(self, name, _as_table(name, getattr(self, name), shape))
+        blocked = as_array("Beams.blocked", self.blocked)
+        rows = blocked.reshape(-1, 3) if blocked.size % 3 == 0 else blocked
+        object.__setattr__(self, "blocked", _as_table("blocked", rows, (blocked.size // 3, 3)))
+        index = self.blocked[:, 0]
+        unknown = index[(index != np.rint(index)) | (index < 0) | (index >= count)]
+        if len(unknown):
+            raise LidarError(
+                f"Blocked directions refer to beam {unknown[0]:g}, but the beams are numbered "
+                f"from 0 to {count - 1}."
+            )
 
     def __len__(self) -> int:
         return len(self.elevation)
@@ -91,12 +110,43 @@ class Beams:
         x, y, z = self.origin.T
         sin, cos = sin_cos(angle)
         origin = np.column_stack([cos * x - sin * y, sin * x + cos * y, z])
-        return Beams(self.elevation, self.azimuth + angle, self.time_ns, origin)
+        return replace(self, azimuth=self.azimuth + angle, origin=origin)
 
     def sort_by_elevation(self) -> Beams:
         """Return the beams sorted by elevation, so that channel 0 is the lowest beam."""
         order = np.argsort(self.elevation, kind="stable")
-        return Beams(*(a[order] for a in (self.elevation, self.azimuth, self.time_ns, self.origin)))
+        blocked = self.blocked.copy()
+        blocked[:, 0] = np.argsort(order)[blocked[:, 0].astype(np.intp)]
+        tables = (self.elevation, self.azimuth, self.time_ns, self.origin)
+        return Beams(*(table[order] for table in tables), blocked)
+
+    def is_blocked(self, beam: Ints, azimuth: Floats) -> Bools:
+        """Return whether the platform blocks pulses.
+
+        Parameters
+        ----------
+        beam
+            Index of the beam of each pulse. Shape (n,).
+        azimuth
+            Azimuth of each pulse in the sensor frame, in radians. Shape (n,).
+        """
+        starts, stops = self._blocked_keys
+        keys = _direction_keys(beam, azimuth)
+        # Intervals may overlap.
+        opened = np.searchsorted(starts, keys, "right")
+        return np.asarray(opened > np.searchsorted(stops, keys, "right"))
+
+    @cached_property
+    def _blocked_keys(self) -> tuple[Ints, Ints]:
+        """Sorted starts and stops of the blocked directions, as keys of directions."""
+        beam = self.blocked[:, 0].astype(np.int64)
+        starts = _direction_keys(beam, self.blocked[:, 1])
+        stops = _direction_keys(beam, self.blocked[:, 2])
+        # An interval that contains azimuth 0 is divided there.
+        is_divided = stops <= starts
+        ends = (beam[is_divided] + 1) << _TURN_BITS
+        begins = beam[is_divided] << _TURN_BITS
+        return np.sort(np.append(starts, begins)), np.sort(np.append(stops, ends))
 
 
 class Head(Protocol):
@@ -310,6 +360,12 @@ class Mirror(Spin):
             line_fraction = phase - 0.5
         turned = np.radians(self.width_deg) * line_fraction
         return np.radians(self.zero_deg) + (-turned if self.clockwise else turned)
+
+
+def _direction_keys(beam: Ints, azimuth: Floats) -> Ints:
+    """Return integers that order directions by beam, and then by azimuth from 0 to a full turn."""
+    steps = np.floor(azimuth / (2 * np.pi) * (1 << _TURN_BITS)).astype(np.int64)
+    return np.asarray((beam.astype(np.int64) << _TURN_BITS) | (steps & ((1 << _TURN_BITS) - 1)))
 
 
 def _as_table(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:

@@ -64,6 +64,9 @@ def _expand_numbers(value: Any) -> Any:
 
 Numbers = Annotated[tuple[float, ...], BeforeValidator(_expand_numbers)]
 OffsetXYZ = tuple[float, float, float]
+_Azimuth = Annotated[float, Field(ge=-360, le=360)]
+# Index of a beam, and the azimuths between which it is blocked, in degrees.
+BlockedSector = tuple[Annotated[int, Field(ge=0)], _Azimuth, _Azimuth]
 # Fractions are exact, whereas a float cannot represent 55.296 exactly, and a decimal number cannot
 # represent 500/9.
 Exact = Annotated[Fraction, BeforeValidator(lambda value: Fraction(str(value)))]
@@ -74,7 +77,8 @@ class BeamTable(_ModelSection):
     """Beams of a sensor model, in the manufacturer's order.
 
     Except for their units, the fields are those of `Beams`. All beams cross in a point at a
-    distance of `crossing_m` from the axis, if it is set.
+    distance of `crossing_m` from the axis, if it is set. The beams in `blocked_deg` are numbered
+    from 0 in the order of the table.
     """
 
     elevation_deg: Numbers = ()
@@ -82,18 +86,36 @@ class BeamTable(_ModelSection):
     time_us: Numbers = ()
     origin_m: OffsetXYZ | tuple[OffsetXYZ, ...] = ()
     crossing_m: Annotated[float, Field(ge=0, le=1)] = 0.0
+    blocked_deg: tuple[BlockedSector, ...] = ()
+
+    @model_validator(mode="after")
+    def _check_blocked(self) -> BeamTable:
+        for beam, start, stop in self.blocked_deg:
+            if start == stop:
+                raise ValueError(
+                    f"The sector [{beam}, {start:g}, {stop:g}] in blocked_deg is empty. To block a "
+                    f"beam in all directions, use [{beam}, 0, 360]."
+                )
+        return self
 
     def beams(self) -> Beams:
         """Create the beams, or a single forward beam if the table has no elevations."""
         count = len(self.elevation_deg)
         if not count:
-            return Beams(np.zeros(1))
+            return Beams(np.zeros(1), blocked=self.blocked())
         return Beams(
             np.radians(self.elevation_deg),
             np.radians(self.azimuth_deg),
             np.multiply(self.time_us, 1000.0),
             self.origins(count),
+            self.blocked(),
         )
+
+    def blocked(self) -> Floats:
+        """Return the blocked directions as `Beams.blocked`, of shape (k, 3)."""
+        blocked = np.array(self.blocked_deg, np.float64).reshape(-1, 3)
+        blocked[:, 1:] = np.radians(blocked[:, 1:])
+        return blocked
 
     def origins(self, count: int) -> Floats:
         """Return the origins of `count` beams in meters.
@@ -261,11 +283,14 @@ class SensorModel(_ModelSection):
             raise ValueError(
                 f"Prisms rotate about x, so {min(unused)} cannot be set. Rotate the sensor instead."
             )
+        if self.beams.blocked_deg and (self.prisms or self.listed):
+            raise ValueError("beams.blocked_deg requires beams that rotate with a head.")
         if self.turning_mirror and not self.prisms:
             raise ValueError(
                 "turning_mirror requires prisms. For a mirror that scans lines, use mirror."
             )
-        self.beams.beams()  # raises LidarError for impossible beams
+        if not self.needs_calibration:  # A calibration may provide more beams.
+            self.beams.beams()  # raises LidarError for impossible beams
         return self
 
     @property
@@ -575,6 +600,11 @@ def _create_listed_sensor(
             f"{unit.file} does not match {sensor_model.name}. One describes rays and the other "
             "describes beams."
         )
+    if sensor_model.beams.blocked_deg:
+        raise LidarError(
+            f"{unit.file} lists rays, but beams.blocked_deg of {sensor_model.name} requires beams. "
+            "Remove blocked_deg."
+        )
     if not unit.head:  # a firing of the model comprises all beams, and one of the list a single ray
         firings = head.firings_per_turn * len(sensor_model.beams.beams())
         head = replace(head, firings_per_turn=firings)
@@ -605,4 +635,4 @@ def _calibrate_beams(sensor_model: SensorModel, unit: Calibration) -> Beams:
         )
     times = beams.time_ns if beams.time_ns.any() else np.multiply(table.time_us, 1000.0)
     origin = beams.origin if beams.origin.any() else table.origins(len(beams))
-    return Beams(beams.elevation, beams.azimuth, times, origin)
+    return Beams(beams.elevation, beams.azimuth, times, origin, table.blocked())

@@ -56,12 +56,21 @@ def _to_plain_data(value: Any, arrays: MutableMapping[str, AnyArray]) -> Any:
     if isinstance(value, Mapping):
         return {"mapping": {key: _to_plain_data(item, arrays) for key, item in value.items()}}
     if _KINDS.get(type(value).__name__) is type(value):
-        names = [field.name for field in fields(value) if field.name not in _LEFT_OUT]
-        of_fields = {name: _to_plain_data(getattr(value, name), arrays) for name in names}
+        stored = {field.name: getattr(value, field.name) for field in fields(value)}
+        of_fields = {
+            name: _to_plain_data(part, arrays)
+            for name, part in stored.items()
+            if name not in _LEFT_OUT and not _is_empty(part)
+        }
         return {"kind": type(value).__name__, **of_fields}
     if not isinstance(value, (str, int, float, type(None))):
         raise TypeError("user-defined classes cannot be written to a file")
     return value
+
+
+def _is_empty(value: Any) -> bool:
+    """Return whether a value is an empty array, which is the default of its field."""
+    return isinstance(value, np.ndarray) and not value.size
 
 
 def from_plain_data(data: Any, arrays: Mapping[str, AnyArray]) -> Any:

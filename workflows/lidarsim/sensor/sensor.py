@@ -14,7 +14,7 @@ from pydantic import Field
 
 from ..environment.notebook import html_picture, html_table
 from ..errors import LidarError
-from ..numerics.arrays import Floats, Ints
+from ..numerics.arrays import Bools, Floats, Ints
 from ..numerics.elementary import arcsin, arctan2, sin_cos
 from ..numerics.vectors import rotate
 from ..schema.checks import check_fields, check_fits
@@ -118,6 +118,11 @@ class Sensor:
         if not self.max_range_m > self.min_range_m:
             raise LidarError(
                 f"max_range_m must be greater than min_range_m, but is {self.max_range_m}."
+            )
+        if len(self.beams.blocked) and type(self).directions is not Sensor.directions:
+            raise LidarError(
+                "Blocked directions require beams that rotate with a head. Remove them from the "
+                "beams."
             )
 
     def _repr_html_(self) -> str:
@@ -347,6 +352,14 @@ class Sensor:
         if not self.beams.origin.any():
             return None
         return self._rotate(firings, self.beams.origin)
+
+    def is_blocked(self, firings: Ints, channels: Ints) -> Bools:
+        """Return whether the platform blocks pulses, which then have no return.
+
+        `firings` and `channels` of the pulses and the result have shape (n,).
+        """
+        azimuth = self.head.azimuths(firings) + self.beams.azimuth[channels]
+        return self.beams.is_blocked(channels, azimuth)
 
     @cached_property
     def beam_directions(self) -> Floats:

@@ -30,6 +30,7 @@ PROPERTIES = {
     "divergence": "beam divergence",
     "returns": "returns per pulse",
     "noise": "noise",
+    "blocked": "directions that the platform blocks",
 }
 
 
@@ -146,7 +147,7 @@ FORMATS: tuple[SensorFormat, ...] = (
         (".xml",),
         "lidarsim.sensor.helios_scanner",
         "a HELIOS++ scanner",
-        frozenset(PROPERTIES) - {"returns"},
+        frozenset(PROPERTIES) - {"returns", "blocked"},
         reads=False,
         describes=True,
     ),

@@ -1,4 +1,7 @@
-"""Sensor faults such as dirt on the window, dead channels, lost packets and frozen sweeps."""
+"""Sensor faults such as dirt on the window, dead channels, lost packets and frozen sweeps.
+
+The directions that the platform blocks are here, too, because they have the same consequence.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +63,10 @@ def _in_spot(fault: Fault, x: Floats, y: Floats, z: Floats) -> Bools:
 
 
 class LossStep(PulseStep):
-    """Simulation step for dead channels, lost packets, and scans missing from frozen sweeps."""
+    """Simulation step for all causes of returns that are missing from the output of the sensor.
+
+    These are blocked directions, dead channels, lost packets, and scans missing from frozen sweeps.
+    """
 
     role = Role.CHANGES
     effects = ("Faults",)
@@ -69,8 +75,9 @@ class LossStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return whether the sensor has dead channels, lost packets or frozen sweeps."""
-        return bool(setup.faults("dead_channels", "dropped_packets", "frozen"))
+        """Return whether the sensor has blocked directions or faults that remove returns."""
+        blocked = setup.sensor.beams.blocked
+        return len(blocked) > 0 or bool(setup.faults("dead_channels", "dropped_packets", "frozen"))
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Drop the lost returns of a batch."""
@@ -86,6 +93,10 @@ class LossStep(PulseStep):
             spec.random_offset != first_sent_again - first_replaced
         ):  # the repeated sweep has no such scan
             return returns.take(np.zeros(0, np.intp))
+        if len(firings.sensor.beams.blocked):
+            number, channel = np.divmod(returns.ray, firings.sensor.channels)
+            blocked = firings.sensor.is_blocked(firings.numbers[number], channel)
+            returns = returns.take(np.flatnonzero(~blocked))
         faults = self.setup.faults("dead_channels", "dropped_packets")
         spans = np.array([fault.span_ns for fault in faults.values()]).reshape(-1, 2)
         lost_channels = np.zeros((len(faults), firings.sensor.channels), np.bool_)
