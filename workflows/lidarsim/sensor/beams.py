@@ -118,7 +118,7 @@ class Beams:
         blocked = self.blocked.copy()
         blocked[:, 0] = np.argsort(order)[blocked[:, 0].astype(np.intp)]
         tables = (self.elevation, self.azimuth, self.time_ns, self.origin)
-        return Beams(*(table[order] for table in tables), blocked)
+        return replace(Beams(*(table[order] for table in tables)), blocked=blocked)
 
     def is_blocked(self, beam: Ints, azimuth: Floats) -> Bools:
         """Return whether the platform blocks pulses.

@@ -11,6 +11,7 @@ from ...numerics.arrays import Bools, Floats, to_writable
 from ...numerics.elementary import sin_cos
 from ...numerics.vectors import hypot
 from ...survey.faults import PACKET, Fault
+from ..casting.motion import Firings
 from ..returns import PulseReturns, require_column
 from .step import PulseBatch, PulseStep, Role, Setup
 
@@ -62,6 +63,15 @@ def _in_spot(fault: Fault, x: Floats, y: Floats, z: Floats) -> Bools:
     return in_spot
 
 
+def _without_blocked(returns: PulseReturns, firings: Firings) -> PulseReturns:
+    """Drop the returns of pulses that the platform blocks."""
+    if not len(firings.sensor.beams.blocked):
+        return returns
+    number, channel = np.divmod(returns.ray, firings.sensor.channels)
+    is_blocked = firings.sensor.is_blocked(firings.numbers[number], channel)
+    return returns.take(np.flatnonzero(~is_blocked))
+
+
 class LossStep(PulseStep):
     """Simulation step for all causes of returns that are missing from the output of the sensor.
 
@@ -93,10 +103,7 @@ class LossStep(PulseStep):
             spec.random_offset != first_sent_again - first_replaced
         ):  # the repeated sweep has no such scan
             return returns.take(np.zeros(0, np.intp))
-        if len(firings.sensor.beams.blocked):
-            number, channel = np.divmod(returns.ray, firings.sensor.channels)
-            blocked = firings.sensor.is_blocked(firings.numbers[number], channel)
-            returns = returns.take(np.flatnonzero(~blocked))
+        returns = _without_blocked(returns, firings)
         faults = self.setup.faults("dead_channels", "dropped_packets")
         spans = np.array([fault.span_ns for fault in faults.values()]).reshape(-1, 2)
         lost_channels = np.zeros((len(faults), firings.sensor.channels), np.bool_)
