@@ -150,7 +150,7 @@ def test_sectors_include_those_across_the_back_and_whole_rings():
     np.testing.assert_array_equal(blocked.contains(azimuth, ring), lost)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_a_twin_has_the_blocked_directions_of_the_recorded_sensor(tmp_path):
     """The sensor file of the twin blocks the directions that the recorded sensor blocked."""
     sensor = load_sensor(MODEL, columns=COLUMNS)
