@@ -175,6 +175,11 @@ def test_a_survey_that_hits_nothing(scenes, backend):
     same(scenes["plain"], survey, backend, (0, survey.scan_count))
 
 
+_SENSOR = MADE["on the move"].mounted_sensors[0].sensor
+WITH_FACTORS = replace(
+    _SENSOR,
+    beams=replace(_SENSOR.beams, intensity_factor=np.linspace(0.5, 2, len(_SENSOR.beams))),
+)
 OWN = Column("own", "float32", "", "of a user", lambda returns: returns.range)
 MORE = {
     "a user's column": {"columns": (*COLUMNS, OWN)},
@@ -199,6 +204,7 @@ MORE = {
         ),
     },
     "a measured material": {"materials": [Material("*", spectrum="asphalt, dry")]},
+    "intensity factors": {"sensor": WITH_FACTORS, "sensors": ()},
 }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
 from functools import cached_property
 from typing import Annotated, Literal, Protocol
@@ -47,12 +47,15 @@ class Beams:
         the beam is blocked, counterclockwise from the first to the second. The first azimuth is
         included, and the second is excluded. By default, no direction is blocked. Shape (k, 3),
         float64.
+    intensity_factor
+        Ratio of the reported to the received intensity of each beam, greater than 0; 1 by default.
+        It does not affect the detection of returns. Shape (c,), float64.
 
     Raises
     ------
     LidarError
-        If the lengths differ, a value is not finite, there are no beams or too many beams, or
-        `blocked` refers to a beam that does not exist.
+        If the lengths differ, a value is not finite, an intensity factor is not positive, there are
+        no beams or too many beams, or `blocked` refers to a beam that does not exist.
     """
 
     elevation: Floats
@@ -60,8 +63,11 @@ class Beams:
     time_ns: Floats = field(default_factory=lambda: np.zeros(0))
     origin: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     blocked: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    intensity_factor: Floats = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
+        if not np.size(self.intensity_factor):
+            object.__setattr__(self, "intensity_factor", np.ones(np.size(self.elevation)))
         count = as_array("Beams.elevation", self.elevation).size
         if not 1 <= count <= MAX_CHANNELS:
             raise LidarError(f"A sensor must have 1 to {MAX_CHANNELS} beams, but has {count}.")
@@ -70,6 +76,7 @@ class Beams:
             ("azimuth", (count,)),
             ("time_ns", (count,)),
             ("origin", (count, 3)),
+            ("intensity_factor", (count,)),
         ):
             object.__setattr__(self, name, _as_table(name, getattr(self, name), shape))
         blocked = as_array("Beams.blocked", self.blocked)
@@ -81,6 +88,11 @@ class Beams:
             raise LidarError(
                 f"Blocked directions refer to beam {unknown[0]:g}, but the beams are numbered "
                 f"from 0 to {count - 1}."
+            )
+        if not (self.intensity_factor > 0).all():
+            raise LidarError(
+                "Beams.intensity_factor must be greater than 0 for each beam, but is "
+                f"{self.intensity_factor.min():g} for one of them."
             )
 
     def __len__(self) -> int:
@@ -117,8 +129,17 @@ class Beams:
         order = np.argsort(self.elevation, kind="stable")
         blocked = self.blocked.copy()
         blocked[:, 0] = np.argsort(order)[blocked[:, 0].astype(np.intp)]
-        tables = (self.elevation, self.azimuth, self.time_ns, self.origin)
-        return replace(Beams(*(table[order] for table in tables)), blocked=blocked)
+        ordered = {
+            column.name: getattr(self, column.name)[order]
+            for column in fields(self)
+            if column.name != "blocked"
+        }
+        return Beams(**ordered, blocked=blocked)
+
+    @property
+    def has_intensity_factors(self) -> bool:
+        """Whether the reported intensity of a beam differs from the received intensity."""
+        return bool((self.intensity_factor != 1).any())
 
     def is_blocked(self, beam: Ints, azimuth: Floats) -> Bools:
         """Return whether the platform blocks pulses.

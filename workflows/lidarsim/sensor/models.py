@@ -21,13 +21,13 @@ from ..io.yamlfile import load_yaml
 from ..numerics.arrays import Floats, Ints
 from ..numerics.elementary import log1p, sin_cos
 from ..schema.checks import check_fits
-from ..schema.declared import UnitShare
+from ..schema.declared import Several, UnitShare
 from ..schema.error_sentences import convert_validation_errors
 from ..schema.model_names import BUILT_IN, GROUP, full_name, maker_folder, model_names, names_in
 from ..words import did_you_mean
 from .beams import Beams, Duty, Mirror, MirrorMotion, Spin, Width
 from .calibrations import Calibration, read_calibration
-from .noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS, Noise
+from .noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS, Bias, Meters, Noise
 from .optics import LIGHT_M_NS, Mode, Optics, Returns
 from .packet_settings import Identifier, PacketSettings, laser_order
 from .ray_sensors import ListedSensor, Prism, PrismSensor, TurningMirror
@@ -87,6 +87,7 @@ class BeamTable(_ModelSection):
     origin_m: OffsetXYZ | tuple[OffsetXYZ, ...] = ()
     crossing_m: Annotated[float, Field(ge=0, le=1)] = 0.0
     blocked_deg: tuple[BlockedSector, ...] = ()
+    intensity_factor: Numbers = ()
 
     @model_validator(mode="after")
     def _check_blocked(self) -> BeamTable:
@@ -96,6 +97,12 @@ class BeamTable(_ModelSection):
                     f"The sector [{beam}, {start:g}, {stop:g}] in blocked_deg is empty. To block a "
                     f"beam in all directions, use [{beam}, 0, 360]."
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _check_factors(self) -> BeamTable:
+        if self.intensity_factor and not self.elevation_deg:
+            raise ValueError("beams.intensity_factor requires beams.elevation_deg.")
         return self
 
     def beams(self) -> Beams:
@@ -109,6 +116,7 @@ class BeamTable(_ModelSection):
             np.multiply(self.time_us, 1000.0),
             self.origins(count),
             self.blocked(),
+            np.array(self.intensity_factor, np.float64),
         )
 
     def blocked(self) -> Floats:
@@ -185,6 +193,8 @@ class Performance(_ModelSection):
     range_per_m: Annotated[float, Field(ge=0)] = 0.0
     range_at_threshold_m: Annotated[float, Field(ge=0)] = 0.0
     precision: tuple[RangePrecision, RangePrecision] | None = None
+    # Constant range errors of the beams, as a standard deviation or in the order of the beams.
+    channel_bias_m: Meters | Several[Bias] = 0.0
     angle_deg: Annotated[float, Field(ge=0)] | None = None
     detection: Detection | None = None
     # Fraction of pulses with a false alarm.
@@ -289,8 +299,14 @@ class SensorModel(_ModelSection):
             raise ValueError(
                 "turning_mirror requires prisms. For a mirror that scans lines, use mirror."
             )
-        if not self.needs_calibration:  # A calibration may provide more beams.
-            self.beams.beams()  # raises LidarError for impossible beams
+        # A calibration may provide more beams.
+        count = 0 if self.needs_calibration else len(self.beams.beams())  # checks the beams
+        biases = () if self.performance is None else self.performance.channel_bias_m
+        if count and self.beams.elevation_deg and np.ndim(biases) and len(biases) not in (0, count):
+            raise ValueError(
+                f"performance.channel_bias_m must have one value for each of the {count} beams, "
+                f"but has {len(biases)} values."
+            )
         return self
 
     @property
@@ -300,6 +316,8 @@ class SensorModel(_ModelSection):
 
     def datasheet(self) -> Datasheet:
         """Return the noise and the settings of returns that the data sheet specifies.
+
+        A list of range errors is in the order of the beams in the file.
 
         Raises
         ------
@@ -553,7 +571,16 @@ def load_sensor(
         beams = beams.with_rotation(head.radians_per_ns)
     kind = LineSensor if sensor_model.axis == "x" else Sensor
     common_fields["packets"] = sensor_model.packet_settings(laser_order(beams.elevation))
+    common_fields["noise"] = _sort_biases(common_fields.get("noise"), beams)
     return kind(beams.sort_by_elevation(), head, **common_fields)
+
+
+def _sort_biases(noise: Noise | None, beams: Beams) -> Noise | None:
+    """Return noise whose range errors are in the order of the channels, not of the beams."""
+    if noise is None or np.shape(noise.channel_bias_m) != (len(beams),):
+        return noise
+    biases_m = np.array(noise.channel_bias_m)[laser_order(beams.elevation)]
+    return replace(noise, channel_bias_m=tuple(biases_m.tolist()))
 
 
 def _sensor_name(sensor_model: SensorModel, unit: Calibration | None) -> str:
@@ -635,4 +662,5 @@ def _calibrate_beams(sensor_model: SensorModel, unit: Calibration) -> Beams:
         )
     times = beams.time_ns if beams.time_ns.any() else np.multiply(table.time_us, 1000.0)
     origin = beams.origin if beams.origin.any() else table.origins(len(beams))
-    return Beams(beams.elevation, beams.azimuth, times, origin, table.blocked())
+    factors = np.array(table.intensity_factor, np.float64)
+    return Beams(beams.elevation, beams.azimuth, times, origin, table.blocked(), factors)

@@ -30,7 +30,7 @@ _KINDS = {
         PacketSettings,
     )
 }
-_LEFT_OUT = ("optics", "noise", "returns")
+_LEFT_OUT = ("optics", "noise", "returns", "intensity_factor")  # not part of the ray pattern
 
 
 def to_plain_data(value: Any, arrays: MutableMapping[str, AnyArray]) -> Any:

@@ -465,6 +465,18 @@ class BatchPoints:
 
     @cached_property
     def intensity(self) -> Floats:
+        """Reported energy, which is the received energy times the intensity factor of the beam."""
+        return self._as_reported(self._energy)
+
+    def _as_reported(self, energy: Floats) -> Floats:
+        """Multiply energies by the intensity factors of their beams."""
+        beams = self.sensor.beams
+        return (
+            energy * beams.intensity_factor[self.channel] if beams.has_intensity_factors else energy
+        )
+
+    @cached_property
+    def _energy(self) -> Floats:
         """Received energy, on the scale of `SceneSurfaces.energy`."""
         if self.pulse_returns.energy is not None:
             return self.pulse_returns.energy
@@ -502,10 +514,9 @@ class BatchPoints:
 
     @property
     def _clipped_energy(self) -> Floats:
-        """Received energy, clipped at saturation."""
-        return np.minimum(
-            self.intensity, self.survey.noise_each[self.specs[0].sensor].saturation_energy
-        )
+        """Reported energy, clipped at saturation."""
+        saturation = self.survey.noise_each[self.specs[0].sensor].saturation_energy
+        return self._as_reported(np.minimum(self._energy, saturation))
 
     @property
     def signal(self) -> NDArray[np.uint16]:
@@ -561,9 +572,8 @@ class BatchPoints:
 
         Both are on the scale of `SceneSurfaces.energy`.
         """
-        return (
-            self.intensity if self.pulse_returns.amplitude is None else self.pulse_returns.amplitude
-        )
+        amplitude = self.pulse_returns.amplitude
+        return self.intensity if amplitude is None else self._as_reported(amplitude)
 
     @property
     def pulse_width(self) -> Floats:

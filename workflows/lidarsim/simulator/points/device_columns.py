@@ -3,8 +3,9 @@
 Formulas and results are bit-identical to `BatchPoints`. If a survey has other columns, the reported
 hits are transferred as well, and NumPy computes these columns. They include energies in haze,
 azimuths and noise, because `exp` and `atan2` on a device differ from `elementary` in the last bit.
-NumPy also computes the energies of hits on actors, which depend on the actors' poses: `SceneCaster`
-finds the hits on actors, and the device merges them with its own hits.
+NumPy also computes the energies of sensors with intensity factors, and of hits on actors, which
+depend on the actors' poses: `SceneCaster` finds the hits on actors, and the device merges them with
+its own hits.
 """
 
 from __future__ import annotations
@@ -67,8 +68,11 @@ def _device_column_names(scene: Scene, survey: Survey) -> set[str]:
         or (several_wavelengths and m.spectrum)
         for m in survey.materials
     )
+    has_factors = any(
+        carried.sensor.beams.has_intensity_factors for carried in survey.mounted_sensors
+    )
     computable = {column.name for column in _DEVICE_COLUMNS} - {
-        *(_ENERGIES if hazy or textured_or_rough else ())
+        *(_ENERGIES if hazy or textured_or_rough or has_factors else ())
     }
     if scene.has_mixed_objects:  # the device does not know the materials of faces
         computable -= {*_ENERGIES, "class"}
