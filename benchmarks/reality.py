@@ -41,6 +41,7 @@ from lidarpool.reconstruction.free_space import find_stationary_points
 from lidarpool.reconstruction.held_out import HeldOutRays
 from lidarpool.reconstruction.lost_pulses import SensorCoverage
 from lidarpool.reconstruction.odometry import RecordedPoses, find_poses
+from lidarpool.reconstruction.range_noise import estimate_range_noise, ring_neighbors
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.reconstruction.submap_tasks import (
     BuildTask,
@@ -61,6 +62,7 @@ _BLOCK_SWEEPS = 20
 _STATIC_VOXEL_M = 0.4
 _STATIC_SWEEPS = 10  # between sweeps that have points at the same surface_map: a second
 _RESAMPLES = 400  # of sweeps, for intervals
+_NOISE_SWEEPS = 13  # of the map, from which the range noise is estimated
 _IMAGE_COLUMNS = 870  # of the cells in which two recorded sweeps are compared
 _TRAM = Path("exampleData/MuehlburgerTor/velodyne_dist")
 
@@ -238,6 +240,33 @@ def _range_image(sweeps: RecordedSweeps, number: int) -> Floats:
     return image
 
 
+def roughness(sweeps: AlignedSweeps, rays: HeldOutRays, mapped: Ints) -> dict[str, float]:
+    """Return the roughness of the recorded and the simulated surfaces along the rings, in meters.
+
+    It is the median absolute second difference of the ranges of three neighboring pulses that
+    return in both. The simulated ranges have the noise that is estimated from the sweeps of the
+    map, and `without_noise` is the roughness of the map.
+    """
+    some = mapped[even_indices(len(mapped), _NOISE_SWEEPS)]
+    noise = estimate_range_noise(sweeps, some.tolist())
+    sigma_m = 0.0 if noise is None else noise.range_m
+    random = np.random.default_rng(0)
+    differences = []
+    for number in np.unique(rays.sweep).tolist():
+        recorded = sweeps.recorded
+        of_sweep = rays.select((rays.sweep == number) & rays.return_mask)
+        before, at, after, _ = ring_neighbors(recorded.read(number), recorded.lasers)
+        noisy_m = of_sweep.simulated_m + sigma_m * random.standard_normal(len(of_sweep.ring))
+        ranges_m = np.stack([of_sweep.range_m, noisy_m, of_sweep.simulated_m])
+        second_m = ranges_m[:, before] - 2 * ranges_m[:, at] + ranges_m[:, after]
+        differences.append(np.abs(second_m[:, np.isfinite(second_m).all(axis=0)]))
+    medians_m = np.median(np.concatenate(differences, axis=1), axis=1).tolist()
+    return {
+        "noise": sigma_m,
+        **dict(zip(("recorded", "simulated", "without_noise"), medians_m, strict=True)),
+    }
+
+
 def interval(
     rays: HeldOutRays, figure: Callable[[HeldOutRays], float | None]
 ) -> list[float] | None:
@@ -322,6 +351,7 @@ def _row(
             lambda part: part.figures()["all"]["median_abs_difference_m"],
         ),
         "next": to_next(recorded, compared, coverage),
+        "roughness_m": roughness(sweeps, rays, np.intersect1d(counting, mapped)),
         "motion": sweeps.alignment.motion.value,
         "plane_m": float(np.nanmedian(plane_m)),
         "submaps": len(submaps),
@@ -342,6 +372,7 @@ def _line(row: dict[str, Any]) -> str:
     standing = twin["stationary"]
     no_return = twin["no_return"] or {"f1": float("nan")}
     correlation = standing["rank_correlation"]
+    rough_mm = {name: 1000 * value for name, value in row["roughness_m"].items()}
     return (
         f"{row['recording']} ({row['rule']}, {row['sweeps']} sweeps, {row['length_m']:.0f} m, "
         f"{row['motion']}): "
@@ -352,7 +383,9 @@ def _line(row: dict[str, Any]) -> str:
         f"static mask {1000 * row['static']['median_abs_difference_m']:.0f} "
         f"({100 * row['static_share']:.1f} %), next {1000 * row['next']['median_size_m']:.0f} "
         f"(F1 {row['next']['f1']:.2f}), "
-        f"planes {1000 * row['plane_m']:.1f}; missed {100 * standing['no_surface']:.2f} %, F1 "
+        f"planes {1000 * row['plane_m']:.1f}, noise {rough_mm['noise']:.1f}, roughness "
+        f"{rough_mm['simulated']:.1f} / {rough_mm['recorded']:.1f} (without noise "
+        f"{rough_mm['without_noise']:.1f}); missed {100 * standing['no_surface']:.2f} %, F1 "
         f"{no_return['f1']:.3f}, points {twin['points']:.3f}, by ring "
         f"{twin['points_by_ring']:.3f}; rank "
         f"{'–' if correlation is None else format(correlation, '.2f')}; {row['seconds']:.0f} s, "

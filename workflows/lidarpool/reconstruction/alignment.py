@@ -615,6 +615,7 @@ def _align_to_planes(
     if ring_count >= MIN_RINGS:
         prior = _POINT_SIGMA_M / np.array([_RANGE_PRIOR_M, _ANGLE_PRIOR_RAD, _ANGLE_PRIOR_RAD])
         normal += np.diag(prior**2)
+        side -= prior**2 * offsets  # Otherwise, offsets that no plane determines would drift.
         offsets = offsets + np.linalg.solve(normal, side[..., None])[..., 0]
     return replace(
         alignment,

@@ -29,7 +29,7 @@ from lidarsim.scene.colors import Colors, as_srgb
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.schema.checks import check_choice, check_number
-from lidarsim.sensor.models import SensorModel, read_model
+from lidarsim.sensor.models import Performance, SensorModel, read_model
 from lidarsim.words import plural
 
 from ..clouds.folder import result_folder, staging
@@ -61,6 +61,7 @@ from .motion import Motion
 from .odometry import RecordedPoses, find_poses
 from .porosity import Porosity
 from .published_metrics import HeldOutFrames
+from .range_noise import RangeNoise, estimate_range_noise
 from .recorded_sweeps import RecordedSweeps, Rotation
 from .reflectances import IntensityModel, Reflectances, Response, fit_response
 from .submap_tasks import BuildTask, SubmapSurfels, SubmapTask, align_submap, build_submap
@@ -93,6 +94,10 @@ NO_RETURN = "no return"  # object name of surfels that return no pulses
 _ROTATION_FIELDS = {"clockwise", "zero_deg", "rate_hz"}  # written even if they have default values
 _RATE_DECIMALS = 4
 _ORIGIN_DECIMALS = 4
+_ANGLE_DECIMALS = 3
+_NOISE_DECIMALS = 5
+_RANGE_NOISE = ("range_m", "range_per_m", "range_at_threshold_m", "precision")
+_FACTOR_DECIMALS = 4
 _MIN_STEP_S = 1e-5  # minimum time between poses of the trajectory
 _MIN_LEAD = 0.01  # minimum time from the first point to the timestamp, in revolutions
 _MIN_DRIVE_M = 0.3  # On a shorter drive, the sensor counts as stationary.
@@ -479,7 +484,7 @@ class _Building:
             if len(part.surfels.corners)
         }
         timing = SweepTiming.from_sweeps(sweeps)
-        model, notes = self._fit_sensor(built, sweeps, meshes, response, timing)
+        model, noise, notes = self._fit_sensor(built, sweeps, meshes, response, timing)
         held_out = built.held_out()
         figures = self._figures(built, alignment) | {
             "poses": poses.source,
@@ -489,6 +494,7 @@ class _Building:
                 [part.frames for part in built.parts if part.frames is not None]
             ),
             "response": None if response is None else response.figures(),
+            "range_noise": None if noise is None else noise.figures(),
             "model": model.name,
             "notes": [
                 *recorded.recording.notes,
@@ -536,14 +542,14 @@ class _Building:
         meshes: Mapping[int, SceneMesh],
         response: Response | None,
         timing: SweepTiming,
-    ) -> tuple[SensorModel, list[str]]:
-        """Fit the sensor's noise to the middle of the drive, and return the sensor and notes."""
+    ) -> FittedSensor:
+        """Fit the sensor's noise to the middle of the drive."""
         middle = len(built.parts) // 2
         numbers = built.submaps[middle].own_numbers
         sizes = built.parts[middle].surfels.points
         near = [mesh for index, mesh in meshes.items() if abs(index - middle) <= 1]
-        sensor = self.base or timing.sensor(sweeps, int(numbers[sizes.argmax()]))
-        model, notes = fit_sensor(
+        sensor = self.base or timing.sensor(sweeps, int(numbers[sizes.argmax()]), response)
+        fitted = fit_sensor(
             sweeps,
             dict(zip(numbers.tolist(), sizes.tolist(), strict=True)),
             Scene.from_meshes([merge_surfels(near)]),
@@ -551,11 +557,11 @@ class _Building:
             sensor,
         )
         if self.base is None and timing.rotation is None:
-            notes.append(
+            fitted.notes.append(
                 "the direction of rotation of the sensor is unknown, so sensor.yaml assumes a "
                 "counterclockwise rotation. Set clockwise and zero_deg in this file"
             )
-        return model, notes
+        return fitted
 
     def _figures(self, built: _Built, alignment: Alignment) -> dict[str, Any]:
         """Return statistics of the reconstruction and the drive."""
@@ -691,7 +697,9 @@ class SweepTiming(NamedTuple):
         pose = alignment.poses[-1] @ step.fraction(rest_s / step_s)
         return TwinPose(pose, float(alignment.times_s[-1]) + rest_s)
 
-    def sensor(self, sweeps: AlignedSweeps, number: int) -> SensorModel | None:
+    def sensor(
+        self, sweeps: AlignedSweeps, number: int, response: Response | None
+    ) -> SensorModel | None:
         """Return a sensor with the recorded rings and rotation, or None if there are no rings.
 
         The azimuth step is determined from the sweep `number`.
@@ -713,14 +721,29 @@ class SweepTiming(NamedTuple):
             firings_per_turn=firings_per_turn(recorded.read(number), recorded.lasers),
             rate_hz=self.rate_hz,
             range_m=(0.0, float(np.ceil(1.1 * sweeps.coverage.max_range_m))),
-            beams=_beam_table(lasers, sweeps.coverage.blocked),
+            beams=_beam_table(
+                lasers, sweeps.alignment.ring_offsets, response, sweeps.coverage.blocked
+            ),
+            performance=_range_biases(sweeps.alignment.ring_offsets),
         )
 
 
-def _beam_table(lasers: RingLasers, blocked: BlockedDirections) -> dict[str, Any]:
-    """Return the `beams` of a sensor model, from the lowest ring to the highest."""
+def _beam_table(
+    lasers: RingLasers,
+    ring_offsets: Floats,
+    response: Response | None,
+    blocked: BlockedDirections,
+) -> dict[str, Any]:
+    """Return the `beams` of a sensor model, from the lowest ring to the highest.
+
+    `ring_offsets` are those of the alignment.
+    """
     order = np.arange(len(lasers))[::-1]
-    table = {"elevation_deg": np.degrees(lasers.elevation_rad[order]).round(3).tolist()}
+    elevation_rad = lasers.elevation_rad + ring_offsets[:, 1]
+    table = {"elevation_deg": np.degrees(elevation_rad[order]).round(_ANGLE_DECIMALS).tolist()}
+    if ring_offsets[:, 2].any():
+        azimuth_deg = np.degrees(ring_offsets[order, 2]).round(_ANGLE_DECIMALS)
+        table["azimuth_deg"] = (azimuth_deg + 0.0).tolist()
     if not lasers.is_at_origin:
         forward = np.zeros(len(lasers))
         origins_m = lasers.positions(forward, lasers.elevation_rad[order], order)
@@ -729,7 +752,19 @@ def _beam_table(lasers: RingLasers, blocked: BlockedDirections) -> dict[str, Any
     sectors = [(last - ring, start, stop) for ring, start, stop in blocked.sectors_deg()]
     if sectors:
         table["blocked_deg"] = sorted(sectors)
+    if response is not None and (response.by_ring != 1).any():
+        table["intensity_factor"] = response.by_ring[order].round(_FACTOR_DECIMALS).tolist()
     return table
+
+
+def _range_biases(ring_offsets: Floats) -> dict[str, Any] | None:
+    """Return the `performance` of a sensor whose rings have range errors, or None without errors.
+
+    The errors are from the lowest ring to the highest. The alignment subtracts them from the
+    recorded ranges.
+    """
+    biases_m = (-ring_offsets[::-1, 0]).round(_ORIGIN_DECIMALS) + 0.0
+    return {"channel_bias_m": biases_m.tolist()} if biases_m.any() else None
 
 
 def _origin_sources(lasers: RingLasers) -> dict[str, str]:
@@ -746,14 +781,25 @@ def _blocked_sources(blocked: BlockedDirections) -> dict[str, str]:
     return {"blocked": "directions in which surfaces at close range are interrupted"}
 
 
+class FittedSensor(NamedTuple):
+    """A sensor with noise."""
+
+    model: SensorModel
+    range_noise: RangeNoise | None  # None if unknown
+    notes: list[str]
+
+
 def fit_sensor(
     sweeps: AlignedSweeps,
     sizes: Mapping[int, int],
     scene: Scene,
     response: Response | None,
     sensor: SensorModel | None,
-) -> tuple[SensorModel, list[str]]:
+) -> FittedSensor:
     """Fit a sensor's noise to its pulses that hit reconstructed surfaces.
+
+    The range noise is determined from neighboring returns on planes instead, because differences to
+    the reconstructed surfaces contain errors of the map.
 
     Parameters
     ----------
@@ -770,12 +816,42 @@ def fit_sensor(
 
     Returns
     -------
-    tuple
+    FittedSensor
         The sensor with noise, and notes for the user.
     """
     assert sensor is not None
     if not len(sweeps.recorded.elevation_rad):
-        return sensor, ["without rings, the sensor noise is that of the sensor model"]
+        note = "without rings, the sensor noise is that of the sensor model"
+        return FittedSensor(sensor, None, [note])
+    chosen = _sweeps_to_fit(sweeps.recorded, sizes)
+    noise = estimate_range_noise(sweeps, chosen.tolist())
+    stated = {} if sensor.performance is None else _stated(sensor.performance)
+    notes = []
+    try:
+        fitted = _fit_to_sweeps(sweeps, chosen, scene, response)
+    except LidarError as error:  # The reconstruction is usable without fitted noise.
+        known = "is unknown" if noise is None else "is unknown except for that of the ranges"
+        notes = [f"the sensor noise {known}: {error}"]
+    else:
+        if fitted.model.performance is not None:
+            biases = {name: value for name, value in stated.items() if name == "channel_bias_m"}
+            stated = biases | _stated(fitted.model.performance)
+        dropout = fitted.figures["figures"].get("dropout")
+        if dropout is not None and not dropout["low"] > 0:
+            stated.pop("dropout", None)
+    if noise is not None:  # without the errors of the map
+        stated = {name: value for name, value in stated.items() if name not in _RANGE_NOISE}
+        stated["range_m"] = round(noise.range_m, _NOISE_DECIMALS)
+    if not stated:
+        return FittedSensor(sensor, noise, notes)
+    count = plural(len(chosen), "sweep")
+    source = f"fitted by lidarpool {__version__} to {Path(sweeps.name).name}, {count}"
+    changes = {"performance": stated, "sources": {**sensor.sources, "performance": source}}
+    return FittedSensor(SensorModel.model_validate(sensor.model_dump() | changes), noise, notes)
+
+
+def _sweeps_to_fit(recorded: RecordedSweeps, sizes: Mapping[int, int]) -> Ints:
+    """Return the numbers of the sweeps to which the noise is fitted, given the point counts."""
     # A sweep with few points, for example due to lost packets, would look as if it came from a
     # different sensor.
     counts = np.array([*sizes.values()])
@@ -783,23 +859,13 @@ def fit_sensor(
     some = whole[even_indices(len(whole), 2 * _FIT_SWEEPS)]
     # Motion-compensated sweeps may be tilted relative to the sensor, in which case their rings are
     # not cones.
-    spread_rad = [sweeps.recorded.cone_spread_rad(number) for number in some.tolist()]
-    chosen = np.sort(some[np.argsort(spread_rad, kind="stable")[:_FIT_SWEEPS]])
-    try:
-        fitted = _fit_to_sweeps(sweeps, chosen, scene, response)
-    except LidarError as error:  # The reconstruction is usable without fitted noise.
-        return sensor, [f"the sensor noise is unknown: {error}"]
-    performance = fitted.model.performance
-    if performance is None:
-        return sensor, []
-    stated = performance.model_dump(exclude_defaults=True)
-    dropout = fitted.figures["figures"].get("dropout")
-    if dropout is not None and not dropout["low"] > 0:
-        stated.pop("dropout", None)
-    count = plural(len(chosen), "sweep")
-    source = f"fitted by lidarpool {__version__} to {Path(sweeps.name).name}, {count}"
-    changes = {"performance": stated, "sources": {**sensor.sources, "performance": source}}
-    return SensorModel.model_validate(sensor.model_dump() | changes), []
+    spread_rad = [recorded.cone_spread_rad(number) for number in some.tolist()]
+    return np.sort(some[np.argsort(spread_rad, kind="stable")[:_FIT_SWEEPS]])
+
+
+def _stated(performance: Performance) -> dict[str, Any]:
+    """Return the values of the performance that differ from the defaults."""
+    return performance.model_dump(exclude_defaults=True)
 
 
 def _fit_to_sweeps(

@@ -5,7 +5,7 @@ incidence (`IntensityModel`), and three sensor factors. The factors depend on th
 incidence, and on the ring. The range factor describes optics that see only part of a surface at
 close range, for example. The factors are fitted to the intensities of surfels that were observed
 from several positions. A simulation applies its own law of range and incidence to the reflectances,
-and none of the factors.
+and the factors of the rings, but not those of range and incidence.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Response:
     typical
         Median reflectance.
     scale
-        Mean ratio of recorded to simulated intensities.
+        Mean ratio of recorded to simulated intensities, which include the factors of the rings.
     """
 
     model: IntensityModel
@@ -146,6 +146,7 @@ class Reflectances:
         """
         law = self.response.model.white_intensities(hits.distance_m, hits.cosine)
         intensities = np.full(len(sweep.points), np.nan)
+        law *= self.response.by_ring[sweep.ring[hits.rays]]
         intensities[hits.rays] = self.surfels[hits.surfel] * law * self.response.scale
         return intensities
 
@@ -192,8 +193,9 @@ def fit_response(
     typical = float(np.nanmedian(best.reflectance)) / white
     simulated = (reflectance / white).clip(_MIN_REFLECTANCE, 1.0)
     simulated *= best.model.white_intensities(observations.range_m, observations.cosine)
-    scale = float(best.intensity.sum() / simulated.sum())
     by_range, by_incidence, by_ring = best.factors
+    simulated *= by_ring[observations.ring]
+    scale = float(best.intensity.sum() / simulated.sum())
     return Response(
         best.model, by_range, by_incidence, by_ring, white, best.brightest, typical, scale
     )

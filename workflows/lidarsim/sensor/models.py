@@ -302,7 +302,8 @@ class SensorModel(_ModelSection):
         # A calibration may provide more beams.
         count = 0 if self.needs_calibration else len(self.beams.beams())  # checks the beams
         biases = () if self.performance is None else self.performance.channel_bias_m
-        if count and self.beams.elevation_deg and np.ndim(biases) and len(biases) not in (0, count):
+        biases = biases if isinstance(biases, tuple) else ()
+        if count and self.beams.elevation_deg and len(biases) not in (0, count):
             raise ValueError(
                 f"performance.channel_bias_m must have one value for each of the {count} beams, "
                 f"but has {len(biases)} values."
