@@ -19,6 +19,7 @@ from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import RecordedPoses
 from lidarpool.reconstruction.range_noise import estimate_range_noise
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
+from lidarpool.recordings.opening import open_recording
 from lidarscenes.procedural.city import city
 from lidarsim.columns.sweep import Sweep
 
@@ -75,7 +76,7 @@ def calibrated():
     All rings meet the ground and walls, because a ring that meets only upright walls tells little
     about its elevation.
     """
-    truth = RingLasers.at_origin(np.radians(np.linspace(-5, -25, CHANNELS)))
+    truth = RingLasers.at_origin(np.radians(np.linspace(-10, -30, CHANNELS)))
     random = np.random.default_rng(3)
     bias_m = random.choice([-0.02, 0.02], CHANNELS)
     error_rad = np.radians(random.choice([-0.1, 0.1], CHANNELS))
@@ -95,7 +96,7 @@ def calibrated():
     first = Alignment.from_poses(given, 0.15, Motion.COMPENSATED, CHANNELS, recorded.lasers)
     alignment = align(recorded, first, np.arange(SWEEPS), set(range(SWEEPS)))
     aligned = AlignedSweeps(recorded, alignment, SensorCoverage.from_sweeps(recorded))
-    return aligned, truth, bias_m, error_rad
+    return aligned, truth, bias_m
 
 
 def written_sensor(aligned, folder):
@@ -107,16 +108,18 @@ def written_sensor(aligned, folder):
 
 
 def test_the_sensor_of_a_twin_has_the_errors_of_the_rings(calibrated, tmp_path):
-    aligned, truth, bias_m, _ = calibrated
+    aligned, truth, bias_m = calibrated
     sensor = written_sensor(aligned, tmp_path)
     found_m = np.array(sensor.noise.channel_bias_m)[::-1]
-    np.testing.assert_allclose(found_m - found_m.mean(), bias_m - bias_m.mean(), atol=0.012)
+    # Errors that neighboring rings have in common also bend the map.
+    np.testing.assert_allclose(np.diff(found_m), np.diff(bias_m), atol=0.012)
     error_deg = np.degrees(sensor.beams.elevation[::-1] - truth.elevation_rad)
-    np.testing.assert_allclose(error_deg - error_deg.mean(), 0, atol=0.06)
+    np.testing.assert_allclose(np.diff(error_deg), 0, atol=0.06)
+    assert np.ptp(error_deg) < 0.2
 
 
 def test_the_sensor_of_a_twin_has_the_recorded_ranges(calibrated, tmp_path):
-    aligned, _, bias_m, error_rad = calibrated
+    aligned, _, bias_m = calibrated
     sensor = written_sensor(aligned, tmp_path)
     beams = sensor.beams
     lasers = RingLasers.at_origin(beams.elevation[::-1])
@@ -133,11 +136,18 @@ def test_the_sensor_of_a_twin_has_the_recorded_ranges(calibrated, tmp_path):
 
 @pytest.mark.extended
 def test_a_twin_has_the_intensities_of_the_rings(tmp_path):
-    truth = Sensor.grid(360, CHANNELS, vertical_fov_deg=30)
-    factors = np.random.default_rng(3).choice([0.6, 1.0, 1.5], CHANNELS)
+    truth = Sensor.grid(360, 32, vertical_fov_deg=30)
+    factors = np.random.default_rng(3).choice([0.6, 1.0, 1.5], 32)
     beams = replace(truth.beams, intensity_factor=factors)
-    drive = recorded_drive(city(5_000), replace(truth, beams=beams))
-    found = twin(drive)
+    opened = open_recording(recorded_drive(city(5_000), replace(truth, beams=beams)), name="drive")
+
+    def read(number):
+        sweep = opened.read_fired(number)
+        time_s = 1e-9 * sweep.columns["time"]
+        columns = {"ring": sweep.rings, "timestamp": time_s, "intensity": sweep.intensity}
+        return Sweep(sweep.points, columns)
+
+    found = twin(Recording("drive", len(opened), read, energies=True))
     found.save(tmp_path / "twin")
     sensor = load_sensor(tmp_path / "twin" / "sensor.yaml")
     ratio = sensor.beams.intensity_factor / factors
