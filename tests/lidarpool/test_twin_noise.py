@@ -150,7 +150,8 @@ def test_a_twin_has_the_intensities_of_the_rings(tmp_path):
     found = twin(Recording("drive", len(opened), read, energies=True))
     found.save(tmp_path / "twin")
     sensor = load_sensor(tmp_path / "twin" / "sensor.yaml")
-    ratio = sensor.beams.intensity_factor / factors
+    down = truth.beams.elevation < np.radians(-5)  # rings that meet the same surfaces
+    ratio = (sensor.beams.intensity_factor / factors)[down]
     np.testing.assert_allclose(ratio / np.median(ratio), 1, rtol=0.15)
     assert found.figures["held_out"]["stationary"]["rank_correlation"] > 0.9
     assert 0 < found.figures["range_noise"]["sigma_m"] < 0.002  # none was simulated
