@@ -757,9 +757,11 @@ def test_sweeps_that_are_tilted_against_the_sensor_tell_no_noise(drive, tmp_path
         return Sweep(sweep.points @ tilt[:3, :3].T, {"ring": sweep.rings})
 
     found = twin(Recording("drive", SWEEPS, read, read_poses=lambda: poses))
-    assert found.model.performance is None
+    performance = found.model.performance
+    assert performance.range_m < 0.005 and performance.detection is None
     assert found.model.firings_per_turn == pytest.approx(480, rel=0.02)
-    assert any("the sensor noise is unknown: " in note for note in found.figures["notes"])
+    known = "the sensor noise is unknown except for that of the ranges: "
+    assert any(known in note for note in found.figures["notes"])
     found.save(tmp_path / "twin")
     prepare(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
 
