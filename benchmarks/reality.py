@@ -41,7 +41,7 @@ from lidarpool.reconstruction.free_space import find_stationary_points
 from lidarpool.reconstruction.held_out import HeldOutRays
 from lidarpool.reconstruction.lost_pulses import SensorCoverage
 from lidarpool.reconstruction.odometry import RecordedPoses, find_poses
-from lidarpool.reconstruction.range_noise import estimate_range_noise, ring_neighbors
+from lidarpool.reconstruction.range_noise import RingNeighbors, estimate_range_noise
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.reconstruction.submap_tasks import (
     BuildTask,
@@ -255,10 +255,12 @@ def roughness(sweeps: AlignedSweeps, rays: HeldOutRays, mapped: Ints) -> dict[st
     for number in np.unique(rays.sweep).tolist():
         recorded = sweeps.recorded
         of_sweep = rays.select((rays.sweep == number) & rays.return_mask)
-        before, at, after, _ = ring_neighbors(recorded.read(number), recorded.lasers)
+        triples = RingNeighbors.from_sweep(recorded.read(number), recorded.lasers)
         noisy_m = of_sweep.simulated_m + sigma_m * random.standard_normal(len(of_sweep.ring))
         ranges_m = np.stack([of_sweep.range_m, noisy_m, of_sweep.simulated_m])
-        second_m = ranges_m[:, before] - 2 * ranges_m[:, at] + ranges_m[:, after]
+        second_m = (
+            ranges_m[:, triples.before] - 2 * ranges_m[:, triples.at] + ranges_m[:, triples.after]
+        )
         differences.append(np.abs(second_m[:, np.isfinite(second_m).all(axis=0)]))
     medians_m = np.median(np.concatenate(differences, axis=1), axis=1).tolist()
     return {

@@ -55,6 +55,10 @@ def noisy_room(sigma_m, pose_error_m=0.0, bias_m=0.0):
     return AlignedSweeps(replace(recorded), alignment, coverage)
 
 
+def test_ranges_without_noise_have_none():
+    assert estimate_range_noise(noisy_room(0.0), range(4)).range_m < 2e-4
+
+
 @pytest.mark.parametrize("sigma_m", [0.005, 0.02, 0.04])
 def test_the_range_noise_is_known_despite_errors_of_the_map(sigma_m):
     sweeps = noisy_room(sigma_m, pose_error_m=0.02, bias_m=0.02)
@@ -154,4 +158,4 @@ def test_a_twin_has_the_intensities_of_the_rings(tmp_path):
     ratio = (sensor.beams.intensity_factor / factors)[down]
     np.testing.assert_allclose(ratio / np.median(ratio), 1, rtol=0.15)
     assert found.figures["held_out"]["stationary"]["rank_correlation"] > 0.9
-    assert 0 < found.figures["range_noise"]["sigma_m"] < 0.002  # none was simulated
+    assert 0 < found.figures["range_noise"]["sigma_m"] < 0.005  # none was simulated

@@ -4,7 +4,7 @@ The residuals between recorded ranges and the reconstructed surfaces contain the
 of the poses and of the calibration, which are often larger than the noise. These errors hardly
 differ between neighboring pulses of a ring. The noise is therefore determined from how far each
 range deviates from the ranges of the two neighboring pulses. On a plane, the inverse range is a
-linear function of the azimuth, apart from terms that are negligible within two steps.
+constant plus a sine of the azimuth.
 """
 
 from __future__ import annotations
@@ -109,51 +109,80 @@ def estimate_range_noise(sweeps: AlignedSweeps, numbers: Sequence[int]) -> Range
     )
 
 
+class RingNeighbors(NamedTuple):
+    """Triples of returns of neighboring pulses in a ring, as indices of the returns of a sweep."""
+
+    before: Ints  # (k,)
+    at: Ints  # (k,)
+    after: Ints  # (k,)
+    span: Floats  # (k,), azimuth difference between the outer returns in radians
+    share: Floats  # (k,), fraction of this difference at which the middle return is
+
+    @classmethod
+    def from_sweep(cls, sweep: Sweep, lasers: RingLasers) -> RingNeighbors:
+        """Find the returns whose neighboring pulses in the ring return as well."""
+        ring = sweep.columns["row"]
+        azimuth, _ = lasers.angles(sweep.points, ring)
+        order = np.lexsort((azimuth, ring))
+        before, at, after = order[:-2], order[1:-1], order[2:]
+        first, second = azimuth[at] - azimuth[before], azimuth[after] - azimuth[at]
+        used = (ring[before] == ring[at]) & (ring[at] == ring[after])
+        if used.any():
+            lower, upper = np.multiply(_STEPS, np.median(first[used]))
+            for step in (first, second):
+                used &= (step > lower) & (step < upper)
+        span = (first + second)[used]
+        return cls(before[used], at[used], after[used], span, first[used] / span)
+
+    def select(self, chosen: Bools) -> RingNeighbors:
+        """Select triples with a mask."""
+        return RingNeighbors(
+            self.before[chosen],
+            self.at[chosen],
+            self.after[chosen],
+            self.span[chosen],
+            self.share[chosen],
+        )
+
+    def deviations(self, range_m: Floats, curved: Floats) -> Floats:
+        """Return the deviations of the middle ranges on planes, scaled to the range noise.
+
+        `curved` (k,) is the part of the inverse range that is a sine of the azimuth.
+        """
+        inverse = (1 - self.share) / range_m[self.before] + self.share / range_m[self.after]
+        inverse *= 1 + curved * self.share * (1 - self.share) * self.span**2 / 2
+        scale = np.sqrt(1 + self.share**2 + (1 - self.share) ** 2)
+        return np.asarray((range_m[self.at] - 1 / inverse) / scale)
+
+
 def _deviations(
     sweeps: AlignedSweeps, number: int, aligned: AlignedSweep, planes: VoxelPlanes
 ) -> _Deviations:
     """Return the deviations of the returns of a sweep that are on planes, like their neighbors."""
     sweep = sweeps.recorded.read(number)
     lasers = sweeps.recorded.lasers
-    ring = sweep.columns["row"]
-    range_m = lasers.ranges(sweep.points, ring)
+    range_m = lasers.ranges(sweep.points, sweep.columns["row"])
     normals, on_plane = _normals(aligned.world, planes, sweeps.alignment.voxel_m)
-    before, at, after, share = ring_neighbors(sweep, lasers)
-    used = on_plane[before] & on_plane[at] & on_plane[after]
-    for neighbor in (before, after):
-        used &= np.abs(np.einsum("ij,ij->i", normals[at], normals[neighbor])) > _MIN_PARALLEL
-        used &= range_m[neighbor] > _MIN_RANGE_M
-    before, at, after, share = before[used], at[used], after[used], share[used]
-    expected_m = 1 / ((1 - share) / range_m[before] + share / range_m[after])
-    scale = np.sqrt(1 + share**2 + (1 - share) ** 2)
-    beams = aligned.world[at] - aligned.origins[at]
-    cosine = np.abs(np.einsum("ij,ij->i", beams, normals[at])) / np.linalg.norm(beams, axis=1)
+    on_plane &= range_m > _MIN_RANGE_M
+    triples = RingNeighbors.from_sweep(sweep, lasers)
+    used = on_plane[triples.at]
+    for neighbor in (triples.before, triples.after):
+        parallel = np.abs(np.einsum("ij,ij->i", normals[triples.at], normals[neighbor]))
+        used &= on_plane[neighbor] & (parallel > _MIN_PARALLEL)
+    triples = triples.select(used)
+    at = triples.at
+    beams = (aligned.world - aligned.origins)[at]
+    beams /= np.linalg.norm(beams, axis=1)[:, None]
+    inward = np.einsum("ij,ij->i", beams, normals[at])
+    up = sweeps.alignment.poses[number][:3, 2]
+    # The upright part of a normal adds a constant to the inverse range.
+    curved = 1 - (normals[at] @ up) * (beams @ up) / np.where(inward == 0, 1, inward)
     return _Deviations(
-        (range_m[at] - expected_m) / scale, ring[at], range_m[at], cosine > _MIN_COSINE
+        triples.deviations(range_m, curved),
+        sweep.columns["row"][at],
+        range_m[at],
+        np.abs(inward) > _MIN_COSINE,
     )
-
-
-def ring_neighbors(sweep: Sweep, lasers: RingLasers) -> tuple[Ints, Ints, Ints, Floats]:
-    """Return the returns whose neighboring pulses in the ring return as well.
-
-    Returns
-    -------
-    tuple of arrays
-        Indices of the previous, the middle and the next of three returns, and the fraction of the
-        azimuth difference between the outer ones at which the middle one is. All have shape (k,).
-    """
-    ring = sweep.columns["row"]
-    azimuth, _ = lasers.angles(sweep.points, ring)
-    order = np.lexsort((azimuth, ring))
-    before, at, after = order[:-2], order[1:-1], order[2:]
-    first, second = azimuth[at] - azimuth[before], azimuth[after] - azimuth[at]
-    used = (ring[before] == ring[at]) & (ring[at] == ring[after])
-    if used.any():
-        lower, upper = np.multiply(_STEPS, np.median(first[used]))
-        for step in (first, second):
-            used &= (step > lower) & (step < upper)
-    share = first[used] / (first[used] + second[used])
-    return before[used], at[used], after[used], share
 
 
 def _normals(world: Floats, planes: VoxelPlanes, voxel_m: float) -> tuple[Floats, Bools]:
