@@ -218,6 +218,45 @@ def test_a_subscriber_reads_what_publishers_offer(dds):
         assert subscriber.publishers("/clock") == 1 and subscriber.publishers("/tf") == 0
 
 
+def test_a_topic_with_reliable_and_other_publishers_is_read_once(dds):
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.qos import Policy, Qos
+    from cyclonedds.topic import Topic
+
+    with dds.RosPublisher(dds.Network(domain=DOMAIN + 5)) as publisher:
+        subscriber = dds.RosSubscriber(publisher, lambda *_: True)
+        received: list[bytes] = []
+
+        def publish_until_received(publish, time_s: float) -> None:
+            """Publish a time, again and again until it arrives, which takes discovery."""
+            sent = simulators.clock(time_s)
+            stop = time.monotonic() + 60
+            while bytes(sent.cdr) not in received:
+                publish(sent)
+                received.extend(bytes(message.cdr) for message in subscriber.receive(0.05))
+                assert time.monotonic() < stop
+
+        publish_until_received(publisher.publish, 1)
+        topic = Topic(publisher._participant, "rt/clock", dds.message_class("rosgraph_msgs/msg/Clock"))
+        qos = Qos(
+            Policy.Reliability.BestEffort,
+            Policy.DataRepresentation(use_cdrv0_representation=True),
+        )
+        writer = DataWriter(publisher._participant, topic, qos=qos)
+        publish_until_received(
+            lambda sent: writer.write(dds._serialized(writer.data_type, bytes(sent.cdr))), 2
+        )
+        received.clear()
+        publish_until_received(publisher.publish, 3)  # until the new reader has been discovered
+        received.clear()
+        for number in range(5):
+            publisher.publish(simulators.clock(4 + number))
+        publish_until_received(publisher.publish, 9)
+        last = [bytes(simulators.clock(4 + number).cdr) for number in range(5)]
+        assert [cdr for cdr in received if cdr in last] == last
+        assert subscriber.publishers("/clock") == 2
+
+
 @pytest.mark.parametrize(
     ("hosts", "environment", "message"),
     [

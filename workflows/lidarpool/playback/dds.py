@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import (
@@ -228,10 +228,19 @@ class _SerializedMessage:
     deserialize_key = deserialize
 
 
+class _Reader(NamedTuple):
+    """A reader of a topic, and the condition with which it ends waiting."""
+
+    data_reader: Any
+    condition: ReadCondition
+    is_reliable: bool
+
+
 class RosSubscriber:
     """Receives the messages of topics as soon as other programs publish them.
 
-    A topic is read with the reliability and the durability of its publisher.
+    A topic is read with the reliability and the durability of its publishers. If only some of them
+    are reliable, it is read without reliability.
 
     Parameters
     ----------
@@ -247,8 +256,8 @@ class RosSubscriber:
         self._discovery = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         self._wait_set = WaitSet(self._participant)
         self._attach(self._discovery)
-        # Readers by topic, message type, and whether they are reliable and receive old messages.
-        self._readers: dict[tuple[str, str, bool, bool], Any] = {}
+        # Readers by topic, message type, and whether they receive old messages.
+        self._readers: dict[tuple[str, str, bool], _Reader] = {}
         self._writers: dict[Any, str] = {}  # {key of a publisher: topic}
 
     def publishers(self, topic: str) -> int:
@@ -260,22 +269,22 @@ class RosSubscriber:
 
         Wait at most `wait_s` seconds for messages if there are none.
         """
-        with suppress(DDSException):  # the time has passed
-            self._wait_set.wait(duration(seconds=wait_s))
+        self._wait_set.wait(duration(seconds=wait_s))
         time.sleep(_GATHER_S)
         self._discover()
         # The clock comes first, because it determines which other messages are up to date.
         readers = sorted(self._readers.items(), key=lambda item: item[0][0] != CLOCK_TOPIC)
-        for (topic, kind, *_), reader in readers:
-            for sample in reader.take(_TAKEN):  # not all, since a flood of messages never ends
+        for (topic, kind, _), reader in readers:
+            for sample in reader.data_reader.take(_TAKEN):  # not all, since a flood of messages never ends
                 if isinstance(sample, _SerializedMessage):
                     time_ns = sample.sample_info.source_timestamp
                     yield RosMessage(topic, kind, time_ns, sample.cdr)
 
-    def _attach(self, reader: Any) -> None:
+    def _attach(self, reader: Any) -> ReadCondition:
         """Let messages of a reader end waiting."""
-        mask = ViewState.Any | SampleState.Any | InstanceState.Any
-        self._wait_set.attach(ReadCondition(reader, mask))
+        condition = ReadCondition(reader, ViewState.Any | SampleState.Any | InstanceState.Any)
+        self._wait_set.attach(condition)
+        return condition
 
     def _discover(self) -> None:
         """Create readers for new publishers of wanted topics."""
@@ -291,12 +300,17 @@ class RosSubscriber:
             policies = [*endpoint.qos]
             is_reliable = any(isinstance(p, Policy.Reliability.Reliable) for p in policies)
             is_latched = Policy.Durability.TransientLocal in policies
-            key = topic, kind, is_reliable, is_latched
-            if key not in self._readers:
-                self._readers[key] = self._reader(*key)
-                self._attach(self._readers[key])
+            # A reader without reliability also receives the messages of reliable publishers. A
+            # second reader would receive each of their messages again.
+            key = topic, kind, is_latched
+            reader = self._readers.get(key)
+            if reader is not None and reader.is_reliable and not is_reliable:
+                self._wait_set.detach(reader.condition)
+                reader = None
+            if reader is None:
+                self._readers[key] = self._reader(topic, kind, is_reliable, is_latched)
 
-    def _reader(self, topic: str, kind: str, is_reliable: bool, is_latched: bool) -> Any:
+    def _reader(self, topic: str, kind: str, is_reliable: bool, is_latched: bool) -> _Reader:
         qos = Qos(
             Policy.Reliability.Reliable(0) if is_reliable else Policy.Reliability.BestEffort,
             Policy.Durability.TransientLocal if is_latched else Policy.Durability.Volatile,
@@ -306,7 +320,7 @@ class RosSubscriber:
         dds_topic = Topic(self._participant, f"rt{topic}", message_class(kind))
         reader = DataReader(self._participant, dds_topic, qos=qos)
         dds_topic.data_type = _SerializedMessage
-        return reader
+        return _Reader(reader, self._attach(reader), is_reliable)
 
 
 def _serialized(kind: Any, cdr: bytes) -> Any:
