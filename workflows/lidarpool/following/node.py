@@ -25,6 +25,7 @@ _MAX_CLOCK_STEP_NS = 1_000_000_000  # a larger step of the clock is a jump
 _SETTLE_NS = 2_000_000_000  # simulation time after which missing poses are reported
 _QUIET_S = 5.0  # time without a clock message after which a notice is shown
 _CHECK_NS = 50_000_000  # simulation time between checks of bodies and frames
+_NEVER_NS = 2**63 - 1  # later than any time
 _POLL_S = 0.05
 _MAX_DELAYS = 10_000  # delays that are kept for the summary
 
@@ -147,19 +148,27 @@ class FollowNode:
             message = sensor.static_frame()
             if message is not None:
                 self._publisher.publish(message)
+        self._clock_s = time.monotonic()  # building the scanners can take long
 
     def run(self) -> NoReturn:
         """Follow the simulator until an exception is raised, such as KeyboardInterrupt."""
+        wait_s = _POLL_S
         while True:
-            self.step()
+            was_due = self.step(wait_s)
+            wait_s = 0.0 if was_due else _POLL_S  # the sweep of another sensor may be due
 
-    def step(self, wait_s: float = _POLL_S) -> None:
+    def step(self, wait_s: float = _POLL_S) -> bool:
         """Receive messages, and simulate at most one sweep.
 
         Parameters
         ----------
         wait_s
-            Time in seconds to wait for a message if no sweep is due.
+            Maximum time in seconds to wait for a message.
+
+        Returns
+        -------
+        bool
+            Whether a sweep was due.
         """
         for message in self._subscriber.receive(wait_s):
             time_ns = self._poses.read(message)
@@ -168,20 +177,23 @@ class FollowNode:
         self._check_publishers()
         clock_ns = self._poses.clock_ns
         if clock_ns is None:
-            return
+            self._tree.drop_before(_NEVER_NS)  # only the last poses are needed
+            return False
         if len(self._tree.received) > len(self._examined):
             self._add_models()
         if abs(clock_ns - self._checked_ns) >= _CHECK_NS:
             self._checked_ns = clock_ns
+            self._tree.drop_before(min(item.span(item.number).start_ns for item in self._sensors))
             self._update_absent(clock_ns)
             if clock_ns - self._start_ns > _SETTLE_NS:
                 self._report_frames()
         sensor = self._next_due()
         if sensor is not None:
             self._simulate(sensor)
+        return sensor is not None
 
     def _set_clock(self, time_ns: int) -> None:
-        """Set the simulation time. Sweeps start again if it has jumped."""
+        """Set the simulation time. The sweeps are restarted if it has jumped."""
         last_ns = self._poses.clock_ns
         self._poses.clock_ns = time_ns
         self._clock_s = time.monotonic()
@@ -196,7 +208,7 @@ class FollowNode:
             self._notices.show_event(
                 "time",
                 f"The simulation time jumped {direction} from {last_ns / 1e9:.3f} to "
-                f"{time_ns / 1e9:.3f} s. Sweeps start again.",
+                f"{time_ns / 1e9:.3f} s. The sweeps are restarted.",
             )
         for sensor in self._sensors:
             if sensor not in self._ends_s and time_ns >= sensor.span(sensor.number).end_ns:
@@ -314,8 +326,6 @@ class FollowNode:
             self._publisher.publish(message)
         self.published += 1
         self._delays_s.append(time.monotonic() - end_s)
-        starts_ns = [other.span(other.number).start_ns for other in self._sensors]
-        self._tree.drop_before(min(starts_ns))
 
     def _add_models(self) -> None:
         """Add models that were spawned."""

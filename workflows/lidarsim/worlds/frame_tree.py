@@ -18,7 +18,6 @@ from ..scene.transform import affine
 from .world import WORLD, WorldFrame
 
 MIN_STEP_NS = 500_000  # samples that follow faster are dropped, which bounds memory and time
-MAX_SAMPLES = 4096  # samples of a frame that are kept
 _BEFORE_JUMP_NS = 1_000  # how long before a jump a frame is held at its earlier pose
 _MAX_DISORDER_NS = 50_000_000  # older samples than the last one by more mean that time jumped
 _MIN_JUMP_M = 0.2  # shorter movements are never jumps
@@ -73,7 +72,7 @@ class _Link:
 
     def drop_before(self, time_ns: int) -> None:
         """Delete samples that do not affect poses at `time_ns` or later."""
-        row = max(bisect_right(self.times_ns, time_ns) - 1, len(self.times_ns) - MAX_SAMPLES)
+        row = bisect_right(self.times_ns, time_ns) - 1
         if row > 0:
             del self.times_ns[:row]
             del self.poses[:row]
@@ -94,7 +93,7 @@ class FrameTree:
 
     Frames are first at their poses in a file, and follow the poses that are added. Between two
     samples, a frame moves at constant velocity and angular velocity relative to its parent. Before
-    the first and after the last sample, it is held.
+    the first and after the last sample, it is held. Samples are kept until `drop_before` is called.
 
     Parameters
     ----------
@@ -185,8 +184,6 @@ class FrameTree:
         if jump is not None:
             link.insert(time_ns - _BEFORE_JUMP_NS, link.poses[-1])
         link.insert(time_ns, values)
-        if len(link.times_ns) > 2 * MAX_SAMPLES:
-            link.drop_before(link.times_ns[-MAX_SAMPLES])
         return jump
 
     def _prefers(self, parent: str, other: str) -> bool:

@@ -88,8 +88,8 @@ class WorldFollower:
         poses
             Matrices (4, 4) from frames to the world, in meters, by the names of the frames (see
             `frames`). Between two updates, frames move at constant velocity and angular velocity.
-            Frames without a pose keep their last one, relative to the frame that carries them in
-            the file.
+            A frame that is omitted keeps its last pose in the world. If no pose of it was ever
+            passed, it moves with the frame that carries it in the file.
 
         Returns
         -------
@@ -148,6 +148,7 @@ class WorldFollower:
             stop_ns = int(np.ceil(stop_s * 1e9))
             if stop_ns > self._last_ns + _SLACK_NS:
                 return
+            self._tree.drop_before(start_ns)
             bodies = [body for body in scanner.world.bodies if self._tree.follows(body.frame)]
             frames = {body.frame for body in bodies} | {self._frame}
             times_ns = knots_ns(self._tree, frames, start_ns, stop_ns)
@@ -155,7 +156,6 @@ class WorldFollower:
             body_poses = {body.name: poses[body.frame] for body in bodies}
             yield scanner.sweep(self._number, times_ns / 1e9, poses[self._frame], body_poses)
             self._number += 1
-            self._tree.drop_before(stop_ns)
 
 
 def knots_ns(tree: FrameTree, frames: set[str], start_ns: int, stop_ns: int) -> Ints:

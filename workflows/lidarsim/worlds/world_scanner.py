@@ -162,8 +162,9 @@ class WorldScanner:
         """Build the scanner for the bodies that are present."""
         world = self._world
         present = [body for body in world.bodies if body.name not in self._absent]
-        moving = [body for body in present if world.static or body.name in self._moved]
-        static = [body.item for body in present if not world.static and body not in moving]
+        can_be_static = world.static is None
+        moving = [body for body in present if not can_be_static or body.name in self._moved]
+        static = [body.item for body in present if can_be_static and body.name not in self._moved]
         actors = [_actor(body) for body in moving]
         unseen = list(self._sensor.unseen)
         if world.static is not None:
