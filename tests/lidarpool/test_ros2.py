@@ -237,7 +237,8 @@ def test_a_topic_with_reliable_and_other_publishers_is_read_once(dds):
                 assert time.monotonic() < stop
 
         publish_until_received(publisher.publish, 1)
-        topic = Topic(publisher._participant, "rt/clock", dds.message_class("rosgraph_msgs/msg/Clock"))
+        kind = dds.message_class("rosgraph_msgs/msg/Clock")
+        topic = Topic(publisher._participant, "rt/clock", kind)
         qos = Qos(
             Policy.Reliability.BestEffort,
             Policy.DataRepresentation(use_cdrv0_representation=True),

@@ -275,7 +275,8 @@ class RosSubscriber:
         # The clock comes first, because it determines which other messages are up to date.
         readers = sorted(self._readers.items(), key=lambda item: item[0][0] != CLOCK_TOPIC)
         for (topic, kind, _), reader in readers:
-            for sample in reader.data_reader.take(_TAKEN):  # not all, since a flood of messages never ends
+            # Not all samples are taken, because a flood of messages never ends.
+            for sample in reader.data_reader.take(_TAKEN):
                 if isinstance(sample, _SerializedMessage):
                     time_ns = sample.sample_info.source_timestamp
                     yield RosMessage(topic, kind, time_ns, sample.cdr)
