@@ -246,6 +246,39 @@ def test_pause_reset_and_jumps_of_time(folder):
     assert sum("jumped back from 30.500 to 0.100 s" in note for note in loop.notes) == 1
 
 
+def test_the_node_does_not_wait_for_messages_while_a_sweep_is_due(folder):
+    mount = "{model: velodyne/vlp16, mount: {link: robot/lidar}}"
+    (folder / "sensors.yaml").write_text(f"sensors: {{left: {mount}, right: {mount}}}")
+    waits = []
+    with Loop("room.sdf") as loop:
+        receive = loop.receive
+
+        def receive_and_record(wait_s: float) -> Iterator[RosMessage]:
+            waits.append(wait_s)
+            if len(waits) == 4:
+                raise KeyboardInterrupt
+            return receive(wait_s)
+
+        loop.send(transforms(1, STILL), clock(1))
+        loop.node.step()
+        loop.send(transforms(1.15, STILL), clock(1.15))
+        loop.receive = receive_and_record
+        with pytest.raises(KeyboardInterrupt):
+            loop.node.run()
+    assert len(loop.clouds("/left/points")) == len(loop.clouds("/right/points")) == 1
+    assert waits[0] == waits[3] > 0 and waits[1:3] == [0, 0]
+
+
+def test_static_poses_of_a_model_apply_until_they_are_replaced(folder):
+    with Loop("room.sdf") as loop:
+        loop.send(transforms(1, [("crate", "room", (2, 0, 0.5), 0.0)], "/model/crate/pose_static"))
+        loop.play(lambda _: STILL[:1], 1, 2.5)
+    assert not notes_of(loop, "vanished") and not notes_of(loop, "Poses of")
+    x, y, z = loop.clouds()[-1].points.T
+    front = (np.abs(y) < 0.9) & (x > 1) & (np.abs(z) < 0.4)
+    assert np.allclose(x[front], 1.5, atol=0.002) and front.sum() > 200
+
+
 def crate_model(folder: Path) -> None:
     (folder / "models" / "box").mkdir(parents=True)
     (folder / "models" / "box" / "model.sdf").write_text(

@@ -33,7 +33,7 @@ _TOPICS = {
     "/joint_states": _JOINTS,
 }
 _MODEL_POSES = (_TRANSFORMS, _STAMPED_TRANSFORM, _STAMPED_POSE, _POSE)
-# Poses whose time differs more from the clock are ignored.
+# Poses are ignored if their time is further ahead of or behind the clock.
 _MAX_AHEAD_NS = 1_000_000_000
 _MAX_BEHIND_NS = 10_000_000_000
 _MAX_FRAMES = 10_000
@@ -103,22 +103,21 @@ class PoseInput:
         if message.kind == CLOCK:
             return nanoseconds(content.clock)
         model = _MODEL_POSE.fullmatch(message.topic)
-        is_static = message.topic == "/tf_static"
+        is_static = message.topic.endswith("_static")
         if message.kind == _JOINTS:
             self._add_joints(content)
         elif message.kind == _TRANSFORMS:
             for transform in content.transforms:
                 self._add_transform(transform, message.topic, "", is_static=is_static)
         elif message.kind == _STAMPED_TRANSFORM and model is not None:
-            self._add_transform(content, message.topic, model[1])
+            self._add_transform(content, message.topic, model[1], is_static=is_static)
         elif model is not None:
             header = content.header if message.kind == _STAMPED_POSE else None
             pose = content if header is None else content.pose
             parent = WORLD if header is None else frame_name(header.frame_id)
             time_ns = 0 if header is None else nanoseconds(header.stamp)
-            self._add(
-                frame_name(model[1]), parent, time_ns, _values(pose.position, pose.orientation)
-            )
+            values = _values(pose.position, pose.orientation)
+            self._add(frame_name(model[1]), parent, time_ns, values, is_static=is_static)
         return None
 
     def _add_transform(
