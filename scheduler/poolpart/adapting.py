@@ -109,6 +109,7 @@ class JobAdvice:
 
     jobs_to_start: int = 0
     jobs_to_forget: Sequence[str] = ()  # jobs to cancel, and jobs whose workers were closed
+    closed_jobs: int = 0  # number of running jobs that were closed for this advice
 
 
 @dataclass(frozen=True)
@@ -458,8 +459,12 @@ async def advise_jobs(
     results = await asyncio.gather(*(adaptation.close_idle(workers) for *_, workers in closing))
     for (name, job, _), closed in zip(closing, results, strict=True):
         if closed:
-            forgotten = [*advice[name].jobs_to_forget, job]
-            advice[name] = replace(advice[name], jobs_to_forget=forgotten)
+            part = advice[name]
+            advice[name] = replace(
+                part,
+                jobs_to_forget=[*part.jobs_to_forget, job],
+                closed_jobs=part.closed_jobs + 1,
+            )
     return advice
 
 

@@ -189,9 +189,61 @@ def test_results_are_copied_and_seceded_tasks_are_not_interrupted(queue, wait_un
         assert sorted(queue.submitted) == ["GPU-0", "GPU-1", "GPU-2"]
 
 
+def test_canceling_a_queued_job_releases_no_node(queue, wait_until, monkeypatch):
+    waiting = [0]
+
+    def others() -> int:
+        if waiting[0]:  # the queue is not listed again
+            monkeypatch.setattr("poolpart.deploy.waiting_jobs.LIST_EVERY_S", NEVER_S)
+        return waiting[0]
+
+    with cluster_of(others, 0, 2) as client:
+        gpu = Partition("GPU", client)
+        tasks = [gpu.submit(wait_for, "go") for _ in range(8)]
+        workers = client.cluster.scheduler.workers
+        wait_until(lambda: [bool(w.processing) for w in workers.values()] == [True, True])
+        queue.held = True
+        gpu.adapt(0, 3, idle_s=NEVER_S)
+        wait_until(lambda: len(queue.submitted) == 3)
+        waiting[0] = 1
+        wait_until(lambda: queue.cancelled == ["GPU-2"])
+        time.sleep(0.3)
+        assert {w.status.name for w in workers.values()} == {"running", "closing_gracefully"}
+        Event("go", client).set()
+        assert client.gather(tasks) == [True] * 8
+
+
+def secedes_after(event, end):
+    wait_for(event)
+    secede()
+    return wait_for(end)
+
+
+@pytest.mark.extended
+def test_a_job_whose_task_secedes_is_not_drained_any_longer(queue, wait_until):
+    waiting = [0]
+    with cluster_of(lambda: waiting[0], 0, 2) as client:
+        gpu = Partition("GPU", client)
+        gpu.adapt(2, 2, idle_s=NEVER_S)
+        wait_until(lambda: len(gpu) == 2)
+        tasks = [
+            gpu.submit(secedes_after, "secede", "go", workers=f"GPU-{number}")
+            for number in range(2)
+        ]
+        workers = client.cluster.scheduler.workers
+        wait_until(lambda: all(worker.processing for worker in workers.values()))
+        gpu.adapt(0, 2, idle_s=NEVER_S)
+        waiting[0] = 1
+        wait_until(lambda: "closing_gracefully" in {w.status.name for w in workers.values()})
+        Event("secede", client).set()
+        wait_until(lambda: {w.status.name for w in workers.values()} == {"running"})
+        Event("go", client).set()
+        assert client.gather(tasks) == [True] * 2
+
+
 @pytest.mark.extended
 def test_a_job_stays_whose_results_cannot_be_copied(queue, wait_until, monkeypatch):
-    monkeypatch.setattr("poolpart.draining.HELD_S", 0.1)
+    monkeypatch.setattr("poolpart.draining.COPY_TIMEOUT_S", 0.1)
     waiting = [0]
     with cluster_of(lambda: waiting[0], 0, 2) as client:
         gpu = Partition("GPU", client)

@@ -289,7 +289,7 @@ class _JobStarter:
             part = self._parts[name]
             to_start = advice_of_part.jobs_to_start
             if part.watch is not None:
-                part.watch.count_released(len(jobs[name].keys() & advice_of_part.jobs_to_forget))
+                part.watch.count_released(advice_of_part.closed_jobs)
             await asyncio.gather(
                 *(self._remove_job(part, job) for job in advice_of_part.jobs_to_forget)
             )

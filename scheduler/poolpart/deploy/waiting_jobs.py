@@ -1,7 +1,7 @@
 """Jobs of other users that wait in the queue, for partitions that make room for them.
 
 The queue is listed rarely, because each listing puts load on the queueing system, which all users
-share. The result of a listing therefore says how many jobs to release until the next one.
+share. Jobs that are released until the next listing are subtracted from its result.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ class QueueWatch:
         self._listing: asyncio.Task[None] | None = None
         self._listed_at = -LIST_EVERY_S
         self._waiting = 0  # result of the last listing
-        self._released = 0  # number of jobs released since then
+        self._released = 0  # number of running jobs closed since then
 
     def to_release(self) -> int | None:
         """Return the number of jobs to release now, or None if no other jobs wait."""
         return max(0, self._waiting - self._released) if self._waiting else None
 
     def count_released(self, jobs: int) -> None:
-        """Record that jobs of the partition have ended."""
+        """Record that running jobs of the partition were closed."""
         self._released += jobs
 
     def refresh(self, has_jobs: bool) -> None:
