@@ -21,8 +21,8 @@ from .internals.scheduler import (
     stop_assigning,
 )
 
-HELD_S = 10.0  # time after the last task in which the results of a job must have been copied
-KEEP_S = 300.0  # time for which a job is not selected again if its results could not be copied
+COPY_TIMEOUT_S = 10.0  # maximum time to copy the results of a job after its last task
+RETRY_AFTER_S = 300.0  # time before a job whose results could not be copied is selected again
 
 
 @dataclass
@@ -31,7 +31,7 @@ class _Drain:
 
     workers: Sequence[Any]
     requested_moves: set[Any] = field(default_factory=set)  # tasks that workers were asked for
-    finished_at: float | None = None  # time when the job was first found without tasks
+    finished_at: float | None = None  # time when the job was found without tasks
     copying: asyncio.Future[Any] | None = None  # done when the results have been copied
 
 
@@ -68,9 +68,10 @@ class DrainingJobs:
         dict
             Jobs without tasks and results, and the states of their workers.
         """
-        # A worker that was lost or restarted has another state, which accepts tasks.
         for job, drain in list(self._drains.items()):
-            if list(running.get(job, ())) != list(drain.workers):
+            # A worker that was lost or restarted has another state, which accepts tasks.
+            is_unchanged = list(running.get(job, ())) == list(drain.workers)
+            if not is_unchanged or not all(map(self._can_drain, drain.workers)):
                 self._resume(job)
         for job in list(self._drains)[count:]:
             self._resume(job)
@@ -107,14 +108,15 @@ class DrainingJobs:
             stop_assigning(self._scheduler, worker)
             hand_off_tasks(self._scheduler, worker, {self._partition}, drain.requested_moves)
         if any(worker.processing for worker in drain.workers):
+            drain.finished_at = None
             return False
         if all(holds_nothing(self._scheduler, worker) for worker in drain.workers):
             return True
         now = time.monotonic()
         drain.finished_at = drain.finished_at or now
         if drain.copying is None or drain.copying.done():
-            if now - drain.finished_at >= HELD_S:
-                self._kept_until[job] = now + KEEP_S
+            if now - drain.finished_at >= COPY_TIMEOUT_S:
+                self._kept_until[job] = now + RETRY_AFTER_S
                 self._resume(job)
             else:
                 copy = copy_results(self._scheduler, drain.workers, self._partition)
