@@ -279,6 +279,18 @@ def test_static_poses_of_a_model_apply_until_they_are_replaced(folder):
     assert np.allclose(x[front], 1.5, atol=0.002) and front.sum() > 200
 
 
+def test_bodies_stay_if_no_poses_are_received_after_a_reset(folder):
+    with Loop("room.sdf") as loop:
+        loop.play(lambda _: STILL, 30, 30.3)
+        for number in range(60):
+            loop.send(clock(number / 20))
+            loop.do_what_is_due()
+    assert not notes_of(loop, "vanished")
+    x, y, z = loop.clouds()[-1].points.T
+    front = (np.abs(y) < 0.9) & (x > 1) & (np.abs(z) < 0.4)
+    assert loop.clouds()[-1].stamp_s > 2.7 and front.sum() > 200
+
+
 def crate_model(folder: Path) -> None:
     (folder / "models" / "box").mkdir(parents=True)
     (folder / "models" / "box" / "model.sdf").write_text(
@@ -331,6 +343,7 @@ def test_joint_states_move_the_links_of_a_robot(folder):
     (folder / "arm.urdf").write_text(ROBOT)
     (folder / "sensors.yaml").write_text(SENSORS.replace("robot/lidar", "mast"))
     with Loop("arm.urdf") as loop:
+        loop.send(joint_states(3, {"turn": np.nan}), clock(3))
         for number in range(26):
             time_s = 3 + number / 50
             joints = {"turn": 0.8 * (time_s - 3), "lift": 1.0, "wheel": 3.0}
@@ -344,6 +357,7 @@ def test_joint_states_move_the_links_of_a_robot(folder):
         depth = np.cos(angle) * x + np.sin(angle) * y
         assert np.abs(depth - 1.95).max() < 0.003
         assert np.abs(z).max() < 0.51
+    assert "A value of the joint turn is ignored, because it is nan." in loop.notes
     assert any("belong to no robot in a .urdf file" in note and "wheel" in note
                for note in loop.notes)  # fmt: skip
 

@@ -202,7 +202,7 @@ class FollowNode:
             self._restart(time_ns)
         elif time_ns < last_ns or time_ns > last_ns + _MAX_CLOCK_STEP_NS:
             self._tree.restart(time_ns)
-            self._poses.jumped_s = self._clock_s
+            self._poses.restart()
             self._restart(time_ns)
             direction = "back" if time_ns < last_ns else "ahead"
             self._notices.show_event(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 import time
@@ -79,12 +80,17 @@ class PoseInput:
         self._notices = notices
         self._robots: list[RobotFrames] = []
         self.clock_ns: int | None = None  # last time that was received
-        self.last_ns: int | None = None  # time of the last pose over time
-        self.jumped_s = -_SETTLE_S  # when the clock last jumped, as `time.monotonic`
+        self.last_ns: int | None = None  # time of the last pose over time, since the last jump
+        self._jumped_s = -_SETTLE_S  # when the clock last jumped, as `time.monotonic`
 
     def add_robots(self, robots: Sequence[RobotFrames]) -> None:
         """Let joint values control the links of further robots."""
         self._robots += robots
+
+    def restart(self) -> None:
+        """Forget when the last pose was received, because the clock has jumped."""
+        self.last_ns = None
+        self._jumped_s = time.monotonic()
 
     def read(self, message: RosMessage) -> int | None:
         """Add the poses in a message. Return the time if it is a clock message.
@@ -153,7 +159,13 @@ class PoseInput:
                 if source not in values or not joint.is_movable:
                     continue
                 known.add(source)
-                matrix = joint_matrix(joint, factor * float(values[source]) + offset)
+                value = factor * float(values[source]) + offset
+                if not math.isfinite(value):
+                    self._notices.show_event(
+                        "joint", f"A value of the joint {source} is ignored, because it is {value}."
+                    )
+                    continue
+                matrix = joint_matrix(joint, value)
                 time_ns = nanoseconds(state.header.stamp)
                 self._add(prefix + link, prefix + joint.parent, time_ns, pose_of(matrix))
         self._notices.show_names(
@@ -177,7 +189,7 @@ class PoseInput:
         if not is_static and clock_ns is not None:
             time_ns = time_ns or clock_ns
             if not clock_ns - _MAX_BEHIND_NS <= time_ns <= clock_ns + _MAX_AHEAD_NS:
-                if time.monotonic() - self.jumped_s > _SETTLE_S:
+                if time.monotonic() - self._jumped_s > _SETTLE_S:
                     self._notices.show_event(
                         "clock",
                         f"Poses of {frame} are ignored, because their time differs from /clock by "
