@@ -368,6 +368,8 @@ scene: {ground: {}, files: [room.sdf]}
 actors: [{name: van, box: [4, 2, 2], at: [10, 0, 0]}]
 sensor: velodyne/vlp16
 mount: [0, 0, 1]
+trajectory: {points: [{time_s: 0, position: [0, 0, 0]}, {time_s: 9, position: [9, 0, 0]}]}
+cloud: {keep_every: 2, columns: [time]}
 """)
 
     def frames(time_s):
@@ -375,6 +377,8 @@ mount: [0, 0, 1]
 
     with Loop("scan.yaml", sensors=None) as loop:
         loop.play(frames, 0, 0.3)
+    (unused,) = notes_of(loop, "not used")
+    assert "trajectory, cloud.keep_every. To move" in unused
     clouds = loop.clouds("/points")
     assert len(clouds) == 2
     x, y, z = clouds[1].points.T

@@ -54,18 +54,26 @@ def create_node(
     followed = load_followed_world(sources.world, sources.assets, note)
     models = ModelFolder(sources.models, note)
     spec = ExportSpec("mcap", sources.layout, organized=sources.organized)
-    sensors = _open_sensors(sources, followed, spec)
+    sensors = _open_sensors(sources, followed, spec, note)
     return FollowNode(followed, models, sensors, *connections, note, options)
 
 
 def _open_sensors(
-    sources: FollowSources, followed: FollowedWorld, spec: ExportSpec
+    sources: FollowSources,
+    followed: FollowedWorld,
+    spec: ExportSpec,
+    note: Callable[[str], None],
 ) -> list[FollowedSensor]:
     """Return the sensors of the sensor file or of the scenario."""
     if sources.sensors is not None:
         file = SensorsFile.load(sources.sensors)
     elif followed.sensors is not None:
         file = followed.sensors
+        if file.unused:
+            note(
+                f"{sources.world}: These fields are not used: {', '.join(file.unused)}. To move "
+                "the sensors with a frame of the simulator, set `link` in `mount`."
+            )
     else:
         raise LidarError(
             f"{sources.world} contains no sensors of lidarpool. Pass a file with sensors as "

@@ -25,6 +25,7 @@ from .sections import NoiseSection, ReturnsSection, Section, SensorSection, allo
 
 # Fields that describe a survey, which a program that follows another simulator does not have.
 _SURVEY_FIELDS = {"steps"}
+_SCENARIO_FIELDS = ("poses", "trajectory")  # fields of a scenario that move the sensors
 _CLOUD_FIELDS = {"columns", "precision_m"}
 
 
@@ -58,6 +59,7 @@ class SensorsFile(Section):
 
     _folder: Path = PrivateAttr(default=Path())  # folder of relative file names
     _source: str = PrivateAttr(default="the sensor file")  # name of the file in messages
+    _unused: tuple[str, ...] = PrivateAttr(default=())
 
     @model_validator(mode="after")
     def _check_fields(self) -> SensorsFile:
@@ -87,10 +89,7 @@ class SensorsFile(Section):
         data = read_yaml(path)
         with convert_validation_errors(SensorsFile, path, data):
             file = cls.model_validate(data)
-        allowed = declared_values(file.cloud, CloudOptions)
-        default = declared_values(CloudOptions(), CloudOptions)
-        changed = {name for name, value in allowed.items() if value != default[name]}
-        if unsupported := sorted(changed - _CLOUD_FIELDS):
+        if unsupported := _unsupported_options(file.cloud):
             raise LidarError(
                 f"{path}: `cloud.{unsupported[0]}` cannot be used here. Only `columns` and "
                 "`precision_m` are supported."
@@ -101,12 +100,20 @@ class SensorsFile(Section):
 
     @classmethod
     def from_scenario(cls, scenario: Scenario) -> SensorsFile:
-        """Return the sensors of a scenario."""
+        """Return the sensors of a scenario. Its fields that do not apply are listed in `unused`."""
         names = cls.model_fields.keys() & scenario.model_fields_set
         file = cls().model_copy(update={name: getattr(scenario, name) for name in names})
         file._folder = scenario.path("")
         file._source = scenario.source
+        moved = [name for name in _SCENARIO_FIELDS if name in scenario.model_fields_set]
+        cloud = [f"cloud.{name}" for name in _unsupported_options(file.cloud)]
+        file._unused = (*moved, *cloud)
         return file
+
+    @property
+    def unused(self) -> tuple[str, ...]:
+        """Names of the scenario's fields that do not apply to sensors on frames."""
+        return self._unused
 
     def sensors_on_frames(self) -> list[SensorOnFrame]:
         """Return the sensors, with the options of `Scanner` that the file states.
@@ -151,3 +158,11 @@ class SensorsFile(Section):
             "returns": Returns(**dict(self.returns)),
             **declared_values(self.weather, Weather),
         }
+
+
+def _unsupported_options(cloud: CloudOptions) -> list[str]:
+    """Return the names of the options that are set, but not supported here."""
+    values = declared_values(cloud, CloudOptions)
+    default = declared_values(CloudOptions(), CloudOptions)
+    changed = {name for name, value in values.items() if value != default[name]}
+    return sorted(changed - _CLOUD_FIELDS)
