@@ -64,7 +64,7 @@ def test_the_frames_of_a_gazebo_world_are_its_models_and_links(room):
     ]  # fmt: skip
     assert [body.is_static for body in world.bodies] == [True, True, False, False, False]
     assert world.frames["robot/lidar"].parent == "robot"
-    assert world.carriers("robot/lidar") == ("robot/lidar", "robot")
+    assert world.chain("robot/lidar") == ("robot/lidar", "robot")
     assert world.roots == {"room"}
     body = world.bodies[3]
     mesh = body.mesh()  # a box around the origin of its link
@@ -221,7 +221,7 @@ def test_the_frames_of_gltf_nodes_have_z_up_and_carry_their_children(tmp_path):
     gltf_file(tmp_path / "car.gltf")
     world = World.load(tmp_path / "car.gltf")
     assert [body.name for body in world.bodies] == ["Body", "Wheel"]
-    assert world.carriers("Wheel") == ("Wheel", "Car")
+    assert world.chain("Wheel") == ("Wheel", "Car")
     assert np.allclose(world.frames["Car"].matrix, at(10, 0, 2))
     assert np.allclose(world.frames["Wheel"].matrix, at(1, 0, 0))
     # The scale of the node belongs to the mesh, whose y axis is the z axis of the frame.

@@ -63,7 +63,7 @@ class QueueWatch:
             self._listing = asyncio.ensure_future(self._list())
 
     async def _list(self) -> None:
-        """List the queue. If this fails, the partition keeps its jobs."""
+        """List the queue. If this fails, assume that no other jobs are waiting."""
         self._waiting, self.problem = await asyncio.to_thread(self._try_to_count)
         self._released = 0
         self._listed_at = time.monotonic()

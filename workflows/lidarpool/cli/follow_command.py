@@ -71,7 +71,7 @@ from .first_step import print_first_step
     default=1.0,
     show_default=True,
     metavar="SECONDS",
-    help="Remove a model if no poses were received for this simulation time; 0 keeps it.",
+    help="Simulation time without poses after which a model is removed; 0 keeps all models.",
 )
 def follow(
     *,

@@ -65,7 +65,7 @@ class MessageSource(Protocol):
 
 
 class FollowNode:
-    """Publishes the sweeps of sensors in a world that a simulator moves.
+    """Publishes the sweeps of sensors in a world that a simulator controls.
 
     The node receives the clock and the poses of frames. A sweep is simulated as soon as the clock
     has passed its end, and the poses of all frames that move have been received up to its end. If
@@ -80,7 +80,7 @@ class FollowNode:
     sensors
         Sensors, all of which have the same world.
     publisher, subscriber
-        Connections to the simulator and to those who read the sensors.
+        Connections through which messages are published and received.
     note
         Function that shows a notice.
     options
@@ -262,7 +262,7 @@ class FollowNode:
             self._notices.show_event(
                 ("slow", sensor.name),
                 f"A sweep of {sensor.name} was skipped, because it could not be simulated in time. "
-                "If this is repeated, reduce the real-time factor or the number of rays.",
+                "If this happens repeatedly, reduce the real-time factor or the number of rays.",
             )
             next_span = sensor.span(sensor.number + 1)
         span = sensor.span(sensor.number)
@@ -290,15 +290,15 @@ class FollowNode:
         span = sensor.span(sensor.number)
         length_ns = span.end_ns - span.start_ns
         frames = {body.frame for body in self._world.bodies if body.name not in self._absent}
-        live = self._tree.live(self._carriers([*frames, sensor.frame]))
+        live = self._tree.live(self._with_ancestors([*frames, sensor.frame]))
         return [
             name
             for name, last_ns in live.items()
             if span.start_ns - length_ns <= last_ns < span.end_ns
         ]
 
-    def _carriers(self, frames: Iterable[str]) -> set[str]:
-        """Return frames together with all frames that carry them."""
+    def _with_ancestors(self, frames: Iterable[str]) -> set[str]:
+        """Return frames and all frames between them and the world."""
         return {name for frame in frames for name in self._tree.chain(frame) or ()}
 
     def _simulate(self, sensor: FollowedSensor) -> None:
@@ -308,8 +308,8 @@ class FollowNode:
             sensor.number += 1
             self._notices.show(
                 ("missing", sensor.name),
-                f"The pose of {sensor.frame}, the frame of the sensor {sensor.name}, is not "
-                "received. Nothing is published until it is.",
+                f"No pose is known for {sensor.frame}, the frame of the sensor {sensor.name}. The "
+                "sensor publishes nothing until its pose is received.",
             )
             return
         self._notices.clear(("missing", sensor.name))
@@ -396,7 +396,7 @@ class FollowNode:
         self._absent = absent
 
     def _is_lost(self, frame: str, oldest_ns: float) -> bool:
-        """Return whether all poses of a frame and of its carriers are older than a time."""
+        """Return whether all poses of a frame and of its ancestors are older than a time."""
         live = self._tree.live(self._tree.chain(frame) or ())
         return bool(live) and max(live.values()) < oldest_ns
 
@@ -407,7 +407,7 @@ class FollowNode:
             body.name
             for body in self._world.bodies
             if body.is_static is False
-            and not any(name in received for name in self._world.carriers(body.frame))
+            and not any(name in received for name in self._world.chain(body.frame))
         ]
         self._notices.show_names(
             "still",
@@ -429,7 +429,7 @@ class FollowNode:
             self._notices.show_names(
                 "loose",
                 unknown,
-                "These frames are not connected to the world: {names}. Their outermost frames are "
+                "These frames are not connected to the world: {names}. Their root frames are "
                 f"{join_names(roots[:MAX_NAMES])}. If one of them coincides with the world, pass "
                 f"`--world-frame {roots[0] if roots else 'NAME'}`.",
             )

@@ -213,7 +213,7 @@ class PoseInput:
             self._notices.show_event(
                 "jump",
                 f"{frame} jumped by {format_rounded(jump.distance_m)} m within "
-                f"{format_rounded(jump.duration_s)} s. It is not moved in between.",
+                f"{format_rounded(jump.duration_s)} s. Its motion in between is not interpolated.",
             )
 
 

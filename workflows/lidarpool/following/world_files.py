@@ -224,7 +224,7 @@ def _prefixed(world: World, prefix: str) -> World:
 
 
 def _inside(world: World, name: str) -> World:
-    """Return a world whose outermost frames are carried by a new frame at the origin."""
+    """Return a world with a new frame at the origin, which is the parent of its root frames."""
     frames = {
         inner: frame._replace(parent=frame.parent or name) for inner, frame in world.frames.items()
     }

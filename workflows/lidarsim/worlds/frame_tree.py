@@ -187,8 +187,8 @@ class FrameTree:
         return jump
 
     def _prefers(self, parent: str, other: str) -> bool:
-        """Return whether only the first of two parents leads to the world."""
-        return self._leads(parent) and not self._leads(other)
+        """Return whether only the first of two parents is connected to the world."""
+        return self._is_connected(parent) and not self._is_connected(other)
 
     def _jump(self, frame: str, link: _Link, time_ns: int, pose: tuple[float, ...]) -> Jump | None:
         """Return the jump between the last pose of a frame and a new one."""
@@ -218,10 +218,10 @@ class FrameTree:
             link.drop_before(time_ns)
 
     def chain(self, frame: str) -> tuple[str, ...] | None:
-        """Return the frames from a frame to the world, or None if the frame does not lead there.
+        """Return the frames from a frame to the world, or None if it is not connected to the world.
 
-        Poses that were added take precedence over those of the file. If the received frames do not
-        lead to the world, the frame is at its pose in the file.
+        Poses that were added take precedence over those of the file. If the received frames are not
+        connected to the world, the frame is at its pose in the file.
         """
         if frame not in self._chains:
             self._chains[frame] = self._find_chain(frame)
@@ -243,12 +243,12 @@ class FrameTree:
         """Return the parent of a frame, or None if there is none."""
         if frame in self._links:
             parent = self._links[frame].parent
-            if frame not in self._in_file or parent in self._roots or self._leads(parent):
+            if frame not in self._in_file or parent in self._roots or self._is_connected(parent):
                 return parent
         return self._in_file[frame].parent if frame in self._in_file else None
 
-    def _leads(self, frame: str) -> bool:
-        """Return whether received frames and frames of the file lead to the world."""
+    def _is_connected(self, frame: str) -> bool:
+        """Return whether received frames and frames of the file connect a frame to the world."""
         seen: set[str] = set()
         while frame not in self._roots:
             if frame in seen or (frame not in self._links and frame not in self._in_file):
@@ -262,7 +262,7 @@ class FrameTree:
         """Return whether poses were received for a frame, or for one that carries it."""
         return any(name in self._links for name in self.chain(frame) or ())
 
-    def uses_received(self, frame: str) -> bool:
+    def _uses_received(self, frame: str) -> bool:
         """Return whether the pose of a frame relative to its parent was received."""
         return frame in self._links and self._parent(frame) == self._links[frame].parent
 
@@ -289,7 +289,7 @@ class FrameTree:
     def poses(self, frames: Iterable[str], times_ns: Ints) -> dict[str, Floats]:
         """Return the poses of frames in the world.
 
-        Frames that do not lead to the world are omitted.
+        Frames that are not connected to the world are omitted.
 
         Parameters
         ----------
@@ -319,7 +319,7 @@ class FrameTree:
 
     def _matrices(self, frame: str, times_ns: Ints) -> Floats:
         """Return the poses of a frame relative to its parent."""
-        if self.uses_received(frame):
+        if self._uses_received(frame):
             return self._links[frame].matrices(times_ns)
         return np.tile(self._in_file[frame].matrix, (len(times_ns), 1, 1))
 

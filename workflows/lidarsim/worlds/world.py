@@ -212,8 +212,8 @@ class World:
         removed = set(names)
         return replace(self, bodies=tuple(body for body in self.bodies if body.name not in removed))
 
-    def carriers(self, frame: str) -> tuple[str, ...]:
-        """Return the names of a frame and of all frames that carry it in the file."""
+    def chain(self, frame: str) -> tuple[str, ...]:
+        """Return the frames from a frame to the world in the file, without the world."""
         names = []
         while frame in self.frames and frame not in names:
             names.append(frame)
