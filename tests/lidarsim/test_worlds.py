@@ -105,6 +105,19 @@ def test_each_beam_meets_a_moving_body_where_it_is_at_the_firing_time(room):
         assert np.ptp(since_s) > 0.001
 
 
+def test_a_frame_without_an_earlier_pose_moves_from_its_pose_in_the_file(room):
+    follower = Follower.from_world(room, VLP16, frame="robot/lidar", columns=COLUMNS)
+    crate = follower.names.index("crate/link")
+    assert follower.update(0, {}) == []
+    clouds = follower.update(0.21, {"crate": at(6 + 2.1, 0, 0.5)})  # 10 m/s
+    assert len(clouds) == 2
+    for cloud in clouds:
+        front = (cloud.object == crate) & (cloud.positions[:, 2] < 0.99)
+        assert front.sum() > 50
+        since_s = cloud["time"][front] / 1e9
+        assert np.abs(cloud.positions[front, 0] - (5.5 + 10 * since_s)).max() < 0.006
+
+
 def test_each_beam_starts_where_the_moving_sensor_is_at_the_firing_time(room):
     mounted = Mounted(VLP16, Pose((0.1, 0, 0), yaw_deg=90))
     follower = Follower.from_world(room, mounted, frame="robot/lidar", columns=COLUMNS)

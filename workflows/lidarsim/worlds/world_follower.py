@@ -109,6 +109,8 @@ class WorldFollower:
         if self._start_ns is None or time_ns < self._start_ns + self._last_ns:
             self.reset()
             self._start_ns = time_ns
+        else:
+            self._add_earlier_poses(checked.keys() - self._poses.keys())
         self._last_ns = time_ns - self._start_ns
         self._poses |= checked
         for name, pose in self._poses.items():
@@ -122,6 +124,12 @@ class WorldFollower:
         self._start_ns = None
         self._last_ns = 0
         self._number = 0
+
+    def _add_earlier_poses(self, names: set[str]) -> None:
+        """Add the poses of frames at the last update, before their first own poses are added."""
+        earlier = self._tree.poses(names, np.array([self._last_ns]))
+        for name, matrices in earlier.items():
+            self._tree.add(name, WORLD, self._last_ns, pose_of(matrices[0]))
 
     def _check_name(self, name: str, world: World) -> None:
         """Raise LidarError if a frame does not exist, or if its name is ambiguous."""
