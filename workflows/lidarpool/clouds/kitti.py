@@ -29,6 +29,7 @@ from lidarsim.scene.files.float_rows import columns_by_name, read_float_columns
 from lidarsim.scene.files.text_rows import RowReader
 from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
 
+from . import kitti_boxes
 from .boxes import Boxes
 from .cloud_format import Entry, PointColumns
 from .job_reader import JobReader
@@ -37,7 +38,7 @@ from .recording import Recording, RecordingSource, sweep_from_columns
 
 _MATRIX_NUMBERS = [f"m{row}{column}" for row in range(3) for column in range(4)]
 MAX_INSTANCES = 65_535
-CALIBRATION_FILE = "calib.txt"
+CALIBRATION_FILE = kitti_boxes.CALIBRATION_FILE
 CLASS_FILE = "semantic-kitti.yaml"
 # Rotation from a level sensor to a KITTI camera, whose axes point to the right, down and forward.
 _CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
@@ -333,6 +334,7 @@ def _sequence(source: RecordingSource, folder: Path, points: Path, name: str = "
         read_stamps=None if times_ns is None else times_ns.tolist,
         notes=source.prefix_notes(notes),
         read_classes=partial(_class_names, folder),
+        read_boxes=partial(kitti_boxes.read_boxes, folder, files),
         sequence=name,
         calibration=calibration,
     )

@@ -32,6 +32,7 @@ from .boxes import Boxes
 from .cloud_format import Entry, PointColumns
 from .job_reader import JobReader
 from .multi_file_format import FileContent, MultiFileFormat, as_bytes
+from .recorded_boxes import RecordedBoxes
 from .recording import Recording, RecordingSource, sweep_from_columns
 
 VERSION = "v1.0-lidarpool"
@@ -535,6 +536,7 @@ def _recording(source: RecordingSource, tables: NuScenesTables, rows: list[_Row]
         len(rows),
         lambda number: tables.read(rows[number]),
         read_stamps=times_ns.tolist,
+        read_boxes=lambda: tables.boxes(rows),
         sequence=tables.scene_name(rows[0]) if tables.scene_count > 1 else "",
     )
 
@@ -643,6 +645,30 @@ class NuScenesTables:
         """Return the sensor pose of a sweep in the world frame, with shape (4, 4)."""
         calibration = _pose_of(self._calibrated[row["calibrated_sensor_token"]])
         return _pose_of(self._poses[row["ego_pose_token"]]) @ calibration
+
+    def boxes(self, rows: Sequence[_Row]) -> RecordedBoxes | None:
+        """Return the annotated boxes in the key frames among the sweeps `rows`, or None."""
+        annotations = self.table("sample_annotation", optional=True)
+        if not annotations:
+            return None
+        instances = self.table("instance")
+        numbers = {token: number for number, token in enumerate(instances)}
+        categories = self.table("category")
+        of_sample: dict[str, list[_Row]] = {}
+        for row in annotations.values():
+            of_sample.setdefault(row["sample_token"], []).append(row)
+        found = []
+        for sweep, row in enumerate(rows):
+            if not row["is_key_frame"]:
+                continue
+            from_world = np.linalg.inv(self.sensor_pose(row))
+            for box in of_sample.get(row["sample_token"], []):
+                instance = box["instance_token"]
+                kind = categories[instances[instance]["category_token"]]["name"]
+                width, length, height = box["size"]
+                pose = from_world @ _pose_of(box)
+                found.append((sweep, numbers[instance], kind, pose, (length, width, height)))
+        return RecordedBoxes.from_rows(found)
 
     def read(self, row: _Row) -> Sweep:
         """Read a sweep."""

@@ -34,6 +34,7 @@ from lidarsim.words import did_you_mean, join_names, plural
 from ..identity.fingerprint import fingerprint
 from ..processes.per_process import PerProcess
 from .point_times import PointTimes
+from .recorded_boxes import RecordedBoxes
 from .rings import Rings
 
 METERS: Meters = (1.0, 1.0, 1.0)
@@ -81,6 +82,9 @@ class Recording:
     read_classes
         Function that returns the names of the semantic classes by number, or None if the format
         does not store them.
+    read_boxes
+        Function that returns the boxes of labeled objects in all sweeps. It returns None if the
+        recording has no labels of objects.
     fired
         Function that returns the sweep with a given number as fired, including its `firing_poses`.
         None if the firing poses are unknown, as in most recordings from real sensors.
@@ -133,6 +137,7 @@ class Recording:
     read_stamps: Callable[[], Iterable[float]] | None = None
     read_poses: Callable[[], Floats | None] | None = None
     read_classes: Callable[[], Mapping[int, str]] | None = None
+    read_boxes: Callable[[], RecordedBoxes | None] | None = None
     fired: Callable[[int], Sweep] | None = None
     sample: Callable[[int], Sweep] | None = None
     compensated: bool | None = None
@@ -181,6 +186,12 @@ class Recording:
         stop = first + count
         read_stamps, read_poses, fired = self.read_stamps, self.read_poses, self.fired
 
+        boxes = self.read_boxes
+
+        def section_boxes() -> RecordedBoxes | None:
+            read = None if boxes is None else boxes()
+            return None if read is None else read.section(first, count)
+
         def section_poses() -> Floats | None:
             poses = None if read_poses is None else read_poses()
             return None if poses is None else poses[first:stop]
@@ -191,6 +202,7 @@ class Recording:
             read=lambda number: self.read(first + number),
             read_stamps=None if read_stamps is None else lambda: [*read_stamps()][first:stop],
             read_poses=None if read_poses is None else section_poses,
+            read_boxes=None if boxes is None else section_boxes,
             fired=None if fired is None else lambda number: fired(first + number),
             stations=self.stations[first:stop],
             files=self.files[first:stop],
@@ -309,6 +321,14 @@ class Recording:
             return {}
         with reading(self.name):
             return self.read_classes()
+
+    @cached_property
+    def boxes(self) -> RecordedBoxes | None:
+        """Boxes of labeled objects in all sweeps, or None if the recording has no labels."""
+        if self.read_boxes is None:
+            return None
+        with reading(self.name):
+            return self.read_boxes()
 
     @cached_property
     def stamps_ns(self) -> Floats | None:
@@ -484,7 +504,7 @@ class RecordingSource:
 
             return call
 
-        for name in ("read_stamps", "read_poses"):
+        for name in ("read_stamps", "read_poses", "read_boxes"):
             if fields.get(name) is not None:
                 fields[name] = locked(fields[name])
         return self.recording(count, read, **fields)
@@ -590,6 +610,8 @@ def open_cloud(
         fields["firing_key"] = fingerprint(
             key, saved.scans[indices], saved.begins_ns[indices], poses
         )
+    if saved.actors:
+        fields["read_boxes"] = lambda: RecordedBoxes.from_sweeps(saved, indices)
     if len(saved.knots):
         fields["compensated"] = saved.coordinates == "world"
     fields |= {"read_stamps": lambda: stamps_ns, "read_poses": read_poses, "fired": read_fired}

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import yaml
@@ -58,17 +58,33 @@ from .labels import SurfelMaterial, split_by_object
 from .lasers import RingLasers
 from .lost_pulses import SensorCoverage, firings_per_turn
 from .motion import Motion
+from .moving_objects import find_tracks, labeled_tracks
+from .moving_rays import MovingRays, StationaryMasks
+from .object_surfels import RecordedObject, reconstruct_objects
+from .object_tracks import ObjectTrack
 from .odometry import RecordedPoses, find_poses
 from .porosity import Porosity
 from .published_metrics import HeldOutFrames
 from .range_noise import RangeNoise, estimate_range_noise
+from .recorded_actors import FOLDER as ACTORS_FOLDER
+from .recorded_actors import RecordedActor, actors_of, class_names
 from .recorded_sweeps import RecordedSweeps, Rotation
 from .reflectances import IntensityModel, Reflectances, Response, fit_response
-from .submap_tasks import BuildTask, SubmapSurfels, SubmapTask, align_submap, build_submap
+from .submap_objects import SubmapObjects
+from .submap_tasks import (
+    BuildTask,
+    MotionTask,
+    SubmapSurfels,
+    SubmapTask,
+    align_submap,
+    build_submap,
+    find_moving_rays,
+)
 from .submaps import AlignedSubmap, Submap, merge_alignments, split_into_submaps
 from .surface_map import Observations
 from .surfels import merge_surfels, surfel_centers, surfel_mesh
 
+ActorSource = Literal["boxes", "clusters", "none"]
 MIN_SWEEPS = 4
 _SUBMAP_BYTES = 3 << 30  # memory per process for a submap of a sensor with 64 rings
 SCENE_FILE = "place.glb"
@@ -86,6 +102,7 @@ _POSE_DECIMALS = 6
 _RESPONSE_SUBMAPS = 4  # submaps from which the response of the sensor is determined
 _POSES = TwinStep("poses", (RecordedPoses,))
 _ALIGN = TwinStep("align", (AlignedSubmap,))
+_MOTION = TwinStep("motion", (StationaryMasks, StationaryMasks, MovingRays, MovingRays))
 _BUILD = TwinStep(
     "build",
     (SubmapSurfels, Observations, HeldOutRays, HeldOutFrames, SweepImages, TopViewPoints),
@@ -98,6 +115,7 @@ _ANGLE_DECIMALS = 3
 _NOISE_DECIMALS = 5
 _RANGE_NOISE = ("range_m", "range_per_m", "range_at_threshold_m", "precision")
 _FACTOR_DECIMALS = 4
+_PRESENCE_STEP_S = 0.1  # step of the times at which objects are sought near a submap
 _MIN_STEP_S = 1e-5  # minimum time between poses of the trajectory
 _MIN_LEAD = 0.01  # minimum time from the first point to the timestamp, in revolutions
 _MIN_DRIVE_M = 0.3  # On a shorter drive, the sensor counts as stationary.
@@ -135,6 +153,8 @@ class Twin:
         Statistics and texts of the report. Lengths are in meters.
     pictures
         Charts of the report by name.
+    actors
+        Moving objects of the recording.
     """
 
     scene: Scene
@@ -146,6 +166,7 @@ class Twin:
     model: SensorModel
     figures: dict[str, Any]
     pictures: dict[str, Any]
+    actors: Sequence[RecordedActor] = ()
 
     def __repr__(self) -> str:
         return render_template("twin.txt", report=self.figures).rstrip("\n")
@@ -178,6 +199,12 @@ class Twin:
             staging(folder) as staged,
         ):
             write_scene(staged / SCENE_FILE, self.scene)
+            (staged / ACTORS_FOLDER).mkdir()
+            actor_files = [
+                f"{ACTORS_FOLDER}/{name}"
+                for actor in self.actors
+                for name in actor.write(staged / ACTORS_FOLDER)
+            ]
             pictures = {name: page.svg() for name, page in self.pictures.items()}
             page = render_template("twin.html", report=self.figures, pictures=pictures)
             stated = self.model.model_dump(mode="json", exclude_defaults=True)
@@ -192,7 +219,10 @@ class Twin:
             }
             for name, text in texts.items():
                 (staged / name).write_text(text, encoding="utf-8", newline="\n")
-            return [(staged / name).replace(folder / name) for name in (SCENE_FILE, *texts)]
+            if self.actors:
+                (folder / ACTORS_FOLDER).mkdir(exist_ok=True)
+            names = (SCENE_FILE, *actor_files, *texts)
+            return [(staged / name).replace(folder / name) for name in names]
 
     def _materials(self) -> list[SurfelMaterial]:
         """Return the materials of surfels that have a class or gaps, in ascending order."""
@@ -236,6 +266,9 @@ class Twin:
             for number in sorted({material.semantic_class for material in surfel_materials})
             if number
         }
+        if self.actors:
+            scenario["classes"] |= class_names(self.actors)
+            scenario["actors"] = [actor.section() for actor in self.actors]
         scenario["cloud"] = {"columns": _COLUMNS}
         head = (
             f"# Reconstruction of {self.figures['name']}, created by lidarpool "
@@ -254,6 +287,7 @@ def twin(
     sensor: str | None = None,
     intensity: str | None = None,
     lidar4d_window: int | None = None,
+    actors: ActorSource | None = None,
     client: Client | None = None,
     folder: str | Path | None = None,
     resume: bool = False,
@@ -289,6 +323,10 @@ def twin(
         First frame of a window of KITTI-360 in which LiDAR4D was evaluated, such as 4950. Only the
         frames of this window are used, and the same frames are held out. The recording must be a
         folder with the frames of the drive 0000, or with the frames of the window.
+    actors
+        How the moving objects are found: "boxes" uses the labeled boxes of the recording,
+        "clusters" uses clusters of points that moved, and "none" omits moving objects. By default,
+        the boxes are used if the recording has any, and otherwise the clusters.
     client
         Client of a cluster whose OTHER workers can read the recording at the same path. By default,
         processes on this machine reconstruct the submaps. A recording in memory is always processed
@@ -311,12 +349,14 @@ def twin(
     LidarError
         If the recording cannot be read, has fewer than four sweeps, has no planes, or has no rings
         and `model` is not set; if an extra is missing; if the folder contains the steps of a
-        different twin, or if another reconstruction is using it; or if the cluster is lost.
+        different twin, if `actors` is "boxes" but the recording has none, or if another reconstruction is using it; or if the cluster is lost.
     """
     check_number("voxel_m", voxel_m, gt=0, le=10)
     require_package("scipy", "twin", "Reconstructing a recording")
     if lidar4d_window is not None:
         check_choice("lidar4d_window", str(lidar4d_window), tuple(map(str, WINDOWS)))
+    if actors is not None:
+        check_choice("actors", actors, get_args(ActorSource))
     base = None if model is None else read_model(model)  # before the recording, which takes long
     if isinstance(recording, (str, Path)):
         recorded = RecordedSweeps.open(Path(recording), sensor, intensity, lidar4d_window)
@@ -332,12 +372,13 @@ def twin(
             recording = open_recording(recording, sensor, intensity, name="the recording")
         recorded = RecordedSweeps.from_recording(recording)
     _check_sweeps(recorded)
+    source = _actor_source(recorded, actors)
     if base is None and not len(recorded.elevation_rad):
         reason = " ".join(recorded.notes) or f"{recorded.recording.name} has no rings."
         raise LidarError(f"{reason} Specify its sensor, for example `--model livox/mid360`.")
     track = None if trajectory is None else Path(trajectory)
     report = report or (lambda line: None)
-    made_of = (_fingerprint_inputs(recorded, track), voxel_m)
+    made_of = (_fingerprint_inputs(recorded, track), voxel_m, source)
     with ExitStack() as stack:
         if folder is None:
             steps_folder = Path(stack.enter_context(TemporaryDirectory(prefix="lidarpool-")))
@@ -345,7 +386,7 @@ def twin(
             steps_folder = stack.enter_context(result_folder(Path(folder)))
         steps = FinishedSteps.create_or_resume(steps_folder, made_of, resume=resume)
         try:
-            built = _Building(recorded, base, voxel_m, steps, client, report).twin(track)
+            built = _Building(recorded, base, voxel_m, source, steps, client, report).twin(track)
         except (KeyboardInterrupt, LostWorkersError) as error:
             if folder is not None:
                 error.add_note(
@@ -367,6 +408,21 @@ def _check_sweeps(recorded: RecordedSweeps) -> None:
             f"requires at least {MIN_SWEEPS}, because sweeps that agree identify stationary "
             "surfaces."
         )
+
+
+def _actor_source(recorded: RecordedSweeps, chosen: ActorSource | None) -> ActorSource:
+    """Return how moving objects are found, or raise LidarError if there are no labeled boxes."""
+    if chosen in ("clusters", "none"):
+        return chosen
+    boxes = recorded.recording.boxes
+    if boxes is not None and len(boxes.sweep):
+        return "boxes"
+    if chosen == "boxes":
+        raise LidarError(
+            f"{recorded.recording.name} contains no labeled boxes. Set `actors` to `clusters`, or "
+            "omit it."
+        )
+    return "clusters"
 
 
 def _fingerprint_inputs(recorded: RecordedSweeps, trajectory: Path | None) -> list[object]:
@@ -396,6 +452,7 @@ class _Building:
     recorded: RecordedSweeps
     base: SensorModel | None
     voxel_m: float
+    actors: ActorSource
     steps: FinishedSteps
     client: Client | None
     report: Callable[[str], None]
@@ -424,9 +481,12 @@ class _Building:
         count = len(submaps) if is_shared else 1
         with parallel_map(self.client, count, _SUBMAP_BYTES) as run:
             task = replace(task, alignment=self._align_submaps(run, task, submaps))
-            built = self._build_submaps(run, task, submaps)
+            moving = None
+            if self.actors != "none":
+                moving = self._find_moving_objects(run, task, submaps)
+            built = self._build_submaps(run, task, submaps, moving)
             sweeps = AlignedSweeps(recorded, task.alignment, task.coverage)
-            return self._assemble(built, sweeps, poses)
+            return self._assemble(built, sweeps, poses, moving)
 
     def _find_poses(self, trajectory: Path | None) -> RecordedPoses:
         def find() -> tuple[RecordedPoses]:
@@ -447,13 +507,58 @@ class _Building:
         aligned = [one for (one,) in self.steps.each(_ALIGN, run, align_submap, tasks)]
         return merge_alignments(task.alignment, submaps, aligned)
 
-    def _build_submaps(
+    def _find_moving_objects(
         self, run: MapFunction, task: BuildTask, submaps: Sequence[Submap]
+    ) -> MovingObjects:
+        """Find the moving objects in all sweeps, and in the sweeps that form the map alone."""
+        self.report(f"finding moving objects in {plural(len(submaps), 'submap')}")
+        boxes = self.recorded.recording.boxes
+        alignment = task.alignment
+        labeled = None if boxes is None else labeled_tracks(boxes, alignment)
+        in_mapped = None if boxes is None else labeled_tracks(boxes, alignment, task.mapped)
+        used = self.actors == "boxes"
+        motion = MotionTask(
+            **vars(task),
+            labeled=labeled if used and labeled else (),
+            labeled_in_mapped=in_mapped if used and in_mapped else (),
+        )
+        tasks = [replace(motion, submap=one) for one in submaps]
+        rays = []
+        mapped_rays = []
+        for _, _, of_all, of_mapped in self.steps.each(_MOTION, run, find_moving_rays, tasks):
+            rays.append(of_all)
+            mapped_rays.append(of_mapped)
+        found = []
+        for part, tracks in ((rays, labeled), (mapped_rays, in_mapped)):
+            joined = MovingRays.concatenate(part)
+            sweep_s = alignment.sweep_s * (2 if part is mapped_rays else 1)
+            followed = find_tracks(joined, tracks if used else None, sweep_s)
+            objects = reconstruct_objects(
+                followed, joined, self.voxel_m, self.recorded.gap_rad
+            )
+            found.append((followed, objects))
+        (all_tracks, objects), (mapped_tracks, mapped_objects) = found
+        return MovingObjects(
+            objects=objects,
+            tracks=[one.track for one in objects] if not used else all_tracks,
+            mapped_objects=mapped_objects,
+            mapped_tracks=(
+                [one.track for one in mapped_objects] if not used else mapped_tracks
+            ),
+            boxes=all_tracks if labeled is None else labeled,
+        )
+
+    def _build_submaps(
+        self,
+        run: MapFunction,
+        task: BuildTask,
+        submaps: Sequence[Submap],
+        moving: MovingObjects | None,
     ) -> _Built:
         sizes = [len(task.recorded.read(int(one.numbers[0]))) for one in submaps]
         count = sum(sizes) / len(sizes) * sum(len(one.own_numbers) for one in submaps)
         fraction = STATIONARY_DOTS / max(count, 1.0)
-        tasks = [replace(task, submap=one, drawn_share=fraction) for one in submaps]
+        tasks = _BuildTasks(replace(task, drawn_share=fraction), submaps, moving, self.steps)
         parts = []
         for number, part in enumerate(self.steps.each(_BUILD, run, build_submap, tasks), 1):
             self.report(f"built {number} of {plural(len(submaps), 'submap')}")
@@ -465,7 +570,13 @@ class _Building:
         observations: Observations = self.steps.load(_BUILD, index)[1]
         return observations
 
-    def _assemble(self, built: _Built, sweeps: AlignedSweeps, poses: RecordedPoses) -> Twin:
+    def _assemble(
+        self,
+        built: _Built,
+        sweeps: AlignedSweeps,
+        poses: RecordedPoses,
+        moving: MovingObjects | None,
+    ) -> Twin:
         """Fit the sensor's response and noise, and assemble the twin."""
         recorded = self.recorded
         alignment = sweeps.alignment
@@ -485,10 +596,14 @@ class _Building:
         }
         timing = SweepTiming.from_sweeps(sweeps)
         model, noise, notes = self._fit_sensor(built, sweeps, meshes, response, timing)
+        start, stop = timing.start(alignment), timing.stop(alignment)
+        actors = self._actors(moving, response, alignment.sweep_s, (start.time_s, stop.time_s))
         held_out = built.held_out()
         figures = self._figures(built, alignment) | {
             "poses": poses.source,
             "motion": alignment.motion.value,
+            "actors_from": self.actors,
+            "actors": [actor.figures() for actor in actors],
             "held_out": held_out.figures(),
             "lidar4d": HeldOutFrames.figures(
                 [part.frames for part in built.parts if part.frames is not None]
@@ -527,13 +642,33 @@ class _Building:
             ),
             poses=alignment.poses,
             times_s=poses.times_s,
-            start=timing.start(alignment),
-            stop=timing.stop(alignment),
+            start=start,
+            stop=stop,
             origin=poses.origin,
             model=model,
             figures=figures,
             pictures=pictures,
+            actors=actors,
         )
+
+    def _actors(
+        self,
+        moving: MovingObjects | None,
+        response: Response | None,
+        sweep_s: float,
+        span_s: tuple[float, float],
+    ) -> list[RecordedActor]:
+        """Return the moving objects as actors, whose colors are their reflectances."""
+        if moving is None:
+            return []
+        meshes = []
+        for one in moving.objects:
+            reflectances = None
+            if response is not None:
+                reflectances = response.reflectances(one.observations, one.surfels.centers)
+            meshes.append(color_by_reflectance(one.surfels.mesh, reflectances))
+        names = self.recorded.recording.classes
+        return actors_of(moving.objects, meshes, names, span_s, sweep_s)
 
     def _fit_sensor(
         self,
@@ -651,6 +786,57 @@ class _Built:
                 "complete recording."
             )
         return images[len(images) // 2]
+
+
+class MovingObjects(NamedTuple):
+    """Moving objects of a recording, according to all sweeps and to those that form the map."""
+
+    objects: Sequence[RecordedObject]
+    tracks: Sequence[ObjectTrack]
+    mapped_objects: Sequence[RecordedObject]
+    mapped_tracks: Sequence[ObjectTrack]
+    boxes: Sequence[ObjectTrack]  # in which held-out points are measured
+
+    def near(
+        self, first_s: float, last_s: float, masks: StationaryMasks, mapped: StationaryMasks
+    ) -> SubmapObjects:
+        """Return the objects that are present between two times."""
+        times_s = np.linspace(first_s, last_s, 2 + int((last_s - first_s) / _PRESENCE_STEP_S))
+
+        def present(tracks: Sequence[ObjectTrack]) -> list[ObjectTrack]:
+            return [track for track in tracks if track.is_present(times_s).any()]
+
+        objects = [one for one in self.mapped_objects if one.track.is_present(times_s).any()]
+        return SubmapObjects(
+            masks,
+            mapped,
+            present(self.tracks),
+            present(self.mapped_tracks),
+            present(self.boxes),
+            objects,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _BuildTasks(Sequence[BuildTask]):
+    """Tasks of building the submaps, which are created when they are needed to save memory."""
+
+    task: BuildTask
+    submaps: Sequence[Submap]
+    moving: MovingObjects | None
+    steps: FinishedSteps
+
+    def __len__(self) -> int:
+        return len(self.submaps)
+
+    def __getitem__(self, index: Any) -> Any:
+        submap = self.submaps[index]
+        objects = None
+        if self.moving is not None:
+            masks, mapped, _, _ = self.steps.load(_MOTION, index)
+            times_s = self.task.alignment.times_s[submap.numbers]
+            objects = self.moving.near(float(times_s[0]), float(times_s[-1]), masks, mapped)
+        return replace(self.task, submap=submap, objects=objects)
 
 
 class SweepTiming(NamedTuple):

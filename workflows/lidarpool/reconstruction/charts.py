@@ -14,8 +14,7 @@ from lidarview.render.picture_page import Page, label_logarithms
 
 from ..clouds.rings import elevations
 from .alignment import AlignedSweep, AlignedSweeps
-from .reflectances import Reflectances
-from .surface_map import SurfaceMap
+from .held_out import HeldOutRays
 
 _WIDTH = 1600
 _LEFT = 0.075
@@ -59,24 +58,19 @@ class SweepImages(NamedTuple):
     simulated_intensity: Floats32 | None
 
     @classmethod
-    def from_sweep(
-        cls,
-        sweeps: AlignedSweeps,
-        surface_map: SurfaceMap,
-        reflectances: Reflectances | None,
-        number: int,
-    ) -> SweepImages:
-        """Create images of a sweep and of its simulation on a surface map."""
+    def from_rays(cls, sweeps: AlignedSweeps, rays: HeldOutRays, number: int) -> SweepImages:
+        """Create images of a held-out sweep and of its simulation."""
         sweep = sweeps.read(number)
         cells = _cells(sweep, sweeps)
-        hits = surface_map.cast_likely(sweep)
-        simulated_m = np.full(len(sweep.points), np.nan)
-        simulated_m[hits.rays] = hits.distance_m
-        range_m, in_twin_m = (_image(values, cells) for values in (sweep.range_m, simulated_m))
-        if reflectances is None or sweep.intensities is None:
+        simulated = rays.select(rays.return_mask & (rays.sweep == number))
+        range_m, in_twin_m = (
+            _image(values, cells) for values in (sweep.range_m, simulated.simulated_m)
+        )
+        if sweep.intensities is None or not np.isfinite(simulated.simulated_intensity).any():
             return cls(np.array([number]), range_m, in_twin_m, None, None)
-        simulated = reflectances.intensities(sweep, hits)
-        intensity, in_twin = (_image(values, cells) for values in (sweep.intensities, simulated))
+        intensity, in_twin = (
+            _image(values, cells) for values in (sweep.intensities, simulated.simulated_intensity)
+        )
         return cls(np.array([number]), range_m, in_twin_m, intensity, in_twin)
 
     def pictures(self) -> list[_Image]:

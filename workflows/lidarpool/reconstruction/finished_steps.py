@@ -109,7 +109,7 @@ class FinishedSteps:
         """
         done = [self._file(step, index).exists() for index in range(len(items))]
         results = iter(
-            run(function, [item for item, known in zip(items, done, strict=True) if not known])
+            run(function, (items[index] for index, known in enumerate(done) if not known))
         )
         for index, is_known in enumerate(done):
             loaded = self._load_intact(step, index) if is_known else None

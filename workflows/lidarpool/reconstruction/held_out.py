@@ -24,6 +24,7 @@ from .surface_map import SurfaceMap
 HeldOutPulses = Mapping[int, tuple[AlignedSweep, AlignedSweep]]
 
 _RANGE_MARGIN_M = 0.5  # margin beyond the maximum recorded range
+_SAME_SURFACE_M = 0.15  # maximum range difference of returns from the same surface
 _RANGES_M = (0, 5, 10, 20, 40, 80, np.inf)  # boundaries of the range classes
 
 
@@ -43,6 +44,10 @@ class HeldOutRays:
         Recorded and simulated intensity, NaN if unknown.
     standing
         Whether the recorded point is stationary according to all sweeps. False for lost pulses.
+    moving
+        Whether the recorded point is in the box of a moving object.
+    on_object
+        Whether the ray hits a moving object in the simulation.
     """
 
     sweep: Ints
@@ -52,6 +57,8 @@ class HeldOutRays:
     intensity: Floats
     simulated_intensity: Floats
     standing: Bools
+    moving: Bools
+    on_object: Bools
 
     @classmethod
     def concatenate(cls, parts: Sequence[HeldOutRays]) -> HeldOutRays:
@@ -86,6 +93,7 @@ class HeldOutRays:
         return {
             "all": self._figures(self.return_mask),
             "stationary": self._figures(self.standing),
+            "moving": self._moving(),
             "by_range": [row for row in classes if row["rays"]],
             "by_sweep": [
                 {"sweep": int(number)} | self._figures(self.return_mask & (self.sweep == number))
@@ -123,6 +131,21 @@ class HeldOutRays:
             "recorded": float(recorded.mean()),
             "simulated": float(simulated.mean()),
             "f1": float(2 * (recorded & simulated).sum() / (recorded.sum() + simulated.sum())),
+        }
+
+    def _moving(self) -> dict[str, Any] | None:
+        """Return statistics of the points in boxes of moving objects, or None without any.
+
+        Ghosts are simulated returns on moving objects where the recording has no such return.
+        """
+        if not self.moving.any() and not self.on_object.any():
+            return None
+        near = np.abs(self.simulated_m - self.range_m) < _SAME_SURFACE_M
+        ghosts = int((self.on_object & ~self.moving & ~near).sum())
+        simulated = int(np.isfinite(self.simulated_m).sum())
+        return self._figures(self.moving) | {
+            "ghosts": ghosts / simulated if simulated else 0.0,
+            "ghosts_on_objects": ghosts / max(int(self.on_object.sum()), 1),
         }
 
     def _figures(self, rays: Bools) -> dict[str, Any]:
@@ -221,4 +244,6 @@ def _rays(
             unknown if reflectances is None else reflectances.intensities(sweep, hits)
         ),
         standing=stationary,
+        moving=np.zeros(len(sweep.points), bool),
+        on_object=np.zeros(len(sweep.points), bool),
     )

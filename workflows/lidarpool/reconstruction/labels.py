@@ -78,6 +78,11 @@ class SurfelMaterial(NamedTuple):
         return {"material": self.name} | {name: value for name, value in fields.items() if value}
 
 
+def class_of(label: int) -> int:
+    """Return the class number in a label, or 0 if there is none."""
+    return label & _MAX_CLASS
+
+
 def split_by_object(mesh: SceneMesh, porosity: Porosity) -> list[SceneMesh]:
     """Split a surfel mesh by object, and name its materials by class and porosity.
 

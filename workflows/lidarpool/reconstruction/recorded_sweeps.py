@@ -211,6 +211,7 @@ class RecordedSweeps:
         - `label`: see `labels_of`.
         - `time_s`: time relative to the timestamp of the sweep, which may be that of its last
           point.
+        - `fired_s`: the same time, only if the points are known to be motion-compensated.
         - `start_rad`: azimuth at which the ring of the point starts.
 
         Raises
@@ -228,11 +229,13 @@ class RecordedSweeps:
         returns = self._returns(number)
         row = self.rings.ring_indices(returns)
         intensity = returns.intensity
+        times_s = self._times_s(number, returns)
         sweep = Sweep(returns.points).with_columns(
             row=row.clip(min=0),
             intensity=None if intensity is None else np.asarray(intensity, np.float64),
             label=labels_of(returns),
-            time_s=None if self.is_compensated else self._times_s(number, returns),
+            time_s=None if self.is_compensated else times_s,
+            fired_s=times_s if self.is_compensated else None,
         )
         known = row >= 0
         return sweep if known.all() or not len(self.rings) else sweep.select(known)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -17,10 +17,13 @@ from .charts import SweepImages, TopViewPoints
 from .free_space import find_stationary_points
 from .held_out import HeldOutRays, simulate_held_out
 from .lost_pulses import SensorCoverage
+from .moving_rays import MovingRays, StationaryMasks, collect_moving_rays
+from .object_tracks import ObjectTrack
 from .porosity import Porosity
 from .published_metrics import HeldOutFrames
 from .recorded_sweeps import RecordedSweeps
 from .reflectances import Reflectances, fit_response
+from .submap_objects import SubmapObjects
 from .submaps import AlignedSubmap, Submap
 from .surface_map import Observations, SurfaceMap, build_surface_map
 from .surfels import surfel_mesh
@@ -62,17 +65,36 @@ class BuildTask(SubmapTask):
         Edge length in meters of the voxels from which surfels are created.
     drawn_share
         Share of the points that are drawn in the top view.
+    objects
+        Moving objects near the submap, or None if they are not reconstructed.
     """
 
     coverage: SensorCoverage
     compared: Ints
     voxel_m: float
     drawn_share: float
+    objects: SubmapObjects | None = None
 
     def read(self) -> AlignedSweeps:
         """Read the sweeps of the submap and its surroundings into memory."""
         recorded = self.recorded.with_cached(self.submap.numbers.tolist())
         return AlignedSweeps(recorded, self.alignment, self.coverage)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionTask(BuildTask):
+    """Task of finding the points on moving objects in a submap.
+
+    Attributes
+    ----------
+    labeled
+        Boxes of moving objects from labels, which are empty if the objects are to be found.
+    labeled_in_mapped
+        The same, from the labels of the sweeps that form the map.
+    """
+
+    labeled: Sequence[ObjectTrack] = ()
+    labeled_in_mapped: Sequence[ObjectTrack] = ()
 
 
 class SubmapSurfels(NamedTuple):
@@ -148,6 +170,30 @@ def align_submap(task: SubmapTask) -> tuple[AlignedSubmap]:
     return (AlignedSubmap.from_alignment(aligned),)
 
 
+def find_moving_rays(
+    task: MotionTask,
+) -> tuple[StationaryMasks, StationaryMasks, MovingRays, MovingRays]:
+    """Find the points on moving objects in a submap, and collect the rays near these objects.
+
+    Returns the masks of the stationary points of all sweeps, and those that follow from the sweeps
+    that form the map alone. The rays are those of the submap's own sweeps, in the same order.
+    """
+    sweeps = task.read()
+    numbers = task.submap.numbers
+    own = task.submap.own_numbers
+    masks = []
+    rays = []
+    for chosen, labeled in (
+        (numbers, task.labeled),
+        (np.intersect1d(numbers, task.mapped), task.labeled_in_mapped),
+    ):
+        stationary = find_stationary_points(sweeps, chosen.tolist())
+        masks.append(StationaryMasks.from_masks(stationary))
+        collected = np.intersect1d(chosen, own).tolist()
+        rays.append(collect_moving_rays(sweeps, stationary, collected, labeled))
+    return masks[0], masks[1], rays[0], rays[1]
+
+
 def build_submap(task: BuildTask) -> BuiltSubmap:
     """Build the surface map of a submap, and compare the held-out sweeps with a simulation.
 
@@ -158,7 +204,10 @@ def build_submap(task: BuildTask) -> BuiltSubmap:
     """
     submap = task.submap
     sweeps = task.read()
-    stationary = find_stationary_points(sweeps, submap.numbers.tolist())
+    if task.objects is None:
+        stationary = find_stationary_points(sweeps, submap.numbers.tolist())
+    else:
+        stationary = task.objects.stationary(sweeps)
     held_out, frames, images = compare_held_out_sweeps(sweeps, task, stationary)
     surface_map = build_surface_map(sweeps, stationary, task.voxel_m)
     own = submap.owns(surface_map.surfels.centers, task.alignment.poses)
@@ -200,20 +249,30 @@ def compare_held_out_sweeps(
     if not compared:
         return None, None, None
     mapped = np.intersect1d(submap.numbers, task.mapped).tolist()
-    surface_map, reflectances = build_map_with_reflectances(sweeps, mapped, task.voxel_m)
+    objects = task.objects
+    if objects is None:
+        mapped_stationary = find_stationary_points(sweeps, mapped)
+    else:
+        mapped_stationary = objects.stationary_in_mapped(sweeps)
+    surface_map, reflectances = build_map_with_reflectances(
+        sweeps, mapped_stationary, task.voxel_m
+    )
     rays, pulses = simulate_held_out(sweeps, surface_map, reflectances, stationary, compared)
+    if objects is not None:
+        response = None if reflectances is None else reflectances.response
+        rays = objects.simulate(sweeps, rays, pulses, response)
     frames = HeldOutFrames.from_rays(sweeps, rays, pulses)
     with_points = np.unique(rays.sweep[rays.return_mask])
     if not len(with_points):
         return rays, frames, None
     drawn = int(with_points[len(with_points) // 2])
-    return rays, frames, SweepImages.from_sweep(sweeps, surface_map, reflectances, drawn)
+    return rays, frames, SweepImages.from_rays(sweeps, rays, drawn)
 
 
 def build_map_with_reflectances(
-    sweeps: AlignedSweeps, numbers: list[int], voxel_m: float
+    sweeps: AlignedSweeps, stationary: Mapping[int, Bools], voxel_m: float
 ) -> tuple[SurfaceMap, Reflectances | None]:
-    """Build a surface map from several sweeps, and estimate its reflectances.
+    """Build a surface map from the stationary points of sweeps, and estimate its reflectances.
 
     The reflectances are None if there are no intensities.
 
@@ -222,7 +281,6 @@ def build_map_with_reflectances(
     LidarError
         If there are too few stationary points.
     """
-    stationary = find_stationary_points(sweeps, numbers)
     surface_map = build_surface_map(sweeps, stationary, voxel_m)
     observations = surface_map.observations(sweeps, stationary)
     response = fit_response(

@@ -10,12 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsim.errors import LidarError
-from lidarsim.io.input_files import read_input_text
 from lidarsim.motion.rotations import matrices
 from lidarsim.numerics.arrays import Floats
-from lidarsim.scene.transform import affine
 
 from ...clouds.boxes import SweepBoxes
+from ...clouds.kitti_boxes import LEVEL_CAMERA, read_calibration
 from ..augmented_sweep import AugmentedSweep
 
 IMAGE_SIZE = (1242, 375)  # size of most KITTI images, width and height in pixels
@@ -31,8 +30,6 @@ _TYPES = {
     for name in ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
 }
 _TYPES |= {"human": "Pedestrian", "person": "Pedestrian", "bicyclist": "Cyclist"}
-# Rotation from a level sensor to a KITTI camera, whose axes point to the right, down and forward.
-_LEVEL_CAMERA = affine(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.zeros(3))
 # Corners of a box from -0.5 to 0.5, and the corners that its edges connect.
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _EDGES = np.array([(i, j) for i in range(8) for j in range(i) if bin(i ^ j).count("1") == 1])
@@ -93,9 +90,9 @@ class KittiCamera:
     def from_sequence(cls, path: Path) -> KittiCamera:
         """Read the file `calib.txt` of a sequence, which may not exist."""
         if not path.exists():
-            return cls(_LEVEL_CAMERA)
-        rows = _read_calibration(path)
-        from_lidar = _square(rows["Tr"]) if "Tr" in rows else _LEVEL_CAMERA
+            return cls(LEVEL_CAMERA)
+        rows = read_calibration(path)
+        from_lidar = _square(rows["Tr"]) if "Tr" in rows else LEVEL_CAMERA
         return cls(from_lidar, _projection(rows))
 
     @classmethod
@@ -104,7 +101,7 @@ class KittiCamera:
 
         Raises LidarError if the calibration is incomplete.
         """
-        rows = _read_calibration(path)
+        rows = read_calibration(path)
         if missing := [name for name in ("R0_rect", "Tr_velo_to_cam") if name not in rows]:
             raise LidarError(
                 f"{path.name} has no `{missing[0]}:` line, which is required for the labels of "
@@ -190,22 +187,6 @@ def _cut_at_camera(corners: Floats) -> Floats:
     shares = (_MIN_DEPTH_M - depths[first]) / (depths[last] - depths[first])
     cuts = corners[first] + shares[:, None] * (corners[last] - corners[first])
     return np.concatenate([corners[depths >= _MIN_DEPTH_M], cuts])
-
-
-def _read_calibration(path: Path) -> dict[str, Floats]:
-    """Read a calibration file with a name and 9 or 12 numbers per line."""
-    rows = {}
-    for number, line in enumerate(read_input_text(path).splitlines(), 1):
-        name, _, values = line.partition(":")
-        if not values.strip():
-            continue
-        try:
-            row = np.array([float(value) for value in values.split()])
-        except ValueError as error:
-            raise LidarError(f"{path.name}, line {number}: {error}.") from error
-        if len(row) in (9, 12):
-            rows[name.strip()] = row
-    return rows
 
 
 def _projection(rows: Mapping[str, Floats]) -> Floats | None:

@@ -32,14 +32,17 @@ from lidarsim.motion.bag_trajectories import read_bag
 from lidarsim.motion.trajectory import Track
 from lidarsim.numerics.arrays import AnyArray, Floats, Floats32
 from lidarsim.survey.survey import Survey
-from lidarsim.sweeps.sweeps import Sweeps, states_compensation
+from lidarsim.motion.rotations import matrices
+from lidarsim.scene.transform import affine
+from lidarsim.sweeps.sweeps import Sweeps, actor_type, states_compensation
 from lidarsim.words import join_names
 
 from ...processes.per_process import PerProcess
 from .. import laser_scan
 from ..cloud_format import CloudFormat, PointColumns
-from ..frame_names import survey_start_ns
+from ..frame_names import WORLD, survey_start_ns
 from ..job_reader import JobReader
+from ..recorded_boxes import RecordedBoxes
 from ..recording import Recording, RecordingSource, sweep_from_columns
 from ..writing import ExportSpec
 from .layouts import EXTRA_FIELDS, LAYOUTS, MessageLayout, message_stamp_ns, sensor_traits
@@ -47,6 +50,10 @@ from .layouts import EXTRA_FIELDS, LAYOUTS, MessageLayout, message_stamp_ns, sen
 _UNSTAMPED = "has no timestamps, so the recording times are used instead"
 _LABEL_TOPIC = "/label_info"
 _LABELS = "vision_msgs/msg/LabelInfo"
+_BOX_TOPIC = "/actors"
+_BOXES = "visualization_msgs/msg/MarkerArray"
+_SAME_NS = 1_000_000  # maximum time between a sweep and the markers of its boxes
+_ADD = 0  # action of a marker that shows a box
 _MAX_DISTANCE_NS = 2e8  # maximum time between a sweep and the first or last pose
 
 
@@ -339,6 +346,7 @@ def _open_bag(source: RecordingSource) -> Recording:
         read_stamps=read_stamps,
         read_poses=read_poses,
         read_classes=lambda: _class_names(bags()),
+        read_boxes=lambda: _boxes(bags(), [*headers()], read_poses()),
         notes=source.prefix_notes(unstamped),
         compensated=_stated_compensation(source.path),
     )
@@ -354,6 +362,38 @@ def _class_names(bag: Any) -> dict[int, str]:
         return {}
     message: Any = message_store().deserialize_cdr(record[2], _LABELS)
     return {int(entry.class_id): str(entry.class_name) for entry in message.class_map}
+
+
+def _boxes(
+    bag: Any, headers: Sequence[MessageHeader], poses: Floats | None
+) -> RecordedBoxes | None:
+    """Return the boxes on the topic `/actors` at the timestamps of sweeps, or None without them.
+
+    `poses` are the poses of the sweeps in the frame `map`.
+    """
+    from .messages import message_store
+
+    connections = [c for c in bag.connections if c.topic == _BOX_TOPIC and c.msgtype == _BOXES]
+    if not connections or poses is None:
+        return None
+    stamps_ns = np.array([header.stamp_ns for header in headers])
+    rows = []
+    for _, _, data in bag.messages(connections):
+        message: Any = message_store().deserialize_cdr(data, _BOXES)
+        for marker in message.markers:
+            stamp = marker.header.stamp
+            differences_ns = np.abs(stamps_ns - (stamp.sec * 10**9 + stamp.nanosec))
+            sweep = int(differences_ns.argmin())
+            is_box = marker.action == _ADD and marker.header.frame_id == WORLD
+            if not is_box or differences_ns[sweep] > _SAME_NS:
+                continue
+            place, turn = marker.pose.position, marker.pose.orientation
+            (rotation,) = matrices(np.array([[turn.x, turn.y, turn.z, turn.w]]))
+            world = affine(rotation, np.array([place.x, place.y, place.z]))
+            pose = np.linalg.inv(poses[sweep]) @ world
+            size = marker.scale.x, marker.scale.y, marker.scale.z
+            rows.append((sweep, int(marker.id), actor_type(marker.text), pose, size))
+    return RecordedBoxes.from_rows(rows) if rows else None
 
 
 def _stated_compensation(path: Path) -> bool | None:

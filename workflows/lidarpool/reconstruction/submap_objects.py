@@ -1,0 +1,135 @@
+"""Moving objects near a submap, and their simulation in held-out sweeps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidarsim.numerics.arrays import Bools, Floats, Ints
+
+from .alignment import AlignedSweeps
+from .held_out import HeldOutPulses, HeldOutRays
+from .moving_rays import StationaryMasks, pulse_times_s
+from .object_surfels import RecordedObject, cast_to_objects
+from .object_tracks import ObjectTrack, in_any_box
+from .reflectances import Reflectances, Response
+
+
+@dataclass(frozen=True, eq=False)
+class SubmapObjects:
+    """Moving objects near a submap.
+
+    Attributes
+    ----------
+    masks, masks_of_mapped
+        Points that are stationary according to the free space, in all sweeps and in the sweeps that
+        form the map.
+    tracks
+        Tracks of the objects according to all sweeps.
+    tracks_in_mapped
+        Tracks according to the sweeps that form the map.
+    boxes
+        Boxes in which held-out points are measured.
+    objects
+        Objects that were reconstructed from the sweeps that form the map.
+    """
+
+    masks: StationaryMasks
+    masks_of_mapped: StationaryMasks
+    tracks: Sequence[ObjectTrack]
+    tracks_in_mapped: Sequence[ObjectTrack]
+    boxes: Sequence[ObjectTrack]
+    objects: Sequence[RecordedObject]
+
+    def stationary(self, sweeps: AlignedSweeps) -> dict[int, Bools]:
+        """Return masks of the points that are not on moving objects, by sweep number."""
+        return _without_objects(sweeps, self.masks.masks(), self.tracks)
+
+    def stationary_in_mapped(self, sweeps: AlignedSweeps) -> dict[int, Bools]:
+        """Return the same masks for the sweeps that form the map, which alone determine them."""
+        return _without_objects(sweeps, self.masks_of_mapped.masks(), self.tracks_in_mapped)
+
+    def simulate(
+        self,
+        sweeps: AlignedSweeps,
+        rays: HeldOutRays,
+        pulses: HeldOutPulses,
+        response: Response | None,
+    ) -> HeldOutRays:
+        """Add the moving objects to the simulation of held-out sweeps.
+
+        Parameters
+        ----------
+        sweeps
+            All sweeps.
+        rays
+            Rays of the held-out sweeps, simulated without moving objects.
+        pulses
+            The pulses of the same rays, in the same order.
+        response
+            Response of the sensor, or None without intensities.
+        """
+        reflectances = [
+            None
+            if response is None
+            else response.reflectances(one.observations, one.surfels.centers)
+            for one in self.objects
+        ]
+        simulated_m = rays.simulated_m.copy()
+        intensity = rays.simulated_intensity.copy()
+        moving = np.zeros(len(simulated_m), bool)
+        on_object = np.zeros(len(simulated_m), bool)
+        start = 0
+        for number, (returns, lost) in pulses.items():
+            times_s = pulse_times_s(sweeps, number, returns, lost)
+            rows = slice(start, start + len(times_s))
+            count = len(returns.world)
+            start = rows.stop
+            moving[rows.start : rows.start + count] = in_any_box(
+                self.boxes, sweeps.read(number).world, times_s[:count]
+            )
+            origins = np.concatenate([returns.origins, lost.origins])
+            ends = np.concatenate([returns.world, lost.world])
+            hits = cast_to_objects(self.objects, origins, ends, times_s)
+            is_first = hits.distance_m < np.nan_to_num(simulated_m[rows], nan=np.inf)
+            is_first &= hits.distance_m <= sweeps.coverage.max_range_m
+            simulated_m[rows][is_first] = hits.distance_m[is_first]
+            on_object[rows] = is_first
+            for index in np.unique(hits.object[is_first]).tolist():
+                chosen = is_first & (hits.object == index)
+                intensity[rows][chosen] = _intensities(
+                    reflectances[index], hits.surfel[chosen], hits.distance_m[chosen],
+                    hits.cosine[chosen],
+                )  # fmt: skip
+        return replace(
+            rays,
+            simulated_m=simulated_m,
+            simulated_intensity=intensity,
+            standing=rays.standing & ~moving,
+            moving=moving,
+            on_object=on_object,
+        )
+
+
+def _intensities(
+    reflectances: Reflectances | None, surfel: Ints, distance_m: Floats, cosine: Floats
+) -> Floats:
+    """Return the simulated intensities of hits on an object, or NaN if they are unknown."""
+    if reflectances is None:
+        return np.full(len(surfel), np.nan)
+    law = reflectances.response.model.white_intensities(distance_m, cosine)
+    return np.asarray(reflectances.surfels[surfel] * law * reflectances.response.scale)
+
+
+def _without_objects(
+    sweeps: AlignedSweeps, masks: Mapping[int, Bools], tracks: Sequence[ObjectTrack]
+) -> dict[int, Bools]:
+    """Remove the points in the boxes of moving objects from masks of stationary points."""
+    found = {}
+    for number, mask in masks.items():
+        sweep = sweeps.read(number)
+        times_s = pulse_times_s(sweeps, number, sweep, sweep)[: len(mask)]
+        found[number] = mask & ~in_any_box(tracks, sweep.world, times_s)
+    return found
