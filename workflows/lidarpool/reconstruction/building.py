@@ -58,10 +58,8 @@ from .labels import SurfelMaterial, split_by_object
 from .lasers import RingLasers
 from .lost_pulses import SensorCoverage, firings_per_turn
 from .motion import Motion
-from .moving_objects import find_tracks, labeled_tracks
+from .moving_objects import LabeledTracks
 from .moving_rays import MovingRays, StationaryMasks
-from .object_surfels import RecordedObject, reconstruct_objects
-from .object_tracks import ObjectTrack
 from .odometry import RecordedPoses, find_poses
 from .porosity import Porosity
 from .published_metrics import HeldOutFrames
@@ -70,7 +68,7 @@ from .recorded_actors import FOLDER as ACTORS_FOLDER
 from .recorded_actors import RecordedActor, actors_of, class_names
 from .recorded_sweeps import RecordedSweeps, Rotation
 from .reflectances import IntensityModel, Reflectances, Response, fit_response
-from .submap_objects import SubmapObjects
+from .submap_objects import MovingObjects, ObjectMap
 from .submap_tasks import (
     BuildTask,
     MotionTask,
@@ -115,7 +113,6 @@ _ANGLE_DECIMALS = 3
 _NOISE_DECIMALS = 5
 _RANGE_NOISE = ("range_m", "range_per_m", "range_at_threshold_m", "precision")
 _FACTOR_DECIMALS = 4
-_PRESENCE_STEP_S = 0.1  # step of the times at which objects are sought near a submap
 _MIN_STEP_S = 1e-5  # minimum time between poses of the trajectory
 _MIN_LEAD = 0.01  # minimum time from the first point to the timestamp, in revolutions
 _MIN_DRIVE_M = 0.3  # On a shorter drive, the sensor counts as stationary.
@@ -348,15 +345,14 @@ def twin(
     ------
     LidarError
         If the recording cannot be read, has fewer than four sweeps, has no planes, or has no rings
-        and `model` is not set; if an extra is missing; if the folder contains the steps of a
-        different twin, if `actors` is "boxes" but the recording has none, or if another reconstruction is using it; or if the cluster is lost.
+        and `model` is not set; if an extra is missing; if `actors` is "boxes" but the recording has
+        no boxes; if the folder contains the steps of a different twin, or if another reconstruction
+        is using it; or if the cluster is lost.
     """
     check_number("voxel_m", voxel_m, gt=0, le=10)
     require_package("scipy", "twin", "Reconstructing a recording")
     if lidar4d_window is not None:
         check_choice("lidar4d_window", str(lidar4d_window), tuple(map(str, WINDOWS)))
-    if actors is not None:
-        check_choice("actors", actors, get_args(ActorSource))
     base = None if model is None else read_model(model)  # before the recording, which takes long
     if isinstance(recording, (str, Path)):
         recorded = RecordedSweeps.open(Path(recording), sensor, intensity, lidar4d_window)
@@ -412,6 +408,8 @@ def _check_sweeps(recorded: RecordedSweeps) -> None:
 
 def _actor_source(recorded: RecordedSweeps, chosen: ActorSource | None) -> ActorSource:
     """Return how moving objects are found, or raise LidarError if there are no labeled boxes."""
+    if chosen is not None:
+        check_choice("actors", chosen, get_args(ActorSource))
     if chosen in ("clusters", "none"):
         return chosen
     boxes = recorded.recording.boxes
@@ -513,39 +511,23 @@ class _Building:
         """Find the moving objects in all sweeps, and in the sweeps that form the map alone."""
         self.report(f"finding moving objects in {plural(len(submaps), 'submap')}")
         boxes = self.recorded.recording.boxes
-        alignment = task.alignment
-        labeled = None if boxes is None else labeled_tracks(boxes, alignment)
-        in_mapped = None if boxes is None else labeled_tracks(boxes, alignment, task.mapped)
-        used = self.actors == "boxes"
-        motion = MotionTask(
-            **vars(task),
-            labeled=labeled if used and labeled else (),
-            labeled_in_mapped=in_mapped if used and in_mapped else (),
-        )
+        labels = LabeledTracks.from_boxes(boxes, task.alignment, task.mapped)
+        used = labels if self.actors == "boxes" else None
+        motion = MotionTask(**vars(task), labels=used)
         tasks = [replace(motion, submap=one) for one in submaps]
-        rays = []
-        mapped_rays = []
-        for _, _, of_all, of_mapped in self.steps.each(_MOTION, run, find_moving_rays, tasks):
-            rays.append(of_all)
-            mapped_rays.append(of_mapped)
-        found = []
-        for part, tracks in ((rays, labeled), (mapped_rays, in_mapped)):
-            joined = MovingRays.concatenate(part)
-            sweep_s = alignment.sweep_s * (2 if part is mapped_rays else 1)
-            followed = find_tracks(joined, tracks if used else None, sweep_s)
-            objects = reconstruct_objects(
-                followed, joined, self.voxel_m, self.recorded.gap_rad
-            )
-            found.append((followed, objects))
-        (all_tracks, objects), (mapped_tracks, mapped_objects) = found
+        parts = [
+            (of_all, of_mapped)
+            for _, _, of_all, of_mapped in self.steps.each(_MOTION, run, find_moving_rays, tasks)
+        ]
+        of_all, of_mapped = (MovingRays.concatenate(part) for part in zip(*parts, strict=True))
+        sweep_s = task.alignment.sweep_s
+        size = self.voxel_m, self.recorded.gap_rad
         return MovingObjects(
-            objects=objects,
-            tracks=[one.track for one in objects] if not used else all_tracks,
-            mapped_objects=mapped_objects,
-            mapped_tracks=(
-                [one.track for one in mapped_objects] if not used else mapped_tracks
+            ObjectMap.from_rays(of_all, None if used is None else used.all, sweep_s, *size),
+            ObjectMap.from_rays(
+                of_mapped, None if used is None else used.in_mapped, 2 * sweep_s, *size
             ),
-            boxes=all_tracks if labeled is None else labeled,
+            None if labels is None else labels.all,
         )
 
     def _build_submaps(
@@ -662,13 +644,13 @@ class _Building:
         if moving is None:
             return []
         meshes = []
-        for one in moving.objects:
+        for one in moving.of_all.objects:
             reflectances = None
             if response is not None:
                 reflectances = response.reflectances(one.observations, one.surfels.centers)
             meshes.append(color_by_reflectance(one.surfels.mesh, reflectances))
         names = self.recorded.recording.classes
-        return actors_of(moving.objects, meshes, names, span_s, sweep_s)
+        return actors_of(moving.of_all.objects, meshes, names, span_s, sweep_s)
 
     def _fit_sensor(
         self,
@@ -788,35 +770,6 @@ class _Built:
         return images[len(images) // 2]
 
 
-class MovingObjects(NamedTuple):
-    """Moving objects of a recording, according to all sweeps and to those that form the map."""
-
-    objects: Sequence[RecordedObject]
-    tracks: Sequence[ObjectTrack]
-    mapped_objects: Sequence[RecordedObject]
-    mapped_tracks: Sequence[ObjectTrack]
-    boxes: Sequence[ObjectTrack]  # in which held-out points are measured
-
-    def near(
-        self, first_s: float, last_s: float, masks: StationaryMasks, mapped: StationaryMasks
-    ) -> SubmapObjects:
-        """Return the objects that are present between two times."""
-        times_s = np.linspace(first_s, last_s, 2 + int((last_s - first_s) / _PRESENCE_STEP_S))
-
-        def present(tracks: Sequence[ObjectTrack]) -> list[ObjectTrack]:
-            return [track for track in tracks if track.is_present(times_s).any()]
-
-        objects = [one for one in self.mapped_objects if one.track.is_present(times_s).any()]
-        return SubmapObjects(
-            masks,
-            mapped,
-            present(self.tracks),
-            present(self.mapped_tracks),
-            present(self.boxes),
-            objects,
-        )
-
-
 @dataclass(frozen=True, eq=False)
 class _BuildTasks(Sequence[BuildTask]):
     """Tasks of building the submaps, which are created when they are needed to save memory."""
@@ -835,7 +788,7 @@ class _BuildTasks(Sequence[BuildTask]):
         if self.moving is not None:
             masks, mapped, _, _ = self.steps.load(_MOTION, index)
             times_s = self.task.alignment.times_s[submap.numbers]
-            objects = self.moving.near(float(times_s[0]), float(times_s[-1]), masks, mapped)
+            objects = self.moving.between(float(times_s[0]), float(times_s[-1]), masks, mapped)
         return replace(self.task, submap=submap, objects=objects)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,6 +34,7 @@ _MAX_RESIDUAL_M = 0.06  # maximum median distance of points from planes in a fur
 _MIN_MATCHED = 0.6  # minimum share of points in a further sweep that are close to the shape
 _LABEL_GAP_S = 0.3  # Labeled poses further from all observed poses are kept.
 _TRIMMED_SWEEPS = 5  # Sweeps at the ends of a track whose clusters are often incomplete.
+_ACCELERATION_M_S2 = 3.0  # standard deviation of the acceleration
 _MAX_GAP_SWEEPS = 3  # maximum number of sweeps without points before an object is lost
 _STANDING_M_S = 0.4  # maximum speed at an end of the track of an object that is stationary there
 _STANDING_SWEEPS = 3  # sweeps at this end that determine the speed
@@ -41,20 +43,29 @@ _TRACK_MARGIN_M = 0.3  # margin around a predicted box
 _BOTTOM_M = 0.05  # Points this close to the underside of a predicted box may be on the ground.
 
 
-def labeled_tracks(
+class LabeledTracks(NamedTuple):
+    """Tracks of moving objects from the labeled boxes of a recording."""
+
+    all: Sequence[ObjectTrack]
+    in_mapped: Sequence[ObjectTrack]  # from the labels of the sweeps that form the map
+
+    @classmethod
+    def from_boxes(
+        cls, boxes: RecordedBoxes | None, alignment: Alignment, mapped: Ints
+    ) -> LabeledTracks | None:
+        """Return the tracks, or None without boxes.
+
+        `mapped` are the numbers of the sweeps that form the map.
+        """
+        if boxes is None:
+            return None
+        return cls(_labeled(boxes, alignment), _labeled(boxes, alignment, mapped))
+
+
+def _labeled(
     boxes: RecordedBoxes, alignment: Alignment, numbers: Ints | None = None
 ) -> list[ObjectTrack]:
-    """Return the tracks of those labeled objects that move.
-
-    Parameters
-    ----------
-    boxes
-        Labeled boxes of the recording.
-    alignment
-        Poses of all sweeps.
-    numbers
-        Numbers of the sweeps whose boxes are used, by default all.
-    """
+    """Return the tracks of labeled objects that move, from all sweeps or those in `numbers`."""
     used = np.ones(len(boxes.sweep), bool) if numbers is None else np.isin(boxes.sweep, numbers)
     tracks = []
     for number in np.unique(boxes.object[used]).tolist():
@@ -209,7 +220,7 @@ def _boxed(sightings: Sequence[Sighting], poses: Floats) -> ObjectTrack:
 
 
 def _on_ground(track: ObjectTrack, rays: MovingRays) -> ObjectTrack:
-    """Lower the underside of a box to the ground around it, if returns from the ground are known."""
+    """Lower the underside of a box to the ground around it, if the ground returned pulses."""
     still = np.flatnonzero(rays.returned & ~rays.moved & track.is_present(rays.time_s))
     local = track.to_object(rays.ends[still], rays.time_s[still])
     apart = np.abs(local[:, :2]) - track.size[:2] / 2
@@ -217,12 +228,8 @@ def _on_ground(track: ObjectTrack, rays: MovingRays) -> ObjectTrack:
     heights = local[around & (np.abs(local[:, 2]) < _MAX_CLEARANCE_M), 2]
     if len(heights) < _MIN_GROUND:
         return track
-    ground_m = min(float(np.quantile(heights, _GROUND_QUANTILE)), 0.0)
-    return replace(
-        track,
-        positions=track.positions + (0.0, 0.0, ground_m),
-        size=track.size - (0.0, 0.0, ground_m),
-    )
+    lower = np.array([0.0, 0.0, min(float(np.quantile(heights, _GROUND_QUANTILE)), 0.0)])
+    return replace(track, positions=track.positions + lower, size=track.size - lower)
 
 
 def _extend(
@@ -273,23 +280,21 @@ def _further_pose(
 
     `count` is the number of points in the preceding sweep.
     """
-    ends, times_s = rays.ends[rows], rays.time_s[rows]
     moving = replace(track, stands_before=False, stands_after=False)
-    local = moving.to_object(ends, times_s)
+    local = moving.to_object(rays.ends[rows], rays.time_s[rows])
     near = np.abs(local[:, :2]) < track.size[:2] / 2 + _TRACK_MARGIN_M
     near &= (local[:, 2:] > _BOTTOM_M) & (local[:, 2:] < track.size[2] + _TRACK_MARGIN_M)
     chosen = np.flatnonzero(near.all(axis=1) & rays.returned[rows] & ~claimed[rows])
     if len(chosen) < max(_MIN_RETURNS, _MIN_SHARE * count):
         return None
     sighting = Sighting.from_rays(rays, chosen + rows.start)
-    times = np.array([sighting.time_s])
-    predicted = np.column_stack(moving.poses(times))[0]
+    predicted = np.column_stack(moving.poses(np.array([sighting.time_s])))[0]
     step_s = sighting.time_s - track.times_s[end]
     inner = 1 if end == 0 else -2
     velocity = np.append(track.positions[end] - track.positions[inner], 0.0)
     velocity /= track.times_s[end] - track.times_s[inner]
-    sigma_m = 3.0 * step_s**2 + 0.03
-    prior = np.array([sigma_m, sigma_m, 0.05, 0.05])
+    prior = np.array([0.03, 0.03, 0.05, 0.05])
+    prior[:2] += _ACCELERATION_M_S2 * step_s**2
     pose, equations = register(shape, sighting, predicted, velocity, prior)
     if equations.matched < _MIN_MATCHED or equations.residual_m > _MAX_RESIDUAL_M:
         return None

@@ -8,7 +8,7 @@ are therefore also collected from the sweeps before it starts and after it stops
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,8 @@ _SAME_M = 2.0  # maximum distance between clusters of an object in consecutive s
 _BEYOND_SWEEPS = 15  # sweeps before an object starts or after it stops
 _MAX_RAYS = 3000  # maximum number of rays per object and sweep
 _SWEEP_S = 0.1  # typical duration of a sweep, in which a labeled object moves
+_LASER_M = 1.0  # maximum distance of a laser from the mean position of all lasers
+_MIN_DISTANCE = 1.5  # Boxes that are closer, in multiples of their radius, surround the sensor.
 _BEHIND_M = 0.1  # A ray that ends this close to the front of a box belongs to it.
 
 
@@ -43,7 +45,8 @@ class MovingRays(NamedTuple):
     @classmethod
     def concatenate(cls, parts: Sequence[MovingRays]) -> MovingRays:
         """Concatenate rays of consecutive sweeps."""
-        return cls(*map(np.concatenate, zip(*parts, strict=True)))
+        columns: list[Any] = [*map(np.concatenate, zip(*parts, strict=True))]
+        return cls(*columns)
 
     @classmethod
     def from_sweep(
@@ -74,7 +77,8 @@ class MovingRays(NamedTuple):
 
     def select(self, rays: Bools | Ints | slice) -> MovingRays:
         """Select rays with a mask, indices or a slice."""
-        return MovingRays(*(values[rays] for values in self))
+        columns: list[Any] = [values[rays] for values in self]
+        return MovingRays(*columns)
 
     def slices(self) -> dict[int, slice]:
         """Return the rows of each sweep, keyed by sweep number."""
@@ -220,15 +224,11 @@ def _labeled_boxes(labeled: Sequence[ObjectTrack], time_s: float) -> list[Cluste
         radius_m = float(np.hypot(*track.size[:2])) / 2
         speed_m = track.speed_m_s(time_s) * _SWEEP_S
         reach = np.array([radius_m + speed_m, radius_m + speed_m, 0.0])
-        found.append(
-            Cluster(position - reach, position + reach + (0, 0, float(track.size[2])), 0)
-        )
+        found.append(Cluster(position - reach, position + reach + (0, 0, float(track.size[2])), 0))
     return found
 
 
-def _rays_near(
-    boxes: Sequence[Cluster], origins: Floats, ends: Floats, cluster: Ints
-) -> Bools:
+def _rays_near(boxes: Sequence[Cluster], origins: Floats, ends: Floats, cluster: Ints) -> Bools:
     """Mark the rays that end in a box or pass through it.
 
     `cluster` has the clusters of the returns, which precede the lost pulses.
@@ -240,28 +240,40 @@ def _rays_near(
     range_m = np.linalg.norm(vectors, axis=1)
     directions = vectors / np.maximum(range_m, 1e-9)[:, None]
     range_m[len(cluster) :] = np.inf
-    middle = origins.mean(axis=0)
     in_cluster = np.append(cluster >= 0, np.zeros(len(ends) - len(cluster), bool))
     for box in boxes:
         low, high = box.low - _MARGIN_M, box.high + _MARGIN_M
-        toward = (low + high) / 2 - middle
-        distance_m = float(np.linalg.norm(toward))
-        radius_m = float(np.linalg.norm(high - low)) / 2 + 1.0
-        rows = np.arange(len(ends))
-        if distance_m > 1.5 * radius_m:
-            cosine = np.sqrt(1 - (radius_m / distance_m) ** 2)
-            rows = np.flatnonzero(directions @ (toward / distance_m) > cosine)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            first = (low - origins[rows]) / directions[rows]
-            second = (high - origins[rows]) / directions[rows]
-        enter_m = np.minimum(first, second).max(axis=1)
-        leave_m = np.maximum(first, second).min(axis=1)
-        rows = rows[
-            (leave_m >= np.maximum(enter_m, 0)) & (range_m[rows] > enter_m - _BEHIND_M)
-        ]
+        rows = _rows_toward(low, high, origins, directions)
+        enter_m, leave_m = box_distances(low, high, origins[rows], directions[rows])
+        rows = rows[(leave_m >= np.maximum(enter_m, 0)) & (range_m[rows] > enter_m - _BEHIND_M)]
         if len(rows) > _MAX_RAYS:
             stride = -(-len(rows) // _MAX_RAYS)
-            kept = np.arange(0, len(rows), stride)
-            rows = rows[np.union1d(kept, np.flatnonzero(in_cluster[rows])[::stride])]
+            members = np.flatnonzero(in_cluster[rows])
+            rows = rows[np.union1d(np.arange(0, len(rows), stride), members[::stride])]
         chosen[rows] = True
     return chosen
+
+
+def _rows_toward(low: Floats, high: Floats, origins: Floats, directions: Floats) -> Ints:
+    """Return the rays that may pass through a box, whose corners are given."""
+    toward = (low + high) / 2 - origins.mean(axis=0)
+    distance_m = float(np.linalg.norm(toward))
+    radius_m = float(np.linalg.norm(high - low)) / 2 + _LASER_M
+    if distance_m < _MIN_DISTANCE * radius_m:
+        return np.arange(len(origins))
+    cosine = np.sqrt(1 - (radius_m / distance_m) ** 2)
+    return np.flatnonzero(directions @ (toward / distance_m) > cosine)
+
+
+def box_distances(
+    low: Floats, high: Floats, origins: Floats, directions: Floats
+) -> tuple[Floats, Floats]:
+    """Return the distances at which rays enter and leave a box.
+
+    They are multiples of the lengths of the directions. A ray passes the box if it enters it before
+    it leaves it. The box is given by two corners, and the rays by arrays of shape (n, 3).
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first = (low - origins) / directions
+        second = (high - origins) / directions
+    return np.minimum(first, second).max(axis=1), np.maximum(first, second).min(axis=1)

@@ -43,7 +43,7 @@ class Cluster(NamedTuple):
 
     low: Floats  # (3,), meters, world frame
     high: Floats  # (3,), meters, world frame
-    count: int  # number of points
+    points: int  # number of points
 
     @property
     def center(self) -> Floats:
@@ -78,26 +78,33 @@ def find_clusters(points: Floats, moved: Bools) -> Ints:
     if len(rows) < _MIN_POINTS:
         return found
     seeds = _components(points[rows], _LINK_M)
-    counts = np.bincount(seeds)
-    for seed in np.flatnonzero(counts >= _MIN_POINTS).tolist():
+    for seed in np.flatnonzero(np.bincount(seeds) >= _MIN_POINTS).tolist():
         members = rows[seeds == seed]
-        low, high = points[members].min(axis=0), points[members].max(axis=0)
-        if (high - low)[:2].max() > _MAX_SIZE_M:
+        if np.ptp(points[members, :2], axis=0).max() > _MAX_SIZE_M:
             continue
         first = found[members].max()  # part of a cluster that was found before
         number = first if first >= 0 else found.max() + 1
         found[members] = number
-        margin = np.array([_CONNECTED_M, _CONNECTED_M, _HEIGHT_M])
-        low[2] += _BOTTOM_M + margin[2]
-        near = np.flatnonzero(((points > low - margin) & (points < high + margin)).all(axis=1))
-        near = np.union1d(near, members)
-        component = _components(points[near], _SURFACE_M)
-        sizes = np.bincount(component)
-        flagged = np.bincount(component, moved[near], len(sizes))
-        seeded = np.bincount(component, np.isin(near, members), len(sizes))
-        kept = (seeded > 0) & (flagged > _MIN_MOVED * sizes)
-        found[near[kept[component]]] = number
+        found[_connected(points, moved, members)] = number
     return found
+
+
+def _connected(points: Floats, moved: Bools, members: Ints) -> Ints:
+    """Return the points that are connected to the members of a cluster.
+
+    If only few of the connected points moved, for example on a wall, they are not used.
+    """
+    margin = np.array([_CONNECTED_M, _CONNECTED_M, 0.0])
+    low = points[members].min(axis=0) - margin + (0.0, 0.0, _BOTTOM_M)
+    high = points[members].max(axis=0) + margin + (0.0, 0.0, _HEIGHT_M)
+    near = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
+    near = np.union1d(near, members)
+    component = _components(points[near], _SURFACE_M)
+    sizes = np.bincount(component)
+    flagged = np.bincount(component, moved[near], len(sizes))
+    seeded = np.bincount(component, np.isin(near, members), len(sizes))
+    kept = (seeded > 0) & (flagged > _MIN_MOVED * sizes)
+    return np.asarray(near[kept[component]])
 
 
 def _components(points: Floats, link_m: float) -> Ints:
@@ -140,7 +147,7 @@ class ClusterTrack:
     @property
     def points(self) -> int:
         """Number of points of all clusters."""
-        return sum(cluster.count for cluster in self.clusters)
+        return sum(cluster.points for cluster in self.clusters)
 
     @property
     def is_moving(self) -> bool:
@@ -193,7 +200,9 @@ def track_clusters(
         is_old = [time_s - track.times_s[-1] > _MAX_MISSING * sweep_s for track in active]
         ended += [track for track, old in zip(active, is_old, strict=True) if old]
         active = [track for track, old in zip(active, is_old, strict=True) if not old]
-        costs = np.array([[track.cost(time_s, one) for one in clusters.values()] for track in active])
+        costs = np.array(
+            [[track.cost(time_s, one) for one in clusters.values()] for track in active]
+        )
         pairs = {}
         if costs.size:
             rows, columns = linear_sum_assignment(costs)

@@ -5,8 +5,8 @@ points of each sweep are therefore registered to those of the other sweeps, and 
 sweeps are adjusted together. Planes determine the pose in the direction of their normals. In the
 other directions, the motion is smooth, and the object faces its direction of travel.
 
-The objects are upright: a pose has a position and a yaw angle. Within a sweep, points are moved with
-the velocity of the object to the mean time of the points.
+The objects are upright: a pose has a position and a yaw angle. Within a sweep, points are moved
+with the velocity of the object to the mean time of the points.
 
 In array shapes, k is the number of sweeps in which an object was observed.
 """
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +24,7 @@ from lidarsim.numerics.arrays import Bools, Floats, Ints
 
 from .moving_rays import MovingRays
 from .object_tracks import rotate_z
+from .surfels import principal_axes
 
 _VOXEL_M = 0.1  # edge length of the voxels of a shape
 _NEIGHBORS = 12  # neighbors that determine a plane
@@ -36,6 +38,7 @@ _EQUIVALENT_POINTS = 60  # Points of a sweep have correlated errors, and count a
 _SWEEP_POINTS = 500  # points per sweep that are registered
 _LOCAL_SWEEPS = 8  # preceding sweeps to which a sweep is registered first
 _SEARCH_M = (1.0, 0.6, 0.4, 0.3, 0.3)  # search radius in each step of the first registration
+_FIRST_SWEEPS = 4  # sweeps until the velocity is known
 _ROUNDS = 10  # iterations of adjusting all poses
 _SHRINK = 0.8  # factor by which the search radius decreases
 _MIN_SEARCH_M = 0.2
@@ -104,21 +107,17 @@ class Shape:
 
         cells = np.floor(points / _VOXEL_M).astype(np.int64)
         _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-        cell = cell.ravel()
-        sums = np.stack([np.bincount(cell, column) for column in points.T], axis=1)
-        means = sums / counts[:, None]
+        sums = [np.bincount(cell.ravel(), column) for column in points.T]
+        means = np.stack(sums, axis=1) / counts[:, None]
         tree = cKDTree(means)
         count = min(_NEIGHBORS, len(means))
         if count < _MIN_NEIGHBORS:
             return cls(means, means, np.zeros_like(means), np.zeros(len(means), bool), tree)
-        _, nearest = tree.query(means, count)
-        around = means[nearest]
-        centers = around.mean(axis=1)
-        around -= centers[:, None]
-        variances, axes = np.linalg.eigh(np.einsum("mki,mkj->mij", around, around) / count)
+        around = means[tree.query(means, count)[1]]
+        variances, axes = principal_axes(around)
         smallest, middle, largest = variances.T
         flat = (smallest < _MAX_FLAT * middle) & (middle > _MIN_WIDTH * largest)
-        return cls(means, centers, axes[:, :, 0], flat, tree)
+        return cls(means, around.mean(axis=1), axes[:, 0], flat, tree)
 
     def equations(self, local: Floats, yaw: float, search_m: float) -> NormalEquations:
         """Return the equations that move points in the object frame to the shape.
@@ -129,30 +128,32 @@ class Shape:
         found = np.isfinite(distance_m)
         points, nearest = local[found], nearest[found]
         flat = self.flat[nearest]
-        on_plane, plane = points[flat], nearest[flat]
-        normals = self.normals[plane]
-        residual = np.einsum("ij,ij->i", on_plane - self.centers[plane], normals)
-        residual_m = float(np.median(np.abs(residual))) if len(residual) else np.inf
-        sigma_m = max(_SIGMA_M, 1.5 * residual_m) if len(residual) else _SIGMA_M
-        weight = np.clip(1 - (residual / (_TUKEY_SIGMAS * sigma_m)) ** 2, 0, None) ** 2
-        weight /= sigma_m**2
-        jacobian = _jacobian(normals, on_plane)
-        matrix = jacobian.T @ (weight[:, None] * jacobian)
-        vector = -jacobian.T @ (weight * residual)
-        others = points[~flat]
-        offsets = others - self.means[nearest[~flat]]
+        matrix, vector, residual_m = self._plane_equations(points[flat], nearest[flat])
+        others, nearest = points[~flat], nearest[~flat]
         for axis in np.eye(3):
             jacobian = _jacobian(np.broadcast_to(axis, others.shape), others)
             matrix += jacobian.T @ jacobian / _POINT_SIGMA_M**2
-            vector -= jacobian.T @ (offsets @ axis) / _POINT_SIGMA_M**2
+            vector -= jacobian.T @ ((others - self.means[nearest]) @ axis) / _POINT_SIGMA_M**2
         scale = min(1.0, _EQUIVALENT_POINTS / max(len(points), 1))
-        turn = np.eye(4)
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        turn[:2, :2] = [[cos, sin], [-sin, cos]]
+        turn = np.eye(4)  # from the world frame to the object frame
+        turn[:2, :2] = [[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]]
+        matched = float(found.mean()) if len(found) else 0.0
         return NormalEquations(
-            scale * turn.T @ matrix @ turn,
-            scale * turn.T @ vector,
-            float(found.mean()) if len(found) else 0.0,
+            scale * turn.T @ matrix @ turn, scale * turn.T @ vector, matched, residual_m
+        )
+
+    def _plane_equations(self, points: Floats, nearest: Ints) -> tuple[Floats, Floats, float]:
+        """Return the equations of points on planes, and the median distance from the planes."""
+        normals = self.normals[nearest]
+        residual = np.einsum("ij,ij->i", points - self.centers[nearest], normals)
+        residual_m = float(np.median(np.abs(residual))) if len(residual) else np.inf
+        sigma_m = max(_SIGMA_M, 1.5 * residual_m)
+        weight = np.clip(1 - (residual / (_TUKEY_SIGMAS * sigma_m)) ** 2, 0, None) ** 2
+        weight /= sigma_m**2
+        jacobian = _jacobian(normals, points)
+        return (
+            jacobian.T @ (weight[:, None] * jacobian),
+            -jacobian.T @ (weight * residual),
             residual_m,
         )
 
@@ -201,23 +202,30 @@ def first_poses(sightings: Sequence[Sighting], centers: Floats) -> Floats:
     poses[seed, :3] = centers[seed]
     poses[seed, 3] = np.arctan2(velocity[1], velocity[0])
     for following in (range(seed + 1, len(sightings)), range(seed - 1, -1, -1)):
-        done = [seed]
-        shapes = [_sample(sightings[seed].local(poses[seed], velocity))]
-        current = velocity.copy()
-        for index in following:
-            step_s = times_s[index] - times_s[done[-1]]
-            predicted = poses[done[-1]] + current * step_s
-            shape = Shape.from_points(np.concatenate(shapes[-_LOCAL_SWEEPS:]))
-            is_new = len(done) < 4
-            sigma_m = 3.0 * abs(step_s) if is_new else 0.5 * abs(step_s) + 0.02
-            prior = np.array([sigma_m, sigma_m, 0.05, 0.03])
-            poses[index] = register(shape, sightings[index], predicted, current, prior)[0]
-            done.append(index)
-            shapes.append(_sample(sightings[index].local(poses[index], current)))
-            ends = done[-min(5, len(done))], index
-            measured = (poses[ends[1]] - poses[ends[0]]) / (times_s[ends[1]] - times_s[ends[0]])
-            current[:2] = measured[:2] if len(done) > 3 else (current[:2] + measured[:2]) / 2
+        _register_in_order(sightings, poses, [seed, *following], velocity)
     return poses
+
+
+def _register_in_order(
+    sightings: Sequence[Sighting], poses: Floats, order: Sequence[int], velocity: Floats
+) -> None:
+    """Determine the poses of sightings in the given order, of which the first pose is known."""
+    times_s = np.array([one.time_s for one in sightings])
+    current = velocity.copy()
+    parts = [_sample(sightings[order[0]].local(poses[order[0]], current))]
+    for count, (last, index) in enumerate(pairwise(order), 1):
+        step_s = times_s[index] - times_s[last]
+        shape = Shape.from_points(np.concatenate(parts[-_LOCAL_SWEEPS:]))
+        is_new = count < _FIRST_SWEEPS
+        sigma_m = 3.0 * abs(step_s) if is_new else 0.5 * abs(step_s) + 0.02
+        prior = np.array([sigma_m, sigma_m, 0.05, 0.03])
+        predicted = poses[last] + current * step_s
+        poses[index], _ = register(shape, sightings[index], predicted, current, prior)
+        parts.append(_sample(sightings[index].local(poses[index], current)))
+        start = order[max(count - _FIRST_SWEEPS, 0)]
+        measured = (poses[index] - poses[start]) / (times_s[index] - times_s[start])
+        share = 0.5 if is_new else 1.0
+        current[:2] += share * (measured - current)[:2]
 
 
 def register(
@@ -280,15 +288,15 @@ def adjust_poses(
         velocities = velocities_of(times_s, poses)
         velocities[:, 2] = 0
         if labeled is None:  # The axes of the shape are arbitrary.
-            poses = poses + [0.0, 0.0, 0.0, _median_drift(poses, velocities)]
-        locals_ = [
+            poses = poses + np.array([0.0, 0.0, 0.0, _median_drift(poses, velocities)])
+        points = [
             one.local(pose, velocity)
             for one, pose, velocity in zip(sightings, poses, velocities, strict=True)
         ]
-        shape = Shape.from_points(np.concatenate(locals_))
+        shape = Shape.from_points(np.concatenate(points))
         search_m = max(0.6 * _SHRINK**number, _MIN_SEARCH_M)
         banded = _Banded(4 * len(poses))
-        for index, local in enumerate(locals_):
+        for index, local in enumerate(points):
             equations = shape.equations(_sample(local), poses[index, 3], search_m)
             banded.add(range(4 * index, 4 * index + 4), equations.matrix, equations.vector)
         if labeled is None:

@@ -13,9 +13,9 @@ from lidarsim.numerics.even_samples import even_indices
 from raybeam import RayCaster
 
 from .alignment import AlignedSweep
-from .moving_rays import MovingRays
+from .moving_rays import MovingRays, box_distances
 from .object_tracks import ObjectTrack
-from .surface_map import Observations, SurfaceMap
+from .surface_map import Observations, SurfaceMap, median_shifts
 from .surfels import Surfels
 
 _VOXEL_SHARES = (0.5, 0.25)  # voxel edges that are tried, relative to those of the scene
@@ -23,7 +23,6 @@ _ROUNDS = 3  # iterations of casting rays, and of removing and moving surfels
 _MAX_RAYS = 200_000  # evenly chosen rays that form an object
 _MAX_SHIFT_M = 0.15  # Rays with a larger range difference do not move a surfel.
 _ON_RAY_M = 0.1  # A ray passes a surfel if it ends this far behind it.
-_SHIFT_PRIOR = 1.0  # weight of the current position of a surfel, in rays
 _REACH_M = 0.5  # margin around a box within which rays are cast
 
 
@@ -94,11 +93,7 @@ def _enters_box(track: ObjectTrack, origins: Floats, directions: Floats) -> Bool
     """Mark the rays in the object frame that pass through the surroundings of its box."""
     high = np.append(track.size[:2] / 2 + _REACH_M, track.size[2] + _REACH_M)
     low = np.append(-high[:2], -_REACH_M)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        first = (low - origins) / directions
-        second = (high - origins) / directions
-    enter = np.minimum(first, second).max(axis=1)
-    leave = np.maximum(first, second).min(axis=1)
+    enter, leave = box_distances(low, high, origins, directions)
     return np.asarray(leave >= np.maximum(enter, 0))
 
 
@@ -123,15 +118,7 @@ def _refine(surfels: Surfels, sweep: AlignedSweep, returned: Bools) -> Surfels |
     votes = np.bincount(hits.surfel[ends], minlength=count)
     votes -= np.bincount(hits.surfel[passing], minlength=count)
     moving = is_return & (np.abs(farther_m) < _MAX_SHIFT_M)
-    offset_m = (farther_m * hits.inward)[moving]
-    surfel = hits.surfel[moving]
-    order = np.lexsort((offset_m, surfel))
-    surfel, offset_m = surfel[order], offset_m[order]
-    starts = np.flatnonzero(np.diff(surfel, prepend=-1))
-    counts = np.diff(np.append(starts, len(surfel)))
-    shifts_m = np.zeros(count)
-    medians_m = (offset_m[starts + (counts - 1) // 2] + offset_m[starts + counts // 2]) / 2
-    shifts_m[surfel[starts]] = medians_m * counts / (counts + _SHIFT_PRIOR)
+    shifts_m = median_shifts(hits.surfel[moving], (farther_m * hits.inward)[moving], count)
     kept = votes >= 0
     return surfels.shift_along_normals(shifts_m).select(kept) if kept.any() else None
 
@@ -174,21 +161,18 @@ def cast_to_objects(
     )
     for index, one in enumerate(objects):
         rows = np.flatnonzero(one.track.is_present(times_s))
-        if not len(rows):
-            continue
         local_origins = one.track.to_object(origins[rows], times_s[rows])
         directions = one.track.to_object(ends[rows], times_s[rows]) - local_origins
         inside = _enters_box(one.track, local_origins, directions)
-        rows, local_origins, directions = rows[inside], local_origins[inside], directions[inside]
+        rows, directions = rows[inside], directions[inside]
         mesh = one.surfels.mesh
-        found = RayCaster(mesh.vertices, mesh.faces).cast(local_origins, directions)
+        found = RayCaster(mesh.vertices, mesh.faces).cast(local_origins[inside], directions)
         nearer = found.hit & (found.distance < hits.distance_m[rows])
         rays = rows[nearer]
-        surfel = found.triangle[nearer].astype(np.int64) // 2
-        normals = one.surfels.normals[surfel]
-        units = directions[nearer] / np.linalg.norm(directions[nearer], axis=1)[:, None]
         hits.distance_m[rays] = found.distance[nearer]
         hits.object[rays] = index
-        hits.surfel[rays] = surfel
+        hits.surfel[rays] = found.triangle[nearer].astype(np.int64) // 2
+        normals = one.surfels.normals[hits.surfel[rays]]
+        units = directions[nearer] / np.linalg.norm(directions[nearer], axis=1)[:, None]
         hits.cosine[rays] = np.abs(np.einsum("ij,ij->i", units, normals))
     return hits

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,10 +12,81 @@ from lidarsim.numerics.arrays import Bools, Floats, Ints
 
 from .alignment import AlignedSweeps
 from .held_out import HeldOutPulses, HeldOutRays
-from .moving_rays import StationaryMasks, pulse_times_s
-from .object_surfels import RecordedObject, cast_to_objects
+from .moving_objects import find_tracks
+from .moving_rays import MovingRays, StationaryMasks, pulse_times_s
+from .object_surfels import RecordedObject, cast_to_objects, reconstruct_objects
 from .object_tracks import ObjectTrack, in_any_box
 from .reflectances import Reflectances, Response
+
+_STEP_S = 0.1  # step of the times at which objects are sought near a submap
+
+
+class ObjectMap(NamedTuple):
+    """Moving objects according to some sweeps."""
+
+    tracks: Sequence[ObjectTrack]
+    objects: Sequence[RecordedObject]
+
+    @classmethod
+    def from_rays(
+        cls,
+        rays: MovingRays,
+        labeled: Sequence[ObjectTrack] | None,
+        sweep_s: float,
+        voxel_m: float,
+        gap_rad: float,
+    ) -> ObjectMap:
+        """Find and reconstruct the moving objects.
+
+        Parameters
+        ----------
+        rays
+            Rays of the sweeps near moving objects.
+        labeled
+            Labeled boxes of moving objects, or None to find the objects.
+        sweep_s
+            Typical time between the sweeps in seconds.
+        voxel_m
+            Edge length of the voxels of the scene in meters.
+        gap_rad
+            Angle between the rays of neighboring rings in radians.
+        """
+        tracks = find_tracks(rays, labeled, sweep_s)
+        objects = reconstruct_objects(tracks, rays, voxel_m, gap_rad)
+        # Points of objects that were found but have too few points remain as they are classified.
+        return cls([one.track for one in objects] if labeled is None else tracks, objects)
+
+    def between(self, times_s: Floats) -> ObjectMap:
+        """Select what is present at one of the times at least."""
+        return ObjectMap(
+            present(self.tracks, times_s),
+            [one for one in self.of_mapped.objects if one.track.is_present(times_s).any()],
+        )
+
+
+def present(tracks: Sequence[ObjectTrack], times_s: Floats) -> list[ObjectTrack]:
+    """Select the tracks of objects that are present at one of the times at least."""
+    return [track for track in tracks if track.is_present(times_s).any()]
+
+
+class MovingObjects(NamedTuple):
+    """Moving objects of a recording."""
+
+    of_all: ObjectMap  # according to all sweeps
+    of_mapped: ObjectMap  # according to the sweeps that form the map
+    labeled: Sequence[ObjectTrack] | None  # boxes from labels, None without labels
+
+    def between(
+        self, first_s: float, last_s: float, masks: StationaryMasks, mapped: StationaryMasks
+    ) -> SubmapObjects:
+        """Return the objects that are present between two times.
+
+        `masks` and `mapped` are the stationary points of a submap.
+        """
+        times_s = np.linspace(first_s, last_s, 2 + int((last_s - first_s) / _STEP_S))
+        of_all = self.of_all.between(times_s)
+        boxes = of_all.tracks if self.labeled is None else present(self.labeled, times_s)
+        return SubmapObjects(masks, mapped, of_all.tracks, boxes, self.of_mapped.between(times_s))
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,20 +100,17 @@ class SubmapObjects:
         form the map.
     tracks
         Tracks of the objects according to all sweeps.
-    tracks_in_mapped
-        Tracks according to the sweeps that form the map.
     boxes
         Boxes in which held-out points are measured.
-    objects
-        Objects that were reconstructed from the sweeps that form the map.
+    of_mapped
+        Objects according to the sweeps that form the map.
     """
 
     masks: StationaryMasks
     masks_of_mapped: StationaryMasks
     tracks: Sequence[ObjectTrack]
-    tracks_in_mapped: Sequence[ObjectTrack]
     boxes: Sequence[ObjectTrack]
-    objects: Sequence[RecordedObject]
+    of_mapped: ObjectMap
 
     def stationary(self, sweeps: AlignedSweeps) -> dict[int, Bools]:
         """Return masks of the points that are not on moving objects, by sweep number."""
@@ -49,7 +118,7 @@ class SubmapObjects:
 
     def stationary_in_mapped(self, sweeps: AlignedSweeps) -> dict[int, Bools]:
         """Return the same masks for the sweeps that form the map, which alone determine them."""
-        return _without_objects(sweeps, self.masks_of_mapped.masks(), self.tracks_in_mapped)
+        return _without_objects(sweeps, self.masks_of_mapped.masks(), self.of_mapped.tracks)
 
     def simulate(
         self,
@@ -75,7 +144,7 @@ class SubmapObjects:
             None
             if response is None
             else response.reflectances(one.observations, one.surfels.centers)
-            for one in self.objects
+            for one in self.of_mapped.objects
         ]
         simulated_m = rays.simulated_m.copy()
         intensity = rays.simulated_intensity.copy()
@@ -92,7 +161,7 @@ class SubmapObjects:
             )
             origins = np.concatenate([returns.origins, lost.origins])
             ends = np.concatenate([returns.world, lost.world])
-            hits = cast_to_objects(self.objects, origins, ends, times_s)
+            hits = cast_to_objects(self.of_mapped.objects, origins, ends, times_s)
             is_first = hits.distance_m < np.nan_to_num(simulated_m[rows], nan=np.inf)
             is_first &= hits.distance_m <= sweeps.coverage.max_range_m
             simulated_m[rows][is_first] = hits.distance_m[is_first]

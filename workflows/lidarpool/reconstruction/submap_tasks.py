@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -17,8 +17,8 @@ from .charts import SweepImages, TopViewPoints
 from .free_space import find_stationary_points
 from .held_out import HeldOutRays, simulate_held_out
 from .lost_pulses import SensorCoverage
+from .moving_objects import LabeledTracks
 from .moving_rays import MovingRays, StationaryMasks, collect_moving_rays
-from .object_tracks import ObjectTrack
 from .porosity import Porosity
 from .published_metrics import HeldOutFrames
 from .recorded_sweeps import RecordedSweeps
@@ -87,14 +87,11 @@ class MotionTask(BuildTask):
 
     Attributes
     ----------
-    labeled
-        Boxes of moving objects from labels, which are empty if the objects are to be found.
-    labeled_in_mapped
-        The same, from the labels of the sweeps that form the map.
+    labels
+        Labeled boxes of moving objects, or None if the objects are to be found.
     """
 
-    labeled: Sequence[ObjectTrack] = ()
-    labeled_in_mapped: Sequence[ObjectTrack] = ()
+    labels: LabeledTracks | None = None
 
 
 class SubmapSurfels(NamedTuple):
@@ -181,11 +178,12 @@ def find_moving_rays(
     sweeps = task.read()
     numbers = task.submap.numbers
     own = task.submap.own_numbers
+    labels = task.labels or LabeledTracks((), ())
     masks = []
     rays = []
     for chosen, labeled in (
-        (numbers, task.labeled),
-        (np.intersect1d(numbers, task.mapped), task.labeled_in_mapped),
+        (numbers, labels.all),
+        (np.intersect1d(numbers, task.mapped), labels.in_mapped),
     ):
         stationary = find_stationary_points(sweeps, chosen.tolist())
         masks.append(StationaryMasks.from_masks(stationary))
@@ -254,9 +252,7 @@ def compare_held_out_sweeps(
         mapped_stationary = find_stationary_points(sweeps, mapped)
     else:
         mapped_stationary = objects.stationary_in_mapped(sweeps)
-    surface_map, reflectances = build_map_with_reflectances(
-        sweeps, mapped_stationary, task.voxel_m
-    )
+    surface_map, reflectances = build_map_with_reflectances(sweeps, mapped_stationary, task.voxel_m)
     rays, pulses = simulate_held_out(sweeps, surface_map, reflectances, stationary, compared)
     if objects is not None:
         response = None if reflectances is None else reflectances.response

@@ -235,7 +235,7 @@ class SurfaceMap:
             moving = ~dark & (hits.ends | (np.abs(hits.farther_m) < _MAX_SHIFT_M))
             surfel.append(hits.surfel[moving])
             offset_m.append((hits.farther_m * hits.inward)[moving])
-        shifts_m = _shifts(np.concatenate(surfel), np.concatenate(offset_m), count)
+        shifts_m = median_shifts(np.concatenate(surfel), np.concatenate(offset_m), count)
         supported = votes >= self.surfels.dark  # a dark surfel requires at least one lost pulse
         if not supported.any():
             raise LidarError(
@@ -312,7 +312,7 @@ def _lost_positions(
     return np.concatenate(positions), np.concatenate(outward)
 
 
-def _shifts(surfel: Ints, offset_m: Floats, count: int) -> Floats:
+def median_shifts(surfel: Ints, offset_m: Floats, count: int) -> Floats:
     """Return how far to shift each surfel, using the median of the offsets of its rays.
 
     The shift is reduced for surfels with few rays.

@@ -208,7 +208,7 @@ class _Planes(NamedTuple):
         left = np.arange(count)
         for neighbors in _NEIGHBORS:
             around = means[_nearest(tree, centers[left], neighbors)]
-            variances, found = _principal(around)
+            variances, found = principal_axes(around)
             axes[left] = found
             flat = variances[:, 0] < _MAX_FLAT * variances[:, 1]
             farthest_m = np.linalg.norm(around[:, -1] - centers[left], axis=1)
@@ -252,7 +252,7 @@ def _nearest(tree: object, centers: Floats, count: int) -> Ints:
     return np.asarray(rows)
 
 
-def _principal(around: Floats) -> tuple[Floats, Floats]:
+def principal_axes(around: Floats) -> tuple[Floats, Floats]:
     """Return the ascending variances and principal axes of point sets.
 
     The point sets have shape (m, k, 3).

@@ -29,11 +29,11 @@ from lidarsim.environment.extras import reading
 from lidarsim.errors import LidarError
 from lidarsim.io.input_files import read_input_text
 from lidarsim.motion.bag_trajectories import read_bag
+from lidarsim.motion.rotations import matrices
 from lidarsim.motion.trajectory import Track
 from lidarsim.numerics.arrays import AnyArray, Floats, Floats32
-from lidarsim.survey.survey import Survey
-from lidarsim.motion.rotations import matrices
 from lidarsim.scene.transform import affine
+from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps, actor_type, states_compensation
 from lidarsim.words import join_names
 
