@@ -282,6 +282,16 @@ def test_what_moved_is_no_part_of_the_place(place):
     assert place.figures["moved"] > 0
 
 
+def test_moving_objects_are_simulated_in_held_out_sweeps(place):
+    moving = place.figures["held_out"]["moving"]
+    assert moving["rays"] > 500
+    assert moving["median_abs_difference_m"] < 0.03
+    assert moving["ghosts"] < 0.002
+    (actor,) = place.figures["actors"]
+    np.testing.assert_allclose(actor["size_m"], CAR, atol=0.01)
+    assert "1 moving object from boxes" in repr(place)
+
+
 def test_surfaces_are_as_bright_as_they_were(place):
     scene = place.scene
     middles = scene.vertices[scene.faces].mean(axis=1)
@@ -296,6 +306,7 @@ def test_a_twin_is_a_scenario_that_runs_with_another_sensor(place, tmp_path):
     files = place.save(tmp_path / "twin")
     assert {file.name for file in files} == {
         "place.glb", "trajectory.csv", "sensor.yaml", "scenario.yaml", "twin.json", "report.html",
+        "car-1.glb", "car-1.csv",
     }  # fmt: skip
     path = tmp_path / "twin" / "scenario.yaml"
     job = prepare(Scenario.load(path))
@@ -303,7 +314,17 @@ def test_a_twin_is_a_scenario_that_runs_with_another_sensor(place, tmp_path):
     pose = job.survey.path.pose(0, 1e9 * place.times_s[middle])
     np.testing.assert_allclose(pose.position, place.poses[middle, :3, 3], atol=1e-5)
     np.testing.assert_allclose(pose.rotation_matrix, place.poses[middle, :3, :3], atol=1e-5)
-    other = prepare(Scenario.load(path, {"sensor": "velodyne/vlp16"}))
+    (actor,) = job.scene.actors
+    assert actor.name == "car 1"
+    position, _ = actor.trajectory.poses(0, np.array([0.6e9]))
+    np.testing.assert_allclose(position, [[-6, CAR_Y, 0]], atol=0.05)
+    simulated, _ = scanned(path.parent)
+    on_car = simulated["object"] == len(job.scene.names)
+    assert on_car.sum() > 100
+    assert set(simulated["class"][on_car].tolist()) == {1}
+    assert job.classes[1] == "car"
+    other = prepare(Scenario.load(path, {"sensor": "velodyne/vlp16", "actors": []}))
+    assert not other.scene.actors
     assert other.survey.mounted_sensors[0].sensor.channels == 16
     result = CliRunner().invoke(cli, ["twin", str(tmp_path), "--out", str(path.parent)])
     assert "already contains scenario.yaml. Use another folder, or pass `--overwrite`." in str(

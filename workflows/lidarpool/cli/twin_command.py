@@ -51,6 +51,13 @@ if TYPE_CHECKING:
     help="First frame of a window of KITTI-360 in which LiDAR4D was evaluated, such as 4950. Only "
     "this window is used, and the same frames are held out.",
 )
+@click.option(
+    "--actors",
+    type=click.Choice(["boxes", "clusters", "none"]),
+    help="How moving objects are found: from the labeled boxes of the recording, from clusters of "
+    "points that moved, or not at all (default: boxes if the recording has any, otherwise "
+    "clusters).",
+)
 @options.scheduler
 @options.flag("--resume", help="Resume an unfinished reconstruction, if there is one.")
 @overwrite
@@ -66,12 +73,12 @@ def twin(
     as_json: bool,
     **settings: Any,
 ) -> None:
-    """Reconstruct the static scene of a recorded drive.
+    """Reconstruct the scene of a recorded drive and its moving objects.
 
-    Moving objects are removed. The output folder contains the scene (place.glb), the trajectory
-    (trajectory.csv), the sensor (sensor.yaml), a scenario that combines them, and report.html,
-    which compares held-out sweeps with simulated sweeps. RECORDING can have any format that
-    `lidarpool compare` reads, and must contain sweeps.
+    The output folder contains the static scene (place.glb), the moving objects (actors), the
+    trajectory (trajectory.csv), the sensor (sensor.yaml), a scenario that combines them, and
+    report.html, which compares held-out sweeps with simulated sweeps. RECORDING can have any format
+    that `lidarpool compare` reads, and must contain sweeps.
 
     \b
     Examples:

@@ -82,10 +82,12 @@ def find_clusters(points: Floats, moved: Bools) -> Ints:
         members = rows[seeds == seed]
         if np.ptp(points[members, :2], axis=0).max() > _MAX_SIZE_M:
             continue
-        first = found[members].max()  # part of a cluster that was found before
-        number = first if first >= 0 else found.max() + 1
+        connected = _connected(points, moved, members)
+        known = np.unique(found[np.union1d(members, connected)])
+        number = known[known >= 0].min(initial=found.max() + 1)
+        found[np.isin(found, known[known >= 0])] = number  # parts of the same vehicle
         found[members] = number
-        found[_connected(points, moved, members)] = number
+        found[connected] = number
     return found
 
 

@@ -47,7 +47,7 @@ _ACCELERATION = np.array([3.0, 3.0, 0.7, 1.0])
 _HEADING_RAD = 0.1  # standard deviation of the direction of travel from the x axis
 _MIN_HEADING_M_S = 1.0  # minimum speed at which an object faces its direction of travel
 _STILL_SHARE = 0.02  # maximum share of points that moved on a stationary object
-_STILL_M_S = 1.0  # maximum speed of an object that may be stationary
+_STILL_M_S = 0.4  # maximum speed of an object that may be stationary
 # Standard deviations of the velocity of a stationary object, m/s and rad/s.
 _STANDSTILL = np.array([0.02, 0.02, 0.02, 0.02])
 # Standard deviations of labeled poses.

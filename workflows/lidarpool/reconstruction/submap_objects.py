@@ -60,7 +60,7 @@ class ObjectMap(NamedTuple):
         """Select what is present at one of the times at least."""
         return ObjectMap(
             present(self.tracks, times_s),
-            [one for one in self.of_mapped.objects if one.track.is_present(times_s).any()],
+            [one for one in self.objects if one.track.is_present(times_s).any()],
         )
 
 

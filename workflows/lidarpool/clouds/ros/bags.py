@@ -377,7 +377,7 @@ def _boxes(
     if not connections or poses is None:
         return None
     stamps_ns = np.array([header.stamp_ns for header in headers])
-    rows = []
+    rows = {}  # Bags of several sensors contain the boxes once for each of them.
     for _, _, data in bag.messages(connections):
         message: Any = message_store().deserialize_cdr(data, _BOXES)
         for marker in message.markers:
@@ -392,8 +392,9 @@ def _boxes(
             world = affine(rotation, np.array([place.x, place.y, place.z]))
             pose = np.linalg.inv(poses[sweep]) @ world
             size = marker.scale.x, marker.scale.y, marker.scale.z
-            rows.append((sweep, int(marker.id), actor_type(marker.text), pose, size))
-    return RecordedBoxes.from_rows(rows) if rows else None
+            row = sweep, int(marker.id), actor_type(marker.text), pose, size
+            rows[row[:2]] = row
+    return RecordedBoxes.from_rows(rows.values()) if rows else None
 
 
 def _stated_compensation(path: Path) -> bool | None:
