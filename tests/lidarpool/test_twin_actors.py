@@ -272,7 +272,7 @@ def test_boxes_are_required_if_they_were_chosen():
     with pytest.raises(LidarError, match=r"no labeled boxes\. Set `actors` to `clusters`"):
         twin(recording, actors="boxes")
     with pytest.raises(LidarError, match="actors"):
-        twin(the_cloud(), sensor="front", actors="labels")
+        twin(recording, actors="labels")
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,7 @@ _VOXEL_SHARES = (0.5, 0.25)  # voxel edges that are tried, relative to those of 
 _ROUNDS = 3  # iterations of casting rays, and of removing and moving surfels
 _MAX_RAYS = 200_000  # evenly chosen rays that form an object
 _MAX_SHIFT_M = 0.15  # Rays with a larger range difference do not move a surfel.
+_PASSING_VOTES = 3  # votes of a ray that passes a surfel, relative to one that ends on it
 _ON_RAY_M = 0.1  # A ray passes a surfel if it ends this far behind it.
 _REACH_M = 0.5  # margin around a box within which rays are cast
 
@@ -105,7 +106,7 @@ def _in_object_frame(track: ObjectTrack, rays: MovingRays) -> AlignedSweep:
 
 
 def _refine(surfels: Surfels, sweep: AlignedSweep, returned: Bools) -> Surfels | None:
-    """Remove surfels that more rays pass than end on, and move the others to the points.
+    """Remove surfels that too many rays pass, and move the others to the points.
 
     Return None if none remains.
     """
@@ -116,7 +117,7 @@ def _refine(surfels: Surfels, sweep: AlignedSweep, returned: Bools) -> Surfels |
     ends = is_return & (np.abs(farther_m) < _ON_RAY_M)
     passing = farther_m >= _ON_RAY_M
     votes = np.bincount(hits.surfel[ends], minlength=count)
-    votes -= np.bincount(hits.surfel[passing], minlength=count)
+    votes -= _PASSING_VOTES * np.bincount(hits.surfel[passing], minlength=count)
     moving = is_return & (np.abs(farther_m) < _MAX_SHIFT_M)
     shifts_m = median_shifts(hits.surfel[moving], (farther_m * hits.inward)[moving], count)
     kept = votes >= 0

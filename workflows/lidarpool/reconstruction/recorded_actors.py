@@ -123,7 +123,10 @@ def actors_of(
         Typical time between sweeps in seconds. An object is present half of it before and after its
         observations.
     """
-    kinds = [one.track.kind or names.get(class_of(one.label), "") or UNKNOWN for one in objects]
+    kinds = [
+        one.track.kind.replace("_", " ") or names.get(class_of(one.label), "") or UNKNOWN
+        for one in objects
+    ]
     numbers = _class_numbers(kinds, [class_of(one.label) for one in objects], names)
     counts: Counter[str] = Counter()
     actors = []
