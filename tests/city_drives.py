@@ -30,7 +30,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 
 SPEED_M_S = 4.0
 # Start, speed and acceleration along x, lateral position and start time of moving cars.
-CARS = ((-10.0, 5.0, 0.6, -3.0, 0.0), (14.0, -9.0, 0.0, 3.0, 0.0), (-16.0, 0.0, 3.0, -6.3, 0.8))
+CARS = ((-10.0, 5.0, 0.6, -3.0, 0.0), (14.0, -9.0, 0.0, 3.0, 0.0), (-16.0, 0.0, 4.0, -6.3, 0.4))
 
 
 def write_city_drive(path: Path, sensor: Sensor, sweep_count: int, start_x_m: float) -> Path:

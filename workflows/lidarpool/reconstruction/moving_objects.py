@@ -33,6 +33,7 @@ _MIN_SHARE = 0.15  # minimum number of points relative to the neighboring sweep
 _MAX_RESIDUAL_M = 0.06  # maximum median distance of points from planes in a further sweep
 _MIN_MATCHED = 0.6  # minimum share of points in a further sweep that are close to the shape
 _LABEL_GAP_S = 0.3  # Labeled poses further from all observed poses are kept.
+_GROWTH_M = 1.5  # margin of a box in which points of clusters belong to the object
 _TRIMMED_SWEEPS = 5  # Sweeps at the ends of a track whose clusters are often incomplete.
 _ACCELERATION_M_S2 = 3.0  # standard deviation of the acceleration
 _MAX_GAP_SWEEPS = 3  # maximum number of sweeps without points before an object is lost
@@ -163,8 +164,8 @@ def _follow(
     """Return the track of an object, or None if it belongs to an object that is known already."""
     sightings = []
     centers = []
-    for number, cluster, index in zip(
-        candidate.sweeps, candidate.clusters, candidate.indices, strict=True
+    for number, position, cluster, index in zip(
+        candidate.sweeps, candidate.path, candidate.clusters, candidate.indices, strict=True
     ):
         start = slices[number].start
         rows = start + np.flatnonzero(rays.cluster[slices[number]] == index)
@@ -172,7 +173,7 @@ def _follow(
         if len(free) < max(_MIN_UNCLAIMED * len(rows), _MIN_RETURNS):
             continue
         sightings.append(Sighting.from_rays(rays, free))
-        centers.append(np.append(cluster.center[:2], cluster.low[2]))
+        centers.append(np.append(position[:2], cluster.low[2]))
     if len(sightings) < MIN_SWEEPS:
         return None
     poses = first_poses(sightings, np.array(centers))
@@ -182,8 +183,10 @@ def _follow(
     track = track.select(slice(trimmed, len(track) - trimmed))
     for step in (1, -1):
         track = _extend(track, rays, slices, claimed, step, sweep_s)
-    inside = rays.returned & ~claimed & in_any_box([track], rays.ends, rays.time_s)
-    sightings = _sightings(rays, inside)
+    # Sides that were not visible in the clusters of the track may be outside its box.
+    inside = in_any_box([track], rays.ends, rays.time_s)
+    inside |= (rays.cluster >= 0) & in_any_box([track], rays.ends, rays.time_s, _GROWTH_M)
+    sightings = _sightings(rays, inside & rays.returned & ~claimed)
     if len(sightings) < MIN_SWEEPS:
         return None
     times_s = np.array([one.time_s for one in sightings])

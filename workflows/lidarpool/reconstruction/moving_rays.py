@@ -15,7 +15,7 @@ import numpy as np
 from lidarsim.numerics.arrays import Bools, Bytes, Floats, Ints
 
 from .alignment import AlignedSweep, AlignedSweeps
-from .object_clusters import Cluster, bounding_boxes, find_clusters
+from .object_clusters import PointCluster, bounding_boxes, find_clusters
 from .object_tracks import ObjectTrack
 
 _MARGIN_M = (0.5, 0.5, 0.3)  # margin around a cluster, within which rays are collected
@@ -195,7 +195,7 @@ def collect_moving_rays(
     return MovingRays.concatenate(parts)
 
 
-def _beyond(clusters: Mapping[int, Sequence[Cluster]], number: int) -> list[Cluster]:
+def _beyond(clusters: Mapping[int, Sequence[PointCluster]], number: int) -> list[PointCluster]:
     """Return the clusters of objects that start moving after a sweep, or stopped before it."""
     order = sorted(clusters)
     index = order.index(number)
@@ -213,7 +213,7 @@ def _beyond(clusters: Mapping[int, Sequence[Cluster]], number: int) -> list[Clus
     return found
 
 
-def _labeled_boxes(labeled: Sequence[ObjectTrack], time_s: float) -> list[Cluster]:
+def _labeled_boxes(labeled: Sequence[ObjectTrack], time_s: float) -> list[PointCluster]:
     """Return the bounding boxes of labeled objects, in axes of the world."""
     found = []
     times_s = np.array([time_s])
@@ -224,11 +224,15 @@ def _labeled_boxes(labeled: Sequence[ObjectTrack], time_s: float) -> list[Cluste
         radius_m = float(np.hypot(*track.size[:2])) / 2
         speed_m = track.speed_m_s(time_s) * _SWEEP_S
         reach = np.array([radius_m + speed_m, radius_m + speed_m, 0.0])
-        found.append(Cluster(position - reach, position + reach + (0, 0, float(track.size[2])), 0))
+        found.append(
+            PointCluster(position - reach, position + reach + (0, 0, float(track.size[2])), 0)
+        )
     return found
 
 
-def _rays_near(boxes: Sequence[Cluster], origins: Floats, ends: Floats, cluster: Ints) -> Bools:
+def _rays_near(
+    boxes: Sequence[PointCluster], origins: Floats, ends: Floats, cluster: Ints
+) -> Bools:
     """Mark the rays that end in a box or pass through it.
 
     `cluster` has the clusters of the returns, which precede the lost pulses.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +31,7 @@ _GATE_M = 1.5  # maximum distance from the predicted position, as a constant and
 _GATE_M_S = 2.0
 _FIRST_GATE_M = 0.6  # maximum cost of the second observation of an object
 _SPEED_COST = 0.25  # cost of the distance to the second observation
-_SIZE_COST = 0.3  # cost of a change of the bounding box
+_SIZE_COST = 0.1  # cost of a change of the bounding box
 _FITTED = 4  # observations that determine the velocity
 MIN_SWEEPS = 4
 MIN_PATH_M = 1.0  # Objects that move less count as stationary.
@@ -38,7 +39,7 @@ _MIN_STRAIGHTNESS = 0.6  # minimum ratio of the distance to the length of the pa
 _IMPOSSIBLE = 1e3
 
 
-class Cluster(NamedTuple):
+class PointCluster(NamedTuple):
     """Axis-aligned bounding box of a cluster of points."""
 
     low: Floats  # (3,), meters, world frame
@@ -50,7 +51,18 @@ class Cluster(NamedTuple):
         """Center of the box."""
         return np.asarray((self.low + self.high) / 2)
 
-    def distance_m(self, other: Cluster) -> float:
+    def offset_from(self, other: PointCluster) -> Floats:
+        """Return the displacement from another cluster of the same object. Shape (3,).
+
+        Different parts of the object may be visible, so the corner of the boxes that moved least is
+        used, or their center.
+        """
+        offsets = np.stack(
+            [self.center - other.center, self.low - other.low, self.high - other.high]
+        )
+        return np.asarray(offsets[np.hypot(offsets[:, 0], offsets[:, 1]).argmin()])
+
+    def distance_m(self, other: PointCluster) -> float:
         """Return the horizontal distance between the centers of two boxes."""
         return float(np.hypot(*(self.center - other.center)[:2]))
 
@@ -124,13 +136,13 @@ def _components(points: Floats, link_m: float) -> Ints:
     return np.asarray(component[cell.ravel()])
 
 
-def bounding_boxes(points: Floats, cluster: Ints) -> dict[int, Cluster]:
+def bounding_boxes(points: Floats, cluster: Ints) -> dict[int, PointCluster]:
     """Return the bounding box of each cluster, keyed by its index."""
     rows = np.flatnonzero(cluster >= 0)
     rows = rows[np.argsort(cluster[rows], kind="stable")]
     groups = np.split(rows, np.flatnonzero(np.diff(cluster[rows])) + 1) if len(rows) else []
     return {
-        int(cluster[group[0]]): Cluster(
+        int(cluster[group[0]]): PointCluster(
             points[group].min(axis=0), points[group].max(axis=0), len(group)
         )
         for group in groups
@@ -143,7 +155,7 @@ class ClusterTrack:
 
     sweeps: list[int]
     times_s: list[float]
-    clusters: list[Cluster]
+    clusters: list[PointCluster]
     indices: list[int]  # indices of the clusters in their sweeps
 
     @property
@@ -156,33 +168,37 @@ class ClusterTrack:
         """Whether the object moved far enough, and consistently."""
         if len(self.clusters) < MIN_SWEEPS:
             return False
-        path = np.array([cluster.center[:2] for cluster in self.clusters])
+        path = self.path[:, :2]
         distance_m = np.hypot(*(path[-1] - path[0]))
         length_m = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
         return bool(distance_m > MIN_PATH_M and distance_m > _MIN_STRAIGHTNESS * length_m)
 
-    def cost(self, time_s: float, cluster: Cluster) -> float:
+    @property
+    def path(self) -> Floats:
+        """Positions of a point of the object in meters. Shape (k, 3)."""
+        steps = [new.offset_from(old) for old, new in pairwise(self.clusters)]
+        return np.cumsum([self.clusters[0].center, *steps], axis=0)
+
+    def cost(self, time_s: float, cluster: PointCluster) -> float:
         """Return the cost of a further observation, which is high if it is implausible."""
         last = self.clusters[-1]
         step_s = time_s - self.times_s[-1]
-        offset = cluster.center - last.center
         growth_m = np.abs((cluster.high - cluster.low) - (last.high - last.low)).sum()
+        cost = _SIZE_COST * growth_m
+        offset = cluster.offset_from(last)[:2]
         if len(self.clusters) == 1:
-            distance_m = float(np.hypot(*offset[:2]))
-            cost = _SPEED_COST * distance_m + _SIZE_COST * growth_m
+            cost += _SPEED_COST * np.hypot(*offset)
             limit = _SPEED_COST * _MAX_SPEED_M_S * step_s + _FIRST_GATE_M
         else:
-            first = max(len(self.clusters) - _FITTED, 0)
-            span_s = self.times_s[-1] - self.times_s[first]
-            velocity = (last.center - self.clusters[first].center) / span_s
-            distance_m = float(np.hypot(*(offset - velocity * step_s)[:2]))
-            cost = distance_m + _SIZE_COST * growth_m
+            recent = self.path[-_FITTED:, :2]
+            velocity = (recent[-1] - recent[0]) / (self.times_s[-1] - self.times_s[-len(recent)])
+            cost += np.hypot(*(offset - velocity * step_s))
             limit = _GATE_M + _GATE_M_S * step_s
         return float(cost) if cost < limit else _IMPOSSIBLE
 
 
 def track_clusters(
-    observed: Sequence[tuple[int, float, Mapping[int, Cluster]]], sweep_s: float
+    observed: Sequence[tuple[int, float, Mapping[int, PointCluster]]], sweep_s: float
 ) -> list[ClusterTrack]:
     """Associate clusters over time, and return the tracks of objects that move.
 

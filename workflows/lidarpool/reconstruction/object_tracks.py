@@ -135,7 +135,9 @@ def rotate_z(vectors: Floats, angles: Floats) -> Floats:
     return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1)
 
 
-def in_any_box(tracks: Sequence[ObjectTrack], points: Floats, times_s: Floats) -> Bools:
+def in_any_box(
+    tracks: Sequence[ObjectTrack], points: Floats, times_s: Floats, margin_m: float = _MARGIN_M
+) -> Bools:
     """Mark points in the world frame that are in the box of an object at their times."""
     inside = np.zeros(len(points), bool)
     for track in tracks:
@@ -143,9 +145,9 @@ def in_any_box(tracks: Sequence[ObjectTrack], points: Floats, times_s: Floats) -
         if not len(rows):
             continue
         positions, _ = track.poses(times_s[rows])
-        reach_m = np.hypot(*track.size[:2]) / 2 + _MARGIN_M
+        reach_m = np.hypot(*track.size[:2]) / 2 + 2 * margin_m
         offsets = points[rows, :2] - positions[:, :2]
         rows = rows[np.einsum("ij,ij->i", offsets, offsets) < reach_m**2]
         if len(rows):
-            inside[rows] |= track.contains(track.to_object(points[rows], times_s[rows]))
+            inside[rows] |= track.contains(track.to_object(points[rows], times_s[rows]), margin_m)
     return inside
