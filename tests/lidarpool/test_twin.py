@@ -322,7 +322,7 @@ def test_a_twin_is_a_scenario_that_runs_with_another_sensor(place, tmp_path):
     on_car = simulated["object"] == len(job.scene.names)
     assert on_car.sum() > 100
     assert set(simulated["class"][on_car].tolist()) == {1}
-    assert job.classes[1] == "car"
+    assert job.survey.classes[1] == "car"
     other = prepare(Scenario.load(path, {"sensor": "velodyne/vlp16", "actors": []}))
     assert not other.scene.actors
     assert other.survey.mounted_sensors[0].sensor.channels == 16
