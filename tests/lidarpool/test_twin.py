@@ -323,8 +323,14 @@ def test_a_twin_is_a_scenario_that_runs_with_another_sensor(place, tmp_path):
     assert on_car.sum() > 100
     assert set(simulated["class"][on_car].tolist()) == {1}
     assert job.survey.classes[1] == "car"
-    other = prepare(Scenario.load(path, {"sensor": "velodyne/vlp16", "actors": []}))
-    assert not other.scene.actors
+    edited = yaml.safe_load(path.read_text())
+    edited["actors"][0]["box"] = [4.5, 1.8, 1.5]
+    del edited["actors"][0]["file"]
+    (path.parent / "edited.yaml").write_text(yaml.safe_dump(edited))
+    (replaced,) = prepare(Scenario.load(path.parent / "edited.yaml")).scene.actors
+    np.testing.assert_allclose(np.ptp(replaced.bounds, axis=0), (4.5, 1.8, 1.5))
+    np.testing.assert_array_equal(replaced.trajectory.positions, actor.trajectory.positions)
+    other = prepare(Scenario.load(path, {"sensor": "velodyne/vlp16"}))
     assert other.survey.mounted_sensors[0].sensor.channels == 16
     result = CliRunner().invoke(cli, ["twin", str(tmp_path), "--out", str(path.parent)])
     assert "already contains scenario.yaml. Use another folder, or pass `--overwrite`." in str(
