@@ -580,13 +580,12 @@ class _Building:
         model, noise, notes = self._fit_sensor(built, sweeps, meshes, response, timing)
         start, stop = timing.start(alignment), timing.stop(alignment)
         actors = self._actors(moving, response, alignment.sweep_s, (start.time_s, stop.time_s))
-        held_out = built.held_out()
         figures = self._figures(built, alignment) | {
             "poses": poses.source,
             "motion": alignment.motion.value,
             "actors_from": self.actors,
             "actors": [actor.figures() for actor in actors],
-            "held_out": held_out.figures(),
+            "held_out": built.held_out().figures(),
             "lidar4d": HeldOutFrames.figures(
                 [part.frames for part in built.parts if part.frames is not None]
             ),
