@@ -304,7 +304,7 @@ class AlignedSweeps:
         is_compensated = self.alignment.motion is Motion.COMPENSATED
         fraction = self.alignment.sweep_s / step_s if is_compensated else 0.0
         moved_m = fraction * float(np.linalg.norm(step.translation))
-        sweep = self.recorded.read(number)
+        sweep = self.recorded.read_all(number)
         return lost_pulses(sweep, self.recorded.lasers, self.coverage, moved_m)
 
     def _are_blocked(self, sweep: Sweep) -> Bools:
@@ -354,7 +354,7 @@ def first_alignment(sweeps: RecordedSweeps, poses: RecordedPoses) -> Alignment:
         If the recording contains hardly any planes or is mirrored.
     """
     numbers = even_indices(sweeps.count, _RANGE_SWEEPS).tolist()
-    voxel_m = _voxel_m([_sample(sweeps.read(number), number) for number in numbers])
+    voxel_m = _voxel_m([_sample(sweeps.read_surfaces(number), number) for number in numbers])
     motion = _motion(sweeps, poses, voxel_m)
     return Alignment.from_poses(poses, voxel_m, motion, sweeps.ring_count, sweeps.lasers)
 
@@ -385,7 +385,7 @@ def align(
     LidarError
         If the sweeps contain hardly any planes.
     """
-    samples = [_sample(sweeps.read(number), number) for number in numbers.tolist()]
+    samples = [_sample(sweeps.read_surfaces(number), number) for number in numbers.tolist()]
     rows = [row for row, number in enumerate(numbers.tolist()) if number in mapped]
     return _align_iteratively(sweeps.recording.name, samples, first.select(numbers), rows, _ROUNDS)
 
@@ -402,7 +402,7 @@ def _motion(sweeps: RecordedSweeps, poses: RecordedPoses, voxel_m: float) -> Mot
     """
     window = _fastest_window(poses)
     numbers = range(sweeps.count)[window]
-    samples = [_sample(sweeps.read(number), number) for number in numbers]
+    samples = [_sample(sweeps.read_surfaces(number), number) for number in numbers]
     is_timed = all("time_s" in sample.columns for sample in samples)
     if sweeps.is_compensated:
         candidates = [Motion.COMPENSATED]

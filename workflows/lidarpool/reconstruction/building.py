@@ -42,6 +42,7 @@ from ..recordings.opening import open_recording
 from ..report.page.rendering import render_template
 from ..run.cluster.worker_map import LostWorkersError, MapFunction, parallel_map
 from ..scenario.point_scene import CLASS_MATERIAL
+from .air_returns import AirStatistics
 from .alignment import AlignedSweeps, Alignment, first_alignment
 from .blocked_directions import BlockedDirections
 from .charts import (
@@ -54,6 +55,7 @@ from .charts import (
 )
 from .finished_steps import FinishedSteps, TwinStep
 from .held_out import HeldOutRays
+from .isolated_returns import IsolatedRanges
 from .labels import SurfelMaterial, split_by_object
 from .lasers import RingLasers
 from .lost_pulses import SensorCoverage, firings_per_turn
@@ -81,6 +83,8 @@ from .submap_tasks import (
 from .submaps import AlignedSubmap, Submap, merge_alignments, split_into_submaps
 from .surface_map import Observations
 from .surfels import merge_surfels, surfel_centers, surfel_mesh
+from .vehicle_detection import find_vehicle_returns
+from .vehicle_returns import VehicleReturns
 
 ActorSource = Literal["boxes", "clusters", "none"]
 MIN_SWEEPS = 4
@@ -98,12 +102,20 @@ _FIT_SWEEPS = 13  # sweeps to which the sensor noise is fitted
 _COMPARED_SWEEPS = 12  # held-out sweeps that are compared
 _POSE_DECIMALS = 6
 _RESPONSE_SUBMAPS = 4  # submaps from which the response of the sensor is determined
-_POSES = TwinStep("poses", (RecordedPoses,))
+_POSES = TwinStep("poses", (RecordedPoses, VehicleReturns, IsolatedRanges))
 _ALIGN = TwinStep("align", (AlignedSubmap,))
 _MOTION = TwinStep("motion", (StationaryMasks, StationaryMasks, MovingRays, MovingRays))
 _BUILD = TwinStep(
     "build",
-    (SubmapSurfels, Observations, HeldOutRays, HeldOutFrames, SweepImages, TopViewPoints),
+    (
+        SubmapSurfels,
+        Observations,
+        HeldOutRays,
+        HeldOutFrames,
+        SweepImages,
+        TopViewPoints,
+        AirStatistics,
+    ),
 )
 NO_RETURN = "no return"  # object name of surfels that return no pulses
 _ROTATION_FIELDS = {"clockwise", "zero_deg", "rate_hz"}  # written even if they have default values
@@ -456,9 +468,12 @@ class _Building:
     report: Callable[[str], None]
 
     def twin(self, trajectory: Path | None) -> Twin:
+        self.report(f"estimating the poses of {plural(self.recorded.count, 'sweep')}")
+        poses, recorded = self._find_poses(trajectory)
+        return replace(self, recorded=recorded)._build(poses)
+
+    def _build(self, poses: RecordedPoses) -> Twin:
         recorded = self.recorded
-        self.report(f"estimating the poses of {plural(recorded.count, 'sweep')}")
-        poses = self._find_poses(trajectory)
         self.report(f"poses {poses.source}; determining the motion compensation of the points")
         first = first_alignment(recorded, poses)
         submaps = split_into_submaps(first.poses[:, :3, 3])
@@ -486,14 +501,29 @@ class _Building:
             sweeps = AlignedSweeps(recorded, task.alignment, task.coverage)
             return self._assemble(built, sweeps, poses, moving)
 
-    def _find_poses(self, trajectory: Path | None) -> RecordedPoses:
-        def find() -> tuple[RecordedPoses]:
-            return (find_poses(self.recorded, trajectory),)
+    def _find_poses(self, trajectory: Path | None) -> tuple[RecordedPoses, RecordedSweeps]:
+        """Find the poses, and the returns that do not come from the scene.
 
-        (poses,) = self.steps.run_once(_POSES, find)
-        return poses._replace(
+        Return the sweeps without the returns from the vehicle.
+        """
+
+        def find() -> tuple[RecordedPoses, VehicleReturns, IsolatedRanges]:
+            recorded = self.recorded.with_isolated_ranges()
+            poses = find_poses(recorded, trajectory)
+            vehicle = find_vehicle_returns(recorded, poses)
+            if vehicle.are_found:
+                recorded = replace(recorded, vehicle=vehicle).with_isolated_ranges()
+                # Returns from the vehicle look as if it did not move.
+                poses = poses if poses.are_given else find_poses(recorded, trajectory)
+            return poses, vehicle, recorded.isolated
+
+        poses, vehicle, isolated = self.steps.run_once(_POSES, find)
+        poses = poses._replace(
             source=str(poses.source), share=float(poses.share), first_s=float(poses.first_s)
         )
+        vehicle = vehicle._replace(share=float(vehicle.share))
+        isolated = IsolatedRanges(*map(float, isolated))
+        return poses, replace(self.recorded, vehicle=vehicle, isolated=isolated)
 
     def _align_submaps(
         self, run: MapFunction, task: BuildTask, submaps: Sequence[Submap]
@@ -586,6 +616,7 @@ class _Building:
             "actors_from": self.actors,
             "actors": [actor.figures() for actor in actors],
             "held_out": built.held_out().figures(),
+            "weather": built.weather(),
             "lidar4d": HeldOutFrames.figures(
                 [part.frames for part in built.parts if part.frames is not None]
             ),
@@ -683,6 +714,7 @@ class _Building:
         """Return statistics of the reconstruction and the drive."""
         path = alignment.poses[:, :3, 3]
         surfels = [part.surfels for part in built.parts]
+        vehicle = self.recorded.vehicle
         return {
             "versions": {"lidarpool": __version__},
             "name": Path(self.recorded.recording.name).name,
@@ -691,6 +723,7 @@ class _Building:
             "submaps": len(surfels),
             "rings": len(self.recorded.elevation_rad),
             "points": sum(int(one.points.sum()) for one in surfels),
+            "vehicle_share": vehicle.share if vehicle is not None else 0.0,
             "moved": sum(int(one.moved.sum()) for one in surfels),
             "surfels": sum(len(one.corners) for one in surfels),
             "dark_surfels": sum(len(one.dark_corners) for one in surfels),
@@ -730,6 +763,7 @@ class _BuiltSubmap(NamedTuple):
     frames: HeldOutFrames | None
     images: SweepImages | None
     top_view: TopViewPoints
+    air: AirStatistics
 
 
 @dataclass(frozen=True, eq=False)
@@ -741,6 +775,21 @@ class _Built:
         return HeldOutRays.concatenate(
             [part.held_out for part in self.parts if part.held_out is not None]
         )
+
+    def weather(self) -> dict[str, Any] | None:
+        """Return statistics of the returns from the air, or None if there are none."""
+        parts = [part.air for part in self.parts if part.air.count]
+        count = sum(int(part.count) for part in parts)
+        if not count:
+            return None
+        total = count + sum(int(part.surfels.points.sum()) for part in self.parts)
+        ranges_m = np.concatenate([part.ranges_m for part in parts])
+        return {
+            "returns": count,
+            "share": count / total,
+            "median_range_m": float(np.median(ranges_m)),
+            "p95_range_m": float(np.quantile(ranges_m, 0.95)),
+        }
 
     def dark(self) -> list[SceneMesh]:
         """Return the mesh of all surfels that return no pulses.

@@ -53,7 +53,7 @@ class RangeImage:
         from scipy.ndimage import maximum_filter, minimum_filter
 
         shape = (len(lasers), _COLUMNS)
-        cells, _, range_m = _locate(points, lasers)
+        cells, _, range_m = locate(points, lasers, _COLUMNS)
         range_m = range_m.astype(np.float32)
         nearest = np.full(shape, np.inf, np.float32)
         farthest = np.full(shape, -np.inf, np.float32)
@@ -75,7 +75,7 @@ class RangeImage:
         Return two masks of shape (n,). The first marks points that a ray passed through, and the
         second marks points that the image confirms.
         """
-        cells, elevation, range_m = _locate(points, self.lasers)
+        cells, elevation, range_m = locate(points, self.lasers, _COLUMNS)
         tolerance_m = _TOLERANCE_M + _TOLERANCE_PER_M * range_m
         nearest = self.nearest_m[cells]
         low, high = self.limits_rad
@@ -85,8 +85,14 @@ class RangeImage:
         return passing, observed & ~passing & ~behind
 
 
-def _locate(points: Floats, lasers: RingLasers) -> tuple[tuple[Ints, Ints], Floats, Floats]:
-    """Return the image cells, elevations and ranges of points as seen from the closest lasers."""
+def locate(
+    points: Floats, lasers: RingLasers, column_count: int
+) -> tuple[tuple[Ints, Ints], Floats, Floats]:
+    """Return the image cells, elevations and ranges of points as seen from the closest lasers.
+
+    The points are in sensor coordinates, with shape (n, 3). The image has a row for each laser,
+    from the highest to the lowest.
+    """
     edges_rad = -(lasers.elevation_rad[1:] + lasers.elevation_rad[:-1]) / 2
     elevation = elevations(points)
     rows = np.searchsorted(edges_rad, -elevation)
@@ -97,7 +103,7 @@ def _locate(points: Floats, lasers: RingLasers) -> tuple[tuple[Ints, Ints], Floa
             rows = np.searchsorted(edges_rad, -elevation)
     range_m = lasers.ranges(points, rows)
     turns = azimuth / (2 * np.pi) + 0.5
-    columns = np.floor(turns * _COLUMNS).astype(np.int64) % _COLUMNS
+    columns = np.floor(turns * column_count).astype(np.int64) % column_count
     return (rows, columns), elevation, range_m
 
 

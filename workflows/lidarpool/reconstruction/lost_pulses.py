@@ -210,7 +210,7 @@ class SensorCoverage(NamedTuple):
         max_range_m = 0.0
         numbers = even_indices(sweeps.count, _COVERAGE_SWEEPS).tolist()
         for number in numbers:
-            sweep = sweeps.read(number)
+            sweep = sweeps.read_surfaces(number)
             cells = np.zeros_like(returned, bool)
             ring = sweep.columns["row"]
             azimuth, _ = sweeps.lasers.angles(sweep.points, ring)

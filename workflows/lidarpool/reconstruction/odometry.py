@@ -204,7 +204,8 @@ def _register_sweeps(sweeps: RecordedSweeps) -> Floats:
     import small_gicp
 
     # The first sweeps may be empty or incomplete.
-    sizes = [np.linalg.norm(sweeps.read(number).points, axis=1) for number in range(_FIRST_SWEEPS)]
+    first = [sweeps.read_surfaces(number) for number in range(_FIRST_SWEEPS)]
+    sizes = [np.linalg.norm(sweep.points, axis=1) for sweep in first]
     reach_m = float(np.quantile(np.concatenate(sizes), 0.98)) if any(map(len, sizes)) else 0.0
     voxel_m = float(np.clip(reach_m / _VOXELS_OF_REACH, _MIN_VOXEL_M, _MAX_VOXEL_M))
     voxels = small_gicp.GaussianVoxelMap(voxel_m)
@@ -212,7 +213,7 @@ def _register_sweeps(sweeps: RecordedSweeps) -> Floats:
     poses: list[Floats] = []
     step = np.eye(4)
     for number in range(sweeps.count):
-        sweep = sweeps.read(number)
+        sweep = sweeps.read_surfaces(number)
         pose = poses[-1] @ step if poses else np.eye(4)
         if len(sweep) >= _MIN_POINTS:
             points, _ = small_gicp.preprocess_points(

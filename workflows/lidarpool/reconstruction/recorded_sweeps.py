@@ -5,7 +5,7 @@ Worker processes read them, too. `RecordedSweeps.read` describes the columns.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -16,7 +16,7 @@ import numpy as np
 from lidarsim.columns.column_names import STRENGTHS, TIMES
 from lidarsim.columns.sweep import Sweep
 from lidarsim.errors import LidarError
-from lidarsim.numerics.arrays import AnyArray, Floats
+from lidarsim.numerics.arrays import AnyArray, Bools, Floats
 from lidarsim.numerics.even_samples import even_indices
 from lidarsim.words import plural
 
@@ -25,12 +25,15 @@ from ..clouds.recording import Recording
 from ..clouds.rings import MIN_RINGS, Rings, elevations, summarize_rings
 from ..comparing.lidar4d import WINDOWS, Window
 from ..recordings.opening import open_recording
+from .isolated_returns import IsolatedRanges
 from .labels import labels_of
 from .lasers import RingLasers
+from .vehicle_returns import VehicleReturns
 
 _COLUMNS = {"channel", "class", "object", *STRENGTHS, *TIMES}  # columns that are used
 _GAP_RAD = np.radians(0.5)  # angle between rays over many sweeps, for sensors without rings
 _REFERENCE_SWEEPS = 5  # sweeps from which the rotation is determined
+_ISOLATED_SWEEPS = 12  # sweeps in which isolated returns are counted
 _MAX_START_RAD = np.radians(12)  # maximum angle between the first pulses of rings
 _MIN_AGREEMENT = 0.9  # minimum resultant length of azimuths minus a uniform rotation
 
@@ -95,6 +98,11 @@ class RecordedSweeps:
         Timestamps of the sweeps in seconds, float64 of shape (s,), or None if there are none.
     lasers
         Positions and directions of the lasers of the rings.
+    vehicle
+        Returns from the vehicle that carries the sensor, which are omitted. None if they have not
+        been determined.
+    isolated
+        Range interval in which isolated returns probably come from the air.
     """
 
     source: RecordingSelection | Recording
@@ -102,7 +110,10 @@ class RecordedSweeps:
     point_times: PointTimes | None
     stamps_s: Floats | None
     lasers: RingLasers
+    vehicle: VehicleReturns | None = None
+    isolated: IsolatedRanges = IsolatedRanges()
     _kept: dict[int, Sweep] = field(default_factory=dict)
+    _air: Mapping[int, Bools] = field(default_factory=dict)
 
     @classmethod
     def open(
@@ -198,10 +209,52 @@ class RecordedSweeps:
 
         `numbers` are in ascending order, because bags can only be read from their start.
         """
-        return replace(self, _kept={number: _compact(self.read(number)) for number in numbers})
+        return replace(self, _kept={number: _compact(self.read_all(number)) for number in numbers})
+
+    def with_isolated_ranges(self) -> RecordedSweeps:
+        """Return a copy with the range interval in which most returns are isolated.
+
+        Nothing is found if the sensor has no rings.
+
+        Raises
+        ------
+        LidarError
+            If the recording cannot be read.
+        """
+        if len(self.rings) < MIN_RINGS:
+            return self
+        numbers = even_indices(self.count, _ISOLATED_SWEEPS).tolist()
+        sweeps = (self.read(number) for number in numbers)
+        return replace(self, isolated=IsolatedRanges.from_sweeps(sweeps))
+
+    def without_air(self, air: Mapping[int, Bools]) -> RecordedSweeps:
+        """Return a copy in which `read` omits returns from the air.
+
+        `air` has masks of these returns by sweep number. The masks have shape (n,).
+        """
+        return replace(self, _air=air)
+
+    def read_surfaces(self, number: int) -> Sweep:
+        """Read the returns that are used to estimate poses, as `read` does.
+
+        Returns that probably come from the air are omitted, since they move with the sensor.
+        """
+        return self.isolated.without_isolated(self.read(number))
 
     def read(self, number: int) -> Sweep:
-        """Read the returns of a sweep whose rings can be determined.
+        """Read the returns of a sweep that come from surfaces, with the columns of `read_all`.
+
+        Raises
+        ------
+        LidarError
+            If the recording cannot be read.
+        """
+        sweep = self.read_all(number)
+        air = self._air.get(number)
+        return sweep if air is None else sweep.select(~air)
+
+    def read_all(self, number: int) -> Sweep:
+        """Read the returns of a sweep whose rings can be determined, except those of the vehicle.
 
         The sweep has the following columns. All except `row` are omitted if they are unknown, and
         `time_s` and `start_rad` are also omitted if the points are known to be motion-compensated.
@@ -237,8 +290,10 @@ class RecordedSweeps:
             time_s=None if self.is_compensated else times_s,
             fired_s=times_s if self.is_compensated else None,
         )
-        known = row >= 0
-        return sweep if known.all() or not len(self.rings) else sweep.select(known)
+        known = row >= 0 if len(self.rings) else np.ones(len(row), bool)
+        if self.vehicle is not None and self.vehicle.are_found:
+            known &= ~self.vehicle.contain(sweep)
+        return sweep if known.all() else sweep.select(known)
 
     def _returns(self, number: int) -> Sweep:
         sweep = self.recording[number]

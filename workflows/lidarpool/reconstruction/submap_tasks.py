@@ -12,6 +12,7 @@ from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints, Ints32
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.scene_mesh import SceneMesh
 
+from .air_returns import AirStatistics, find_air_returns
 from .alignment import AlignedSweeps, Alignment, align
 from .charts import SweepImages, TopViewPoints
 from .free_space import find_stationary_points
@@ -152,6 +153,7 @@ BuiltSubmap = tuple[
     HeldOutFrames | None,
     SweepImages | None,
     TopViewPoints,
+    AirStatistics,
 ]
 
 
@@ -202,6 +204,8 @@ def build_submap(task: BuildTask) -> BuiltSubmap:
     """
     submap = task.submap
     sweeps = task.read()
+    air = find_air_returns(sweeps, submap.numbers.tolist())
+    sweeps = replace(sweeps, recorded=sweeps.recorded.without_air(air))
     if task.objects is None:
         stationary = find_stationary_points(sweeps, submap.numbers.tolist())
     else:
@@ -214,7 +218,8 @@ def build_submap(task: BuildTask) -> BuiltSubmap:
     )
     surfels = SubmapSurfels.from_surfels(surface_map, own, stationary, submap.own_numbers)
     top_view = TopViewPoints.from_sweeps(sweeps, stationary, submap.own_numbers, task.drawn_share)
-    return surfels, observations, held_out, frames, images, top_view
+    statistics = AirStatistics.from_sweeps(sweeps, air, submap.own_numbers)
+    return surfels, observations, held_out, frames, images, top_view, statistics
 
 
 def compare_held_out_sweeps(

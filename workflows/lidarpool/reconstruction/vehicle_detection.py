@@ -1,0 +1,145 @@
+"""Find the returns that come from the vehicle that carries the sensor.
+
+The vehicle always has the same range in the same direction. On a level road, so does the ground.
+They differ in what other sweeps observe: after the vehicle has moved, rays pass through the position
+where it was, but the ground is still there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lidarsim.columns.sweep import Sweep
+from lidarsim.numerics.arrays import Bools, Floats, Floats32
+from lidarsim.numerics.even_samples import even_indices
+
+from ..clouds.rings import MIN_RINGS
+from .free_space import RangeImage
+from .odometry import RecordedPoses
+from .recorded_sweeps import RecordedSweeps
+from .vehicle_returns import VEHICLE_COLUMNS, VehicleReturns, vehicle_cells
+
+_SWEEPS = 24  # number of sweeps that are examined
+_MAX_RANGE_M = 5.0  # maximum range of the vehicle
+_MIN_SHARE = 0.5  # minimum share of sweeps with a return from a cell of the vehicle
+_MAX_SPREAD_M = 0.1  # maximum range between the quartiles of a cell
+# Distances over which the vehicle has moved between compared sweeps.
+_MIN_MOVED_M = 2.0
+_MAX_MOVED_M = 12.0
+_MIN_VOTES = 2  # minimum number of rays that pass through a cell of the vehicle
+
+
+def find_vehicle_returns(recorded: RecordedSweeps, poses: RecordedPoses) -> VehicleReturns:
+    """Find the returns that come from the vehicle, given the poses of all sweeps.
+
+    Nothing is found if the sensor is stationary or has no rings.
+
+    Raises
+    ------
+    LidarError
+        If the recording cannot be read.
+    """
+    from scipy.ndimage import binary_propagation
+
+    shape = (recorded.ring_count, VEHICLE_COLUMNS)
+    pairs = _moved_pairs(poses.matrices[:, :3, 3])
+    if len(recorded.rings) < MIN_RINGS or not pairs:
+        return _vehicle(np.zeros(shape, bool), np.full((1, *shape), np.nan, np.float32))
+    near = [_near_returns(recorded, first) for first, _ in pairs]
+    ranges_m = np.stack([_shortest_ranges(sweep, shape) for sweep in near])
+    constant = _is_constant(ranges_m)
+    passing, confirming = np.zeros((2, *shape), np.int64)
+    lasers = recorded.lasers.sort_by_elevation()
+    for (first, second), sweep in zip(pairs, near, strict=True):
+        if not constant.any():
+            break
+        image = RangeImage.from_points(recorded.read(second).points, lasers)
+        cell = vehicle_cells(sweep.points, sweep.columns["row"])
+        moved = np.linalg.inv(poses.matrices[second]) @ poses.matrices[first]
+        passed, confirmed = image.classify(sweep.points @ moved[:3, :3].T + moved[:3, 3])
+        np.add.at(passing, cell, passed)
+        np.add.at(confirming, cell, confirmed)
+    is_passed = constant & (passing >= _MIN_VOTES) & (passing > 2 * confirming)
+    # Other sweeps cannot observe positions that the vehicle itself hides.
+    unknown = constant & (passing >= confirming)
+    vehicle = _vehicle(binary_propagation(is_passed, mask=unknown), ranges_m)
+    if not vehicle.are_found:
+        return vehicle
+    found = sum(int(vehicle.contain(sweep).sum()) for sweep in near)
+    return vehicle._replace(share=found / sum(len(recorded.read(first)) for first, _ in pairs))
+
+
+def _moved_pairs(positions: Floats) -> list[tuple[int, int]]:
+    """Return pairs of sweeps between which the vehicle has moved, alternately forward and backward.
+
+    The positions have shape (s, 3).
+    """
+    pairs = []
+    for index, first in enumerate(even_indices(len(positions), _SWEEPS).tolist()):
+        ways = [range(first + 1, len(positions)), range(first - 1, -1, -1)]
+        found = [_first_moved(positions, first, others) for others in ways]
+        seconds = [second for second in found if second is not None]
+        if seconds:
+            pairs.append((first, seconds[index % len(seconds)]))
+    return pairs
+
+
+def _first_moved(positions: Floats, first: int, others: Sequence[int]) -> int | None:
+    """Return the first of the other sweeps that is far enough away, or None."""
+    for other in others:
+        distance_m = np.linalg.norm(positions[other] - positions[first])
+        if distance_m > _MIN_MOVED_M:
+            return other if distance_m < _MAX_MOVED_M else None
+    return None
+
+
+def _near_returns(recorded: RecordedSweeps, number: int) -> Sweep:
+    """Return the returns of a sweep that may come from the vehicle."""
+    sweep = recorded.read(number)
+    return sweep.select(np.linalg.norm(sweep.points, axis=1) < _MAX_RANGE_M)
+
+
+def _shortest_ranges(sweep: Sweep, shape: tuple[int, int]) -> Floats32:
+    """Return the shortest range in each cell of a sweep, or NaN if there is no return.
+
+    The array has the given shape, (r, c).
+    """
+    shortest = np.full(shape, np.inf, np.float32)
+    cell = vehicle_cells(sweep.points, sweep.columns["row"])
+    np.minimum.at(shortest, cell, np.linalg.norm(sweep.points, axis=1).astype(np.float32))
+    shortest[np.isinf(shortest)] = np.nan
+    return shortest
+
+
+def _is_constant(ranges_m: Floats32) -> Bools:
+    """Mark the cells whose range is the same in most sweeps.
+
+    The ranges have shape (k, r, c).
+    """
+    often = np.isfinite(ranges_m).mean(axis=0) >= _MIN_SHARE
+    constant = np.zeros(often.shape, bool)
+    if often.any():
+        low, high = np.nanquantile(ranges_m[:, often], (0.25, 0.75), axis=0)
+        constant[often] = high - low < _MAX_SPREAD_M
+    return constant
+
+
+def _vehicle(cells: Bools, ranges_m: Floats32) -> VehicleReturns:
+    """Return the ranges of the cells, of which each extends to its neighbors.
+
+    The edges of the vehicle are not in the same cells in all sweeps.
+    """
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    nearest, farthest = np.full((2, *cells.shape), np.inf, np.float32)
+    farthest *= -1
+    if cells.any():
+        low, high = np.nanquantile(ranges_m[:, cells], (0.1, 0.9), axis=0)
+        nearest[cells] = low
+        farthest[cells] = high
+    modes = ("nearest", "wrap")
+    return VehicleReturns(
+        minimum_filter(nearest, 3, mode=modes), maximum_filter(farthest, 3, mode=modes)
+    )
