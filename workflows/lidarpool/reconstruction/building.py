@@ -85,6 +85,7 @@ from .surface_map import Observations
 from .surfels import merge_surfels, surfel_centers, surfel_mesh
 from .vehicle_detection import find_vehicle_returns
 from .vehicle_returns import VehicleReturns
+from .visibility import estimate_visibility
 
 ActorSource = Literal["boxes", "clusters", "none"]
 MIN_SWEEPS = 4
@@ -616,7 +617,7 @@ class _Building:
             "actors_from": self.actors,
             "actors": [actor.figures() for actor in actors],
             "held_out": built.held_out().figures(),
-            "weather": built.weather(),
+            "weather": self._weather(built, model),
             "lidar4d": HeldOutFrames.figures(
                 [part.frames for part in built.parts if part.frames is not None]
             ),
@@ -710,6 +711,16 @@ class _Building:
             )
         return fitted
 
+    def _weather(self, built: _Built, model: SensorModel) -> dict[str, Any] | None:
+        """Return statistics of the weather, or None if there are no returns from the air."""
+        found = built.air_returns()
+        if found is None:
+            return None
+        some = even_indices(len(built.parts), _RESPONSE_SUBMAPS).tolist()
+        observations = [self._load_observations(index) for index in some]
+        wavelength_nm = model.optics.wavelength_nm
+        return found | {"visibility_m": estimate_visibility(observations, wavelength_nm)}
+
     def _figures(self, built: _Built, alignment: Alignment) -> dict[str, Any]:
         """Return statistics of the reconstruction and the drive."""
         path = alignment.poses[:, :3, 3]
@@ -776,7 +787,7 @@ class _Built:
             [part.held_out for part in self.parts if part.held_out is not None]
         )
 
-    def weather(self) -> dict[str, Any] | None:
+    def air_returns(self) -> dict[str, Any] | None:
         """Return statistics of the returns from the air, or None if there are none."""
         parts = [part.air for part in self.parts if part.air.count]
         count = sum(int(part.count) for part in parts)
