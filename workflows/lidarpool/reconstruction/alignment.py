@@ -167,8 +167,9 @@ class Alignment:
             return points, origins
         compensated = np.empty_like(points)
         for rows, step, fractions in self._split_by_step(number, times_s):
-            compensated[rows] = step.compensate(points[rows], fractions)
-            origins[rows] = step.compensate(origins[rows], fractions)
+            compensated[rows], origins[rows] = step.compensate(
+                fractions, points[rows], origins[rows]
+            )
         return compensated, origins
 
     def points_as_fired(self, sweep: Sweep, number: int) -> tuple[Floats, FiringPoses] | None:
@@ -190,7 +191,8 @@ class Alignment:
         offsets = np.zeros((len(sweep), 3))
         turns = np.zeros((len(sweep), 3))
         for rows, step, fractions in self._split_by_step(number, times_s):
-            offsets[rows] = step.compensate(origins[rows], fractions) @ pose[:3, :3].T
+            (moved,) = step.compensate(fractions, origins[rows])
+            offsets[rows] = moved @ pose[:3, :3].T
             turns[rows] = fractions[:, None] * step.rotation
         quaternions = Rotation.from_rotvec(turns).as_quat().T
         poses = FiringPoses(pose[:3, 3], pose[:3, :3], offsets.T, quaternions)
@@ -215,12 +217,15 @@ class Alignment:
         """
         ring = sweep.columns["row"]
         lasers = self.lasers or RingLasers.at_origin(np.zeros(len(self.ring_offsets)))
-        origins = lasers.origins(sweep.points, ring)
-        if not self.ring_offsets.any():
+        is_calibrated = not self.ring_offsets.any()
+        if is_calibrated and lasers.is_at_origin:
+            return sweep.points, np.zeros_like(sweep.points)
+        azimuth, elevation = lasers.angles(sweep.points, ring)
+        origins = lasers.positions(azimuth, elevation, ring)
+        if is_calibrated:
             return sweep.points, origins
         range_offset_m, elevation_offset, azimuth_offset = self.ring_offsets[ring].T
         range_m = np.linalg.norm(sweep.points - origins, axis=1) + range_offset_m
-        azimuth, elevation = lasers.angles(sweep.points, ring)
         directions = unit_vectors(azimuth + azimuth_offset, elevation + elevation_offset)
         return origins + range_m[:, None] * directions, origins
 
@@ -253,6 +258,11 @@ class AlignedSweeps:
     recorded: RecordedSweeps
     alignment: Alignment
     coverage: SensorCoverage
+    _lost: dict[int, tuple[Sweep, Floats]] | None = None
+
+    def with_lost_cached(self) -> AlignedSweeps:
+        """Return a copy that keeps the lost pulses of the sweeps that are read."""
+        return replace(self, _lost={})
 
     @property
     def name(self) -> str:
@@ -291,7 +301,10 @@ class AlignedSweeps:
         The lost pulses are represented by points one meter from their lasers. Pulses that the
         vehicle blocks did not reach the surroundings, so they are omitted.
         """
-        lost, gap_range_m = self._lost_pulses(number)
+        kept = None if self._lost is None else self._lost.get(number)
+        lost, gap_range_m = self._lost_pulses(number) if kept is None else kept
+        if self._lost is not None:
+            self._lost[number] = lost, gap_range_m
         passed = ~self._are_blocked(lost)
         aligned = self.align(lost.select(passed), number)
         returned = self.align(self.recorded.read(number), number)

@@ -127,14 +127,18 @@ def find_stationary_points(sweeps: AlignedSweeps, numbers: Sequence[int]) -> dic
         world = sweeps.read(number).world
         passing = np.zeros(len(world), np.int64)
         confirming = np.zeros(len(world), np.int64)
-        for offset in (*_OFFSETS, *(-offset for offset in _OFFSETS)):
-            if not 0 <= index + offset < len(numbers):
-                continue
-            other = numbers[index + offset]
+        rows = np.arange(len(world))  # points whose result is still open
+        others = [
+            numbers[index + offset]
+            for offset in (*_OFFSETS, *(-offset for offset in _OFFSETS))
+            if 0 <= index + offset < len(numbers)
+        ]
+        for left, other in zip(reversed(range(len(others))), others, strict=True):
             pose = sweeps.alignment.poses[other]
-            passed, confirmed = images[other].classify((world - pose[:3, 3]) @ pose[:3, :3])
-            passing += passed
-            confirming += confirmed
+            passed, confirmed = images[other].classify((world[rows] - pose[:3, 3]) @ pose[:3, :3])
+            passing[rows] += passed
+            confirming[rows] += confirmed
+            rows = rows[np.abs(passing[rows] - confirming[rows]) <= left]
         moved = (passing > confirming) | ((passing >= _MIN_PASSING) & (passing >= confirming))
         masks[number] = ~moved
     return masks

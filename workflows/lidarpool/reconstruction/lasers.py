@@ -180,7 +180,12 @@ class RingLasers:
 
     def ranges(self, points: Floats, ring: Ints) -> Floats:
         """Return the distances between points and their lasers in meters, of shape (n,)."""
-        return np.asarray(np.linalg.norm(points - self.origins(points, ring), axis=1))
+        # The offsets are perpendicular to the beam.
+        x, y, z = points.T
+        squares = np.square(x) + np.square(y) + np.square(z)
+        if not self.is_at_origin:
+            squares -= np.square(self.vertical_m[ring]) + np.square(self.horizontal_m[ring])
+        return np.sqrt(np.maximum(squares, 0))
 
     def positions(self, azimuth: Floats, elevation: Floats, ring: Ints) -> Floats:
         """Return the positions of lasers whose beams have the given angles, of shape (n, 3)."""

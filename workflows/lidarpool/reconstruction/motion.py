@@ -99,13 +99,14 @@ class MotionStep(NamedTuple):
         moved[:3, 3] = share * self.translation
         return moved
 
-    def compensate(self, points: Floats, shares: Floats) -> Floats:
-        """Transform points to the first sensor frame of the step.
+    def compensate(self, shares: Floats, *groups: Floats) -> list[Floats]:
+        """Transform several groups of points to the first sensor frame of the step.
 
-        The points have shape (n, 3) and were fired at the given fractions of the step, of shape
-        (n,).
+        Each group has shape (n, 3), and its points were fired at the given fractions of the step,
+        of shape (n,).
         """
         from scipy.spatial.transform import Rotation
 
-        turned = Rotation.from_rotvec(shares[:, None] * self.rotation).apply(points)
-        return np.asarray(turned + shares[:, None] * self.translation)
+        rotations = Rotation.from_rotvec(shares[:, None] * self.rotation)
+        moved = shares[:, None] * self.translation
+        return [rotations.apply(points) + moved for points in groups]

@@ -275,6 +275,7 @@ def build_surface_map(
     LidarError
         If there are too few stationary points.
     """
+    sweeps = sweeps.with_lost_cached()
     points, outward, labels = _stationary_points(sweeps, stationary)
     if not len(points):
         raise LidarError(
