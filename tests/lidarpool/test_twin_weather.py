@@ -55,8 +55,8 @@ def static_box(name, size, middle):
 
 def ahead(start, height_m=0.0):
     """The track of something that moves as fast as the sensor."""
-    start = np.array([*start, height_m])
-    return Track([0, END_S], [start, start + [SPEED_M_S * END_S, 0, 0]])
+    x, y = start
+    return Track([0, END_S], [[x, y, height_m], [x + SPEED_M_S * END_S, y, height_m]])
 
 
 def street(*actors):

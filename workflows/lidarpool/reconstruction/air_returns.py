@@ -12,7 +12,7 @@ recognized in range intervals in which they are a large part.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -38,10 +38,13 @@ _MIN_CELLS = 4  # minimum number of supporting and passing cells for this ratio
 _MAX_SUPPORT_IN_SKY = 0.1
 _CHANCE = 1.5  # factor of the expected number of cells that support by chance
 _CHANCE_SIGMAS = 2.0  # margin above this number in standard deviations
-_RANGE_EDGES_M = np.geomspace(0.1, 60.0, 36)  # boundaries of range intervals
+_RANGE_EDGES_M = np.append(0, np.geomspace(0.1, 60.0, 36))  # boundaries of range intervals
 _MIN_SHARE = 0.5  # minimum share of isolated returns that come from the air in an interval
 _STATED_RETURNS = 10_000  # returns whose ranges are kept per submap
 _MIN_RETURNS = 6  # minimum number of such returns in an interval
+# All returns in an interval come from the air if this share of them are isolated, and if this share
+# of the isolated returns come from the air.
+_PURE_SHARE = 0.9
 
 
 class _Candidates(NamedTuple):
@@ -59,9 +62,20 @@ class _Candidates(NamedTuple):
         """Concatenate the candidates of several sweeps."""
         return cls(*map(np.concatenate, zip(*parts, strict=True)))
 
-    def select(self, chosen: Bools) -> _Candidates:
-        """Select candidates with a mask."""
-        return _Candidates(*(values[chosen] for values in self))
+    def are_free(self, per_m: Floats) -> Bools:
+        """Mark the candidates at whose positions other sweeps have hardly any returns.
+
+        `per_m` is the mean number of isolated returns per meter in a cell at the range of each
+        candidate. The arrays have shape (k,).
+        """
+        tolerance_m = _TOLERANCE_M + _TOLERANCE_PER_M * self.range_m
+        cells = self.supporting + self.passing + self.empty
+        chance = 2 * tolerance_m * per_m * cells
+        by_chance = _CHANCE * chance + _CHANCE_SIGMAS * np.sqrt(chance)
+        support = self.solid + np.maximum(self.supporting - self.solid - by_chance, 0)
+        tested = self.supporting + self.passing
+        free = (tested >= _MIN_CELLS) & (support <= _MAX_SUPPORT * tested)
+        return np.asarray(free | (support <= _MAX_SUPPORT_IN_SKY * cells))
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +88,8 @@ class _Images:
     nearest_m: Floats32  # (r + 2, c), inf without a return
     farthest_m: Floats32  # (r + 2, c), -inf without a return
     solid_m: Floats32  # (r + 2, c), nearest, inf without a return
-    isolated_m: Floats  # ranges of the isolated returns
+    interval: Ints  # (n,), range intervals of the returns
+    isolated: Bools  # (n,)
 
     @classmethod
     def from_sweep(
@@ -90,7 +105,15 @@ class _Images:
         np.minimum.at(nearest, (rows + 1, columns), single)
         np.maximum.at(farthest, (rows + 1, columns), single)
         np.minimum.at(smooth, (rows[solid] + 1, columns[solid]), single[solid])
-        return cls(nearest, farthest, smooth, range_m[isolated])
+        return cls(nearest, farthest, smooth, _intervals(range_m), isolated)
+
+    def are_near_solid(self, cells: tuple[Ints, Ints], range_m: Floats) -> Bools:
+        """Mark returns next to a smooth surface, such as those from the edges of an object."""
+        near = np.zeros(len(range_m), bool)
+        for above, beside in _NEIGHBORHOOD:
+            solid_m = self.solid_m[cells[0] + 1 + above, (cells[1] + beside) % _COLUMNS]
+            near |= np.abs(solid_m - range_m) < _NEAR_SOLID_M
+        return near
 
     def open_cells(self) -> Ints:
         """Return the number of cells that are not blocked before the end of each interval."""
@@ -98,6 +121,32 @@ class _Images:
         empty = int(np.isneginf(ends_m).sum())
         beyond = len(ends_m) - np.searchsorted(ends_m, _RANGE_EDGES_M[1:])
         return np.asarray(beyond + empty)
+
+
+@dataclass(eq=False)
+class _Counts:
+    """Numbers of returns, isolated returns, and cells that are not blocked, by range interval.
+
+    The last interval contains everything outside the boundaries.
+    """
+
+    returns: Ints = field(default_factory=lambda: np.zeros(len(_RANGE_EDGES_M), np.int64))
+    isolated: Ints = field(default_factory=lambda: np.zeros(len(_RANGE_EDGES_M), np.int64))
+    open_cells: Ints = field(default_factory=lambda: np.zeros(len(_RANGE_EDGES_M), np.int64))
+
+    def add(self, images: _Images) -> None:
+        """Add the returns of a sweep."""
+        count = len(_RANGE_EDGES_M)
+        self.returns += np.bincount(images.interval, minlength=count)
+        self.isolated += np.bincount(images.interval[images.isolated], minlength=count)
+        self.open_cells[:-1] += images.open_cells()
+
+
+class _Found(NamedTuple):
+    """Returns that come from the air."""
+
+    candidates: Bools  # (k,), mask of the candidates
+    intervals: Bools  # (intervals,), range intervals in which all returns do
 
 
 def find_air_returns(sweeps: AlignedSweeps, numbers: Sequence[int]) -> dict[int, Bools]:
@@ -116,22 +165,20 @@ def find_air_returns(sweeps: AlignedSweeps, numbers: Sequence[int]) -> dict[int,
     if not sweeps.recorded.isolated.are_found:
         return {}
     lasers = sweeps.recorded.lasers.sort_by_elevation()
-    counts = [0] * len(numbers)
     parts = []
-    isolated = np.zeros(len(_RANGE_EDGES_M) - 1)
-    open_cells = np.zeros(len(_RANGE_EDGES_M) - 1)
-    for index, sweep, candidates, images in _compare_sweeps(sweeps, numbers, lasers):
-        counts[index] = len(sweep.points)
+    intervals = []
+    counts = _Counts()
+    for candidates, images in _compare_sweeps(sweeps, numbers, lasers):
         parts.append(candidates)
-        isolated += np.histogram(images.isolated_m, _RANGE_EDGES_M)[0]
-        open_cells += images.open_cells()
-    found = _from_air(_Candidates.concatenate(parts), isolated, open_cells)
+        intervals.append(images.interval.astype(np.int8))
+        counts.add(images)
+    found = _from_air(_Candidates.concatenate(parts), counts)
     sizes = [len(part.rows) for part in parts]
     masks = {}
-    for number, count, part, chosen in zip(
-        numbers, counts, parts, np.split(found, np.cumsum(sizes)[:-1]), strict=True
+    for number, part, chosen, interval in zip(
+        numbers, parts, np.split(found.candidates, np.cumsum(sizes)[:-1]), intervals, strict=True
     ):
-        mask = np.zeros(count, bool)
+        mask = found.intervals[interval]
         mask[part.rows[chosen]] = True
         masks[number] = mask
     return masks
@@ -139,44 +186,32 @@ def find_air_returns(sweeps: AlignedSweeps, numbers: Sequence[int]) -> dict[int,
 
 def _compare_sweeps(
     sweeps: AlignedSweeps, numbers: Sequence[int], lasers: RingLasers
-) -> Iterator[tuple[int, AlignedSweep, _Candidates, _Images]]:
-    """Yield the index, content, candidates and images of each sweep.
+) -> Iterator[tuple[_Candidates, _Images]]:
+    """Yield the candidates and images of each sweep.
 
     Only the images of sweeps that are compared with the current one are in memory.
     """
     reach = max(_OFFSETS)
-    kept: dict[int, tuple[AlignedSweep, Bools, _Images]] = {}
+    kept: dict[int, tuple[AlignedSweep, _Images]] = {}
     for index in range(len(numbers)):
         for other in range(index, min(index + reach + 1, len(numbers))):
             if other not in kept:
                 recorded = sweeps.recorded.read(numbers[other])
-                isolated, solid = isolated_and_solid(recorded)
                 sweep = sweeps.align(recorded, numbers[other])
-                images = _Images.from_sweep(sweep, lasers, isolated, solid)
-                kept[other] = sweep, isolated, images
+                images = _Images.from_sweep(sweep, lasers, *isolated_and_solid(recorded))
+                kept[other] = sweep, images
         kept.pop(index - reach - 1, None)
-        sweep, isolated, images = kept[index]
-        rows = np.flatnonzero(isolated)
-        (row, column), _, range_m = locate(sweep.points[rows], lasers, _COLUMNS)
-        chosen = ~_is_near_solid(images, row, column, range_m)
-        chosen &= range_m < _RANGE_EDGES_M[-1]
+        sweep, images = kept[index]
+        rows = np.flatnonzero(images.isolated)
+        cells, _, range_m = locate(sweep.points[rows], lasers, _COLUMNS)
+        chosen = ~images.are_near_solid(cells, range_m) & (range_m < _RANGE_EDGES_M[-1])
         compared = [
-            (kept[index + offset][2], sweeps.alignment.poses[numbers[index + offset]])
+            (kept[index + offset][1], sweeps.alignment.poses[numbers[index + offset]])
             for offset in _OFFSETS
             if 0 <= index + offset < len(numbers)
         ]
-        world = sweep.world[rows[chosen]]
-        cells = _count_cells(compared, lasers, world)
-        yield index, sweep, _Candidates(rows[chosen], range_m[chosen], *cells), images
-
-
-def _is_near_solid(images: _Images, row: Ints, column: Ints, range_m: Floats) -> Bools:
-    """Mark returns next to a smooth surface of the same sweep, such as edges of an object."""
-    near = np.zeros(len(range_m), bool)
-    for above, beside in _NEIGHBORHOOD:
-        solid_m = images.solid_m[row + 1 + above, (column + beside) % _COLUMNS]
-        near |= np.abs(solid_m - range_m) < _NEAR_SOLID_M
-    return near
+        counted = _count_cells(compared, lasers, sweep.world[rows[chosen]])
+        yield _Candidates(rows[chosen], range_m[chosen], *counted), images
 
 
 def _count_cells(
@@ -208,39 +243,38 @@ def _count_cells(
     return solid, np.maximum(solid, supporting), passing, empty
 
 
-def _from_air(candidates: _Candidates, isolated: AnyFloats, open_cells: AnyFloats) -> Bools:
-    """Mark the candidates that come from the air.
+def _intervals(range_m: Floats) -> Ints:
+    """Return the range intervals of returns, of which the last is outside the boundaries."""
+    interval = np.searchsorted(_RANGE_EDGES_M, range_m, side="right") - 1
+    return np.where(interval < 0, len(_RANGE_EDGES_M) - 1, interval)
 
-    `isolated` and `open_cells` are the numbers of isolated returns and of cells that are not
-    blocked, by range interval. The mask has shape (k,).
-    """
-    interval = (np.searchsorted(_RANGE_EDGES_M, candidates.range_m, side="right") - 1).clip(min=0)
-    per_m = isolated / np.maximum(open_cells, 1) / np.diff(_RANGE_EDGES_M)
-    tolerance_m = _TOLERANCE_M + _TOLERANCE_PER_M * candidates.range_m
-    cells = candidates.supporting + candidates.passing + candidates.empty
-    chance = 2 * tolerance_m * per_m[interval] * cells
-    by_chance = _CHANCE * chance + _CHANCE_SIGMAS * np.sqrt(chance)
-    others = candidates.supporting - candidates.solid
-    support = candidates.solid + np.maximum(others - by_chance, 0)
-    tested = candidates.supporting + candidates.passing
-    free = (tested >= _MIN_CELLS) & (support <= _MAX_SUPPORT * tested)
-    free |= support <= _MAX_SUPPORT_IN_SKY * cells
+
+def _from_air(candidates: _Candidates, counts: _Counts) -> _Found:
+    """Find the returns that come from the air."""
+    interval = _intervals(candidates.range_m)
+    isolated = counts.isolated
+    widths_m = np.append(np.diff(_RANGE_EDGES_M), np.inf)
+    per_m = isolated / np.maximum(counts.open_cells, 1) / widths_m
+    free = candidates.are_free(per_m[interval])
     count = np.bincount(interval[free], minlength=len(isolated))
     is_airy = count >= _MIN_SHARE * isolated
     is_enough = isolated >= _MIN_RETURNS
     # The density of returns from the air decreases with the range, so the first interval in which
     # most isolated returns come from surfaces is the end.
-    stop = int(np.argmax(np.append(is_enough & ~is_airy, True)))
+    stop = int(np.argmax(np.append(is_enough[:-1] & ~is_airy[:-1], True)))
     starts = np.flatnonzero(is_enough[:stop])
     if not len(starts) or _RANGE_EDGES_M[starts[0]] > MAX_START_M:
-        return np.zeros(len(free), bool)
-    return np.asarray(free & (interval < stop) & is_airy[interval])
+        stop = 0
+    is_airy &= np.arange(len(isolated)) < stop
+    is_pure = is_airy & is_enough & (count >= _PURE_SHARE * isolated)
+    is_pure &= isolated >= _PURE_SHARE * counts.returns
+    return _Found(free & is_airy[interval], is_pure)
 
 
 class AirStatistics(NamedTuple):
     """Returns from the air in the sweeps of a submap."""
 
-    count: int  # number of returns from the air
+    returns: int  # number of returns from the air
     ranges_m: AnyFloats  # (k,), ranges of some of them
 
     @classmethod

@@ -789,8 +789,8 @@ class _Built:
 
     def air_returns(self) -> dict[str, Any] | None:
         """Return statistics of the returns from the air, or None if there are none."""
-        parts = [part.air for part in self.parts if part.air.count]
-        count = sum(int(part.count) for part in parts)
+        parts = [part.air for part in self.parts if part.air.returns]
+        count = sum(int(part.returns) for part in parts)
         if not count:
             return None
         total = count + sum(int(part.surfels.points.sum()) for part in self.parts)

@@ -29,6 +29,7 @@ _MIN_STEP_RAD = np.radians(0.02)  # Closer returns belong to the same pulse.
 _RANGE_EDGES_M = np.array([0, 0.5, 0.7, 1, 1.4, 2, 2.8, 4, 5.6, 8, 11, 16, 22, 32])
 _MIN_RETURNS = 8  # minimum number of isolated returns in an interval that contains weather
 _MIN_SHARE = 0.4  # minimum share of isolated returns in such an interval
+_MIN_FIRST_SHARE = 0.8  # minimum share in the first such interval
 # Maximum start of the first such interval. At longer ranges, most returns may come from leaves.
 MAX_START_M = 2.8
 
@@ -99,7 +100,8 @@ class IsolatedRanges(NamedTuple):
             total += np.histogram(range_m, _RANGE_EDGES_M)[0]
             isolated += np.histogram(range_m[is_isolated(sweep)], _RANGE_EDGES_M)[0]
         found = (isolated >= _MIN_RETURNS) & (isolated >= _MIN_SHARE * total)
-        starts = np.flatnonzero(found & (_RANGE_EDGES_M[:-1] <= MAX_START_M))
+        is_first = found & (isolated >= _MIN_FIRST_SHARE * total)
+        starts = np.flatnonzero(is_first & (_RANGE_EDGES_M[:-1] <= MAX_START_M))
         if not len(starts):
             return cls()
         length = int(np.argmin(np.append(found[starts[0] :], False)))
@@ -116,3 +118,6 @@ class IsolatedRanges(NamedTuple):
             return sweep
         near = np.linalg.norm(sweep.points, axis=1) < self.stop_m
         return sweep.select(~(near & is_isolated(sweep)))
+
+
+NO_RANGES = IsolatedRanges()

@@ -25,7 +25,7 @@ from ..clouds.recording import Recording
 from ..clouds.rings import MIN_RINGS, Rings, elevations, summarize_rings
 from ..comparing.lidar4d import WINDOWS, Window
 from ..recordings.opening import open_recording
-from .isolated_returns import IsolatedRanges
+from .isolated_returns import NO_RANGES, IsolatedRanges
 from .labels import labels_of
 from .lasers import RingLasers
 from .vehicle_returns import VehicleReturns
@@ -111,7 +111,7 @@ class RecordedSweeps:
     stamps_s: Floats | None
     lasers: RingLasers
     vehicle: VehicleReturns | None = None
-    isolated: IsolatedRanges = IsolatedRanges()
+    isolated: IsolatedRanges = NO_RANGES
     _kept: dict[int, Sweep] = field(default_factory=dict)
     _air: Mapping[int, Bools] = field(default_factory=dict)
 

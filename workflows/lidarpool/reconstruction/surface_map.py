@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsim.errors import LidarError
-from lidarsim.numerics.arrays import AnyFloats, Bools, Floats, Integers, Ints
+from lidarsim.numerics.arrays import AnyArray, AnyFloats, Bools, Floats, Integers, Ints
 from lidarsim.numerics.even_samples import even_indices
 from raybeam import RayCaster
 
@@ -284,6 +284,7 @@ def build_surface_map(
     name = Path(sweeps.name).name
     gap_rad = sweeps.recorded.gap_rad
     surfels = Surfels.from_points(name, points, outward, voxel_m, gap_rad, labels)
+    del points, outward, labels  # before other arrays are created, to save memory
     dark_points, dark_outward = _lost_positions(sweeps, stationary)
     if Surfels.are_enough(dark_points, voxel_m):
         dark = Surfels.from_points(name, dark_points, dark_outward, voxel_m, gap_rad)
@@ -359,10 +360,21 @@ def _stationary_points(
         outward.append((sweep.origins[kept] - sweep.world[kept]).astype(np.float32))
         if sweep.labels is not None:
             labels.append(sweep.labels[kept])
-    world = np.concatenate(positions)
+    world = _join(positions)
     # A sweep without points may lack columns.
     labeled = sum(map(len, labels)) == len(world)
-    return world, np.concatenate(outward), np.concatenate(labels) if labels and labeled else None
+    return world, _join(outward), _join(labels) if labels and labeled else None
+
+
+def _join(parts: list[AnyArray]) -> AnyArray:
+    """Concatenate arrays and empty the list, so that only one copy is in memory."""
+    joined = np.empty((sum(map(len, parts)), *parts[0].shape[1:]), parts[0].dtype)
+    stop = len(joined)
+    while parts:
+        part = parts.pop()
+        joined[stop - len(part) : stop] = part
+        stop -= len(part)
+    return joined
 
 
 def _closest_ranges(sweeps: AlignedSweeps, stationary: Mapping[int, Bools]) -> tuple[Ints, Floats]:

@@ -1,8 +1,8 @@
 """Find the returns that come from the vehicle that carries the sensor.
 
 The vehicle always has the same range in the same direction. On a level road, so does the ground.
-They differ in what other sweeps observe: after the vehicle has moved, rays pass through the position
-where it was, but the ground is still there.
+They differ in what other sweeps observe: after the vehicle has moved, rays pass through its former
+position, but the ground is still there.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from lidarsim.numerics.arrays import Bools, Floats, Floats32
 from lidarsim.numerics.even_samples import even_indices
 
 from ..clouds.rings import MIN_RINGS
+from .alignment import transform_points
 from .free_space import RangeImage
 from .odometry import RecordedPoses
 from .recorded_sweeps import RecordedSweeps
@@ -28,6 +29,7 @@ _MAX_SPREAD_M = 0.1  # maximum range between the quartiles of a cell
 # Distances over which the vehicle has moved between compared sweeps.
 _MIN_MOVED_M = 2.0
 _MAX_MOVED_M = 12.0
+_DILATION = 5  # size of the neighborhood of a cell
 _MIN_VOTES = 2  # minimum number of rays that pass through a cell of the vehicle
 
 
@@ -50,15 +52,13 @@ def find_vehicle_returns(recorded: RecordedSweeps, poses: RecordedPoses) -> Vehi
     near = [_near_returns(recorded, first) for first, _ in pairs]
     ranges_m = np.stack([_shortest_ranges(sweep, shape) for sweep in near])
     constant = _is_constant(ranges_m)
+    if not constant.any():
+        return _vehicle(constant, ranges_m)
     passing, confirming = np.zeros((2, *shape), np.int64)
-    lasers = recorded.lasers.sort_by_elevation()
     for (first, second), sweep in zip(pairs, near, strict=True):
-        if not constant.any():
-            break
-        image = RangeImage.from_points(recorded.read(second).points, lasers)
         cell = vehicle_cells(sweep.points, sweep.columns["row"])
         moved = np.linalg.inv(poses.matrices[second]) @ poses.matrices[first]
-        passed, confirmed = image.classify(sweep.points @ moved[:3, :3].T + moved[:3, 3])
+        passed, confirmed = _observe(recorded, second, transform_points(sweep.points, moved))
         np.add.at(passing, cell, passed)
         np.add.at(confirming, cell, confirmed)
     is_passed = constant & (passing >= _MIN_VOTES) & (passing > 2 * confirming)
@@ -69,6 +69,15 @@ def find_vehicle_returns(recorded: RecordedSweeps, poses: RecordedPoses) -> Vehi
         return vehicle
     found = sum(int(vehicle.contain(sweep).sum()) for sweep in near)
     return vehicle._replace(share=found / sum(len(recorded.read(first)) for first, _ in pairs))
+
+
+def _observe(recorded: RecordedSweeps, number: int, points: Floats) -> tuple[Bools, Bools]:
+    """Mark points through which rays of a sweep passed, and those that the sweep confirms.
+
+    The points are in the sensor frame of the sweep, and have shape (n, 3).
+    """
+    lasers = recorded.lasers.sort_by_elevation()
+    return RangeImage.from_points(recorded.read(number).points, lasers).classify(points)
 
 
 def _moved_pairs(positions: Floats) -> list[tuple[int, int]]:
@@ -131,15 +140,9 @@ def _vehicle(cells: Bools, ranges_m: Floats32) -> VehicleReturns:
 
     The edges of the vehicle are not in the same cells in all sweeps.
     """
-    from scipy.ndimage import maximum_filter, minimum_filter
+    from scipy.ndimage import maximum_filter
 
-    nearest, farthest = np.full((2, *cells.shape), np.inf, np.float32)
-    farthest *= -1
+    farthest = np.full(cells.shape, -np.inf, np.float32)
     if cells.any():
-        low, high = np.nanquantile(ranges_m[:, cells], (0.1, 0.9), axis=0)
-        nearest[cells] = low
-        farthest[cells] = high
-    modes = ("nearest", "wrap")
-    return VehicleReturns(
-        minimum_filter(nearest, 3, mode=modes), maximum_filter(farthest, 3, mode=modes)
-    )
+        farthest[cells] = np.nanquantile(ranges_m[:, cells], 0.9, axis=0)
+    return VehicleReturns(maximum_filter(farthest, _DILATION, mode=("nearest", "wrap")))

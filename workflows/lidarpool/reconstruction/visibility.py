@@ -2,8 +2,8 @@
 
 Air with the extinction coefficient α attenuates the return from a surface at the range r by the
 factor exp(-2 α r). Each surface is compared with itself, so its reflectance does not matter. The
-backscatter is not used, because the energy of returns from the air depends on optics that recordings
-do not describe.
+backscatter is not used, because the energy of returns from the air depends on the optics of the
+sensor, which recordings do not describe.
 """
 
 from __future__ import annotations

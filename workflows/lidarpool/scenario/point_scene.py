@@ -41,6 +41,7 @@ _EXTENT = 0.85
 _MAX_HALF_VOXELS = 3
 _SAMPLE = 20_000  # number of points from which the spacing is estimated
 _NEAREST = 9  # a point and its eight neighbors on a square grid
+_BLOCK_VOXELS = 1 << 17  # voxels whose points are averaged together
 _MAX_VOXELS = 1 << 62  # voxels are numbered with 64-bit integers
 CLASS_MATERIAL = "class "  # followed by the class number in the material names of surfels
 _GRAY = "have the mean color of their neighbors, or are gray"  # used in notes
@@ -328,10 +329,12 @@ class PointVoxels:
             raise LidarError(
                 f"{path} is too large for voxels of {voxel_m:.3g} m. Increase `voxel_m`."
             )
-        # The minimum x, y and z are at the center of the first voxel.
-        cells = np.floor((positions - lower) / voxel_m + 0.5).astype(np.int64)
-        _, ny, nz = (int(span) + 1 for span in spans)
-        numbers = (cells[:, 0] * ny + cells[:, 1]) * nz + cells[:, 2]
+        numbers = np.zeros(len(positions), np.int64)
+        for axis, span in enumerate(spans):  # one axis at a time, to save memory
+            # The minimum x, y and z are at the center of the first voxel.
+            cells = np.floor((positions[:, axis] - lower[axis]) / voxel_m + 0.5)
+            numbers *= int(span) + 1
+            numbers += cells.astype(np.int64)
         order = np.argsort(numbers, kind="stable")
         ordered = numbers[order]
         starts = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
@@ -342,8 +345,14 @@ class PointVoxels:
 
         `values` has shape (n, k), and the means have shape (v, k).
         """
-        sums = np.add.reduceat(values[self.order].astype(np.float64), self.starts, axis=0)
-        means: Floats = sums / self.counts[:, None]
+        means = np.empty((len(self.starts), *values.shape[1:]))
+        for start in range(0, len(self.starts), _BLOCK_VOXELS):  # blocks, to save memory
+            block = slice(start, start + _BLOCK_VOXELS)
+            first = int(self.starts[start])
+            stop = first + int(self.counts[block].sum())
+            some = values[self.order[first:stop]].astype(np.float64)
+            means[block] = np.add.reduceat(some, self.starts[block] - first, axis=0)
+        means /= self.counts[:, None]
         return means
 
     def known_means(self, values: AnyArray) -> Floats:
