@@ -40,7 +40,7 @@ from lidarpool.reconstruction.building import DEFAULT_VOXEL_M
 from lidarpool.reconstruction.free_space import find_stationary_points
 from lidarpool.reconstruction.held_out import HeldOutRays
 from lidarpool.reconstruction.lost_pulses import SensorCoverage
-from lidarpool.reconstruction.odometry import RecordedPoses, find_poses
+from lidarpool.reconstruction.odometry import RecordedPoses
 from lidarpool.reconstruction.range_noise import RingNeighbors, estimate_range_noise
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.reconstruction.submap_tasks import (
@@ -49,6 +49,7 @@ from lidarpool.reconstruction.submap_tasks import (
     compare_held_out_sweeps,
 )
 from lidarpool.reconstruction.submaps import merge_alignments, split_into_submaps
+from lidarpool.reconstruction.vehicle_detection import find_poses_and_vehicle
 from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import Bools, Floats, Ints
@@ -289,11 +290,11 @@ def measure(name: str, root: Path, rules: tuple[str, ...]) -> list[dict[str, Any
     source = SOURCES[name]
     rows = []
     whole = source.open(root / source.repository)
-    coverage = SensorCoverage.from_sweeps(RecordedSweeps.from_recording(whole))
+    whole_sweeps = RecordedSweeps.from_recording(whole)
     for part, chosen in source.parts.items():
         recording = part_of(whole, chosen)
-        recorded = RecordedSweeps.from_recording(recording)
-        poses = find_poses(recorded, None)
+        poses, recorded = find_poses_and_vehicle(RecordedSweeps.from_recording(recording), None)
+        coverage = SensorCoverage.from_sweeps(replace(whole_sweeps, vehicle=recorded.vehicle))
         for rule in rules:
             mapped = mapped_sweeps(recorded.count, rule)
             if len(mapped) == recorded.count:

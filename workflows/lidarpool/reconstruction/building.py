@@ -62,7 +62,7 @@ from .lost_pulses import SensorCoverage, firings_per_turn
 from .motion import Motion
 from .moving_objects import LabeledTracks
 from .moving_rays import MovingRays, StationaryMasks
-from .odometry import RecordedPoses, find_poses
+from .odometry import RecordedPoses
 from .porosity import Porosity
 from .published_metrics import HeldOutFrames
 from .range_noise import RangeNoise, estimate_range_noise
@@ -83,7 +83,7 @@ from .submap_tasks import (
 from .submaps import AlignedSubmap, Submap, merge_alignments, split_into_submaps
 from .surface_map import Observations
 from .surfels import merge_surfels, surfel_centers, surfel_mesh
-from .vehicle_detection import find_vehicle_returns
+from .vehicle_detection import find_poses_and_vehicle
 from .vehicle_returns import VehicleReturns
 from .visibility import estimate_visibility
 
@@ -508,15 +508,9 @@ class _Building:
         Return the sweeps without the returns from the vehicle.
         """
 
-        def find() -> tuple[RecordedPoses, VehicleReturns, IsolatedRanges]:
-            recorded = self.recorded.with_isolated_ranges()
-            poses = find_poses(recorded, trajectory)
-            vehicle = find_vehicle_returns(recorded, poses)
-            if vehicle.are_found:
-                recorded = replace(recorded, vehicle=vehicle).with_isolated_ranges()
-                # Returns from the vehicle look as if it did not move.
-                poses = poses if poses.are_given else find_poses(recorded, trajectory)
-            return poses, vehicle, recorded.isolated
+        def find() -> tuple[RecordedPoses, VehicleReturns | None, IsolatedRanges]:
+            poses, recorded = find_poses_and_vehicle(self.recorded, trajectory)
+            return poses, recorded.vehicle, recorded.isolated
 
         poses, vehicle, isolated = self.steps.run_once(_POSES, find)
         poses = poses._replace(

@@ -8,6 +8,8 @@ position, but the ground is still there.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -18,7 +20,7 @@ from lidarsim.numerics.even_samples import even_indices
 from ..clouds.rings import MIN_RINGS
 from .alignment import transform_points
 from .free_space import RangeImage
-from .odometry import RecordedPoses
+from .odometry import RecordedPoses, find_poses
 from .recorded_sweeps import RecordedSweeps
 from .vehicle_returns import VEHICLE_COLUMNS, VehicleReturns, vehicle_cells
 
@@ -31,6 +33,29 @@ _MIN_MOVED_M = 2.0
 _MAX_MOVED_M = 12.0
 _DILATION = 5  # size of the neighborhood of a cell
 _MIN_VOTES = 2  # minimum number of rays that pass through a cell of the vehicle
+
+
+def find_poses_and_vehicle(
+    recorded: RecordedSweeps, trajectory: Path | None
+) -> tuple[RecordedPoses, RecordedSweeps]:
+    """Find the poses of all sweeps, and the returns that do not come from the scene.
+
+    Return the poses and the sweeps without the returns from the vehicle.
+
+    Raises
+    ------
+    LidarError
+        If the recording cannot be read, or in the cases of `find_poses`.
+    """
+    recorded = recorded.with_isolated_ranges()
+    poses = find_poses(recorded, trajectory)
+    vehicle = find_vehicle_returns(recorded, poses)
+    recorded = replace(recorded, vehicle=vehicle)
+    if vehicle.are_found:
+        recorded = recorded.with_isolated_ranges()
+        # Returns from the vehicle look as if it did not move.
+        poses = poses if poses.are_given else find_poses(recorded, trajectory)
+    return poses, recorded
 
 
 def find_vehicle_returns(recorded: RecordedSweeps, poses: RecordedPoses) -> VehicleReturns:
