@@ -81,6 +81,12 @@ class BuildTask(SubmapTask):
         recorded = self.recorded.with_cached(self.submap.numbers.tolist())
         return AlignedSweeps(recorded, self.alignment, self.coverage)
 
+    def read_without_air(self) -> tuple[AlignedSweeps, dict[int, Bools]]:
+        """Read the sweeps without the returns from the air, and return the masks of these."""
+        sweeps = self.read()
+        air = find_air_returns(sweeps, self.submap.numbers.tolist())
+        return replace(sweeps, recorded=sweeps.recorded.without_air(air)), air
+
 
 @dataclass(frozen=True, eq=False)
 class MotionTask(BuildTask):
@@ -177,7 +183,7 @@ def find_moving_rays(
     Returns the masks of the stationary points of all sweeps, and those that follow from the sweeps
     that form the map alone. The rays are those of the submap's own sweeps, in the same order.
     """
-    sweeps = task.read()
+    sweeps, _ = task.read_without_air()
     numbers = task.submap.numbers
     own = task.submap.own_numbers
     labels = task.labels or LabeledTracks((), ())
@@ -203,9 +209,7 @@ def build_submap(task: BuildTask) -> BuiltSubmap:
         If there are too few stationary points.
     """
     submap = task.submap
-    sweeps = task.read()
-    air = find_air_returns(sweeps, submap.numbers.tolist())
-    sweeps = replace(sweeps, recorded=sweeps.recorded.without_air(air))
+    sweeps, air = task.read_without_air()
     if task.objects is None:
         stationary = find_stationary_points(sweeps, submap.numbers.tolist())
     else:
