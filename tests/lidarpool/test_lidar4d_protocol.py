@@ -389,6 +389,8 @@ def held_out(number, points, pose, moved, simulated):
         intensity=np.full(len(points), 100.0),
         simulated_intensity=np.full(len(points), 100.0),
         standing=np.ones(len(points), bool),
+        moving=np.zeros(len(points), bool),
+        on_object=np.zeros(len(points), bool),
     )
     return pulses, rays
 

@@ -290,6 +290,7 @@ def test_moving_objects_are_simulated_in_held_out_sweeps(place):
     (actor,) = place.figures["actors"]
     np.testing.assert_allclose(actor["size_m"], CAR, atol=0.01)
     assert "1 moving object from boxes" in repr(place)
+    assert place.figures["vehicle_share"] == 0, "a car that passes at close range moves"
 
 
 def test_surfaces_are_as_bright_as_they_were(place):
@@ -401,6 +402,7 @@ def test_a_twin_simulates_all_sweeps_with_energies_as_recorded(bag):
     assert max(ratios) < 1.25 * min(ratios), ratios
 
 
+@pytest.mark.extended
 def test_intensities_that_are_compensated_for_range_are_found(drive, survey):
     opened = open_recording(drive, name="drive")
 

@@ -255,8 +255,14 @@ def test_slots_are_counted_right_after_the_first_worker_of_a_stolen_task_has_lef
     with balance(client, [a, b], min=2) as group:
         tasks = [a.submit(hold) for _ in range(8)]
         wait_until(lambda: len(workers["a"].processing) == len(workers["b"].processing) == 4)
-        client.run_on_scheduler(move_a_waiting_task)
-        wait_until(lambda: len(workers["b"].processing) == 5)
+
+        def b_has_another():
+            # A worker that has not received the task yet refuses to hand it over.
+            if len(workers["b"].processing) == 4:
+                client.run_on_scheduler(move_a_waiting_task)
+            return len(workers["b"].processing) == 5
+
+        wait_until(b_has_another)
         released.set()
         assert client.gather(tasks) == [True] * 8
         leave(client, "a")

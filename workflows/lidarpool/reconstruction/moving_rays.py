@@ -83,8 +83,8 @@ class MovingRays(NamedTuple):
     def slices(self) -> dict[int, slice]:
         """Return the rows of each sweep, keyed by sweep number."""
         numbers, starts = np.unique(self.sweep, return_index=True)
-        stops = [*starts[1:].tolist(), len(self.sweep)]
-        bounds = zip(numbers.tolist(), starts.tolist(), stops, strict=True)
+        stops = np.append(starts, len(self.sweep))[1:]
+        bounds = zip(numbers.tolist(), starts.tolist(), stops.tolist(), strict=True)
         return {number: slice(start, stop) for number, start, stop in bounds}
 
 

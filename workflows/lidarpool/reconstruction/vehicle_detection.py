@@ -26,7 +26,7 @@ from .vehicle_returns import VEHICLE_COLUMNS, VehicleReturns, vehicle_cells
 
 _SWEEPS = 24  # number of sweeps that are examined
 _MAX_RANGE_M = 5.0  # maximum range of the vehicle
-_MIN_SHARE = 0.5  # minimum share of sweeps with a return from a cell of the vehicle
+_MIN_SHARE = 0.8  # minimum share of sweeps with a return from a cell of the vehicle
 _MAX_SPREAD_M = 0.1  # maximum range between the quartiles of a cell
 # Distances over which the vehicle has moved between compared sweeps.
 _MIN_MOVED_M = 2.0

@@ -66,9 +66,9 @@ class Beams:
     intensity_factor: Floats = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
-        if not np.size(self.intensity_factor):
-            object.__setattr__(self, "intensity_factor", np.ones(np.size(self.elevation)))
         count = as_array("Beams.elevation", self.elevation).size
+        if not as_array("Beams.intensity_factor", self.intensity_factor).size:
+            object.__setattr__(self, "intensity_factor", np.ones(count))
         if not 1 <= count <= MAX_CHANNELS:
             raise LidarError(f"A sensor must have 1 to {MAX_CHANNELS} beams, but has {count}.")
         for name, shape in (
