@@ -79,8 +79,49 @@ def test_unless_they_say_otherwise(client):
     assert mixed == ("B-0", "A-0")
 
 
+async def names_from_coroutine(client):
+    """Names of the workers of tasks that a library submits in the event loop."""
+    futures = client.map(worker_name, range(8), pure=False)
+    [value] = client.persist([dask.delayed(worker_name)("persisted")])
+    with dask.annotate(resources={}):
+        anywhere = client.map(worker_name, range(20), pure=False)
+    inside = {*await client.gather(futures), await client.compute(value)}
+    return inside, set(await client.gather(anywhere))
+
+
+def use_coroutine(**options):
+    client = get_client()
+    return client.sync(names_from_coroutine, client, **options)
+
+
+async def name_of_worker(client, worker):
+    return await client.submit(worker_name, workers=[worker], pure=False)
+
+
+def submit_to_worker(worker):
+    client = get_client()
+    return client.sync(name_of_worker, client, worker)
+
+
+def test_tasks_that_a_coroutine_of_the_task_submits(client):
+    part = Partition("A", client)
+    for options in ({}, {"asynchronous": False}):
+        inside, anywhere = part.submit(use_coroutine, **options).result(LONG_S)
+        assert inside == {"A-0"}
+        assert anywhere - {"A-0"}
+    for worker in ("plain", "A-0"):  # the second one takes the slot of the waiting task
+        assert part.submit(submit_to_worker, worker).result(LONG_S) == worker
+    foreman = part.submit(Foreman, actor=True).result(LONG_S)
+    assert foreman.from_coroutine().result(LONG_S) == {"A-0"}
+    outside, *_ = client.submit(use_coroutine, pure=False).result(LONG_S)
+    assert len(outside) > 1
+
+
 class Foreman:
     """An actor whose method submits tasks."""
+
+    def from_coroutine(self):
+        return use_coroutine()[0]
 
     def places(self, count):
         client = get_client()

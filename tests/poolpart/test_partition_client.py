@@ -8,6 +8,7 @@ import dask
 import pytest
 from distributed import (
     Client,
+    Event,
     as_completed,
     default_client,
     get_client,
@@ -16,6 +17,7 @@ from distributed import (
     worker_client,
 )
 from distributed.diagnostics.plugin import SchedulerPlugin
+from tests.daemons import wait_until
 from tests.poolpart.helpers import LONG_S, addresses, worker_name
 
 from poolpart import Partition, Pipe, Pool, PoolError
@@ -189,6 +191,73 @@ def test_coroutines_use_it(client, a):
     assert result in A_WORKERS
     assert value == 5
     assert workers == members(client)
+
+
+# -- results that computations share -------------------------------------------------------
+
+
+def chain_of(name, count=8):
+    """Return two lists of delayed values that depend on the same named values of their workers."""
+    shared = [dask.delayed(worker_name)(n, dask_key_name=f"{name}-{n}") for n in range(count)]
+    return [
+        [dask.delayed(str)(x, dask_key_name=f"{name}-{end}-{n}") for n, x in enumerate(shared)]
+        for end in ("first", "second")
+    ]
+
+
+def test_released_results_are_computed_again_in_the_partition(client, a, b):
+    first, second = chain_of("shared")
+    held = client.compute(first, optimize_graph=False)
+    assert {*client.gather(held)} > A_WORKERS
+    again = a.as_client().compute(second, optimize_graph=False)
+    assert {*client.gather(again)} <= A_WORKERS
+    del again
+    wait_until(lambda: "shared-second-0" not in client.cluster.scheduler.tasks)
+    again = b.as_client().compute(second, optimize_graph=False)
+    assert {*client.gather(again)} == {"B-0"}
+    del again
+    wait_until(lambda: "shared-second-0" not in client.cluster.scheduler.tasks)
+    again = client.compute(second, optimize_graph=False)  # and the other way around
+    assert {*client.gather(again)} > A_WORKERS
+    assert {*client.gather(held)} > A_WORKERS
+
+
+def test_arrays_that_a_plain_client_holds_in_part(client, a, ran_on):
+    da = pytest.importorskip("dask.array")
+    numbers = da.random.default_rng(1).random((100, 4), chunks=(10, 4))
+    total = numbers.sum(axis=1).persist()
+    wait(total)
+    ran_on.clear()
+    with a.as_client():
+        assert (numbers > 0.5).any().compute()
+    assert ran_on
+    assert ran_on <= A_WORKERS
+    assert len(total) == 100
+
+
+def wait_for(event):
+    Event(event).wait()
+
+
+def test_queued_tasks_of_another_client_move_to_the_partition(client, a):
+    """Waiting, queued and unplaced tasks, which have not started."""
+    values = [dask.delayed(worker_name)(n, dask_key_name=f"queued-{n}") for n in range(30)]
+    blockers = client.map(wait_for, ["queued"] * 60, pure=False)
+    tasks = client.cluster.scheduler.tasks
+    wait_until(lambda: any(task.state == "queued" for task in tasks.values()))
+    late = dask.delayed(worker_name)(blockers[0], dask_key_name="late")
+    nowhere = dask.delayed(worker_name)(dask_key_name="nowhere")
+    futures = client.compute([*values, late], optimize_graph=False)
+    missing = client.compute(nowhere, optimize_graph=False, resources={"MISSING": 1})
+    wait_until(lambda: "nowhere" in tasks and tasks["nowhere"].state == "no-worker")
+    assert {tasks[f"queued-{n}"].state for n in range(30)} == {"queued"}
+    shared = a.as_client().compute([*values, late, nowhere], optimize_graph=False)
+    keys = [future.key for future in shared]
+    wait_until(lambda: all(tasks[key].resource_restrictions == {"A": 1} for key in keys))
+    Event("queued", client).set()
+    assert {*client.gather(shared)} <= A_WORKERS
+    assert {*client.gather([*futures, missing])} <= A_WORKERS
+    wait(blockers)
 
 
 # -- libraries -----------------------------------------------------------------------------

@@ -2,16 +2,21 @@
 
 In plain Dask, resources are not inherited, so the tasks that a GPU task submits run on any worker.
 With this feature, the scheduler assigns such tasks, at any depth, to the partition of the
-submitting task, unless they specify resources, workers or another partition.
+submitting task, unless they specify resources, another partition, or workers outside the partition.
 ``dask.annotate(resources={})`` excludes them from all partitions.
 
 Each of these tasks takes a slot, like a task of `Partition.submit`. The submitting task lends its
 own slot while it waits for them (see `lending.py`).
 
-The submitting task is identified by its thread. Tasks that a method of an actor submits belong to
-the partition of the actor, unless actors with the same key prefix belong to different partitions.
-Tasks that are submitted by coroutines, or by threads that a task has started, do not inherit a
+The submitting task is identified by its thread, or in a coroutine by the context of the thread that
+has started the coroutine with `Client.sync`. Tasks that a method of an actor submits belong to the
+partition of the actor, unless actors with the same key prefix belong to different partitions. Tasks
+that are submitted by coroutine functions, or by threads that a task has started, do not inherit a
 partition.
+
+The graph of a computation may contain tasks that already exist, because another computation needs
+them or needed them before. Dask does not apply the annotations of the graph to them. With this
+feature, tasks that have not started run in the partition of the latest computation.
 
 Running each function under ``dask.annotate`` instead was rejected. The annotation is a context
 variable and reaches `submit`, `map` and collections, but not the next level of nested tasks. In
@@ -30,8 +35,13 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 from ..choosing import WorkerChooser
 from ..errors import PoolError
 from ..features import FEATURES, Feature
-from ..internals.method_rules import MethodRules, add_graph_rule, add_shuffle_rule
-from ..internals.names import CHOOSING, NESTED, READING, SHUFFLES, require_feature
+from ..internals.method_rules import (
+    MethodRules,
+    add_existing_task_rule,
+    add_graph_rule,
+    add_shuffle_rule,
+)
+from ..internals.names import CHOOSING, EXISTING, NESTED, READING, SHUFFLES, require_feature
 from ..internals.scheduler import Resources, set_worker_plugin
 from .lending import lending_plugin
 from .unreadable import UnreadableInputs
@@ -58,6 +68,9 @@ class Inheritance(SchedulerPlugin):
             NESTED, "Tasks that other tasks submit may run on any worker.", self._nest
         )
         self._enable_part(
+            EXISTING, "Tasks that computations share may run on any worker.", self._move_existing
+        )
+        self._enable_part(
             SHUFFLES, "Shuffles may use workers outside their partition.", self._shuffle
         )
         self._enable_part(CHOOSING, "Task placement takes longer in larger clusters.", self._choose)
@@ -82,6 +95,9 @@ class Inheritance(SchedulerPlugin):
 
     def _nest(self) -> None:
         add_graph_rule(self._rules, self.scheduler, self._inherited_resources)
+
+    def _move_existing(self) -> None:
+        add_existing_task_rule(self._rules, self.scheduler, self.names)
 
     def _shuffle(self) -> None:
         add_shuffle_rule(self._rules, self.scheduler)

@@ -46,7 +46,7 @@ from distributed import Status, rejoin, secede
 from distributed.diagnostics.plugin import WorkerPlugin
 from distributed.protocol.pickle import dumps
 
-from ..internals.client import install_wait_hooks
+from ..internals.client import install_wait_hooks, name_submitter_in_coroutines
 from ..internals.names import CLIENTS, missing_names
 from ..internals.partition_client import show_partitions_to_tasks
 from ..internals.scheduler import Resources, SubmittingTask, call_worker
@@ -340,6 +340,7 @@ def begin_lending(worker: Any, name: str) -> Lender:
     """Let a partition's tasks lend their slots. Runs in the worker's event loop."""
     with _lock:
         install_wait_hooks(WAIT_HOOKS)
+        name_submitter_in_coroutines()
         if not missing_names(CLIENTS):
             show_partitions_to_tasks()
         lender = _lenders.setdefault(worker, Lender(worker))

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
-from collections.abc import Awaitable, Callable, Collection, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from functools import cache
+from collections.abc import Awaitable, Callable, Collection, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextvars import ContextVar
+from functools import cache, wraps
 from typing import Any, Protocol
 
 import distributed
@@ -64,6 +65,8 @@ def install_wait_hooks(hooks: WaitHooks) -> None:
             waits = all(pending) if first else any(pending)
             with hooks.lend(waits):
                 return sync(caller, function, *args, **kwargs)
+        if kwargs.get("asynchronous") is False:
+            del kwargs["asynchronous"]
         if caller.asynchronous or not kwargs.keys().isdisjoint(_OPTIONS_OF_SYNC):
             return sync(caller, function, *args, **kwargs)
         return sync_until_wanted(caller, function, *args, **kwargs)
@@ -95,6 +98,57 @@ def install_wait_hooks(hooks: WaitHooks) -> None:
     SyncMethodMixin.sync = sync_lending
     ActorFuture.result = result_of_actor_lending
     as_completed.__next__ = as_completed.next = next_lending
+
+
+_submitter: ContextVar[Any] = ContextVar("_submitter", default=None)  # key of a task
+
+
+@cache  # only once per process, like `install_wait_hooks`
+def name_submitter_in_coroutines() -> None:
+    """Make coroutines that a task runs with `Client.sync` submit tasks on behalf of the task.
+
+    Dask sends the key of the submitting task, but looks it up in the state of the thread. Libraries
+    such as xgboost submit in coroutines, which run in the thread of the event loop. A coroutine
+    inherits the context variables of the thread that has started it.
+    """
+    from distributed.utils import SyncMethodMixin
+
+    sync = SyncMethodMixin.sync
+    send = Client._send_to_scheduler
+
+    @wraps(sync)
+    def sync_for_task(caller: Any, function: Any, *args: Any, **kwargs: Any) -> Any:
+        with _submitting(_key_of_thread()):
+            return sync(caller, function, *args, **kwargs)
+
+    @wraps(send)
+    def send_for_task(client: Client, message: dict[str, Any]) -> None:
+        if message.get("op") == "update-graph" and message.get("submitting_task") is None:
+            message["submitting_task"] = _submitter.get()
+        send(client, message)
+
+    SyncMethodMixin.sync = sync_for_task
+    Client._send_to_scheduler = send_for_task
+
+
+def _key_of_thread() -> Any:
+    """Return the key of the task that this thread runs, or None."""
+    from distributed.worker import thread_state
+
+    return getattr(thread_state, "key", None)
+
+
+@contextmanager
+def _submitting(key: Any) -> Iterator[None]:
+    """If a task is given, let coroutines that start in the block submit on its behalf."""
+    if key is None:
+        yield
+        return
+    token = _submitter.set(key)
+    try:
+        yield
+    finally:
+        _submitter.reset(token)
 
 
 def lend_slots(waits: bool) -> AbstractContextManager[None]:

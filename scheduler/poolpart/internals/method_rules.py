@@ -8,13 +8,21 @@ from __future__ import annotations
 
 import inspect
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 import distributed
 
 from ..errors import PoolError
-from .scheduler import SUBMITTER, Resources, SubmittingTask, actor_of_method
+from .scheduler import (
+    SUBMITTER,
+    Resources,
+    SubmittingTask,
+    actor_of_method,
+    is_bound,
+    requires_any,
+    reschedule_tasks,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -149,9 +157,16 @@ def add_graph_rule(
     """Make nested tasks inherit resources from the task that submits them.
 
     `inherited_resources` returns these resources for the state of the submitting task. Tasks that
-    specify resources or workers inherit nothing. Each nested task is also annotated with its
-    submitting task, so that workers can recognize tasks that wait for the slots of their parents.
+    specify resources, or workers that do not declare them, inherit nothing. Each nested task is
+    also annotated with its submitting task, so that workers can recognize tasks that wait for the
+    slots of their parents.
     """
+
+    def declare_all(workers: Any, resources: Resources) -> bool:
+        """Return whether the workers, which a user has specified, declare the resources."""
+        listed = workers if isinstance(workers, list | tuple | set) else [workers]
+        addresses = {scheduler.aliases.get(worker, worker) for worker in listed}
+        return all(addresses <= scheduler.resources.get(name, {}).keys() for name in resources)
 
     def add_annotations(graph: dict[str, Any]) -> dict[str, Any]:
         name = graph["submitting_task"]
@@ -164,10 +179,14 @@ def add_graph_rule(
         global_annotations = graph["global_annotations"] or {}
         by_type = graph["annotations_by_type"]  # {"workers": {key: …}, "resources": …}
         by_type = {**by_type, SUBMITTER: dict.fromkeys(graph["dsk"], submitter)}
-        if "resources" not in global_annotations and "workers" not in global_annotations:
+        if "resources" not in global_annotations and (
+            "workers" not in global_annotations
+            or declare_all(global_annotations["workers"], inherited)
+        ):
             stated = by_type.get("resources", {})
-            restricted = stated.keys() | by_type.get("workers", {}).keys()
-            heirs = {key: inherited for key in graph["dsk"] if key not in restricted}
+            bound = by_type.get("workers", {}).items()
+            elsewhere = {key for key, workers in bound if not declare_all(workers, inherited)}
+            heirs = {key: inherited for key in graph["dsk"].keys() - stated.keys() - elsewhere}
             by_type["resources"] = {**stated, **heirs}
         return {**graph, "annotations_by_type": by_type}
 
@@ -177,6 +196,61 @@ def add_graph_rule(
         add_annotations,
         *("submitting_task", "annotations_by_type", "global_annotations", "dsk"),
     )
+
+
+def add_existing_task_rule(
+    rules: MethodRules, scheduler: Any, partitions: Collection[str]
+) -> None:
+    """Apply the annotations of an arriving graph to its existing tasks that have not started.
+
+    Dask only applies them to new tasks. Therefore, an intermediate result that has been released,
+    and that the graph needs again, would be computed where an earlier graph has placed it.
+
+    Released tasks are treated like new tasks. Tasks that wait to run for another computation are
+    only changed if the graph assigns them to one of the partitions, which may change later, and if
+    they are not bound to workers. Nothing else is changed, so that graphs without a partition
+    behave as in plain Dask.
+    """
+
+    def apply_annotations(graph: dict[str, Any]) -> dict[str, Any]:
+        found = [scheduler.tasks[key] for key in graph["dsk"] if key in scheduler.tasks]
+        idle = [task for task in found if task.state in _NOT_STARTED and not _in_shuffle(task)]
+        annotations = {name: graph[name] for name in ("annotations_by_type", "global_annotations")}
+        changed = [task for task in idle if is_changed(task, **annotations)]
+        for task in changed:
+            task.resource_restrictions = task.worker_restrictions = task.host_restrictions = None
+            task.loose_restrictions = False
+            task.annotations = None
+        if changed:
+            scheduler._apply_annotations(changed, **annotations)
+            reschedule_tasks(scheduler, [t for t in changed if t.state in ("queued", "no-worker")])
+        return graph
+
+    def is_changed(
+        task: Any, annotations_by_type: dict[str, Any], global_annotations: dict[str, Any] | None
+    ) -> bool:
+        resources = (global_annotations or {}).get("resources")
+        resources = annotations_by_type.get("resources", {}).get(task.key, resources)
+        if callable(resources):
+            resources = resources(task.key)
+        if not set(resources or ()).isdisjoint(partitions):
+            return task.state == "released" or not is_bound(task)
+        return task.state == "released" and requires_any(task, partitions)
+
+    rules.call_before(
+        scheduler,
+        "_create_taskstate_from_graph",
+        apply_annotations,
+        *("annotations_by_type", "global_annotations", "dsk"),
+    )
+
+
+_NOT_STARTED = frozenset({"released", "waiting", "queued", "no-worker"})
+
+
+def _in_shuffle(task: Any) -> bool:
+    """Return whether a running shuffle has bound a task to a worker."""
+    return "shuffle_original_restrictions" in (task.annotations or {})
 
 
 def add_arrival_rule(rules: MethodRules, scheduler: Any, check: Before) -> None:

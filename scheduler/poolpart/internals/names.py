@@ -24,6 +24,7 @@ from .queues import PRIVATE_NAMES as PIPE_NAMES
 TESTED = "2025.5.0", "2026.8.0"  # oldest and newest tested version of distributed (`make compat`)
 
 NESTED = "keeping nested tasks in their partition"
+EXISTING = "moving shared tasks into a partition"
 REFUSING = "rejecting tasks that can never run"
 FENCES = "exclusive partitions"
 DIVIDING = "dividing a pool"
@@ -64,6 +65,8 @@ PRIVATE_NAMES = (
         (
             f"{_SCHEDULER}._create_taskstate_from_graph"
             "(submitting_task, annotations_by_type, global_annotations, dsk)",
+            f"{_SCHEDULER}.aliases",
+            f"{_SCHEDULER}.resources",
         ),
         "nested tasks inherit the partition of their parent",
         (
@@ -104,6 +107,31 @@ PRIVATE_NAMES = (
             "test_lending.py::test_on_one_slot_nested_tasks_and_their_parent_run_one_at_a_time",
             "test_lending.py::test_a_tree_of_waiting_tasks_on_two_slots_ends",
             "test_lending.py::test_a_worker_without_this_package_ignores_the_plugin",
+        ),
+    ),
+    PrivateNames(
+        NESTED,
+        ("distributed.client:Client._send_to_scheduler(msg)",),
+        "name the submitting task in coroutines; wrapped once per process and never restored",
+        ("test_inherit.py::test_tasks_that_a_coroutine_of_the_task_submits",),
+    ),
+    PrivateNames(
+        EXISTING,
+        (
+            f"{_SCHEDULER}._create_taskstate_from_graph"
+            "(annotations_by_type, global_annotations, dsk)",
+            f"{_SCHEDULER}._apply_annotations(tasks, annotations_by_type, global_annotations)",
+            f"{_SCHEDULER}.transitions",
+            f"{_SCHEDULER_TASK}.resource_restrictions",
+            f"{_SCHEDULER_TASK}.worker_restrictions",
+            f"{_SCHEDULER_TASK}.host_restrictions",
+            f"{_SCHEDULER_TASK}.loose_restrictions",
+            f"{_SCHEDULER_TASK}.annotations",
+        ),
+        "tasks of an earlier computation that run again, or have not started, change their place",
+        (
+            "test_partition_client.py::test_released_results_are_computed_again_in_the_partition",
+            "test_partition_client.py::test_queued_tasks_of_another_client_move_to_the_partition",
         ),
     ),
     PrivateNames(
