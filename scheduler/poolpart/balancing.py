@@ -409,8 +409,8 @@ async def _create_group(steward: Steward, spec: GroupSpec) -> None:
     Raises
     ------
     PoolError
-        If a partition does not exist, is adaptive, or belongs to another group, or if the workers
-        are not interchangeable.
+        If a partition does not exist, is adaptive, or belongs to another group, if the bounds do
+        not fit the number of workers, or if the workers are not interchangeable.
     """
     require_feature(BALANCING)
     scheduler = steward.scheduler
@@ -421,6 +421,7 @@ async def _create_group(steward: Steward, spec: GroupSpec) -> None:
                 "partitions. Balance only partitions with a fixed number of jobs."
             )
         steward.adopt_partition(name)
+    _check_workers(steward, spec)
     gpus: dict[Hashable, bool | None] = {}
     if spec.workers is None:
         members = [record for name in spec.names for record in steward.members(name)]
@@ -444,6 +445,27 @@ async def _create_group(steward: Steward, spec: GroupSpec) -> None:
         balancer.groups.remove(former)
         group.moves.extend(former.moves)
     balancer.add(group)
+
+
+def _check_workers(steward: Steward, spec: GroupSpec) -> None:
+    """Raise PoolError if a named worker does not exist, or if the bounds cannot be met."""
+    members = [record for name in spec.names for record in steward.members(name)]
+    if unknown := sorted((spec.workers or set()) - {record.info.name for record in members}):
+        raise PoolError(
+            f"`workers` names {', '.join(map(repr, unknown))}, but the partitions have no such "
+            f"workers. Their workers are {join_names(members)}."
+        )
+    total = len(members)
+    # The default minimum of 1 is accepted for partitions that have lost their workers.
+    if (least := sum(spec.minimum.values())) > max(total, len(spec.names)):
+        raise PoolError(
+            f"The partitions require {least} workers in total, but they have {total}. Reduce `min`."
+        )
+    if (most := sum(spec.maximum.values())) < total:
+        raise PoolError(
+            f"The partitions may have {most:g} workers in total, but they have {total}. "
+            "Increase `max`, or remove workers with `shrink` first."
+        )
 
 
 def _check_same_kind(

@@ -462,7 +462,8 @@ class Pool:
         ------
         PoolError
             If a partition does not exist, is adaptive, or belongs to another group, if a bound is
-            invalid, or if only some of the workers have GPUs.
+            invalid or does not fit the number of workers, if `workers` names a worker that is in
+            none of the partitions, or if only some of the workers have GPUs.
 
         Notes
         -----

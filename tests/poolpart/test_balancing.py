@@ -318,6 +318,8 @@ def test_balancing_again_replaces_the_bounds(eight, quickly, wait_until):
         (["A", "B"], {"max": {"X": 2}}, "`max` names 'X'"),
         (["A", "B"], {"workers": "a"}, "value 'a' for `workers`"),
         (["A", "C"], {}, "'C' already belongs to another balanced group"),
+        (["A", "B"], {"workers": ["x"]}, "`workers` names 'x', but the partitions have no such"),
+        (["A", "B"], {"min": 2}, "require 4 workers in total, but they have 2. Reduce `min`"),
     ],
 )
 def test_impossible_groups_are_refused(start, names, options, message):
@@ -325,6 +327,14 @@ def test_impossible_groups_are_refused(start, names, options, message):
     parts = divide(client, A=1, B=1, C=1, D=1)
     with balance(client, parts[2:]), pytest.raises(PoolError, match=message):
         balance(client, names, **options)
+
+
+def test_a_maximum_must_leave_room_for_all_workers(start):
+    client = start({name: {} for name in "abcd"})
+    parts = divide(client, A=3, B=1)
+    with pytest.raises(PoolError, match="may have 2 workers in total, but they have 4"):
+        balance(client, parts, max=1)
+    balance(client, parts, max=2).stop()
 
 
 def test_moves_are_shown_on_the_page_and_logged(eight, quickly, wait_until, caplog):

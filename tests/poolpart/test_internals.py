@@ -231,6 +231,6 @@ def test_an_untested_version_is_warned_about(monkeypatch):
 
 
 def test_the_documentation_lists_the_private_names():
-    page = (Path(__file__).parents[2] / "docs/pool-partitions.md").read_text("utf-8")
+    page = (Path(__file__).parents[2] / "docs/pool-partitions/dask-internals.md").read_text("utf-8")
     for row in names.PRIVATE_NAMES:
         assert names.table_row(row) in page

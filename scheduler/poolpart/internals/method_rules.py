@@ -198,9 +198,7 @@ def add_graph_rule(
     )
 
 
-def add_existing_task_rule(
-    rules: MethodRules, scheduler: Any, partitions: Collection[str]
-) -> None:
+def add_existing_task_rule(rules: MethodRules, scheduler: Any, partitions: Collection[str]) -> None:
     """Apply the annotations of an arriving graph to its existing tasks that have not started.
 
     Dask only applies them to new tasks. Therefore, an intermediate result that has been released,

@@ -2,7 +2,7 @@
 
 Private names may change in any release of Dask. Before a feature is used, `require_feature` checks
 the names that it needs. If a name is missing, a `PoolError` reports it, and all other features
-continue to work. docs/pool-partitions.md contains a table of `PRIVATE_NAMES`.
+continue to work. docs/pool-partitions/dask-internals.md contains a table of `PRIVATE_NAMES`.
 """
 
 from __future__ import annotations
