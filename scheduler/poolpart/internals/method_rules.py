@@ -186,7 +186,7 @@ def add_graph_rule(
             stated = by_type.get("resources", {})
             bound = by_type.get("workers", {}).items()
             elsewhere = {key for key, workers in bound if not declare_all(workers, inherited)}
-            heirs = {key: inherited for key in graph["dsk"].keys() - stated.keys() - elsewhere}
+            heirs = dict.fromkeys(graph["dsk"].keys() - stated.keys() - elsewhere, inherited)
             by_type["resources"] = {**stated, **heirs}
         return {**graph, "annotations_by_type": by_type}
 
