@@ -1,7 +1,7 @@
 """Traps of Dask: each is sprung first by Dask's own means, then by ours, which do not suffer.
 
-Those that have their tests elsewhere are listed in docs/pool-partitions/dask-internals.md. Where one
-of these fails in its first half, Dask has got better, and something here may be left out.
+Those that have their tests elsewhere are listed in docs/pool-partitions/dask-internals.md. Where
+one of these fails in its first half, Dask has got better, and something here may be left out.
 """
 
 import time
