@@ -363,7 +363,7 @@ def _row(
 
 def _compared(task: BuildTask) -> HeldOutRays | None:
     """Return the rays of a submap's held-out sweeps."""
-    sweeps = task.read_without_air()[0]
+    sweeps = task.read()
     standing = find_stationary_points(sweeps, task.submap.numbers.tolist())
     rays, _, _ = compare_held_out_sweeps(sweeps, task, standing)
     return rays

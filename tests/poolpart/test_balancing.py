@@ -243,6 +243,8 @@ def move_a_waiting_task(dask_scheduler=None):
     dask_scheduler.extensions["stealing"].move_task_request(task, a, b)
 
 
+# Workers sometimes refuse to hand over a task until the time limit of the test is reached.
+@pytest.mark.slow
 def test_slots_are_counted_right_after_the_first_worker_of_a_stolen_task_has_left(
     start, quickly, wait_until
 ):
