@@ -236,15 +236,17 @@ def test_workers_that_leave_for_good_are_replaced_from_the_group(eight, quickly,
         assert eight.gather(tasks) == [None] * 120
 
 
-def move_a_waiting_task(dask_scheduler=None):
-    """Move the task that A's worker a would run last to worker b, like work stealing."""
-    a, b = (w for w in dask_scheduler.workers.values() if w.name in "ab")
-    [*_, task] = sorted(a.processing, key=lambda task: task.priority)
+def move_a_waiting_task(attempt, dask_scheduler=None):
+    """Move a task of worker a to worker b, like work stealing.
+
+    A worker refuses to hand over the task that it runs, so each attempt takes another task.
+    """
+    by_name = {worker.name: worker for worker in dask_scheduler.workers.values()}
+    a, b = by_name["a"], by_name["b"]
+    task = list(a.processing)[attempt % len(a.processing)]
     dask_scheduler.extensions["stealing"].move_task_request(task, a, b)
 
 
-# Workers sometimes refuse to hand over a task until the time limit of the test is reached.
-@pytest.mark.slow
 def test_slots_are_counted_right_after_the_first_worker_of_a_stolen_task_has_left(
     start, quickly, wait_until
 ):
@@ -257,18 +259,19 @@ def test_slots_are_counted_right_after_the_first_worker_of_a_stolen_task_has_lef
     with balance(client, [a, b], min=2) as group:
         tasks = [a.submit(hold) for _ in range(8)]
         wait_until(lambda: len(workers["a"].processing) == len(workers["b"].processing) == 4)
+        attempts = itertools.count()
 
-        def b_has_another():
-            # A worker that has not received the task yet refuses to hand it over.
+        def another_has_been_moved():
             if len(workers["b"].processing) == 4:
-                client.run_on_scheduler(move_a_waiting_task)
-            return len(workers["b"].processing) == 5
+                client.run_on_scheduler(move_a_waiting_task, next(attempts))
+            return len(workers["b"].processing) > 4
 
-        wait_until(b_has_another)
+        wait_until(another_has_been_moved)
         released.set()
         assert client.gather(tasks) == [True] * 8
         leave(client, "a")
-        wait_until(lambda: group.stats().partitions["A"].workers == 1)
+        # The statistics are empty before the first interval.
+        wait_until(lambda: group.stats().partitions and group.stats().partitions["A"].workers == 1)
         # Tasks whose results have left with the worker run again.
         wait_until(lambda: group.stats().partitions["A"].backlog == 0)
 

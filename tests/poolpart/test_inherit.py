@@ -103,8 +103,6 @@ def submit_to_worker(worker):
     return client.sync(name_of_worker, client, worker)
 
 
-# After certain other tests in the same process, the tasks of the coroutine inherit nothing.
-@pytest.mark.slow
 def test_tasks_that_a_coroutine_of_the_task_submits(client):
     part = Partition("A", client)
     for options in ({}, {"asynchronous": False}):
@@ -113,7 +111,8 @@ def test_tasks_that_a_coroutine_of_the_task_submits(client):
         assert annotated == {"B-0"}
     for worker in ("plain", "A-0"):  # the second one takes the slot of the waiting task
         assert part.submit(submit_to_worker, worker).result(LONG_S) == worker
-    foreman = part.submit(Foreman, actor=True).result(LONG_S)
+    future = part.submit(Foreman, actor=True)
+    foreman = future.result(LONG_S)  # an actor may end with its future
     assert foreman.from_coroutine().result(LONG_S) == {"A-0"}
 
 

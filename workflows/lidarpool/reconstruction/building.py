@@ -123,6 +123,8 @@ _ROTATION_FIELDS = {"clockwise", "zero_deg", "rate_hz"}  # written even if they 
 _RATE_DECIMALS = 4
 _ORIGIN_DECIMALS = 4
 _ANGLE_DECIMALS = 3
+# Median offset over the rings, in meters and radians, from which ring offsets are significant.
+_MIN_RING_OFFSETS = (0.005, np.radians(0.02), np.radians(0.02))
 _NOISE_DECIMALS = 5
 _RANGE_NOISE = ("range_m", "range_per_m", "range_at_threshold_m", "precision")
 _FACTOR_DECIMALS = 4
@@ -900,6 +902,7 @@ class SweepTiming(NamedTuple):
         lasers = recorded.lasers
         if not len(lasers):
             return None
+        ring_offsets = _significant_offsets(sweeps.alignment.ring_offsets)
         known: dict[str, Any] = {}
         if self.rotation is not None:
             zero_deg = round(self.rotation.start_deg, 2) % 360
@@ -913,11 +916,19 @@ class SweepTiming(NamedTuple):
             firings_per_turn=firings_per_turn(recorded.read(number), recorded.lasers),
             rate_hz=self.rate_hz,
             range_m=(0.0, float(np.ceil(1.1 * sweeps.coverage.max_range_m))),
-            beams=_beam_table(
-                lasers, sweeps.alignment.ring_offsets, response, sweeps.coverage.blocked
-            ),
-            performance=_range_biases(sweeps.alignment.ring_offsets),
+            beams=_beam_table(lasers, ring_offsets, response, sweeps.coverage.blocked),
+            performance=_range_biases(ring_offsets),
         )
+
+
+def _significant_offsets(ring_offsets: Floats) -> Floats:
+    """Return the ring offsets of an alignment, or zeros if most of them are small.
+
+    A sensor without errors has a few large offsets, of rings that meet only level ground.
+    """
+    typical = np.median(np.abs(ring_offsets), axis=0)
+    is_significant = (typical >= _MIN_RING_OFFSETS).any()
+    return ring_offsets if is_significant else np.zeros_like(ring_offsets)
 
 
 def _beam_table(
@@ -928,7 +939,7 @@ def _beam_table(
 ) -> dict[str, Any]:
     """Return the `beams` of a sensor model, from the lowest ring to the highest.
 
-    `ring_offsets` are those of the alignment.
+    `ring_offsets` are the significant ones of the alignment.
     """
     order = np.arange(len(lasers))[::-1]
     elevation_rad = lasers.elevation_rad + ring_offsets[:, 1]
