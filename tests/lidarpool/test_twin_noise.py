@@ -12,12 +12,12 @@ from tests.lidarpool.test_twin_lasers import recorded_drive, room_sweep, true_la
 from lidarpool import Sensor, load_sensor, twin
 from lidarpool.clouds.recording import Recording
 from lidarpool.reconstruction.alignment import AlignedSweeps, Alignment, align
-from lidarpool.reconstruction.building import SweepTiming
 from lidarpool.reconstruction.lasers import RingLasers, unit_vectors
 from lidarpool.reconstruction.lost_pulses import SensorCoverage
 from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import RecordedPoses
 from lidarpool.reconstruction.range_noise import estimate_range_noise
+from lidarpool.reconstruction.recorded_sensor import SweepTiming
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.recordings.opening import open_recording
 from lidarscenes.procedural.city import city

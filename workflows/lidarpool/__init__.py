@@ -46,7 +46,8 @@ if TYPE_CHECKING:
     from .pages.scanner_page import show
     from .plan import Plan, Planning
     from .playback.live import play
-    from .reconstruction.building import Twin, twin
+    from .reconstruction.building import twin
+    from .reconstruction.twin import Twin
     from .recordings.opening import open_recording
     from .report.merging import merge
     from .run.pipeline.stage_messages import ScanFrame
@@ -144,7 +145,8 @@ _MODULES = {
     ".comparing.comparison": ("Comparison",),
     ".comparing.two_clouds": ("compare",),
     ".comparing.fit": ("Fit", "fit"),
-    ".reconstruction.building": ("Twin", "twin"),
+    ".reconstruction.building": ("twin",),
+    ".reconstruction.twin": ("Twin",),
     ".run.run_result": ("CampaignRun",),
     ".run.store.run_store": ("remove_run",),
     ".scenario.job": ("Job",),

@@ -90,9 +90,9 @@ def twin(
     """  # noqa: D301 - Click requires the character \b
     from ..clouds.folder import result_folder
     from ..processes.fork_server import keep_freed_memory
-    from ..reconstruction.building import SCENARIO_FILE
     from ..reconstruction.building import twin as build
     from ..reconstruction.finished_steps import STEPS_FOLDER, FinishedSteps
+    from ..reconstruction.twin import SCENARIO_FILE
     from ..run.cluster.connection import connect_client
 
     if resume and overwrite:
