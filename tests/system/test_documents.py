@@ -13,6 +13,7 @@ import json
 import re
 import runpy
 import shlex
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -532,13 +533,23 @@ def leaves(data: dict[str, Any], above: str = "") -> Iterator[str]:
 @pytest.mark.extended
 def test_a_twin_is_made_and_scanned_as_shown(tmp_path, lidarpool):
     blocks = [block for block in blocks_of(ROOT / "docs/how-to/twin.md") if not block.reason]
+    sections = []
     for block in blocks:
-        if block.language == "yaml":
+        if block.language == "yaml" and block.title:
             Path(block.title).write_text(block.code, encoding="utf-8")
-            continue
-        for words in commands(block):
-            outcome = lidarpool(*words[1:])
-            assert outcome.code == 0, outcome.err
+        elif block.language == "yaml":
+            sections.append(yaml.safe_load(block.code))
+        else:
+            for words in commands(block):
+                outcome = lidarpool(*words[1:])
+                assert outcome.code == 0, outcome.err
+    scenario = yaml.safe_load((tmp_path / "twin/scenario.yaml").read_text())
+    written, edited = sections
+    assert written == {"actors": scenario["actors"]}
+    shutil.copy(ROOT / "examples/car.obj", tmp_path / "twin")
+    (tmp_path / "twin/edited.yaml").write_text(yaml.safe_dump(scenario | edited))
+    outcome = lidarpool("run", "twin/edited.yaml", "--out", "edited")
+    assert outcome.code == 0, outcome.err
     figures = json.loads((tmp_path / "twin/twin.json").read_text())
     assert figures["motion"] == "as fired, with point times"
     assert figures["held_out"]["stationary"]["median_abs_difference_m"] < 0.003

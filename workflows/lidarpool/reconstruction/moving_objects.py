@@ -67,7 +67,9 @@ def _labeled(
     boxes: RecordedBoxes, alignment: Alignment, numbers: Ints | None = None
 ) -> list[ObjectTrack]:
     """Return the tracks of labeled objects that move, from all sweeps or those in `numbers`."""
-    used = np.ones(len(boxes.sweep), bool) if numbers is None else np.isin(boxes.sweep, numbers)
+    used = boxes.sweep < len(alignment.poses)  # A part of a recording has the boxes of all sweeps.
+    if numbers is not None:
+        used &= np.isin(boxes.sweep, numbers)
     tracks = []
     for number in np.unique(boxes.object[used]).tolist():
         rows = np.flatnonzero(used & (boxes.object == number))

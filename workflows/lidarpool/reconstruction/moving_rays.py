@@ -238,7 +238,7 @@ def _rays_near(
     `cluster` has the clusters of the returns, which precede the lost pulses.
     """
     chosen = np.zeros(len(ends), bool)
-    if not boxes:
+    if not boxes or not len(ends):
         return chosen
     vectors = ends - origins
     range_m = np.linalg.norm(vectors, axis=1)

@@ -53,7 +53,7 @@ _END_VOTES = 4
 _MIN_LOST_RATIO = 2
 _POROSITY_SWEEPS = 24  # maximum number of sweeps from which gaps are determined
 _MAX_CROSSINGS = 6  # maximum number of surfels that a ray crosses
-_BEHIND_M = 1e-4  # distance behind a surfel from which a ray is cast again
+_BEHIND_M = 1e-5  # distance behind a surfel from which a ray is cast again, as in simulations
 
 
 class Observations(NamedTuple):

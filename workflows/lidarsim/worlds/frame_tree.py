@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -333,7 +334,7 @@ def pose_of(matrix: Floats) -> tuple[float, ...]:
 def _checked_pose(pose: Sequence[float]) -> tuple[float, ...]:
     """Return a pose with a quaternion of norm 1. Raise ValueError if it is invalid."""
     values = tuple(map(float, pose))
-    size = sum(value * value for value in values[3:]) ** 0.5
+    size = math.sqrt(sum(value * value for value in values[3:]))
     if not np.isfinite(values).all() or not abs(size - 1) <= _MAX_NORM_ERROR:
         raise ValueError("the pose is not finite, or the norm of its quaternion is not 1")
     return (*values[:3], *(value / size for value in values[3:]))
