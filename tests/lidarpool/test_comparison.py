@@ -526,6 +526,7 @@ def test_a_thinned_result_has_no_lost_returns(written, tmp_path):
     assert "only one in every 5 hits" in repr(compare(tmp_path, folder))
 
 
+@pytest.mark.extended(keep=("ray-True",))
 @pytest.mark.parametrize("scans_in_rings", [True, False])
 @pytest.mark.parametrize("told", ["time", "ray", "neither"])
 def test_results_with_the_same_rays_are_paired_by_ray(tmp_path, told, scans_in_rings):

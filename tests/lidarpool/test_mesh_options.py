@@ -20,6 +20,7 @@ def test_each_command_that_takes_a_mesh_says_how_it_is_read(name):
     assert {"--unit", "--up-axis"} <= options
 
 
+@pytest.mark.extended
 def test_stations_of_a_mesh_that_lies_on_its_side(tmp_path):
     """A glTF that was written with z up; the note comes before the places are looked from."""
     mesh_file(tmp_path / "house.glb", (8, 6, 3), 2, generator="scan2mesh", version="2.0")

@@ -74,6 +74,7 @@ def test_only_the_columns_that_are_asked_for_are_read(storage):
         columns_of(storage, 5)
 
 
+@pytest.mark.extended
 def test_a_part_with_any_damage_is_refused_or_gives_the_same_values(storage):
     """Of every byte: only bytes that nothing relies on may change."""
     data = storage.read(NAME)

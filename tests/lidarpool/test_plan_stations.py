@@ -180,6 +180,7 @@ def test_targets_are_covered_and_other_objects_only_occlude():
         plan_stations(Scene.from_meshes(buried), EVERYWHERE, targets=["Buried"], **options)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("slant_deg", "is_noted"), [(80, False), (65, True)])
 def test_a_target_that_is_mostly_out_of_reach_is_noted(tmp_path, slant_deg, is_noted):
     """A flat roof of 100 m², 0.5 m below the instrument.

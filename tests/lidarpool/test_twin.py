@@ -350,6 +350,7 @@ def bag(tmp_path_factory):
     return folder, found
 
 
+@pytest.mark.extended
 def test_the_sensor_of_a_twin_rotates_like_the_recorded_sensor(bag):
     folder, found = bag
     stated = yaml.safe_load((folder / "twin" / "sensor.yaml").read_text())
@@ -369,6 +370,7 @@ def test_the_sensor_of_a_twin_rotates_like_the_recorded_sensor(bag):
     assert not any("direction of rotation" in note for note in found.figures["notes"])
 
 
+@pytest.mark.extended
 def test_a_twin_simulates_all_sweeps_with_energies_as_recorded(bag):
     folder, found = bag
     response = found.figures["response"]

@@ -101,6 +101,7 @@ def test_the_directions_that_a_vehicle_blocks_are_found(drive):
     assert_sectors_match(find_sectors(fired(drive, beside_body)), BODY)
 
 
+@pytest.mark.extended
 def test_a_drive_without_a_vehicle_has_no_blocked_directions(drive):
     """Some pulses meet the sky in all sweeps, also straight ahead between houses."""
     recording = fired(drive)
@@ -108,6 +109,7 @@ def test_a_drive_without_a_vehicle_has_no_blocked_directions(drive):
     assert find_sectors(recording) == []
 
 
+@pytest.mark.extended
 def test_random_losses_are_not_blocked_directions(drive):
     random = np.random.default_rng(3)
     recording = fired(drive, lambda sweep: random.random(len(sweep)) < 0.9)

@@ -111,6 +111,7 @@ def written_sensor(aligned, folder):
     return load_sensor(path)
 
 
+@pytest.mark.extended
 def test_the_sensor_of_a_twin_has_the_errors_of_the_rings(calibrated, tmp_path):
     aligned, truth, bias_m = calibrated
     sensor = written_sensor(aligned, tmp_path)

@@ -115,6 +115,7 @@ def found_and_true(cloud):
     return np.concatenate(masks), np.concatenate(causes) == AIR
 
 
+@pytest.mark.extended(keep=("rain",))
 @pytest.mark.parametrize(
     ("weather", "precision", "recall"),
     [

@@ -158,6 +158,7 @@ def test_a_worker_that_does_not_answer_is_not_restarted(processes, event, monkey
     assert gpu.submit(os.getpid).result(LONG_S) == pid
 
 
+@pytest.mark.extended
 def test_each_of_many_tasks_is_accounted_for_beside_a_worker_that_does_not_answer(
     nannies, event, monkeypatch
 ):

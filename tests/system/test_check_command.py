@@ -379,6 +379,7 @@ def test_options_describe_the_survey_of_a_mesh(cluster, tmp_path, lidarpool):
     assert {"range", "intensity"} <= cloud.columns.keys()
 
 
+@pytest.mark.extended
 def test_a_flight_is_told_by_its_lines_without_turns(check):
     """Lines of 200 cycles a second at 60 m/s, and a turn at half that speed."""
     way = [(0, 0, 0), (2, 120, 0), (6, 360, 0), (8, 480, 0), (14, 560, 60), (20, 480, 120)]

@@ -289,6 +289,7 @@ def test_help_and_completion_load_nothing_of_a_run(words):
     assert not {"numpy", "dask", "distributed", "pydantic", "rich", "trimesh"} & loaded
 
 
+@pytest.mark.extended
 def test_checking_a_scenario_loads_neither_reports_nor_loops_for_moving_bodies(tmp_path):
     (tmp_path / "s.yaml").write_text(PLAIN)
     done = subprocess.run(

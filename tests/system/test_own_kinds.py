@@ -92,6 +92,7 @@ def test_points_lie_where_the_sensors_own_geometry_says(result):
     assert np.abs(cloud.positions - expected).max() <= 0.006
 
 
+@pytest.mark.extended
 @pytest.mark.usefixtures("pictures")
 def test_a_result_tells_of_itself_and_its_points_become_frames_and_clouds(result, local_client):
     told = repr(result)

@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import open3d as o3d
+import pytest
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "own_stages.py"
 
 
+@pytest.mark.extended
 def test_frames_come_in_order_and_no_point_is_lost(tmp_path):
     run = subprocess.run(
         [sys.executable, EXAMPLE], cwd=tmp_path, capture_output=True, text=True, check=False

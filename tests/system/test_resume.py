@@ -88,6 +88,7 @@ def test_a_driver_is_killed_at_several_moments(drive, undisturbed, tmp_path):
     assert not [path.name for path in out.iterdir() if path.name.startswith(".")]
 
 
+@pytest.mark.extended
 def test_an_unfinished_run_is_refused_resumed_or_dropped(
     cluster, drive, lidarpool, undisturbed, tmp_path
 ):

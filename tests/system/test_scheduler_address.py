@@ -18,6 +18,7 @@ from lidarpool.connection.scheduler_address import (
 from lidarpool.connection.tls_files import TlsFiles
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize("option", ["--scheduler", "--scheduler-file"])
 def test_doctor_finds_the_workers_by_a_scheduler_file(lidarpool, tmp_path, option):
     with thread_cluster({"GPU": 1}) as cluster:
@@ -27,6 +28,7 @@ def test_doctor_finds_the_workers_by_a_scheduler_file(lidarpool, tmp_path, optio
     assert outcome.code == 0 and "cluster: 1 worker on 1 host" in outcome.out
 
 
+@pytest.mark.extended(every=2)
 @pytest.mark.parametrize(
     ("slots", "fault"),
     [

@@ -86,6 +86,7 @@ def test_stations_become_a_scenario_and_a_picture(hall, lidarpool):
     assert sum(covered) / sum(seen) == pytest.approx(shares[-1])
 
 
+@pytest.mark.extended
 def test_a_mesh_needs_no_scenario_and_a_number_may_be_more_than_needed(hall, lidarpool):
     arguments = ("--sensor", "velodyne/vlp16", "--count", "100", "--out", "a/b", "--spacing", "2")
     outcome = lidarpool("stations", "hall.glb", *arguments)
