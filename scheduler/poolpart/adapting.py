@@ -13,9 +13,9 @@ it receives a task.
 In a worker group (see `deploy/worker_groups.py`), each worker is a job, and has no name before it
 joins. Therefore, such a job cannot be canceled before it joins.
 
-If jobs of other users wait in the queue, the process with the cluster object reports how many jobs
-the partition should release. Until the next report, the partition starts no further jobs, and jobs
-that run are drained (see `draining.py`).
+If jobs of other users wait in a queue, the process with the cluster object reports how many jobs
+the partitions that use the queue should release together. Until the next report, these partitions
+start no further jobs, and as many of their jobs are drained (see `draining.py`).
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ from .internals.scheduler import (
     unrunnable_tasks,
 )
 from .internals.worker import has_running_tasks
+from .partition_stats import SharedQueue
 from .rules import check_count
 
 logger = logging.getLogger(__name__)
@@ -113,6 +114,17 @@ class JobAdvice:
 
 
 @dataclass(frozen=True)
+class QueueReport:
+    """Report on a queue, sent to the scheduler by the process that starts the jobs."""
+
+    partitions: Sequence[str]  # names of the partitions that yield to other users in this queue
+    # Number of running jobs to release together, or None if no jobs of other users wait.
+    to_release: int | None = None
+    waiting: int | None = 0  # number of waiting jobs of other users, or None if it is unknown
+    problem: str = ""  # reason why the queue cannot be listed
+
+
+@dataclass(frozen=True)
 class GroupReport:
     """Report on a worker group, sent to the scheduler by the process that scales the group."""
 
@@ -147,6 +159,8 @@ class _Record:
     missing_slots: float = 0.0  # number of missing slots at the last report
     superfluous_since: dict[str, float] = field(default_factory=dict)  # {queued job: time}
     leaving: set[str] = field(default_factory=set)  # closed workers that the group still lists
+    queue: QueueReport | None = None  # last report on the queue, if the partition yields
+    drained_at: float = 0.0  # time when a job was last selected for release
 
     @property
     def is_current(self) -> bool:
@@ -265,7 +279,7 @@ class AdaptivePartitions(SchedulerPlugin):
         name: str,
         jobs: Mapping[str, Sequence[str]],
         waiting: float,
-        to_release: int | None = None,
+        to_drain: int | None = None,
     ) -> _Decision | None:
         """Decide which of a partition's jobs to start and which to end.
 
@@ -277,8 +291,8 @@ class AdaptivePartitions(SchedulerPlugin):
             Names of the workers of each job, by job. The newest job is last.
         waiting
             Number of slots that tasks without a worker request.
-        to_release
-            Number of running jobs to release for jobs of other users, or None if no such jobs wait.
+        to_drain
+            Number of running jobs to drain for jobs of other users, or None if no such jobs wait.
 
         Returns
         -------
@@ -292,9 +306,9 @@ class AdaptivePartitions(SchedulerPlugin):
         bounds = record.spec.bounds
         if bounds is None:
             return None
-        if to_release is not None:
+        if to_drain is not None:
             bounds = bounds.while_others_wait()
-        drained = self._drain(name, running, min(to_release or 0, len(running) - bounds.maximum))
+        drained = self._drain(name, running, min(to_drain or 0, len(running) - bounds.maximum))
         slots_per_job = record.spec.slots * record.spec.workers
         missing = self.missing_slots(name, waiting, float(bounds.maximum * slots_per_job))
         # Work that takes less than a second is finished before a new job starts.
@@ -316,6 +330,47 @@ class AdaptivePartitions(SchedulerPlugin):
         assigned = {job: workers for job, workers in running.items() if job not in record.draining}
         idle = self._idle(name, assigned, -missing / slots_per_job, bounds)
         return _Decision(advice, drained | idle)
+
+    def jobs_to_drain(
+        self, jobs: Mapping[str, Mapping[str, Sequence[str]]], queues: Sequence[QueueReport]
+    ) -> dict[str, int]:
+        """Return the number of jobs to drain, for partitions in whose queue other jobs wait."""
+        numbers: dict[str, int] = {}
+        for queue in queues:
+            for name in queue.partitions:
+                self.records[name].queue = queue
+            if queue.to_release is not None:
+                numbers |= self._divide_releases(jobs, queue)
+        return numbers
+
+    def _divide_releases(
+        self, jobs: Mapping[str, Mapping[str, Sequence[str]]], queue: QueueReport
+    ) -> dict[str, int]:
+        """Divide the jobs to release among the partitions that share a queue.
+
+        Jobs that are already being drained are kept, followed by jobs without tasks. After that,
+        the partitions take turns.
+        """
+        loads: dict[str, list[int]] = {}
+        for name in queue.partitions:
+            record = self.records[name]
+            running, *_ = self._job_states(jobs[name])
+            if record.spec.bounds is not None:
+                most = len(running) - record.spec.bounds.while_others_wait().maximum
+                loads[name] = record.draining.loads(running)[: max(0, most)]
+        counts = dict.fromkeys(loads, 0)
+
+        def order(name: str) -> tuple[int, int, float, int]:
+            """Return the key by which the partition that drains the next job is selected."""
+            load = loads[name][counts[name]]
+            return min(load, 1), counts[name], self.records[name].drained_at, load
+
+        for _ in range(queue.to_release or 0):
+            candidates = [name for name in loads if counts[name] < len(loads[name])]
+            if not candidates:
+                break
+            counts[min(candidates, key=order)] += 1
+        return counts
 
     def _job_states(
         self, jobs: Mapping[str, Sequence[str]]
@@ -351,6 +406,7 @@ class AdaptivePartitions(SchedulerPlugin):
         before = len(draining)
         finished = draining.update(running, max(0, count))
         if len(draining) > before:
+            self.records[name].drained_at = time.monotonic()
             logger.info(
                 "Partition %r releases %d of %d jobs, because jobs of other users wait.",
                 name,
@@ -430,24 +486,25 @@ def add_partitions(specs: Mapping[str, JobSpec], dask_scheduler: Any = None) -> 
 
 async def advise_jobs(
     jobs: Mapping[str, Mapping[str, Sequence[str]]],
-    to_release: Mapping[str, int] | None = None,
+    queues: Sequence[QueueReport] = (),
     dask_scheduler: Any = None,
 ) -> dict[str, JobAdvice]:
     """Close idle workers, and return advice on each partition's jobs.
 
-    `jobs` maps each partition to its jobs, and each job to the names of its workers. `to_release`
-    contains the number of jobs to release for each partition for which jobs of other users wait.
-    Partitions with a fixed number of jobs are omitted from the result.
+    `jobs` maps each partition to its jobs, and each job to the names of its workers. `queues`
+    contains a report on each queue in which partitions yield to other users. Partitions with a
+    fixed number of jobs are omitted from the result.
     """
     adaptation = _adaptation_of(dask_scheduler)
     if adaptation is None:
         return {}
     waiting = adaptation.waiting_slots()
+    to_drain = adaptation.jobs_to_drain(jobs, queues)
     advice: dict[str, JobAdvice] = {}
     closing: list[tuple[str, str, list[Any]]] = []
     for name, jobs_of_partition in jobs.items():
         decision = adaptation.decide(
-            name, jobs_of_partition, waiting.get(name, 0.0), (to_release or {}).get(name)
+            name, jobs_of_partition, waiting.get(name, 0.0), to_drain.get(name)
         )
         if decision is None:
             continue
@@ -552,6 +609,14 @@ def queued_jobs_of(scheduler: Any, name: str) -> int:
     if record is None or record.spec.bounds is None:
         return 0
     return record.queued_jobs if record.is_current else 0
+
+
+def shared_queue_of(scheduler: Any, name: str) -> SharedQueue | None:
+    """Return the state of the queue in which a partition yields to other users, or None."""
+    record = _record(scheduler, name)
+    if record is None or record.queue is None or not record.is_current:
+        return None
+    return SharedQueue(record.queue.waiting, len(record.draining), record.queue.problem)
 
 
 def expects_workers(scheduler: Any, name: str) -> bool:

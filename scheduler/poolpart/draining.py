@@ -80,6 +80,14 @@ class DrainingJobs:
             self._drains[job] = _Drain(running[job])
         return {job: [*self._drains[job].workers] for job in list(self._drains) if self._step(job)}
 
+    def loads(self, running: Mapping[str, Sequence[Any]]) -> list[int]:
+        """Return the number of tasks of each job that can be drained, in the order of selection.
+
+        Jobs that are already being drained come first. Their number of tasks is given as -1.
+        """
+        draining = [-1 for job in self._drains if job in running]
+        return draining + [_count_tasks(running[job]) for job in self._candidates(running)]
+
     def _candidates(self, running: Mapping[str, Sequence[Any]]) -> list[str]:
         """Return the jobs that can be drained, starting with the jobs with the fewest tasks."""
         now = time.monotonic()
@@ -90,7 +98,7 @@ class DrainingJobs:
             and self._kept_until.get(job, now) <= now
             and all(map(self._can_drain, workers))
         ]
-        return sorted(jobs, key=lambda job: sum(len(worker.processing) for worker in running[job]))
+        return sorted(jobs, key=lambda job: _count_tasks(running[job]))
 
     def _can_drain(self, worker: Any) -> bool:
         """Return whether the tasks of a worker are expected to finish.
@@ -127,3 +135,7 @@ class DrainingJobs:
         """Assign tasks to the workers of a job again."""
         for worker in self._drains.pop(job).workers:
             resume_assigning(self._scheduler, worker)
+
+
+def _count_tasks(workers: Sequence[Any]) -> int:
+    return sum(len(worker.processing) for worker in workers)

@@ -13,6 +13,7 @@ COUNTS = ("waiting", "queued", "running", "done", "failed")  # task states, in t
 _HEAD_OF_STAGES = ("stage", *COUNTS, "seconds")
 NO_PARTITION = "no partition"  # label for workers without a partition and for plain Dask tasks
 _HEAD_OF_PARTITIONS = ("partition", "workers", "slots", "busy", *COUNTS, "seconds")
+HEAD_OF_QUEUES = ("partition", "waiting jobs of others", "jobs being released", "state")
 
 
 def describe_size(workers: int, target: int | None, slots: int) -> str:
@@ -21,6 +22,37 @@ def describe_size(workers: int, target: int | None, slots: int) -> str:
     if target is not None and target != workers:
         counted = f"{workers} of {format_workers(target)}"
     return f"{counted}, {slots} {'slot' if slots == 1 else 'slots'}"
+
+
+@dataclass(frozen=True)
+class SharedQueue:
+    """Queue in which a partition yields to other users, as of its last listing.
+
+    Parameters
+    ----------
+    waiting
+        Number of waiting jobs of other users, or None if the queue cannot be listed.
+    releasing
+        Number of jobs of the partition that end after their running tasks to make room.
+    problem
+        Reason why the queue cannot be listed, or "".
+    """
+
+    waiting: int | None = 0
+    releasing: int = 0
+    problem: str = ""
+
+    def __str__(self) -> str:
+        if self.waiting is None:
+            return f"queue cannot be listed: {self.problem}"
+        return f"{self.waiting} waiting {'job' if self.waiting == 1 else 'jobs'} of other users"
+
+    @property
+    def cells(self) -> list[object]:
+        """Table cells in the order of the columns, after the name of the partition."""
+        if self.waiting is None:
+            return ["unknown", self.releasing, f"cannot be listed: {self.problem}"]
+        return [self.waiting, self.releasing, "listed"]
 
 
 @dataclass(frozen=True)
@@ -102,6 +134,9 @@ class PartitionStats(StageStats):
         Counts of each stage, by name.
     since
         Time in UTC when counting began.
+    queue
+        Queue that the partition shares with other users if it has the option `yield_to_others`,
+        otherwise None.
     """
 
     name: str = ""
@@ -112,13 +147,15 @@ class PartitionStats(StageStats):
     stages: Mapping[str, StageStats] = field(default_factory=dict)
     since: datetime | None = None
     target: int | None = None
+    queue: SharedQueue | None = None
 
     def __repr__(self) -> str:
         size = describe_size(self.workers, self.target, self.slots)
         since = f", counted since {self.since:%H:%M:%S} UTC" if self.since else ""
         stages = [[stage, *stats._figures] for stage, stats in self.stages.items()]
         lost = f", {self.lost} lost {'task' if self.lost == 1 else 'tasks'}" if self.lost else ""
-        title = f"<PartitionStats {self.name!r}: {size}, {self.busy} busy{lost}{since}>"
+        queue = f", {self.queue}" if self.queue else ""
+        title = f"<PartitionStats {self.name!r}: {size}, {self.busy} busy{lost}{since}{queue}>"
         return f"{title}\n{text_table(_HEAD_OF_STAGES, [*stages, ['all', *self._figures]])}"
 
     def _repr_html_(self) -> str:
@@ -128,4 +165,6 @@ class PartitionStats(StageStats):
         if self.stages:
             stages = [[stage, *stats._figures] for stage, stats in self.stages.items()]
             tables += html_table("Stages", _HEAD_OF_STAGES, stages)
+        if self.queue:
+            tables += html_table("Shared queue", HEAD_OF_QUEUES, [[name, *self.queue.cells]])
         return tables

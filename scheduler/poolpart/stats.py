@@ -15,6 +15,7 @@ from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
 
+from .adapting import shared_queue_of
 from .features import FEATURES
 from .fence import fence_names
 from .partition_stats import PartitionStats, StageStats, describe_size
@@ -300,6 +301,7 @@ def stats_of(names: Sequence[str], dask_scheduler: Any = None) -> list[Partition
                 since=to_datetime(statistics.since),
                 target=target_of(scheduler, name),
                 stages=stages,
+                queue=shared_queue_of(scheduler, name),
                 **sums,
             )
         )

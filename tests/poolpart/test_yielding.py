@@ -5,7 +5,10 @@ The queue is a stand-in, and its jobs are workers of this process. `test_slurm.p
 
 import itertools
 import json
+import logging
+import math
 import re
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,6 +16,7 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
+import numpy as np
 import pytest
 from distributed import Client, Event, secede, wait
 from tests.clusters import import_jobqueue
@@ -21,7 +25,15 @@ from tests.poolpart.job_queue import SCHEDULER
 
 from poolpart import Partition, PoolError
 from poolpart.deploy import start_partitions
-from poolpart.deploy.waiting_jobs import count_slurm_jobs
+from poolpart.deploy.waiting_jobs import (
+    QueueReport,
+    QueueWatch,
+    SlurmCounter,
+    count_slurm_jobs,
+    watch_queues,
+)
+from poolpart.extras.dashboard_page import render_page
+from poolpart.partition_stats import SharedQueue
 
 NEVER_S = 3600.0  # longer than a test
 
@@ -260,26 +272,268 @@ def test_a_job_stays_whose_results_cannot_be_copied(queue, wait_until, monkeypat
         assert sorted(queue.submitted) == ["GPU-0", "GPU-1"]
 
 
-def test_a_queue_that_cannot_be_listed_is_reported_and_jobs_stay(queue, wait_until):
+def test_a_queue_that_cannot_be_listed_is_reported_and_jobs_stay(queue, wait_until, caplog):
+    caplog.set_level(logging.INFO, "poolpart.deploy.waiting_jobs")
     said: list[str] = []
+    broken = threading.Event()
+    broken.set()
 
     def fails() -> int:
-        raise OSError("qstat: no server")
+        if broken.is_set():
+            raise OSError("qstat: no server")
+        return 1
 
     with cluster_of(fails, 0, 2, report=said.append) as client:
+        caplog.handler.setLevel(logging.INFO)  # the cluster has silenced it
         gpu = Partition("GPU", client)
         tasks = [gpu.submit(wait_for, "go") for _ in range(4)]
         wait_until(lambda: len(gpu) == 2 and said)
         time.sleep(0.3)
-        assert said == ["The waiting jobs of other users could not be listed. qstat: no server"]
+        assert said == [
+            "No jobs of partition 'GPU' are released for other users, because the queue cannot be "
+            "listed. OSError: qstat: no server"
+        ]
         assert len(gpu) == 2
+        stats = gpu.stats()
+        assert stats.queue == SharedQueue(None, 0, "OSError: qstat: no server")
+        page = client.run_on_scheduler(lambda dask_scheduler: render_page(dask_scheduler)).decode()
+        for shown in (repr(stats), stats._repr_html_(), page):
+            assert "cannot be listed: OSError: qstat: no server" in shown
+        broken.clear()
+        wait_until(lambda: gpu.stats().queue == SharedQueue(1, 1))
+        assert "1 waiting job of other users" in repr(gpu.stats())
+        assert "The queue of partition 'GPU' can be listed again." in caplog.text
+        assert len(said) == 1
         Event("go", client).set()
         assert client.gather(tasks) == [True] * 4
+
+
+@pytest.mark.extended
+def test_after_a_failed_listing_no_jobs_end_and_for_some_time_none_start(
+    queue, wait_until, monkeypatch
+):
+    results: list[Any] = [2]
+
+    def others() -> int:
+        if isinstance(results[0], Exception):
+            raise results[0]
+        return results[0]
+
+    with cluster_of(others, 2, 4) as client:
+        gpu = Partition("GPU", client)
+        wait_until(lambda: gpu.stats().queue == SharedQueue(2))
+        results[0] = TimeoutError()
+        wait_until(lambda: gpu.stats().queue == SharedQueue(None, 0, "TimeoutError: "))
+        tasks = [gpu.submit(wait_for, "go") for _ in range(16)]
+        time.sleep(0.3)
+        assert sorted(queue.submitted) == ["GPU-0", "GPU-1"]
+        monkeypatch.setattr("poolpart.deploy.waiting_jobs.HOLD_S", 0.0)
+        wait_until(lambda: len(gpu) == 4)
+        Event("go", client).set()
+        assert client.gather(tasks) == [True] * 16
+
+
+@pytest.mark.extended
+def test_a_function_that_hangs_stalls_nothing(queue, wait_until, monkeypatch):
+    monkeypatch.setattr("poolpart.deploy.waiting_jobs.LISTING_S", 0.3)
+    said: list[str] = []
+    calls: list[float] = []
+    released = threading.Event()
+
+    def hangs() -> int:
+        calls.append(time.monotonic())
+        released.wait(LONG_S)
+        return 0
+
+    with cluster_of(hangs, 0, 2, report=said.append) as client:
+        gpu = Partition("GPU", client)
+        assert gpu.submit(worker_name).result(LONG_S) == "GPU-0"
+        wait_until(lambda: said)
+        assert said[0].endswith("cannot be listed. The listing has not ended after 0.3 s.")
+        tasks = [gpu.submit(wait_for, "go") for _ in range(4)]
+        wait_until(lambda: len(gpu) == 2)  # the partition still follows its work
+        assert len(calls) == 1
+        assert gpu.stats().queue.waiting is None
+        released.set()
+        wait_until(lambda: gpu.stats().queue == SharedQueue(0))
+        assert len(said) == 1
+        Event("go", client).set()
+        assert client.gather(tasks) == [True] * 4
+        released.clear()
+        known = len(calls)
+        wait_until(lambda: len(calls) > known)
+    # The cluster has been closed although the function has not returned.
+    assert not released.is_set()
+    released.set()
+
+
+@pytest.mark.parametrize("result", [-1, 1.0, math.nan, True, None, "3", [1, 2]])
+def test_results_that_are_not_a_number_of_jobs_are_refused(result, wait_until):
+    watch = QueueWatch(lambda: result, ["GPU"])
+    watch.refresh(has_jobs=True)
+    wait_until(lambda: watch.refresh(has_jobs=True) or watch.problem)
+    assert watch.problem == (
+        "The function for `yield_to_others` must return a number of jobs, but it returned "
+        f"{result!r}."
+    )
+    assert watch.report() == QueueReport(("GPU",), None, None, watch.problem)
+
+
+@pytest.mark.parametrize("error", [SystemExit(1), KeyboardInterrupt(), ValueError("bad")])
+def test_errors_of_any_kind_are_problems(error, wait_until):
+    def fails() -> int:
+        raise error
+
+    watch = QueueWatch(fails, ["GPU", "IO"])
+    watch.refresh(has_jobs=True)
+    wait_until(lambda: watch.refresh(has_jobs=True) or watch.problem)
+    assert watch.problem == f"{type(error).__name__}: {error}"
+    assert watch.names == "partitions 'GPU' and 'IO'"
+
+
+def test_numbers_of_numpy_are_numbers_of_jobs(wait_until):
+    watch = QueueWatch(lambda: np.int64(3), ["GPU"])
+    assert watch.report() == QueueReport(("GPU",), None, 0)
+    watch.refresh(has_jobs=True)
+    wait_until(lambda: watch.refresh(has_jobs=True) or watch.report().waiting)
+    assert watch.report() == QueueReport(("GPU",), 3, 3)
+    watch.count_released(1)
+    assert watch.report() == QueueReport(("GPU",), 2, 3)
+
+
+def test_a_released_node_counts_until_the_listing_after_the_next(wait_until, monkeypatch):
+    """The queue needs some time to assign the node to the waiting job."""
+    listed = itertools.count()
+    waiting = iter([1, 1, 1])
+
+    def others() -> int:
+        next(listed)
+        return next(waiting)
+
+    def list_again() -> QueueReport:
+        before = watch.report()
+        monkeypatch.setattr("poolpart.deploy.waiting_jobs.LIST_EVERY_S", 0.0)
+        watch.refresh(has_jobs=True)
+        monkeypatch.setattr("poolpart.deploy.waiting_jobs.LIST_EVERY_S", NEVER_S)
+        wait_until(lambda: watch.refresh(has_jobs=True) or watch._listing is None)
+        assert watch.report() != before or before.waiting == 1
+        return watch.report()
+
+    watch = QueueWatch(others, ["GPU"])
+    assert list_again().to_release == 1
+    watch.count_released(1)
+    assert watch.report().to_release == 0
+    assert list_again().to_release == 0
+    assert list_again().to_release == 1
+
+
+@contextmanager
+def two_partitions(gpu_others: Any, io_others: Any) -> Iterator[tuple[Client, list[Partition]]]:
+    """Client and partitions GPU and IO, each with two busy jobs, on a cluster of jobs."""
+    options = {"adapt": [0, 2], "idle_s": NEVER_S}
+    with import_jobqueue().SLURMCluster(
+        cores=2, processes=1, memory="2GB", scheduler_options=SCHEDULER
+    ) as cluster:
+        start_partitions(
+            cluster,
+            {
+                "GPU": options | {"yield_to_others": gpu_others},
+                "IO": options | {"yield_to_others": io_others},
+            },
+        )
+        with Client(cluster) as client:
+            yield client, [Partition("GPU", client), Partition("IO", client)]
+
+
+@pytest.mark.extended
+def test_one_waiting_job_costs_one_worker_of_all_partitions_in_the_queue(queue, wait_until):
+    waiting = [0]
+
+    def others() -> int:
+        return waiting[0]
+
+    with two_partitions(others, others) as (client, parts):
+        tasks = [part.submit(wait_for, "go") for part in parts for _ in range(8)]
+        workers = client.cluster.scheduler.workers
+
+        def releasing() -> list[int]:
+            return [part.stats().queue.releasing for part in parts]
+
+        wait_until(lambda: [len(part) for part in parts] == [2, 2])
+        wait_until(lambda: all(worker.processing for worker in workers.values()))
+        waiting[0] = 1
+        wait_until(lambda: sum(releasing()) == 1)
+        first = releasing()
+        time.sleep(0.5)
+        assert releasing() == first  # the same job, at each listing
+        waiting[0] = 2
+        wait_until(lambda: releasing() == [1, 1])  # they take turns
+        waiting[0] = 7
+        time.sleep(0.3)
+        assert releasing() == [1, 1]  # one job of each partition remains
+        waiting[0] = 0
+        wait_until(lambda: releasing() == [0, 0])
+        Event("go", client).set()
+        assert client.gather(tasks) == [True] * 16
+
+
+@pytest.mark.extended
+def test_partitions_in_different_queues_release_jobs_for_each(queue, wait_until):
+    with two_partitions(lambda: 1, lambda: 1) as (client, parts):
+        tasks = [part.submit(wait_for, "go") for part in parts for _ in range(8)]
+        for part in parts:
+            part.adapt(2, 2, idle_s=NEVER_S)
+        wait_until(lambda: [len(part) for part in parts] == [2, 2])
+        for part in parts:
+            part.adapt(0, 2, idle_s=NEVER_S)
+        wait_until(lambda: [part.stats().queue.releasing for part in parts] == [1, 1])
+        Event("go", client).set()
+        assert client.gather(tasks) == [True] * 16
+
+
+@pytest.mark.extended
+def test_an_idle_job_is_released_before_a_busy_one(queue, wait_until, monkeypatch):
+    monkeypatch.setattr("poolpart.adapting.YIELD_IDLE_S", NEVER_S)
+    waiting = [0]
+
+    def others() -> int:
+        return waiting[0]
+
+    with two_partitions(others, others) as (client, (gpu, io)):
+        for part in (gpu, io):
+            part.adapt(2, 2, idle_s=NEVER_S)
+        wait_until(lambda: len(gpu) == len(io) == 2)
+        tasks = [gpu.submit(wait_for, "go", workers=worker.name) for worker in gpu.workers]
+        wait_until(lambda: gpu.stats().running == 2)
+        for part in (gpu, io):
+            part.adapt(0, 2, idle_s=NEVER_S)
+        waiting[0] = 1
+        wait_until(lambda: len(io) == 1)
+        assert len(gpu) == 2
+        assert gpu.stats().queue.releasing == 0
+        Event("go", client).set()
+        assert client.gather(tasks) == [True] * 2
+
+
+async def counts_later() -> int:
+    return 0
+
+
+class Counts:
+    async def __call__(self) -> int:
+        return 0
 
 
 WRONG = {
     "fixed": ({"yield_to_others": True}, "`yield_to_others`, which requires `adapt`"),
     "text": ({"adapt": [0, 1], "yield_to_others": "yes"}, "Invalid value 'yes'"),
+    "number": ({"adapt": [0, 1], "yield_to_others": 1}, "Invalid value 1 for"),
+    "coroutine": ({"adapt": [0, 1], "yield_to_others": counts_later}, "is a coroutine function"),
+    "coroutine method": ({"adapt": [0, 1], "yield_to_others": Counts()}, "is a coroutine function"),
+    "arguments": (
+        {"adapt": [0, 1], "yield_to_others": lambda user: 0},
+        "without required arguments, .* missing a required argument: 'user'",
+    ),
 }
 
 
@@ -336,6 +590,18 @@ def test_a_failing_squeue_is_reported(slurm_commands):
     script.write_text("#!/bin/sh\necho 'squeue: error: Invalid partition' >&2; exit 1\n")
     with pytest.raises(PoolError, match="squeue failed: squeue: error: Invalid partition"):
         count_slurm_jobs("nowhere")
+
+
+def test_a_squeue_that_hangs_is_ended(slurm_commands, monkeypatch):
+    monkeypatch.setattr("poolpart.deploy.waiting_jobs._COMMAND_S", 0.2)
+    slurm_commands.with_name("squeue").write_text("#!/bin/sh\nexec sleep 60\n")
+    with pytest.raises(PoolError, match=r"squeue failed: .* timed out after 0\.2 seconds"):
+        count_slurm_jobs("gpu")
+
+
+def test_partitions_in_the_same_slurm_queue_share_a_listing():
+    counters = {"A": SlurmCounter("gpu"), "B": SlurmCounter(None), "C": SlurmCounter("gpu")}
+    assert [watch.partitions for watch in watch_queues(counters)] == [("A", "C"), ("B",)]
 
 
 def test_the_function_for_pbs_in_the_manual(tmp_path, monkeypatch):

@@ -22,12 +22,12 @@ from distributed import SpecCluster, Status
 from distributed.deploy import ssh
 from tornado.ioloop import PeriodicCallback
 
-from ..adapting import IDLE_S, JobBounds, JobSpec, add_partitions, advise_jobs
+from ..adapting import IDLE_S, JobBounds, JobSpec, QueueReport, add_partitions, advise_jobs
 from ..errors import PoolError
 from ..internals.names import ADAPTING, CLUSTERS, require_feature
 from ..internals.scheduler import run_on_cluster_scheduler
 from ..rules import check_count, check_name
-from .waiting_jobs import QueueWatch, waiting_jobs_counter
+from .waiting_jobs import Counter, waiting_jobs_counter, watch_queues
 
 logger = logging.getLogger(__name__)
 
@@ -127,7 +127,7 @@ class _PartitionJobs:
     initial_count: int  # number of jobs to start initially
     spec: JobSpec
     describe: Describe
-    watch: QueueWatch | None = None  # None if the partition does not yield to other users
+    count_waiting: Counter | None = None  # None if the partition does not yield to other users
     submitted: int = 0  # number of jobs submitted so far
     host_indices: dict[str, int] = field(default_factory=dict)  # {job: index of its host}
 
@@ -166,8 +166,7 @@ class _PartitionJobs:
             raise PoolError(f"Partition {name!r} cannot be started. {error}") from error
         spec = JobSpec(slots, len(sample.get("group", ".")), bounds)
         count_waiting = waiting_jobs_counter(cluster, name, yields, sample["options"])
-        watch = count_waiting and QueueWatch(count_waiting)
-        return cls(name, cluster_options, count, spec, describe, watch)
+        return cls(name, cluster_options, count, spec, describe, count_waiting)
 
     def add(self, cluster: SpecCluster, count: int) -> None:
         """Add jobs to the cluster, which starts them when it is awaited."""
@@ -238,6 +237,13 @@ class _JobStarter:
             for part in partition_jobs.values()
         )
         self._logs = JobLogs(sample["options"] for sample in samples)
+        self._watches = watch_queues(
+            {
+                name: part.count_waiting
+                for name, part in partition_jobs.items()
+                if part.count_waiting is not None
+            }
+        )
         self._messages: set[str] = set()  # reported messages, without their numbers
         self._logs_read_at = time.monotonic()
 
@@ -281,15 +287,14 @@ class _JobStarter:
     async def _adapt(self) -> bool:
         """Apply the scheduler's advice on jobs, and return whether any jobs must start."""
         jobs = {name: part.workers(self._cluster) for name, part in self._parts.items()}
-        to_release = self._jobs_to_release(jobs)
         advice = await run_on_cluster_scheduler(
-            self._cluster, advise_jobs, jobs=jobs, to_release=to_release
+            self._cluster, advise_jobs, jobs=jobs, queues=self._queue_reports(jobs)
         )
+        for watch in self._watches:
+            watch.count_released(sum(advice[name].closed_jobs for name in watch.partitions))
         for name, advice_of_part in advice.items():  # adaptive partitions only
             part = self._parts[name]
             to_start = advice_of_part.jobs_to_start
-            if part.watch is not None:
-                part.watch.count_released(advice_of_part.closed_jobs)
             await asyncio.gather(
                 *(self._remove_job(part, job) for job in advice_of_part.jobs_to_forget)
             )
@@ -301,20 +306,16 @@ class _JobStarter:
             part.add(self._cluster, to_start - len(lost))
         return any(advice_of_part.jobs_to_start for advice_of_part in advice.values())
 
-    def _jobs_to_release(self, jobs: Mapping[str, Mapping[str, Sequence[str]]]) -> dict[str, int]:
-        """Return the number of jobs to release, for partitions for which other users wait."""
-        to_release: dict[str, int] = {}
-        for name, part in self._parts.items():
-            if part.watch is not None:
-                part.watch.refresh(has_jobs=bool(jobs[name]))
-                number = part.watch.to_release()
-                if number is not None:
-                    to_release[name] = number
-                if part.watch.problem:
-                    self._report_once(
-                        f"The waiting jobs of other users could not be listed. {part.watch.problem}"
-                    )
-        return to_release
+    def _queue_reports(self, jobs: Mapping[str, Mapping[str, Sequence[str]]]) -> list[QueueReport]:
+        """Return the states of the queues that partitions share with other users."""
+        for watch in self._watches:
+            watch.refresh(has_jobs=any(jobs[name] for name in watch.partitions))
+            if watch.problem:
+                self._report_once(
+                    f"No jobs of {watch.names} are released for other users, because the queue "
+                    f"cannot be listed. {watch.problem}"
+                )
+        return [watch.report() for watch in self._watches]
 
     async def _remove_job(self, part: _PartitionJobs, job: str) -> None:
         """Remove a job. Its workers have been closed, or will be closed when they join."""

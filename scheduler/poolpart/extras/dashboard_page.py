@@ -1,4 +1,4 @@
-"""A page in Dask's dashboard that shows partitions, stages, workers, pipes and moves in tables.
+"""A page in Dask's dashboard that shows partitions, their queues, workers, pipes and moves.
 
 The scheduler renders the page, which contains no scripts and reloads every two seconds.
 """
@@ -26,7 +26,7 @@ from ..html_table import TEXT_COLUMNS, format_seconds
 from ..internals.names import PAGE, require_feature
 from ..internals.scheduler import add_pages, remove_pages
 from ..membership import partition_names, release_statistics
-from ..partition_stats import COUNTS, NO_PARTITION, StageStats
+from ..partition_stats import COUNTS, HEAD_OF_QUEUES, NO_PARTITION, StageStats
 from ..pipe_states import pipes_of
 from ..stats import NAME as STATISTICS
 from ..stats import (
@@ -105,11 +105,14 @@ def render_page(scheduler: Any, only: str = "") -> bytes:
     shown = [only] if only else [*sorted(names), ""]
     partitions: list[list[object]] = []
     stages: list[list[object]] = []
+    queues: list[list[object]] = []
     pipes: list[list[object]] = []
     for p in stats_of(shown, scheduler):
         title = f"{_label(p.name)}{' (exclusive)' * p.exclusive}"
         partitions.append([title, p.workers, p.slots, p.busy, *_counts(p)])
         stages += [[name, _label(p.name), *_counts(stage)] for name, stage in p.stages.items()]
+        if p.queue:
+            queues.append([p.name, *p.queue.cells])
     rows_of_workers = sorted(
         (_worker_row(worker) for worker in workers), key=_by_partition_and_name
     )
@@ -121,6 +124,7 @@ def render_page(scheduler: Any, only: str = "") -> bytes:
     tables = [
         ("Partitions", ["partition", "workers", "slots", "busy", *_FIGURES], partitions),
         ("Stages", ["stage", "partition", *_FIGURES], stages),
+        ("Shared queues", HEAD_OF_QUEUES, queues),
         ("Workers", _OF_A_WORKER, rows_of_workers),
         ("Pipes", ["pipe", "depth", "capacity", "state"], pipes),
         ("Moves", HEAD_OF_MOVES, [move.cells for move in moves[:_SHOWN_MOVES]]),
