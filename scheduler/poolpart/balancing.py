@@ -15,7 +15,6 @@ import math
 import time
 from collections import Counter, deque
 from collections.abc import Collection, Coroutine, Hashable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from itertools import chain, islice
@@ -24,7 +23,7 @@ from typing import Any, Self
 from distributed import Client
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from .adapting import adaptive_names
+from .adapting import JobBounds, adaptive_names, set_bounds
 from .balance_policy import BalancePolicy, LoadSample, WorkerShift
 from .balance_stats import BalanceStats, DemandStats, WorkerMove
 from .division import call_steward, in_moving_order, move_workers, settled_members
@@ -33,7 +32,7 @@ from .internals.names import BALANCING, require_feature
 from .internals.scheduler import call_worker, unrunnable_tasks, used_slots
 from .pipe_states import feeding_pipes
 from .probe import worker_gpus
-from .rules import check_count
+from .rules import check_count, check_name
 from .stats import statistics_of
 from .steward import NAME as STEWARD
 from .steward import Steward, WorkerRecord, join_names
@@ -45,6 +44,7 @@ NAME = "poolpart-balancing"
 INTERVAL_S = 0.5  # interval between decisions
 DRAIN_S = 60.0  # maximum time that a worker has to finish its running tasks
 PAUSE_S = 300.0  # time for which a worker that has not finished them in time is not moved
+_ANSWER_S = 10.0  # maximum time that a worker has to report its GPUs
 MAX_MOVES = 1000  # number of moves in the history of a group
 _MAX_WAITING = 10_000  # number of tasks without a worker that are examined
 _MIN_PARTITIONS = 2
@@ -76,9 +76,16 @@ class BalancedGroup:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        with suppress(OSError):  # the scheduler has ended, and the group with it
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        try:
             self.stop()
+        except OSError:  # the scheduler has ended, and the group with it
+            pass
+        except PoolError as failure:
+            if error is None:
+                raise
+            # The first error is more important than the failure that follows it.
+            error.add_note(f"poolpart: The balanced group was not stopped. {failure}")
 
     def stats(self) -> BalanceStats:
         """Return the load of each partition, and the workers that were moved and why."""
@@ -95,20 +102,20 @@ def balance_partitions(
     names: Sequence[str],
     minimum: Bounds,
     maximum: Bounds,
-    workers: Iterable[str] | None,
+    workers: Iterable[str | int] | None,
 ) -> BalancedGroup:
     """Create a balanced group. See `Pool.balance`."""
+    for name in names:
+        check_name(name)
     if len(set(names)) < _MIN_PARTITIONS or len(set(names)) < len(names):
         raise PoolError(
             f"`balance` requires at least two different partitions, but got {list(names)!r}."
         )
-    if isinstance(workers, str):
-        raise PoolError(f"Invalid value {workers!r} for `workers`. Expected a list of names.")
     spec = GroupSpec(
         tuple(names),
         _bounds("min", names, minimum, 1, 0),
         _bounds("max", names, maximum, math.inf, 1),
-        None if workers is None else frozenset(map(str, workers)),
+        None if workers is None else _worker_names(workers),
     )
     for name in names:
         if spec.minimum[name] > spec.maximum[name]:
@@ -135,6 +142,17 @@ def _bounds(
     return {name: bounds.get(name, default) for name in names}
 
 
+def _worker_names(workers: Iterable[str | int]) -> frozenset[str]:
+    """Validate the names of workers that a user has passed."""
+    names = [*workers] if isinstance(workers, Iterable) and not isinstance(workers, str) else []
+    if not names or not all(type(name) in (str, int) for name in names):
+        raise PoolError(
+            f"Invalid value {workers!r:.100} for `workers`. Expected a list with the names of the "
+            "workers that may be moved, or None for all workers."
+        )
+    return frozenset(map(str, names))
+
+
 @dataclass(frozen=True)
 class GroupSpec:
     """Partitions of a balanced group, their bounds, and the workers that may be moved."""
@@ -154,6 +172,8 @@ class _Group:
     """State of a balanced group. All times are values of `time.monotonic`."""
 
     spec: GroupSpec
+    # {partition that has not been dissolved: number that identifies it}
+    partitions: dict[str, int]
     has_gpus: bool  # whether workers of the group have GPUs
     policy: BalancePolicy = field(default_factory=BalancePolicy)
     moves: deque[WorkerMove] = field(default_factory=lambda: deque(maxlen=MAX_MOVES))
@@ -225,14 +245,24 @@ class GroupBalancer(SchedulerPlugin):
             has_lost_workers = self._has_lost_workers
             self._has_lost_workers = False
             for group in list(self.groups):
-                self._balance(group, has_lost_workers)
+                try:
+                    self._balance(group, has_lost_workers)
+                except Exception:  # other groups are not affected
+                    logger.exception("%s is no longer balanced.", group.spec)
+                    self.remove(group)
 
     # -- decisions ---------------------------------------------------------------------
 
     def _balance(self, group: _Group, has_lost_workers: bool) -> None:
         """Take samples of a group's partitions, and start to move workers if necessary."""
         steward: Steward | None = self.scheduler.plugins.get(STEWARD)
-        names = [name for name in group.spec.names if steward and name in steward.rules]
+        # A partition that was dissolved leaves the group, even if it was created again.
+        group.partitions = {
+            name: number
+            for name, number in group.partitions.items()
+            if steward is not None and steward.number_of(name) == number
+        }
+        names = [*group.partitions]
         if steward is None or len(names) < _MIN_PARTITIONS:
             self.remove(group)
             return
@@ -304,10 +334,23 @@ class GroupBalancer(SchedulerPlugin):
 
     def _ask_for_gpus(self, group: _Group, records: Sequence[WorkerRecord]) -> None:
         """Ask workers that have joined later whether they have GPUs."""
-        joined = [record for record in records if record.key not in group.gpus]
-        if joined and group.spec.workers is None:
-            group.gpus.update(dict.fromkeys((record.key for record in joined), None))
-            _start(find_gpus(self.scheduler, joined, group.gpus), group.tasks)
+        now = time.monotonic()
+        unknown = [
+            record
+            for record in records
+            if record.key not in group.gpus and group.paused_until.get(record.key, 0.0) <= now
+        ]
+        if unknown and group.spec.workers is None:
+            group.gpus.update(dict.fromkeys((record.key for record in unknown), None))
+            _start(self._find_gpus(group, unknown), group.tasks)
+
+    async def _find_gpus(self, group: _Group, records: Sequence[WorkerRecord]) -> None:
+        """Store whether workers have GPUs. Workers that do not respond are asked again later."""
+        group.gpus.update(await find_gpus(self.scheduler, records))
+        for record in records:
+            if group.gpus[record.key] is None:
+                del group.gpus[record.key]
+                group.paused_until[record.key] = time.monotonic() + PAUSE_S
 
     # -- moves -------------------------------------------------------------------------
 
@@ -381,26 +424,28 @@ def _start(
 
 def _log_error(task: asyncio.Task[None]) -> None:
     if not task.cancelled() and (error := task.exception()):
-        logger.error("Partitions are no longer balanced: %r", error, exc_info=error)
+        logger.error("Workers could not be moved: %r", error, exc_info=error)
 
 
-async def find_gpus(
-    scheduler: Any, records: Iterable[WorkerRecord], gpus: dict[Hashable, bool | None]
-) -> None:
-    """Ask workers whether they have GPUs, and store the answers by worker key.
+async def find_gpus(scheduler: Any, records: Iterable[WorkerRecord]) -> dict[Hashable, bool | None]:
+    """Ask workers whether they have GPUs, and return the answers by worker key.
 
     The answer of a worker that does not respond is None.
     """
 
-    async def ask(record: WorkerRecord) -> None:
+    async def ask(record: WorkerRecord) -> tuple[Hashable, bool | None]:
+        request = call_worker(scheduler, record.info.address, worker_gpus)
         try:
-            answer = await call_worker(scheduler, record.info.address, worker_gpus)
-        except OSError as error:
-            logger.warning("Worker %s cannot list its GPUs: %s", record.info.name, error)
-            return
-        gpus[record.key] = bool(answer)
+            return record.key, bool(await asyncio.wait_for(request, _ANSWER_S))
+        except (OSError, TimeoutError) as error:
+            logger.warning(
+                "Worker %s is not moved for now, because it does not report its GPUs. %s",
+                record.info.name,
+                error,
+            )
+            return record.key, None
 
-    await asyncio.gather(*map(ask, records))
+    return dict(await asyncio.gather(*map(ask, records)))
 
 
 async def _create_group(steward: Steward, spec: GroupSpec) -> None:
@@ -414,37 +459,51 @@ async def _create_group(steward: Steward, spec: GroupSpec) -> None:
     """
     require_feature(BALANCING)
     scheduler = steward.scheduler
-    for name in spec.names:
+    for name in spec.names:  # all checks that are possible before a partition is changed
         if name in adaptive_names(scheduler):
             raise PoolError(
                 f"Partition {name!r} is adaptive, so its workers cannot be moved to other "
                 "partitions. Balance only partitions with a fixed number of jobs."
             )
+        steward.check_exists(name)
+    _check_groups(scheduler, spec)
+    for name in spec.names:
         steward.adopt_partition(name)
     _check_workers(steward, spec)
     gpus: dict[Hashable, bool | None] = {}
     if spec.workers is None:
         members = [record for name in spec.names for record in steward.members(name)]
-        await find_gpus(scheduler, [r for r in members if not r.is_absent], gpus)
+        gpus = await find_gpus(scheduler, [r for r in members if not r.is_absent])
+        # In the meantime, other clients may have made requests.
+        for name in spec.names:
+            steward.check_exists(name)
+        _check_groups(scheduler, spec)
         _check_same_kind(steward, spec, gpus)
-    balancer: GroupBalancer | None = scheduler.plugins.get(NAME)
-    former = balancer.find(spec.names) if balancer is not None else None
-    others = [g for g in balancer.groups if g is not former] if balancer is not None else []
-    for name in spec.names:
-        if any(name in other.spec.names for other in others):
-            raise PoolError(
-                f"Partition {name!r} already belongs to another balanced group. Stop that group "
-                "first, or balance all of the partitions together."
-            )
     statistics_of(scheduler, keep=False)
+    balancer: GroupBalancer | None = scheduler.plugins.get(NAME)
     if balancer is None:
         balancer = GroupBalancer(scheduler)
         scheduler.add_plugin(balancer)
-    group = _Group(spec, any(gpus.values()), gpus=gpus)
-    if former is not None:
+    known = {key: answer for key, answer in gpus.items() if answer is not None}
+    numbers = {name: steward.number_of(name) for name in spec.names}
+    group = _Group(spec, numbers, any(known.values()), gpus=dict(known))
+    if (former := balancer.find(spec.names)) is not None:
         balancer.groups.remove(former)
         group.moves.extend(former.moves)
     balancer.add(group)
+
+
+def _check_groups(scheduler: Any, spec: GroupSpec) -> None:
+    """Raise PoolError if a partition belongs to a group of other partitions."""
+    for group in _groups(scheduler):
+        if set(group.spec.names) == set(spec.names):
+            continue  # this group is replaced
+        for name in spec.names:
+            if name in group.partitions:
+                raise PoolError(
+                    f"Partition {name!r} already belongs to another balanced group. Stop that "
+                    "group first, or balance all of the partitions together."
+                )
 
 
 def _check_workers(steward: Steward, spec: GroupSpec) -> None:
@@ -455,6 +514,12 @@ def _check_workers(steward: Steward, spec: GroupSpec) -> None:
             f"`workers` names {', '.join(map(repr, unknown))}, but the partitions have no such "
             f"workers. Their workers are {join_names(members)}."
         )
+    for name, most in spec.maximum.items():
+        if (least := steward.rules[name].minimum) > most:
+            raise PoolError(
+                f"The rule of partition {name!r} has the minimum {least}, so its `max` cannot be "
+                f"{most:g}."
+            )
     total = len(members)
     # The default minimum of 1 is accepted for partitions that have lost their workers.
     if (least := sum(spec.minimum.values())) > max(total, len(spec.names)):
@@ -515,6 +580,22 @@ def _stop_group(names: Sequence[str], dask_scheduler: Any = None) -> None:
     balancer: GroupBalancer | None = dask_scheduler.plugins.get(NAME)
     if balancer is not None and (group := balancer.find(names)) is not None:
         balancer.remove(group)
+
+
+def set_job_bounds(name: str, bounds: JobBounds, dask_scheduler: Any = None) -> str:
+    """Change the allowed number of a partition's jobs, and return why this is impossible or ""."""
+    if any(name in group.partitions for group in _groups(dask_scheduler)):
+        return (
+            f"Partition {name!r} belongs to a balanced group, so its workers cannot be started and "
+            "stopped according to its work. Stop the group first."
+        )
+    if set_bounds(name, bounds, dask_scheduler):
+        return ""
+    return (
+        f"Partition {name!r} has no jobs that can be started. Only partitions that "
+        "`start_partitions` or `scale_groups` created are adaptive. To change the size of a "
+        "partition of a divided pool, use `Partition.resize`."
+    )
 
 
 def recent_moves(scheduler: Any, count: int) -> list[WorkerMove]:

@@ -34,6 +34,7 @@ from .errors import PoolError
 from .features import disable_features, enable_features, names_with_features, wait_for_features
 from .internals.method_rules import MethodRules, add_arrival_rule
 from .internals.names import REFUSING, require_feature
+from .internals.partition_client import CLIENT_OF
 from .internals.placing import has_worker_for, workers_declaring
 from .internals.worker import current_task
 from .registration import is_registered, record_registration
@@ -199,20 +200,62 @@ class Registrations(SchedulerPlugin):
         if not isinstance(resources, dict):  # None or a callable
             return graph
         self._refuse(client, resources)
-        workers = annotations.get("workers")
-        if not workers or not all(isinstance(worker, MemberName) for worker in workers):
-            return graph
-        [name] = resources
-        workers = addresses_of_members(self.scheduler, name, workers)
-        return {**graph, "global_annotations": {**annotations, "workers": workers}}
+        return {**graph, "global_annotations": self._with_members(annotations)}
 
-    def _refuse(self, client: str, resources: Mapping[str, float]) -> None:
+    def _with_members(self, annotations: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Replace the selected workers in the annotations of a graph by addresses of members.
+
+        Raises
+        ------
+        PoolError
+            If a worker does not belong to the partition.
+        """
+        workers = annotations.get("workers") or ()
+        name = annotations.get(CLIENT_OF)  # of a `PartitionClient`
+        if name is None and workers and all(isinstance(w, MemberName) for w in workers):
+            [name] = annotations["resources"]
+        elif name is None or not workers:
+            return annotations
+        elif annotations.get("allow_other_workers"):
+            # If none of the workers is a member, Dask would ignore the resource as well.
+            members = workers_declaring(self.scheduler, name)
+            names = {alias for m in members for alias in (m.address, str(m.name), m.host)}
+            workers = [worker for worker in workers if str(worker) in names]
+            if not workers:
+                placing = ("workers", "allow_other_workers")
+                return {key: value for key, value in annotations.items() if key not in placing}
+        hosts = [host for host in workers if host in self.scheduler.host_info]
+        names_of_workers = [worker for worker in workers if worker not in hosts]
+        addresses = addresses_of_members(self.scheduler, name, names_of_workers)
+        return {**annotations, "workers": addresses + hosts}
+
+    def _refuse(self, client: str, resources: Mapping[str, Any]) -> None:
         """Raise PoolError if a client's tasks with these resources could never run."""
-        for name, slots in resources.items():
-            if client in self.clients.get(name, ()):
-                objection = rejection_reason(self.scheduler, name, slots, name in self.with_rule)
-                if objection:
-                    raise PoolError(objection)
+        partitions = [name for name in resources if client in self.clients.get(name, ())]
+        if partitions and len(resources) > 1:
+            self._refuse_two_partitions(resources)
+        for name in partitions:
+            slots = resources[name]
+            if not isinstance(slots, int | float) or not slots >= 0:
+                raise PoolError(
+                    f"Invalid value {slots!r} for the slots of a task in partition {name!r}. "
+                    "Expected a number of at least 0."
+                )
+            objection = rejection_reason(self.scheduler, name, slots, name in self.with_rule)
+            if objection:
+                raise PoolError(objection)
+
+    def _refuse_two_partitions(self, resources: Mapping[str, Any]) -> None:
+        """Raise PoolError if a task requests slots in partitions that share no worker."""
+        known = {*self.clients, *names_with_rule(self.scheduler), *adaptive_names(self.scheduler)}
+        names = sorted(name for name in resources if name in known)
+        workers = self.scheduler.workers.values()
+        if len(names) > 1 and not any(w.resources.keys() >= {*names} for w in workers):
+            raise PoolError(
+                f"A task requests slots in the partitions {' and '.join(map(repr, names))}, but a "
+                "worker belongs to at most one partition. Submit the task to one of them, outside "
+                "of `with` blocks of the others."
+            )
 
 
 async def _register(

@@ -9,13 +9,15 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from contextvars import ContextVar
+from functools import partial
 from typing import Any, Literal, Self, overload
 
 import dask
 from dask.utils import funcname
 from distributed import Client, Future
 
-from .adapting import IDLE_S, JobBounds, request_slots, set_bounds
+from .adapting import IDLE_S, JobBounds, request_slots
+from .balancing import set_job_bounds
 from .division import (
     call_steward,
     grow_partition,
@@ -30,13 +32,13 @@ from .extras.dashboard_page import open_page
 from .extras.notebook import table_of_partition
 from .for_each import ItemTasks
 from .internals.names import CANCELLING, CLIENTS, MAP, require_feature
-from .internals.partition_client import PartitionClient, whole_client
+from .internals.partition_client import PartitionClient, entered_partitions, whole_client
 from .mapping import Results, Stage
 from .membership import MemberName, register
 from .partition_stats import PartitionStats
 from .pipe import Pipe
 from .pipe_states import USES_PIPES
-from .rules import check_count
+from .rules import check_count, check_name
 from .stats import size_of, stats_of, tasks_of
 from .task_context import own_client
 from .task_table import TaskTable, to_datetime
@@ -94,6 +96,7 @@ class Partition:
     def __init__(
         self, name: str, client: Client | None = None, note: str = "", by_rule: bool = False
     ) -> None:
+        check_name(name)
         self.name = name
         self.note = note
         self._client = None if client is None else whole_client(client)
@@ -287,7 +290,7 @@ class Partition:
         If `asks` is true, the client is registered for the partition, which may send a request to
         the scheduler.
         """
-        if not isinstance(slots, int) or slots < 1:
+        if not isinstance(slots, int) or slots is True or slots < 1:
             raise ValueError(
                 f"Invalid value {slots!r} for `slots`. Expected an integer of at least 1."
             )
@@ -635,7 +638,7 @@ class Partition:
         """
         require_feature(CLIENTS)
         self._resources_for(1, asks=not self.client.asynchronous)
-        return PartitionClient(self.client, self.name)
+        return PartitionClient(self.client, self.name, partial(self._resources_for, 1))
 
     def scatter(self, data: Any, **options: Any) -> Any:
         """Scatter data into the memory of these workers, and return futures.
@@ -692,6 +695,9 @@ class Partition:
         with ExitStack() as stack:
             stack.enter_context(self.client.as_current())
             stack.enter_context(dask.annotate(resources=resources))
+            outer = entered_partitions.get()
+            entered_partitions.set((*outer, self.name))
+            stack.callback(entered_partitions.set, outer)
             _entered.set((*_entered.get(), stack.pop_all()))
         return self
 
@@ -832,20 +838,16 @@ class Partition:
         Raises
         ------
         PoolError
-            If the workers are not started by `start_partitions` or `scale_groups`, or if a number
-            is invalid.
+            If the workers are not started by `start_partitions` or `scale_groups`, if the partition
+            belongs to a balanced group, or if a number is invalid.
 
         Examples
         --------
         >>> gpu.adapt(0, 8)                                              # doctest: +SKIP
         """
         bounds = JobBounds.from_user_values(self.name, minimum, maximum, idle_s)
-        if not run_on_scheduler(self.client, set_bounds, name=self.name, bounds=bounds):
-            raise PoolError(
-                f"Partition {self.name!r} has no jobs that can be started. Only partitions that "
-                "`start_partitions` or `scale_groups` created are adaptive. To change the size of "
-                "a partition of a divided pool, use `Partition.resize`."
-            )
+        if problem := run_on_scheduler(self.client, set_job_bounds, name=self.name, bounds=bounds):
+            raise PoolError(problem)
 
     def request_slots(self, slots: int) -> bool:
         """Request slots on behalf of this client, and return whether the partition is adaptive.

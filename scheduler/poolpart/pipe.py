@@ -167,8 +167,17 @@ class Pipe:
         fails_with_tasks: bool = True,
         drop_repeats: bool = True,
     ) -> None:
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"Invalid name {name!r} of a pipe. Expected a string.")
+        options = {"fails_with_tasks": fails_with_tasks, "drop_repeats": drop_repeats}
+        for option, value in options.items():
+            if not isinstance(value, bool):
+                raise ValueError(
+                    f"Invalid value {value!r} for `{option}` of pipe {name!r}. Expected True or "
+                    "False."
+                )
         for quantity, number in (("capacity", capacity), ("number of producers", producers)):
-            if not isinstance(number, int) or number < 1:
+            if not isinstance(number, int) or number is True or number < 1:
                 raise ValueError(
                     f"Invalid value {number!r} for the {quantity} of pipe {name!r}. Expected an "
                     "integer of at least 1."

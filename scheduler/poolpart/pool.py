@@ -431,7 +431,7 @@ class Pool:
         *,
         min: int | Mapping[str, int] = 1,  # noqa: A002 - reads as a bound
         max: int | Mapping[str, int] | None = None,  # noqa: A002
-        workers: Iterable[str] | None = None,
+        workers: Iterable[str | int] | None = None,
     ) -> BalancedGroup:
         """Move workers between partitions according to their work, until the group is stopped.
 
@@ -479,9 +479,12 @@ class Pool:
         DECODE     56       58.2    180      331      0.17          0.37
         DETECT     70       72.1    232      331      0.21          0.49
         """
+        if isinstance(partitions, str | Partition) or not isinstance(partitions, Iterable):
+            raise PoolError(
+                f"Invalid value {partitions!r} for `partitions`. Expected a list of partitions or "
+                "of their names, for example `[decode, detect]`."
+            )
         names = [part.name if isinstance(part, Partition) else part for part in partitions]
-        for name in names:
-            check_name(name)
         return balance_partitions(self.client, names, min, max, workers)
 
     def page(self) -> str:

@@ -440,7 +440,7 @@ def check_name(partition: object) -> None:
 
 def check_count(name: str, count: object, minimum: int = 1) -> None:
     """Raise PoolError if the value is not an integer of at least `minimum`."""
-    if not isinstance(count, Integral) or count < minimum:
+    if isinstance(count, bool) or not isinstance(count, Integral) or count < minimum:
         raise PoolError(
             f"Invalid value {count!r} for {name}. Expected an integer of at least {minimum}."
         )

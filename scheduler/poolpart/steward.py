@@ -19,6 +19,7 @@ leaves nothing behind.
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
 import time
 from collections.abc import Collection, Hashable, Iterable, Iterator
@@ -52,6 +53,7 @@ logger = logging.getLogger(__name__)
 NAME = "poolpart-steward"
 HOLD_S = 30.0  # time for which the record of a worker is kept while its nanny restarts it
 CHECK_EVERY_S = 0.01  # interval between attempts to reconcile a worker
+_numbers = itertools.count()  # numbers of partitions, of all stewards in this process
 _ASSIGN_EVERY_S = 0.1  # about the time that applying all rules to a thousand workers takes
 
 
@@ -91,7 +93,7 @@ class Steward(SchedulerPlugin):
         self.rules: dict[str, Rule] = {}  # {partition: rule}, in the order in which they apply
         self.records: dict[Hashable, WorkerRecord] = {}  # {worker key: record}
         self.open_requests = 0  # number of client requests in progress
-        self._names: set[str] = set()  # names of all partitions so far, including dissolved ones
+        self._numbers: dict[str, int] = {}  # {partition, even if it was dissolved: its number}
         self._assignment_timer: asyncio.TimerHandle | None = None
         for worker in scheduler.workers.values():
             self._add_record(worker)
@@ -130,7 +132,7 @@ class Steward(SchedulerPlugin):
         """
         if record.partition is None:
             return {r: slots for r, slots in record.original.items() if r not in self.rules}
-        original = {r: slots for r, slots in record.original.items() if r not in self._names}
+        original = {r: slots for r, slots in record.original.items() if r not in self._numbers}
         return {**original, record.partition: record.slots}
 
     def home_of(self, record: WorkerRecord) -> str | None:
@@ -167,9 +169,31 @@ class Steward(SchedulerPlugin):
 
     def set_rule(self, name: str, rule: Rule) -> None:
         """Add a partition, or change its rule. The partition with the rule `rest` remains last."""
-        self._names.add(name)
+        if name not in self.rules:
+            self._numbers[name] = next(_numbers)
         rules = {**self.rules, name: rule}.items()
         self.rules = dict(sorted(rules, key=lambda item: isinstance(item[1], rest)))
+
+    def number_of(self, name: str) -> int:
+        """Return a number that identifies a partition, or -1 if it does not exist.
+
+        A partition that was dissolved and created again has another number.
+        """
+        return self._numbers[name] if name in self.rules else -1
+
+    def check_exists(self, name: str) -> None:
+        """Raise PoolError if a partition neither has a rule nor workers that started in it."""
+        records = self.records.values()
+        if name not in self.rules and not any(self._started_in(name, r) for r in records):
+            raise PoolError(
+                f"There is no partition {name!r}. No worker declares this resource, and the "
+                "partition was not created with `Pool.partition` or `Pool.divide`."
+            )
+
+    @staticmethod
+    def _started_in(name: str, record: WorkerRecord) -> bool:
+        """Return whether a worker belongs to a partition because it was started in it."""
+        return record.partition is None and bool(record.original.get(name))
 
     def adopt_partition(self, name: str) -> None:
         """Add a partition whose workers were started with its resource, unless it is already known.
@@ -181,12 +205,8 @@ class Steward(SchedulerPlugin):
         """
         if name in self.rules:
             return
-        members = [s for s in self.records.values() if s.partition is None and s.original.get(name)]
-        if not members:
-            raise PoolError(
-                f"There is no partition {name!r}. No worker declares this resource, and the "
-                "partition was not created with `Pool.partition` or `Pool.divide`."
-            )
+        self.check_exists(name)
+        members = [record for record in self.records.values() if self._started_in(name, record)]
         self.set_rule(name, Rule(minimum=0))
         for record in members:
             self.set_home(record, name, record.original[name])

@@ -15,6 +15,7 @@ from tests.clusters import QUIET
 from tests.poolpart.helpers import LONG_S, addresses, leave, metrics_of, worker_name
 
 from poolpart import Partition, Pool, PoolError, n_workers
+from poolpart.adapting import JobSpec, add_partitions
 from poolpart.balancing import NAME as BALANCER
 from poolpart.deploy.local_processes import FixedCluster
 
@@ -321,7 +322,16 @@ def test_balancing_again_replaces_the_bounds(eight, quickly, wait_until):
         (["A", "B"], {"min": -1}, "value -1 for `min` of partition 'A'"),
         (["A", "B"], {"min": 3, "max": {"B": 2}}, "minimum of partition 'B' is 3, but its max"),
         (["A", "B"], {"max": {"X": 2}}, "`max` names 'X'"),
+        ("AB", {}, "value 'AB' for `partitions`. Expected a list"),
+        (None, {}, "value None for `partitions`"),
+        (["A", None], {}, "Invalid partition name None"),
+        (["A", "B"], {"min": True}, "value True for `min` of partition 'A'"),
+        (["A", "B"], {"min": float("nan")}, "value nan for `min` of partition 'A'"),
+        (["A", "B"], {"max": {"B": 0}}, "value 0 for `max` of partition 'B'"),
         (["A", "B"], {"workers": "a"}, "value 'a' for `workers`"),
+        (["A", "B"], {"workers": []}, r"value \[\] for `workers`"),
+        (["A", "B"], {"workers": 1}, "value 1 for `workers`"),
+        (["A", "B"], {"workers": [None]}, r"value \[None\] for `workers`"),
         (["A", "C"], {}, "'C' already belongs to another balanced group"),
         (["A", "B"], {"workers": ["x"]}, "`workers` names 'x', but the partitions have no such"),
         (["A", "B"], {"min": 2}, "require 4 workers in total, but they have 2. Reduce `min`"),
@@ -340,6 +350,155 @@ def test_a_maximum_must_leave_room_for_all_workers(start):
     with pytest.raises(PoolError, match="may have 2 workers in total, but they have 4"):
         balance(client, parts, max=1)
     balance(client, parts, max=2).stop()
+
+
+def test_a_maximum_below_the_minimum_of_the_rule_is_refused(start):
+    client = start({name: {} for name in "abcd"})
+    pool = Pool.from_client(client)
+    pool.divide({"A": n_workers(2, minimum=2), "B": n_workers(2)})
+    with pytest.raises(PoolError, match="'A' has the minimum 2, so its `max` cannot be 1"):
+        pool.balance(["A", "B"], max={"A": 1})
+
+
+def test_a_refused_group_changes_no_partition(start):
+    client = start({"a": {"resources": {"A": 1}}, "b": {"resources": {"B": 1}}, "c": {}})
+    pool = Pool.from_client(client)
+    with pytest.raises(PoolError, match="no partition 'X'"):
+        pool.balance(["A", "B", "X"])
+    leave(client, "a")
+    assert list(pool.partitions()) == ["B"]  # A has not become a partition with a rule
+
+
+def test_a_partition_that_is_created_again_is_not_balanced(eight, quickly, wait_until):
+    a, b, c = parts = divide(eight, A=2, B=2, C=4)
+    with balance(eight, parts) as group:
+        wait_until(lambda: group.stats().partitions.keys() == {"A", "B", "C"})
+        c.dissolve()
+        [again] = divide(eight, C=4)
+        wait_until(lambda: group.stats().partitions.keys() == {"A", "B"})
+        with keep_busy(a):
+            wait_until(lambda: len(a) == 3)
+            assert sizes([b, again]) == [1, 4]
+        with pytest.raises(PoolError, match="'B' already belongs to another balanced group"):
+            balance(eight, [b, again])
+    balance(eight, [b, again]).stop()
+    pool = Pool.from_client(eight)
+    with balance(eight, [a, b]) as group:
+        pool.dissolve()
+        divide(eight, A=4, B=4)
+        wait_until(lambda: group.stats().partitions == {})
+
+
+def test_a_partition_of_a_group_cannot_become_adaptive(start):
+    client = start({name: {"resources": {name.upper(): 1}} for name in "abcd"})
+    add = {"specs": {"A": JobSpec(1), "B": JobSpec(1)}}
+    client.run_on_scheduler(add_partitions, **add)
+    a = Partition("A", client)
+    message = "'A' belongs to a balanced group, so its workers"
+    with balance(client, ["A", "B"]), pytest.raises(PoolError, match=message):
+        a.adapt(0, 2)
+    a.adapt(0, 2)
+    with pytest.raises(PoolError, match="'A' is adaptive, so its workers cannot be moved"):
+        balance(client, ["A", "B"])
+
+
+def test_an_error_in_the_block_is_not_replaced_by_that_of_a_closed_client(start):
+    client = start({name: {} for name in "ab"})
+    divide(client, A=1, B=1)
+    with Client(client.cluster) as other:
+        group = balance(other, ["A", "B"])
+
+    def fail_in_block():
+        with group:
+            raise ValueError("of the block")
+
+    with pytest.raises(ValueError, match="of the block") as caught:
+        fail_in_block()
+    assert "The balanced group was not stopped. The client is closed." in caught.value.__notes__[0]
+    with pytest.raises(PoolError, match="The client is closed"):
+        group.stop()
+
+
+def start_to_move(client, parts, wait_until):
+    """Start to move a worker from the second partition to the first, which has to finish a task.
+
+    Returns the task.
+    """
+    released.clear()
+    a, b = parts
+    held = b.submit(hold, retries=9)
+    wait_until(lambda: b.stats().running == 1)
+    busy = [a.submit(pause) for _ in range(1000)]
+    wait_until(lambda: sum(len(part.workers) for part in parts) == 1)  # the other one is moving
+    client.cancel(busy)
+    return held
+
+
+def test_partitions_are_dissolved_while_a_worker_is_moved(start, quickly, wait_until):
+    client = start({name: {} for name in "ab"})
+    pool = Pool.from_client(client)
+    parts = list(pool.divide({"A": n_workers(1, minimum=0), "B": n_workers(1, minimum=0)}).values())
+    group = balance(client, parts, min=0)
+    held = start_to_move(client, parts, wait_until)
+    with pytest.raises(PoolError, match="1 task of partitions 'A' and 'B' has not finished"):
+        pool.dissolve(timeout_s=0.2)
+    released.set()
+    assert held.result(LONG_S)
+    assert pool.dissolve() == ["A", "B"]
+    scheduler = client.cluster.scheduler
+    wait_until(lambda: BALANCER not in scheduler.plugins)
+    assert [worker.resources for worker in scheduler.workers.values()] == [{}, {}]
+    assert group.stats().partitions == {}
+
+
+def test_a_worker_leaves_while_it_is_moved(start, quickly, wait_until):
+    client = start({name: {} for name in "ab"})
+    rules = {"A": n_workers(1, minimum=0), "B": n_workers(1, minimum=0)}
+    parts = list(Pool.from_client(client).divide(rules).values())
+    with balance(client, parts, min=0) as group:
+        start_to_move(client, parts, wait_until)
+        leave(client, "b")
+        released.set()
+        wait_until(lambda: sum(s.workers for s in group.stats().partitions.values()) == 1)
+        # The other worker now serves both partitions in turn.
+        for part in parts:
+            assert part.submit(worker_name).result(LONG_S) == "a"
+        assert {move.worker for move in group.stats().moves} == {"a"}
+
+
+@pytest.mark.extended
+def test_the_group_goes_on_after_the_workers_were_restarted(patient, quickly, wait_until):
+    with process_cluster(4) as cluster, Client(cluster) as client:
+        client.wait_for_workers(4, timeout=LONG_S)
+        a, b = parts = divide(client, A=2, B=2)
+        with balance(client, parts) as group:
+            with keep_busy(a):
+                wait_until(lambda: sizes(parts) == [3, 1])
+            client.restart()
+            wait_until(lambda: sizes(parts) == [3, 1])
+            with keep_busy(b):
+                wait_until(lambda: sizes(parts) == [1, 3])
+            assert group.stats().partitions.keys() == {"A", "B"}
+
+
+def test_workers_that_do_not_report_their_gpus_are_asked_again(
+    start, quickly, monkeypatch, wait_until, caplog
+):
+    answers = {"b": iter([OSError("busy"), ()])}
+
+    async def call(scheduler, address, function, **arguments):
+        answer = next(answers.get(str(scheduler.workers[address].name), iter([()])))
+        if isinstance(answer, OSError):
+            raise answer
+        return answer
+
+    monkeypatch.setattr("poolpart.balancing.PAUSE_S", 0.2)
+    monkeypatch.setattr("poolpart.balancing.call_worker", call)
+    client = start({name: {} for name in "abc"})
+    parts = divide(client, A=1, B=2)
+    with balance(client, parts), keep_busy(parts[0]):
+        wait_until(lambda: sizes(parts) == [2, 1])
+    assert caplog.text.count("is not moved for now, because it does not report its GPUs. busy") == 1
 
 
 def test_moves_are_shown_on_the_page_and_logged(eight, quickly, wait_until, caplog):

@@ -1,7 +1,9 @@
 """Libraries that list workers, or submit by themselves, stay inside a partition."""
 
 import gc
+import math
 import os
+import pickle
 import warnings
 
 import dask
@@ -20,7 +22,7 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 from tests.daemons import wait_until
 from tests.poolpart.helpers import LONG_S, addresses, worker_name
 
-from poolpart import Partition, Pipe, Pool, PoolError
+from poolpart import Partition, Pipe, Pool, PoolError, n_workers
 from poolpart.internals.partition_client import PartitionClient
 
 A_WORKERS = {"A-0", "A-1"}
@@ -177,6 +179,74 @@ def test_a_partition_without_workers_stores_nothing(start):
     assert view.nthreads() == view.run(worker_name_of) == {}
     with pytest.raises(PoolError, match="'A' has no workers to store the data"):
         view.scatter(1)
+
+
+def test_tasks_that_could_never_run_are_refused(start):
+    client = start({name: {} for name in "abc"})
+    parts = Pool.from_client(client).divide({"A": n_workers(1), "B": n_workers(2)})
+    a, b = parts.values()
+    view = b.as_client()
+    [foreign] = a.workers
+    for workers in (foreign.address, foreign.name, [foreign.address], "nobody"):
+        with pytest.raises(PoolError, match="does not belong to partition 'B'"):
+            view.submit(worker_name, workers=workers, pure=False).result(LONG_S)
+    assert view.submit(worker_name, workers=b.workers[0].name).result(LONG_S) == b.workers[0].name
+    anywhere = {"workers": [foreign.address], "allow_other_workers": True, "pure": False}
+    ran = view.map(worker_name, range(8), **anywhere)
+    assert {*view.gather(ran)} <= {worker.name for worker in b.workers}
+    with pytest.raises(PoolError, match="slots in the partitions 'A' and 'B', but a worker belong"):
+        view.submit(worker_name, resources={"A": 1}, pure=False).result(LONG_S)
+    b.dissolve()
+    for call in (
+        lambda: view.submit(worker_name),
+        lambda: view.map(worker_name, range(2)),
+        lambda: view.compute(dask.delayed(worker_name)()),
+        b.as_client,
+    ):
+        with pytest.raises(PoolError, match="Partition 'B' was dissolved"):
+            call()
+
+
+@pytest.mark.parametrize("slots", [0, -1, 0.5, math.nan, math.inf, True, "1", None])
+def test_slots_must_be_a_number_of_slots(client, a, slots):
+    with pytest.raises(PoolError, match=r"in partition 'A'\. Expected an integer"):
+        a.as_client().submit(worker_name, resources={"A": slots}, pure=False)
+    with pytest.raises(PoolError, match="value 5 for `resources`"):
+        a.as_client().submit(worker_name, resources=5, pure=False)
+
+
+@pytest.mark.parametrize("slots", [-1, math.nan, "1", None])
+def test_slots_of_plain_tasks_are_refused_if_they_are_no_number(client, a, slots):
+    """Dask would fail in the middle of a transition, and the rule of poolpart with it."""
+    assert a.submit(worker_name).result(LONG_S) in A_WORKERS
+    future = client.submit(worker_name, resources={"A": slots}, pure=False)
+    with pytest.raises(PoolError, match=r"in partition 'A'\. Expected a number"):
+        future.result(LONG_S)
+
+
+def test_it_takes_precedence_over_the_block_of_another_partition(client, a, b):
+    view = a.as_client()
+    with b:
+        assert {*view.gather(view.map(worker_name, range(8), pure=False))} <= A_WORKERS
+        with dask.annotate(resources={"A": 2}):
+            assert view.submit(worker_name, pure=False).result(LONG_S) in A_WORKERS
+        assert client.submit(worker_name, pure=False).result(LONG_S) == "B-0"
+
+
+def test_a_closed_client_and_a_pickled_one_are_explained(client, a):
+    with Client(client.cluster) as other:
+        view = Partition("A", other).as_client()
+    assert repr(view) == "<PartitionClient 'A': scheduler=closed>"
+    with pytest.raises(PoolError, match="The client is closed"):
+        view.scheduler_info()
+    with pytest.raises(PoolError, match="Pass the partition instead"):
+        pickle.dumps(a.as_client())
+
+
+@pytest.mark.parametrize("name", [None, "", 5, True, math.nan])
+def test_names_of_partitions_are_strings(client, name):
+    with pytest.raises(PoolError, match="Invalid partition name"):
+        Partition(name, client)
 
 
 def test_coroutines_use_it(client, a):

@@ -726,10 +726,21 @@ def test_a_task_that_is_run_again_closes_for_one_producer(client, a, make_pipe, 
     assert list(pipe) == [9]
 
 
-@pytest.mark.parametrize("options", [{"capacity": 0}, {"producers": 0}, {"producers": 1.5}])
+@pytest.mark.parametrize(
+    "options", [{"name": ""}, {"name": 5}, {"drop_repeats": "no"}, {"fails_with_tasks": None}]
+)
+def test_names_and_flags_that_make_no_pipe(client, options):
+    with pytest.raises(ValueError, match=r"Invalid (name|value) .* Expected (a string|True or)"):
+        Pipe(**{"name": "nothing", "client": client} | options)
+
+
+@pytest.mark.parametrize(
+    "options", [{"capacity": 0}, {"capacity": True}, {"producers": 0}, {"producers": 1.5}]
+)
 def test_numbers_that_make_no_pipe(client, options):
     with pytest.raises(
-        ValueError, match=r"Invalid value (0|1\.5) for the .* Expected an integer of at least 1"
+        ValueError,
+        match=r"Invalid value (0|True|1\.5) for the .* Expected an integer of at least 1",
     ):
         Pipe("nothing", client=client, **options)
 

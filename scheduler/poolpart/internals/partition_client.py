@@ -8,7 +8,7 @@ of the thread. They then list workers, submit tasks to some of them, or compute 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack
 from contextvars import ContextVar
 from functools import cache, wraps
@@ -48,6 +48,8 @@ _OF_WORKERS = frozenset(
 _SUMS = {"n_workers": None, "total_threads": "nthreads", "total_memory": "memory_limit"}
 
 _entered: ContextVar[tuple[ExitStack, ...]] = ContextVar("_entered", default=())
+# Names of the partitions with a `with partition:` block around the current code.
+entered_partitions: ContextVar[tuple[str, ...]] = ContextVar("entered_partitions", default=())
 
 
 class _PartitionScheduler:
@@ -98,11 +100,16 @@ class PartitionClient(Client):
     """
 
     # All other attributes are those of the client, because both objects have the same `__dict__`.
-    __slots__ = ("_identity", "_partition", "_whole")
+    __slots__ = ("_identity", "_partition", "_register", "_whole")
 
-    def __init__(self, client: Client, partition: str) -> None:
+    def __init__(
+        self, client: Client, partition: str, register: Callable[[], object] = lambda: None
+    ) -> None:
         self._whole = client
         self._partition = partition
+        # Registers the client for the partition if necessary, or raises PoolError if the partition
+        # was dissolved.
+        self._register = register
         self._identity = SchedulerInfo({})
         object.__setattr__(self, "__dict__", client.__dict__)
         # The annotations are applied when a dataframe is computed, although Dask warns that
@@ -113,7 +120,16 @@ class PartitionClient(Client):
         """Leave the connection open."""
 
     def __repr__(self) -> str:
-        return f"<PartitionClient {self._partition!r}: scheduler={self._whole.scheduler.address!r}>"
+        scheduler = self.__dict__["scheduler"]
+        address = repr(scheduler.address) if scheduler is not None else "closed"
+        return f"<PartitionClient {self._partition!r}: scheduler={address}>"
+
+    def __reduce__(self) -> Any:
+        """Raise PoolError, because a connection cannot be pickled."""
+        raise PoolError(
+            "A client cannot be sent to a task. Pass the partition instead, and call its "
+            "`as_client` method in the task."
+        )
 
     def _repr_html_(self) -> None:
         """Let notebooks show the plain representation."""
@@ -227,9 +243,30 @@ class PartitionClient(Client):
         return addresses
 
     def _annotate(self, resources: Mapping[str, float] | None) -> AbstractContextManager[None]:
-        """Return a block in which tasks take a slot of the partition."""
-        others = dask.get_annotations().get("resources") if resources is None else resources
+        """Return a block in which tasks take a slot of the partition.
+
+        Raises
+        ------
+        PoolError
+            If the partition was dissolved, or if `resources` is invalid.
+        """
+        if not self.asynchronous:  # a request would block the client's event loop
+            self._register()
+        others = resources
+        if others is None and isinstance(others := dask.get_annotations().get("resources"), dict):
+            # This client takes precedence over the `with partition:` blocks around the call.
+            others = {n: slots for n, slots in others.items() if n not in entered_partitions.get()}
+        if others is not None and not isinstance(others, Mapping):
+            raise PoolError(
+                f"Invalid value {others!r} for `resources`. Expected a mapping of names to numbers."
+            )
         slots = {self._partition: 1, **(others or {})}
+        taken = slots[self._partition]
+        if not isinstance(taken, int) or taken is True or taken < 1:
+            raise PoolError(
+                f"Invalid value {taken!r} for the slots of a task in partition "
+                f"{self._partition!r}. Expected an integer of at least 1."
+            )
         annotations = {"resources": slots, CLIENT_OF: self._partition}
         block: AbstractContextManager[None] = dask.annotate(**annotations)
         return block
@@ -238,6 +275,8 @@ class PartitionClient(Client):
 
     def scheduler_info(self, n_workers: int = -1, **kwargs: Any) -> SchedulerInfo:
         """Return information about the scheduler and the partition's workers."""
+        if self.status == "closed":
+            raise PoolError("The client is closed. Create a new client and a new pool.")
         if not self.asynchronous:
             identity = self.sync(self.scheduler.identity, n_workers=n_workers, **kwargs)
             self._identity = SchedulerInfo(identity)
