@@ -419,51 +419,51 @@ def test_an_error_in_the_block_is_not_replaced_by_that_of_a_closed_client(start)
         group.stop()
 
 
-def start_to_move(client, parts, wait_until):
-    """Start to move a worker from the second partition to the first, which has to finish a task.
+@contextmanager
+def moving(client, parts, wait_until):
+    """Keep a worker of the second partition moving, since it has to finish a task, in the block.
 
-    Returns the task.
+    The first value is the name of the worker.
     """
     released.clear()
     a, b = parts
-    held = b.submit(hold, retries=9)
-    wait_until(lambda: b.stats().running == 1)
-    busy = [a.submit(pause) for _ in range(1000)]
-    wait_until(lambda: sum(len(part.workers) for part in parts) == 1)  # the other one is moving
-    client.cancel(busy)
-    return held
+    held = [b.submit(hold) for _ in range(2)]
+    wait_until(lambda: b.stats().running == 2)
+    names = {worker.name for worker in b.workers}
+    with keep_busy(a):
+        wait_until(lambda: len(b) == 1 and len(a) == 2)
+    yield (names - {worker.name for worker in b.workers}).pop()
+    released.set()
+    client.gather(held)
 
 
 def test_partitions_are_dissolved_while_a_worker_is_moved(start, quickly, wait_until):
-    client = start({name: {} for name in "ab"})
+    client = start({name: {} for name in "abcd"})
     pool = Pool.from_client(client)
-    parts = list(pool.divide({"A": n_workers(1, minimum=0), "B": n_workers(1, minimum=0)}).values())
-    group = balance(client, parts, min=0)
-    held = start_to_move(client, parts, wait_until)
-    with pytest.raises(PoolError, match="1 task of partitions 'A' and 'B' has not finished"):
+    parts = divide(client, A=2, B=2)
+    group = balance(client, parts)
+    with (
+        moving(client, parts, wait_until),
+        pytest.raises(PoolError, match="tasks of partitions 'A' and 'B' have not finished"),
+    ):
         pool.dissolve(timeout_s=0.2)
-    released.set()
-    assert held.result(LONG_S)
     assert pool.dissolve() == ["A", "B"]
     scheduler = client.cluster.scheduler
     wait_until(lambda: BALANCER not in scheduler.plugins)
-    assert [worker.resources for worker in scheduler.workers.values()] == [{}, {}]
+    assert [worker.resources for worker in scheduler.workers.values()] == [{}] * 4
     assert group.stats().partitions == {}
 
 
 def test_a_worker_leaves_while_it_is_moved(start, quickly, wait_until):
-    client = start({name: {} for name in "ab"})
-    rules = {"A": n_workers(1, minimum=0), "B": n_workers(1, minimum=0)}
-    parts = list(Pool.from_client(client).divide(rules).values())
-    with balance(client, parts, min=0) as group:
-        start_to_move(client, parts, wait_until)
-        leave(client, "b")
-        released.set()
-        wait_until(lambda: sum(s.workers for s in group.stats().partitions.values()) == 1)
-        # The other worker now serves both partitions in turn.
-        for part in parts:
-            assert part.submit(worker_name).result(LONG_S) == "a"
-        assert {move.worker for move in group.stats().moves} == {"a"}
+    client = start({name: {} for name in "abcd"})
+    parts = divide(client, A=2, B=2)
+    with balance(client, parts) as group:
+        with moving(client, parts, wait_until) as name:
+            threading.Timer(0.2, released.set).start()  # a worker that closes waits for its task
+            leave(client, name)
+            wait_until(lambda: sum(s.workers for s in group.stats().partitions.values()) == 3)
+        wait_until(lambda: sum(sizes(parts)) == 3)
+        assert all(part.submit(worker_name).result(LONG_S) != name for part in parts)
 
 
 @pytest.mark.extended
@@ -495,6 +495,7 @@ def test_workers_that_do_not_report_their_gpus_are_asked_again(
     monkeypatch.setattr("poolpart.balancing.PAUSE_S", 0.2)
     monkeypatch.setattr("poolpart.balancing.call_worker", call)
     client = start({name: {} for name in "abc"})
+    caplog.set_level(logging.WARNING, "poolpart.balancing")  # the cluster has silenced it
     parts = divide(client, A=1, B=2)
     with balance(client, parts), keep_busy(parts[0]):
         wait_until(lambda: sizes(parts) == [2, 1])

@@ -16,7 +16,6 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-import numpy as np
 import pytest
 from distributed import Client, Event, secede, wait
 from tests.clusters import import_jobqueue
@@ -392,6 +391,7 @@ def test_errors_of_any_kind_are_problems(error, wait_until):
 
 
 def test_numbers_of_numpy_are_numbers_of_jobs(wait_until):
+    np = pytest.importorskip("numpy")
     watch = QueueWatch(lambda: np.int64(3), ["GPU"])
     assert watch.report() == QueueReport(("GPU",), None, 0)
     watch.refresh(has_jobs=True)
