@@ -200,6 +200,8 @@ class Registrations(SchedulerPlugin):
         if not isinstance(resources, dict):  # None or a callable
             return graph
         self._refuse(client, resources)
+        if not annotations.get("workers"):
+            return graph
         return {**graph, "global_annotations": self._with_members(annotations)}
 
     def _with_members(self, annotations: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -210,11 +212,11 @@ class Registrations(SchedulerPlugin):
         PoolError
             If a worker does not belong to the partition.
         """
-        workers = annotations.get("workers") or ()
+        workers = annotations["workers"]
         name = annotations.get(CLIENT_OF)  # of a `PartitionClient`
-        if name is None and workers and all(isinstance(w, MemberName) for w in workers):
+        if name is None and all(isinstance(worker, MemberName) for worker in workers):
             [name] = annotations["resources"]
-        elif name is None or not workers:
+        elif name is None:
             return annotations
         elif annotations.get("allow_other_workers"):
             # If none of the workers is a member, Dask would ignore the resource as well.

@@ -439,7 +439,8 @@ class Pool:
         which tasks arrive or finish, times their mean running time, plus up to a quarter if tasks
         or items of pipes wait. If a partition has too few workers and others can spare some, up to
         an eighth of the workers are moved at a time. Each of them first finishes its running tasks.
-        If there is a group of the same partitions, it is replaced.
+        If there is a group of the same partitions, it is replaced, and both objects
+        refer to the new group.
 
         Parameters
         ----------
@@ -462,8 +463,9 @@ class Pool:
         ------
         PoolError
             If a partition does not exist, is adaptive, or belongs to another group, if a bound is
-            invalid or does not fit the number of workers, if `workers` names a worker that is in
-            none of the partitions, or if only some of the workers have GPUs.
+            invalid or does not fit the number of workers or the minimum of a rule, if `workers`
+            names a worker that is in none of the partitions, or if only some of the workers have
+            GPUs.
 
         Notes
         -----

@@ -63,9 +63,12 @@ def start_partitions(
         8]`` (see `Partition.adapt`), and ``idle_s`` the time in seconds without work after which a
         job ends (60 by default). With ``yield_to_others``, the partition releases jobs while jobs
         of other users wait in the queue. Its value is True for Slurm, or a function that returns
-        the number of these jobs. All other options are passed to the class of the cluster, for
-        example ``job_extra_directives``, ``queue`` or ``memory``. An `SSHCluster` accepts
-        ``connect_options``, ``remote_python``, ``worker_class``, ``worker_options`` and ``hosts``.
+        the number of these jobs. Partitions in the same queue, or with the same function, release
+        one job together for each of these jobs. If the queue cannot be listed, no jobs are
+        released, and the problem is reported. All other options are passed to the class of the
+        cluster, for example ``job_extra_directives``, ``queue`` or ``memory``. An `SSHCluster`
+        accepts ``connect_options``, ``remote_python``, ``worker_class``, ``worker_options`` and
+        ``hosts``.
         Workers are distributed over the hosts in turn. By default, there is one for each host.
     report
         Function that is called with problems that occur later: the last line of a job's log while
