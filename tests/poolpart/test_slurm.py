@@ -86,8 +86,7 @@ def test_a_gpu_is_released_to_another_user_and_used_again(
 
     with cluster_of(tmp_path, partitions) as client:
         gpu = Partition("GPU", client)
-        results = gpu.map(sleep, [0.2] * 1500, chunk=1, ordered=False)  # work for minutes
-        jobs = {next(results)}
+        tasks = [gpu.submit(sleep, 0.2) for _ in range(1500)]  # work for minutes
         wait_until(lambda: len(gpu) == 2)
         slurm_queue.ask(
             *("sbatch", "--uid=nobody", "--job-name=other", "--gres=gpu:1", "--chdir=/tmp"),
@@ -96,7 +95,8 @@ def test_a_gpu_is_released_to_another_user_and_used_again(
         wait_until(lambda: state_of_other() == "PENDING")  # both GPUs are taken
         wait_until(lambda: state_of_other() == "RUNNING")
         assert len(gpu) == 1
-        jobs.add(next(results))  # the other worker has not stopped
+        done = gpu.stats().done
+        wait_until(lambda: gpu.stats().done > done)  # the other worker has not stopped
         slurm_queue.ask("scancel", "--name=other")
         wait_until(lambda: len(gpu) == 2)
-        results.close()
+        client.cancel(tasks)
