@@ -38,6 +38,7 @@ from .internals.partition_client import CLIENT_OF
 from .internals.placing import has_worker_for, workers_declaring
 from .internals.worker import current_task
 from .registration import is_registered, record_registration
+from .rules import check_name
 from .stats import NAME as STATISTICS
 from .stats import forget_statistics, statistics_of
 from .steward import NAME as STEWARD
@@ -75,11 +76,12 @@ def register(client: Client, name: str, slots: int, by_rule: bool) -> bool:
     Raises
     ------
     PoolError
-        If the first task could never run, if poolpart is not installed in the scheduler's
-        environment, or if the client is closed or asynchronous.
+        If the name is invalid, if the first task could never run, if poolpart is not installed in
+        the scheduler's environment, or if the client is closed or asynchronous.
     """
     if is_registered(client, name):
         return by_rule
+    check_name(name)
     connection = client.scheduler_comm
     has_or_had_rule, objection, others = run_on_scheduler(
         client,

@@ -96,7 +96,8 @@ class Partition:
     def __init__(
         self, name: str, client: Client | None = None, note: str = "", by_rule: bool = False
     ) -> None:
-        check_name(name)
+        if name != "":  # only for the statistics of tasks without a partition
+            check_name(name)
         self.name = name
         self.note = note
         self._client = None if client is None else whole_client(client)

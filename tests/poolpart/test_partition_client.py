@@ -246,7 +246,7 @@ def test_a_closed_client_and_a_pickled_one_are_explained(client, a):
 @pytest.mark.parametrize("name", [None, "", 5, True, math.nan])
 def test_names_of_partitions_are_strings(client, name):
     with pytest.raises(PoolError, match="Invalid partition name"):
-        Partition(name, client)
+        Partition(name, client).as_client()
 
 
 def test_coroutines_use_it(client, a):
