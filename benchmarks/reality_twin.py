@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -200,8 +201,10 @@ class HalfTwin:
         return settings
 
     def _materials(self, effects: Effects) -> list[Material]:
-        reflectance = "texture" if effects.reflectances and self.scene.has_colors.any() else None
-        names = {name for part in self.scene.materials.names for name in part}
+        is_textured = effects.reflectances and bool(self.scene.has_colors.any())
+        reflectance: Literal["texture"] | None = "texture" if is_textured else None
+        materials = self.scene.materials
+        names = set() if materials is None else {*chain.from_iterable(materials.names)}
         porous = [SurfelMaterial.from_name(name).entry() for name in sorted(names - {""})]
         return [
             Material(NO_RETURN, reflectance=0),
@@ -209,7 +212,7 @@ class HalfTwin:
             Material("*", reflectance=reflectance),
         ]
 
-    def _path(self, number: int, *, moves: bool) -> tuple[Trajectory, float | None]:
+    def _path(self, number: int, *, moves: bool) -> tuple[Pose | Trajectory, float | None]:
         """Return the trajectory of the sensor, and the time on it at which a sweep starts."""
         alignment = self.sweeps.alignment
         pose = alignment.poses[number]
@@ -219,7 +222,7 @@ class HalfTwin:
         before = [start] if start.time_s < alignment.times_s[0] else []
         times_s = [*(one.time_s for one in before), *alignment.times_s, stop.time_s]
         poses = np.stack([*(one.pose for one in before), *alignment.poses, stop.pose])
-        path = Track(times_s, poses[:, :3, 3], quaternions_of(poses[:, :3, :3]))
+        path = Track(np.array(times_s), poses[:, :3, 3], quaternions_of(poses[:, :3, :3]))
         return path, alignment.times_s[number] + self.timing.first_s - start.time_s
 
     def _paired(self, number: int, image: Floats) -> PairedPulses:
