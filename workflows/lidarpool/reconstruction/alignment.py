@@ -302,7 +302,7 @@ class AlignedSweeps:
         vehicle blocks did not reach the surroundings, so they are omitted.
         """
         kept = None if self._lost is None else self._lost.get(number)
-        lost, gap_range_m = self._lost_pulses(number) if kept is None else kept
+        lost, gap_range_m = self.read_lost(number) if kept is None else kept
         if self._lost is not None:
             self._lost[number] = lost, gap_range_m
         passed = ~self._are_blocked(lost)
@@ -310,8 +310,14 @@ class AlignedSweeps:
         returned = self.align(self.recorded.read(number), number)
         return returned, aligned._replace(gap_range_m=gap_range_m[passed])
 
-    def _lost_pulses(self, number: int) -> tuple[Sweep, Floats]:
-        """Return the results of `lost_pulses` for a sweep."""
+    def read_lost(self, number: int) -> tuple[Sweep, Floats]:
+        """Determine the lost pulses of a sweep and the ranges at their gaps, as `lost_pulses` does.
+
+        Raises
+        ------
+        LidarError
+            If the recording cannot be read.
+        """
         step, step_s = self.alignment.step(number)
         # Without motion compensation, motion does not cause gaps between points.
         is_compensated = self.alignment.motion is Motion.COMPENSATED
@@ -335,7 +341,7 @@ class AlignedSweeps:
         Pulses that the vehicle blocks are included and marked.
         """
         sweep = self.recorded.read(number)
-        lost, gap_range_m = self._lost_pulses(number)
+        lost, gap_range_m = self.read_lost(number)
         lasers = self.recorded.lasers
         modeled = lasers.on_rings(sweep) if lasers.have_constant_elevations else sweep
         returned = self.align(modeled, number)._replace(is_blocked=self._are_blocked(sweep))
