@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.numerics.arrays import Bools, Floats, Ints
+from lidarsim.numerics.arrays import Bools, Floats
 
 from .alignment import AlignedSweeps
 from .held_out import HeldOutPulses, HeldOutRays
@@ -16,7 +16,7 @@ from .moving_objects import find_tracks
 from .moving_rays import MovingRays, StationaryMasks, pulse_times_s
 from .object_surfels import RecordedObject, cast_to_objects, reconstruct_objects
 from .object_tracks import ObjectTrack, in_any_box
-from .reflectances import Reflectances, Response
+from .reflectances import Response
 
 _STEP_S = 0.1  # step of the times at which objects are sought near a submap
 
@@ -166,12 +166,20 @@ class SubmapObjects:
             is_first &= hits.distance_m <= sweeps.coverage.max_range_m
             simulated_m[rows][is_first] = hits.distance_m[is_first]
             on_object[rows] = is_first
+            ring = np.concatenate([returns.ring, lost.ring])
             for index in np.unique(hits.object[is_first]).tolist():
                 chosen = is_first & (hits.object == index)
-                intensity[rows][chosen] = _intensities(
-                    reflectances[index], hits.surfel[chosen], hits.distance_m[chosen],
-                    hits.cosine[chosen],
-                )  # fmt: skip
+                known = reflectances[index]
+                intensity[rows][chosen] = (
+                    np.nan
+                    if known is None
+                    else known.intensities(
+                        hits.surfel[chosen],
+                        hits.distance_m[chosen],
+                        hits.cosine[chosen],
+                        ring[chosen],
+                    )
+                )
         return replace(
             rays,
             simulated_m=simulated_m,
@@ -180,16 +188,6 @@ class SubmapObjects:
             moving=moving,
             on_object=on_object,
         )
-
-
-def _intensities(
-    reflectances: Reflectances | None, surfel: Ints, distance_m: Floats, cosine: Floats
-) -> Floats:
-    """Return the simulated intensities of hits on an object, or NaN if they are unknown."""
-    if reflectances is None:
-        return np.full(len(surfel), np.nan)
-    law = reflectances.response.model.white_intensities(distance_m, cosine)
-    return np.asarray(reflectances.surfels[surfel] * law * reflectances.response.scale)
 
 
 def _without_objects(
