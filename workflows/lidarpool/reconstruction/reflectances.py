@@ -23,7 +23,7 @@ from lidarsim.sensor.optics import MIN_COSINE
 from .surface_map import Observations
 
 _ROUNDS = 12  # iterations of fitting the response and the reflectances
-# Ranges at which the factors of the rings are estimated
+# Ranges in meters at which the factors of the rings are estimated.
 RANGES_M = np.array([3, 5, 7, 10, 15, 20, 30, 45, 65, 100, 150], np.float64)
 _EDGES_M = np.sqrt(RANGES_M[:-1] * RANGES_M[1:])
 _MIN_RAYS = 200  # A factor with fewer rays is not changed.
@@ -108,9 +108,7 @@ class Response:
     typical: float
     scale: float
 
-    def white_intensities(
-        self, range_m: AnyFloats, cosine: AnyFloats, ring: Integers
-    ) -> Floats:
+    def white_intensities(self, range_m: AnyFloats, cosine: AnyFloats, ring: Integers) -> Floats:
         """Return the intensities that a simulation stores for white surfaces.
 
         Energies correspond to the simulated column `intensity`. Intensities that are compensated
@@ -257,48 +255,95 @@ class _Fit(NamedTuple):
         A surface is observed at few ranges, incidences and rings, so what they do not determine
         remains unchanged.
         """
-        law = model.law(observations.range_m, observations.cosine)
-        brightest = float(np.quantile(observations.intensity / law, _WHITE_QUANTILE))
-        intensity = np.minimum(observations.intensity, brightest * law)
-        unknown = np.full(int(observations.surfel.max()) + 1, np.nan)
-        range_row = np.searchsorted(_EDGES_M, observations.range_m)
-        shape = ring_count, len(RANGES_M)
-        cell = observations.ring * shape[1] + range_row
-        rows: list[Integers] = [range_row, observations.ring, cell]
-        factors = [np.ones(shape[1]), np.ones(shape[0]), np.ones(shape[0] * shape[1])]
+        product = model.law(observations.range_m, observations.cosine)
+        brightest = float(np.quantile(observations.intensity / product, _WHITE_QUANTILE))
+        intensity = np.minimum(observations.intensity, brightest * product)
+        surfel = observations.surfel
+        unknown = np.full(int(surfel.max()) + 1, np.nan)
+        factors = _RingFactors.ones(ring_count)
         slopes = _within_surfels(observations)
         exponent = model.incidence_exponent
-        product = law
         for _ in range(_ROUNDS):
-            reflectance = _ratios(observations.surfel, intensity, product, unknown)
-            for index, row in enumerate(rows):
-                others = product / factors[index][row]
-                expected = others * reflectance[observations.surfel]
-                factors[index] = _ratios(row, intensity, expected, factors[index])
-                factors[index] = factors[index].clip(_MIN_FACTOR)
-                factors[index] /= np.average(
-                    factors[index], weights=np.bincount(row, minlength=len(factors[index]))
-                )
-                product = others * factors[index][row]
-            reflectance = _ratios(observations.surfel, intensity, product, unknown)
-            step = _exponent_step(slopes, intensity / product, reflectance[observations.surfel])
+            reflectance = _ratios(surfel, intensity, product, unknown)
+            factors, product = factors.fit(observations, intensity, product, reflectance[surfel])
+            reflectance = _ratios(surfel, intensity, product, unknown)
+            step = _exponent_step(slopes, intensity / product, reflectance[surfel])
             step = float(np.clip(exponent + step, 0, _MAX_EXPONENT)) - exponent
             exponent += step
             product = product * np.asarray(observations.cosine, np.float64) ** step
-        by_range, by_ring, by_cell = factors
-        by_ring = (by_ring[:, None] * by_range * by_cell.reshape(shape)).round(_FACTOR_DECIMALS)
-        reflectance = _ratios(observations.surfel, intensity, product, unknown)
-        expected = reflectance[observations.surfel] * product
-        difference = np.abs(expected - intensity) / np.maximum(expected + intensity, 1e-300)
+        reflectance = _ratios(surfel, intensity, product, unknown)
         return cls(
             model,
-            by_ring.clip(_MIN_FACTOR),
+            factors.table.round(_FACTOR_DECIMALS).clip(_MIN_FACTOR),
             round(exponent, _EXPONENT_DECIMALS),
             intensity,
             reflectance,
             brightest,
-            float(difference.mean()),
+            _relative_difference(intensity, reflectance[surfel] * product),
         )
+
+
+class _RingFactors(NamedTuple):
+    """Factors for k ranges, for r rings, and for each of these rings at each range."""
+
+    by_range: Floats  # (k,)
+    by_ring: Floats  # (r,)
+    by_cell: Floats  # (r * k,)
+
+    @classmethod
+    def ones(cls, ring_count: int) -> _RingFactors:
+        """Return factors that change nothing."""
+        count = len(RANGES_M)
+        return cls(np.ones(count), np.ones(ring_count), np.ones(ring_count * count))
+
+    @property
+    def table(self) -> Floats:
+        """Products of the factors. Shape (r, k)."""
+        by_cell = self.by_cell.reshape(len(self.by_ring), len(self.by_range))
+        return self.by_ring[:, None] * self.by_range * by_cell
+
+    def fit(
+        self, observations: Observations, intensity: Floats, product: Floats, reflectance: Floats
+    ) -> tuple[_RingFactors, Floats]:
+        """Fit one kind of factor after the other.
+
+        Parameters
+        ----------
+        observations
+            The n rays.
+        intensity
+            Their intensities, where retroreflectors are clipped to white.
+        product
+            The response, which includes the factors.
+        reflectance
+            Reflectance of the surfel of each ray.
+
+        Returns
+        -------
+        tuple
+            The fitted factors and the product that includes them.
+        """
+        range_row = np.searchsorted(_EDGES_M, observations.range_m)
+        ring = observations.ring
+        fitted = []
+        for factor, row in zip(
+            self, (range_row, ring, ring * len(RANGES_M) + range_row), strict=True
+        ):
+            others = product / factor[row]
+            ratios = _ratios(row, intensity, others * reflectance, factor).clip(_MIN_FACTOR)
+            ratios /= np.average(ratios, weights=np.bincount(row, minlength=len(ratios)))
+            product = others * ratios[row]
+            fitted.append(ratios)
+        return _RingFactors(*fitted), product
+
+
+def _relative_difference(intensity: Floats, expected: Floats) -> float:
+    """Return the mean difference between recorded and modeled intensities, relative to their sum.
+
+    Both arrays have shape (n,).
+    """
+    total = np.maximum(expected + intensity, 1e-300)
+    return float(np.mean(np.abs(expected - intensity) / total))
 
 
 def _within_surfels(observations: Observations) -> Floats:

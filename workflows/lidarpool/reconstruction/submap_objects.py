@@ -8,15 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.numerics.arrays import Bools, Floats
+from lidarsim.numerics.arrays import Bools, Floats, Ints
 
 from .alignment import AlignedSweeps
 from .held_out import HeldOutPulses, HeldOutRays
 from .moving_objects import find_tracks
 from .moving_rays import MovingRays, StationaryMasks, pulse_times_s
-from .object_surfels import RecordedObject, cast_to_objects, reconstruct_objects
+from .object_surfels import ObjectHits, RecordedObject, cast_to_objects, reconstruct_objects
 from .object_tracks import ObjectTrack, in_any_box
-from .reflectances import Response
+from .reflectances import Reflectances, Response
 
 _STEP_S = 0.1  # step of the times at which objects are sought near a submap
 
@@ -166,19 +166,10 @@ class SubmapObjects:
             is_first &= hits.distance_m <= sweeps.coverage.max_range_m
             simulated_m[rows][is_first] = hits.distance_m[is_first]
             on_object[rows] = is_first
-            ring = np.concatenate([returns.ring, lost.ring])
             for index in np.unique(hits.object[is_first]).tolist():
                 chosen = is_first & (hits.object == index)
-                known = reflectances[index]
-                intensity[rows][chosen] = (
-                    np.nan
-                    if known is None
-                    else known.intensities(
-                        hits.surfel[chosen],
-                        hits.distance_m[chosen],
-                        hits.cosine[chosen],
-                        ring[chosen],
-                    )
+                intensity[rows][chosen] = _intensities(
+                    reflectances[index], hits, rays.ring[rows], chosen
                 )
         return replace(
             rays,
@@ -188,6 +179,17 @@ class SubmapObjects:
             moving=moving,
             on_object=on_object,
         )
+
+
+def _intensities(
+    reflectances: Reflectances | None, hits: ObjectHits, ring: Ints, chosen: Bools
+) -> Floats:
+    """Return the simulated intensities of the chosen hits, or NaN if they are unknown."""
+    if reflectances is None:
+        return np.full(int(chosen.sum()), np.nan)
+    return reflectances.intensities(
+        hits.surfel[chosen], hits.distance_m[chosen], hits.cosine[chosen], ring[chosen]
+    )
 
 
 def _without_objects(

@@ -166,15 +166,14 @@ class Beams:
         range_m
             Range of each return in meters. Shape (n,).
         """
+        table = self.intensity_factor.reshape(len(self), -1)
+        if table.shape[1] == 1:
+            return table[beam, 0]
         knots = self.intensity_range_m
-        if not len(knots):
-            return self.intensity_factor[beam]
-        row = np.clip(np.searchsorted(knots, range_m, "right") - 1, 0, max(len(knots) - 2, 0))
-        above = np.minimum(row + 1, len(knots) - 1)
-        spacing_m = np.maximum(knots[above] - knots[row], np.finfo(np.float64).tiny)
-        weight = np.clip((range_m - knots[row]) / spacing_m, 0.0, 1.0)
-        low = self.intensity_factor[beam, row]
-        return np.asarray(low + weight * (self.intensity_factor[beam, above] - low))
+        row = np.clip(np.searchsorted(knots, range_m, "right") - 1, 0, len(knots) - 2)
+        weight = (np.clip(range_m, knots[0], knots[-1]) - knots[row]) / np.diff(knots)[row]
+        low = table[beam, row]
+        return np.asarray(low + weight * (table[beam, row + 1] - low))
 
     def is_blocked(self, beam: Ints, azimuth: Floats) -> Bools:
         """Return whether the platform blocks pulses.

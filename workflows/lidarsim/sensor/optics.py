@@ -22,7 +22,8 @@ from .reflectivity import SCALES
 
 LIGHT_M_NS = 0.299792458  # speed of light in vacuum; the speed in air is 0.03 % lower
 FWHM = sqrt(8 * log_of(2.0))  # full width at half maximum of a Gaussian, in standard deviations
-MIN_COSINE = 0.01  # Reported intensities of surfaces at more grazing incidence are not corrected more.
+# Cosine of incidence below which the correction of reported intensities does not increase further.
+MIN_COSINE = 0.01
 # Width of a return in a waveform, in standard deviations of the system waveform.
 WINDOW_SIGMAS = 10
 # Number of standard deviations beyond which a return is set to 0, because it is less than 4e-6 of

@@ -69,8 +69,7 @@ def _device_column_names(scene: Scene, survey: Survey) -> set[str]:
         for m in survey.materials
     )
     has_factors = any(
-        carried.sensor.beams.has_intensity_factors
-        or carried.sensor.optics.incidence_exponent != 1
+        carried.sensor.beams.has_intensity_factors or carried.sensor.optics.incidence_exponent != 1
         for carried in survey.mounted_sensors
     )
     computable = {column.name for column in _DEVICE_COLUMNS} - {
