@@ -180,6 +180,7 @@ WITH_FACTORS = replace(
     _SENSOR,
     beams=replace(_SENSOR.beams, intensity_factor=np.linspace(0.5, 2, len(_SENSOR.beams))),
 )
+WITH_EXPONENT = replace(_SENSOR, optics=replace(_SENSOR.optics, incidence_exponent=0.3))
 OWN = Column("own", "float32", "", "of a user", lambda returns: returns.range)
 MORE = {
     "a user's column": {"columns": (*COLUMNS, OWN)},
@@ -205,6 +206,7 @@ MORE = {
     },
     "a measured material": {"materials": [Material("*", spectrum="asphalt, dry")]},
     "intensity factors": {"sensor": WITH_FACTORS, "sensors": ()},
+    "incidence exponent": {"sensor": WITH_EXPONENT, "sensors": ()},
 }
 
 

@@ -234,15 +234,18 @@ def _rays(
     if sweep.is_blocked is not None:
         simulated_m[sweep.is_blocked] = np.nan
     unknown = np.full(len(sweep.points), np.nan)
+    intensity = unknown.copy()
+    if reflectances is not None:
+        intensity[hits.rays] = reflectances.intensities(
+            hits.surfel, hits.distance_m, hits.cosine, sweep.ring[hits.rays]
+        )
     return HeldOutRays(
         sweep=np.full(len(sweep.points), number),
         ring=sweep.ring,
         range_m=range_m,
         simulated_m=simulated_m,
         intensity=unknown if sweep.intensities is None else sweep.intensities,
-        simulated_intensity=(
-            unknown if reflectances is None else reflectances.intensities(sweep, hits)
-        ),
+        simulated_intensity=intensity,
         standing=stationary,
         moving=np.zeros(len(sweep.points), bool),
         on_object=np.zeros(len(sweep.points), bool),

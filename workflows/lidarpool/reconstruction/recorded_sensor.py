@@ -26,7 +26,7 @@ from .lost_pulses import firings_per_turn
 from .motion import Motion
 from .range_noise import RangeNoise, estimate_range_noise
 from .recorded_sweeps import RecordedSweeps, Rotation
-from .reflectances import IntensityModel, Response
+from .reflectances import RANGES_M, IntensityModel, Response
 from .twin import TwinPose
 
 _FIT_SWEEPS = 13  # sweeps to which the sensor noise is fitted
@@ -37,7 +37,6 @@ _ANGLE_DECIMALS = 3
 _MIN_RING_OFFSETS = (0.005, np.radians(0.02), np.radians(0.02))
 _NOISE_DECIMALS = 5
 _RANGE_NOISE = ("range_m", "range_per_m", "range_at_threshold_m", "precision")
-_FACTOR_DECIMALS = 4
 _MIN_LEAD = 0.01  # minimum time from the first point to the timestamp, in revolutions
 
 
@@ -111,6 +110,7 @@ class SweepTiming(NamedTuple):
             rate_hz=self.rate_hz,
             range_m=(0.0, float(np.ceil(1.1 * sweeps.coverage.max_range_m))),
             beams=_beam_table(lasers, ring_offsets, response, sweeps.coverage.blocked),
+            optics=_optics(response),
             performance=_range_biases(ring_offsets),
         )
 
@@ -150,8 +150,14 @@ def _beam_table(
     if sectors:
         table["blocked_deg"] = sorted(sectors)
     if response is not None and (response.by_ring != 1).any():
-        table["intensity_factor"] = response.by_ring[order].round(_FACTOR_DECIMALS).tolist()
+        table["intensity_factor"] = response.by_ring[order].tolist()
+        table["intensity_range_m"] = RANGES_M.tolist()
     return table
+
+
+def _optics(response: Response | None) -> dict[str, Any]:
+    """Return the `optics` of a sensor model with the given response."""
+    return {} if response is None else {"incidence_exponent": response.incidence_exponent}
 
 
 def _range_biases(ring_offsets: Floats) -> dict[str, Any] | None:

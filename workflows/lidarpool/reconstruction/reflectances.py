@@ -1,37 +1,46 @@
 """Estimate the reflectances of surfels from recorded intensities.
 
-A recorded intensity is modeled as the product of the surface reflectance, a law of range and
-incidence (`IntensityModel`), and three sensor factors. The factors depend on the range, on the
-incidence, and on the ring. The range factor describes optics that see only part of a surface at
-close range, for example. The factors are fitted to the intensities of surfels that were observed
-from several positions. A simulation applies its own law of range and incidence to the reflectances,
-and the factors of the rings, but not those of range and incidence.
+A recorded intensity is modeled as the product of the surface reflectance and the response of the
+sensor. The response is a factor for each ring that depends on the range, times a power of the
+cosine of incidence. If intensities are energies (`IntensityModel`), they also decrease with the
+square of the range. The response is fitted to the intensities of surfels that were observed from
+several positions. A simulation applies the same response, which is part of the sensor file.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from lidarsim.numerics.arrays import AnyFloats, Floats, Integers, Ints
+from lidarsim.sensor.beams import Beams
+from lidarsim.sensor.optics import MIN_COSINE
 
-from .alignment import AlignedSweep
-from .surface_map import Observations, SurfelHits
+from .surface_map import Observations
 
-_ROUNDS = 12  # iterations of fitting the factors and the reflectances
-_RANGE_EDGES_M = (0, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40, 50, 65, 80, 100, 130, 200, np.inf)
-_INCIDENCE_BINS = 10  # bins of the cosine
+_ROUNDS = 12  # iterations of fitting the response and the reflectances
+# Ranges in meters at which the factors of the rings are estimated.
+RANGES_M = np.array([3, 5, 7, 10, 15, 20, 30, 45, 65, 100, 150], np.float64)
+_EDGES_M = np.sqrt(RANGES_M[:-1] * RANGES_M[1:])
 _MIN_RAYS = 200  # A factor with fewer rays is not changed.
 _WHITE_QUANTILE = 0.999  # quantile of the intensities above which a surface counts as white
 _WHITE_SHARE = 0.99  # quantile of the reflectances, weighted by rays, that counts as white
 _MIN_REFLECTANCE = 0.01  # for surfaces that were recorded as black
 _MAX_DIFFERENCE = 0.9  # maximum error of the energy model relative to the compensated model
-_MIN_COSINE = 1e-3  # minimum cosine of the incidence of rays that are used for the fit
 _WHITE_RANGE_M = 10.0  # range at which a white surface has a simulated intensity of 1
+_FACTOR_DECIMALS = 3
+_EXPONENT_DECIMALS = 2
+_MIN_FACTOR = 0.001  # for rings and ranges that only recorded black
+_MAX_EXPONENT = 4.0
+# Minimum variance of the logarithm of the cosine of incidence, over the rays of a surfel, from
+# which the exponent is estimated. It is smaller if the sensor is stationary.
+_MIN_INCIDENCE_VARIANCE = 0.003
+_NEIGHBORS = 9  # surfels whose mean reflectance supplements surfels with few rays
+_PRIOR_RAYS = 3.0  # weight of this mean, in rays
 
 
 class IntensityModel(StrEnum):
@@ -40,22 +49,30 @@ class IntensityModel(StrEnum):
     COMPENSATED = "compensated for range"
     ENERGIES = "energies"
 
-    def law(self, range_m: AnyFloats, cosine: AnyFloats) -> Floats:
-        """Return the relative intensities of surfaces that have equal reflectance."""
+    @property
+    def incidence_exponent(self) -> float:
+        """Exponent of the cosine of incidence, unless the observations determine it."""
+        return 1.0 if self is IntensityModel.ENERGIES else 0.0
+
+    def attenuation(self, range_m: AnyFloats) -> Floats:
+        """Return the relative intensities of equally bright surfaces at normal incidence."""
         if self is IntensityModel.COMPENSATED:
             return np.ones(len(range_m))
-        return self.white_intensities(range_m, cosine)
+        return np.asarray((_WHITE_RANGE_M / np.asarray(range_m, np.float64)) ** 2)
 
-    def white_intensities(self, range_m: AnyFloats, cosine: AnyFloats) -> Floats:
-        """Return the intensities that a simulation stores for white surfaces.
+    def law(self, range_m: AnyFloats, cosine: AnyFloats) -> Floats:
+        """Return the relative intensities of equally bright surfaces."""
+        return self.attenuation(range_m) * incidence_factors(cosine, self.incidence_exponent)
 
-        Energies correspond to the simulated column `intensity`. Intensities that are compensated
-        for range correspond to the column `reflectance`, to which `reflectivity` is proportional.
-        """
-        level = np.asarray(cosine, np.float64)
-        if self is IntensityModel.COMPENSATED:
-            return level
-        return level * (_WHITE_RANGE_M / np.asarray(range_m, np.float64)) ** 2
+
+def incidence_factors(cosine: AnyFloats, exponent: float) -> Floats:
+    """Return the relative intensities of surfaces, given the cosines of incidence.
+
+    As in a simulation, the received intensity is proportional to the cosine, and the sensor applies
+    a power of the cosine to it.
+    """
+    cosine = np.asarray(cosine, np.float64)
+    return np.asarray(cosine * np.maximum(cosine, MIN_COSINE) ** (exponent - 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +82,12 @@ class Response:
     Attributes
     ----------
     model
-        How intensities depend on range and incidence.
-    by_range, by_incidence, by_ring
-        Intensity factors for the ranges between `_RANGE_EDGES_M`, for evenly spaced cosines, and
-        for the rings. float64 arrays.
+        How intensities depend on the range.
+    by_ring
+        Intensity factors of the r rings at the k ranges `RANGES_M`, between which they are
+        interpolated. float64 array of shape (r, k).
+    incidence_exponent
+        Exponent of the cosine of incidence.
     white
         Intensity of a white surface. If intensities are energies, this is the intensity at 10 m and
         normal incidence.
@@ -78,41 +97,55 @@ class Response:
     typical
         Median reflectance.
     scale
-        Mean ratio of recorded to simulated intensities, which include the factors of the rings.
+        Mean ratio of recorded to simulated intensities.
     """
 
     model: IntensityModel
-    by_range: Floats
-    by_incidence: Floats
     by_ring: Floats
+    incidence_exponent: float
     white: float
     brightest: float
     typical: float
     scale: float
 
-    def factors(self, range_m: AnyFloats, cosine: AnyFloats, ring: Integers) -> Floats:
-        """Return the expected intensities of white surfaces.
+    def white_intensities(self, range_m: AnyFloats, cosine: AnyFloats, ring: Integers) -> Floats:
+        """Return the intensities that a simulation stores for white surfaces.
 
-        The array has shape (k,).
+        Energies correspond to the simulated column `intensity`. Intensities that are compensated
+        for range correspond to the column `reflectance`, to which `reflectivity` is proportional.
+        The array has shape (n,).
         """
-        factors = self.by_range[_range_bin(range_m)] * self.by_incidence[_incidence_bin(cosine)]
-        law = self.model.law(range_m, cosine)
-        return np.asarray(factors * self.by_ring[ring] * self.white * law)
+        beams = Beams(
+            np.zeros(len(self.by_ring)),
+            intensity_factor=self.by_ring,
+            intensity_range_m=RANGES_M,
+        )
+        factors = beams.intensity_factors(ring, range_m)
+        factors *= incidence_factors(cosine, self.incidence_exponent)
+        return factors * self.model.attenuation(range_m)
 
     def reflectances(self, observations: Observations, centers: Floats) -> Reflectances:
         """Estimate the reflectances of surfels, given the centers of the surfels.
 
-        The centers have shape (m, 3). A surfel that no ray hits, for example because it is
-        occluded, has the reflectance of the nearest surfel with observations.
+        The centers have shape (m, 3). A surfel with few rays has about the mean reflectance of its
+        neighbors. If these have no rays, because they are occluded for example, it has the
+        reflectance of the nearest surfel whose reflectance is known.
         """
         from scipy.spatial import cKDTree
 
-        observations = observations.select(np.isfinite(observations.intensity))
+        rays = observations.select(np.isfinite(observations.intensity))
         count = len(centers)
-        expected = self.factors(observations.range_m, observations.cosine, observations.ring)
-        law = self.model.law(observations.range_m, observations.cosine)
-        intensity = np.minimum(observations.intensity, self.brightest * law)
-        surfels = _ratios(observations.surfel, intensity, expected, np.full(count, np.nan))
+        expected = self.white * self.white_intensities(rays.range_m, rays.cosine, rays.ring)
+        law = self.model.law(rays.range_m, rays.cosine)
+        intensity = np.minimum(rays.intensity, self.brightest * law)
+        ray_count = np.bincount(rays.surfel, minlength=count)
+        recorded = np.bincount(rays.surfel, intensity, count)
+        white = np.bincount(rays.surfel, expected, count)
+        neighbors = cKDTree(centers).query(centers, min(_NEIGHBORS, count))[1].reshape(count, -1)
+        with np.errstate(divide="ignore", invalid="ignore"):  # surfels without rays
+            surfels = np.nan_to_num(recorded / white)
+            nearby = recorded[neighbors].sum(axis=1) / white[neighbors].sum(axis=1)
+        surfels = (ray_count * surfels + _PRIOR_RAYS * nearby) / (ray_count + _PRIOR_RAYS)
         known = np.isfinite(surfels)
         if known.any():
             _, nearest = cKDTree(centers[known]).query(centers[~known])
@@ -126,9 +159,9 @@ class Response:
         return {
             "model": self.model.value,
             "white": self.white,
-            "by_range": self.by_range.round(4).tolist(),
-            "by_incidence": self.by_incidence.round(4).tolist(),
-            "by_ring": self.by_ring.round(4).tolist(),
+            "incidence_exponent": self.incidence_exponent,
+            "ranges_m": RANGES_M.tolist(),
+            "by_ring": self.by_ring.tolist(),
         }
 
 
@@ -139,16 +172,15 @@ class Reflectances:
     surfels: Floats  # (m,), 0.01 to 1
     response: Response
 
-    def intensities(self, sweep: AlignedSweep, hits: SurfelHits) -> Floats:
-        """Simulate the intensities of a sweep's rays, on the scale of the recorded intensities.
+    def intensities(
+        self, surfel: Ints, range_m: AnyFloats, cosine: AnyFloats, ring: Integers
+    ) -> Floats:
+        """Simulate the intensities of rays that hit surfels, on the scale of the recording.
 
-        The array has shape (n,), and is NaN for rays that hit nothing.
+        All arrays have shape (n,).
         """
-        law = self.response.model.white_intensities(hits.distance_m, hits.cosine)
-        intensities = np.full(len(sweep.points), np.nan)
-        law *= self.response.by_ring[sweep.ring[hits.rays]]
-        intensities[hits.rays] = self.surfels[hits.surfel] * law * self.response.scale
-        return intensities
+        white = self.response.white_intensities(range_m, cosine, ring)
+        return self.surfels[surfel] * white * self.response.scale
 
 
 def fit_response(
@@ -177,12 +209,12 @@ def fit_response(
     """
     observations = Observations.concatenate(parts)
     observations = observations.select(
-        np.isfinite(observations.intensity) & (observations.cosine > _MIN_COSINE)
+        np.isfinite(observations.intensity) & (observations.cosine > MIN_COSINE)
     )
     if not (observations.intensity > 0).any():
         return None
     models = (IntensityModel.ENERGIES,) if are_energies else tuple(IntensityModel)
-    fits = [_Factors.from_rays(observations, model, ring_count) for model in models]
+    fits = [_Fit.to_rays(observations, model, ring_count) for model in models]
     best = fits[0]
     if fits[-1].difference < _MAX_DIFFERENCE * best.difference:
         best = fits[-1]
@@ -190,63 +222,156 @@ def fit_response(
     # with few rays are noisy, so they are weighted by rays.
     reflectance = best.reflectance[observations.surfel]
     white = max(float(np.quantile(reflectance, _WHITE_SHARE)), 1e-6 * best.brightest)
-    typical = float(np.nanmedian(best.reflectance)) / white
-    simulated = (reflectance / white).clip(_MIN_REFLECTANCE, 1.0)
-    simulated *= best.model.white_intensities(observations.range_m, observations.cosine)
-    by_range, by_incidence, by_ring = best.factors
-    simulated *= by_ring[observations.ring]
-    scale = float(best.intensity.sum() / simulated.sum())
-    return Response(
-        best.model, by_range, by_incidence, by_ring, white, best.brightest, typical, scale
+    response = Response(
+        best.model,
+        best.by_ring,
+        best.incidence_exponent,
+        white,
+        best.brightest,
+        typical=float(np.nanmedian(best.reflectance)) / white,
+        scale=1.0,
     )
+    simulated = (reflectance / white).clip(_MIN_REFLECTANCE, 1.0) * response.white_intensities(
+        observations.range_m, observations.cosine, observations.ring
+    )
+    return replace(response, scale=float(best.intensity.sum() / simulated.sum()))
 
 
-class _Factors(NamedTuple):
-    """Fitted sensor factors and reflectances of surfels, which are NaN for unobserved surfels."""
+class _Fit(NamedTuple):
+    """Fitted sensor response and reflectances of surfels, which are NaN for unobserved surfels."""
 
     model: IntensityModel
-    intensity: Floats  # (k,), where retroreflectors are clipped to white
-    factors: list[Floats]
-    reflectance: Floats  # intensity divided by the law of the model and the factors
+    by_ring: Floats  # (r, k)
+    incidence_exponent: float
+    intensity: Floats  # (n,), where retroreflectors are clipped to white
+    reflectance: Floats  # (m,), intensity divided by the response
     brightest: float
     difference: float  # mean relative difference between modeled and recorded intensities
 
     @classmethod
-    def from_rays(
-        cls, observations: Observations, model: IntensityModel, ring_count: int
-    ) -> _Factors:
-        """Alternately fit the factors and the reflectances to the intensities of rays.
+    def to_rays(cls, observations: Observations, model: IntensityModel, ring_count: int) -> _Fit:
+        """Alternately fit the response and the reflectances to the intensities of rays.
 
         A surface is observed at few ranges, incidences and rings, so what they do not determine
         remains unchanged.
         """
-        law = model.law(observations.range_m, observations.cosine)
-        brightest = float(np.quantile(observations.intensity / law, _WHITE_QUANTILE))
-        intensity = np.minimum(observations.intensity, brightest * law)
-        unknown = np.full(int(observations.surfel.max()) + 1, np.nan)
-        rows: list[Integers] = [
-            _range_bin(observations.range_m),
-            _incidence_bin(observations.cosine),
-            observations.ring,
-        ]
-        counts = (len(_RANGE_EDGES_M) - 1, _INCIDENCE_BINS, ring_count)
-        factors = [np.ones(count) for count in counts]
-        reflectance = unknown
-        product = law
+        product = model.law(observations.range_m, observations.cosine)
+        brightest = float(np.quantile(observations.intensity / product, _WHITE_QUANTILE))
+        intensity = np.minimum(observations.intensity, brightest * product)
+        surfel = observations.surfel
+        unknown = np.full(int(surfel.max()) + 1, np.nan)
+        factors = _RingFactors.ones(ring_count)
+        slopes = _within_surfels(observations)
+        exponent = model.incidence_exponent
         for _ in range(_ROUNDS):
-            product = law * np.prod([f[row] for f, row in zip(factors, rows, strict=True)], axis=0)
-            reflectance = _ratios(observations.surfel, intensity, product, unknown)
-            for index, row in enumerate(rows):
-                others = product / factors[index][row]
-                expected = others * reflectance[observations.surfel]
-                factors[index] = _ratios(row, intensity, expected, factors[index])
-                factors[index] /= np.average(
-                    factors[index], weights=np.bincount(row, minlength=len(factors[index]))
-                )
-                product = others * factors[index][row]
-        expected = reflectance[observations.surfel] * product
-        difference = np.abs(expected - intensity) / np.maximum(expected + intensity, 1e-300)
-        return cls(model, intensity, factors, reflectance, brightest, float(difference.mean()))
+            reflectance = _ratios(surfel, intensity, product, unknown)
+            factors, product = factors.fit(observations, intensity, product, reflectance[surfel])
+            reflectance = _ratios(surfel, intensity, product, unknown)
+            step = _exponent_step(slopes, intensity / product, reflectance[surfel])
+            step = float(np.clip(exponent + step, 0, _MAX_EXPONENT)) - exponent
+            exponent += step
+            product = product * np.asarray(observations.cosine, np.float64) ** step
+        reflectance = _ratios(surfel, intensity, product, unknown)
+        return cls(
+            model,
+            factors.table.round(_FACTOR_DECIMALS).clip(_MIN_FACTOR),
+            round(exponent, _EXPONENT_DECIMALS),
+            intensity,
+            reflectance,
+            brightest,
+            _relative_difference(intensity, reflectance[surfel] * product),
+        )
+
+
+class _RingFactors(NamedTuple):
+    """Factors for k ranges, for r rings, and for each of these rings at each range."""
+
+    by_range: Floats  # (k,)
+    by_ring: Floats  # (r,)
+    by_cell: Floats  # (r * k,)
+
+    @classmethod
+    def ones(cls, ring_count: int) -> _RingFactors:
+        """Return factors that change nothing."""
+        count = len(RANGES_M)
+        return cls(np.ones(count), np.ones(ring_count), np.ones(ring_count * count))
+
+    @property
+    def table(self) -> Floats:
+        """Products of the factors. Shape (r, k)."""
+        by_cell = self.by_cell.reshape(len(self.by_ring), len(self.by_range))
+        return self.by_ring[:, None] * self.by_range * by_cell
+
+    def fit(
+        self, observations: Observations, intensity: Floats, product: Floats, reflectance: Floats
+    ) -> tuple[_RingFactors, Floats]:
+        """Fit one kind of factor after the other.
+
+        Parameters
+        ----------
+        observations
+            The n rays.
+        intensity
+            Their intensities, where retroreflectors are clipped to white.
+        product
+            The response, which includes the factors.
+        reflectance
+            Reflectance of the surfel of each ray.
+
+        Returns
+        -------
+        tuple
+            The fitted factors and the product that includes them.
+        """
+        range_row = np.searchsorted(_EDGES_M, observations.range_m)
+        ring = observations.ring
+        fitted = []
+        for factor, row in zip(
+            self, (range_row, ring, ring * len(RANGES_M) + range_row), strict=True
+        ):
+            others = product / factor[row]
+            ratios = _ratios(row, intensity, others * reflectance, factor).clip(_MIN_FACTOR)
+            ratios /= np.average(ratios, weights=np.bincount(row, minlength=len(ratios)))
+            product = others * ratios[row]
+            fitted.append(ratios)
+        return _RingFactors(*fitted), product
+
+
+def _relative_difference(intensity: Floats, expected: Floats) -> float:
+    """Return the mean difference between recorded and modeled intensities, relative to their sum.
+
+    Both arrays have shape (n,).
+    """
+    total = np.maximum(expected + intensity, 1e-300)
+    return float(np.mean(np.abs(expected - intensity) / total))
+
+
+def _within_surfels(observations: Observations) -> Floats:
+    """Return the logarithms of the cosines of incidence minus their means over each surfel."""
+    logarithm = np.log(np.asarray(observations.cosine, np.float64))
+    counts = np.bincount(observations.surfel)
+    means = np.bincount(observations.surfel, logarithm) / np.maximum(counts, 1)
+    return np.asarray(logarithm - means[observations.surfel])
+
+
+def _exponent_step(slopes: Floats, brightness: Floats, reflectance: Floats) -> float:
+    """Return the change of the incidence exponent that best explains the rays of each surfel.
+
+    The step is 0 if each surfel was observed at about the same incidence.
+
+    Parameters
+    ----------
+    slopes
+        Result of `_within_surfels`.
+    brightness
+        Intensity of each ray divided by the response.
+    reflectance
+        Reflectance of the surfel of each ray.
+    """
+    if np.square(slopes).mean() < _MIN_INCIDENCE_VARIANCE:
+        return 0.0
+    variance = float(reflectance @ np.square(slopes))
+    return float((brightness - reflectance) @ slopes) / variance if variance > 0 else 0.0
 
 
 def _ratios(row: Integers, values: AnyFloats, expected: AnyFloats, before: Floats) -> Floats:
@@ -261,11 +386,3 @@ def _ratios(row: Integers, values: AnyFloats, expected: AnyFloats, before: Float
     if np.isfinite(before).all():  # factors, not reflectances
         enough &= np.bincount(row, minlength=count) >= _MIN_RAYS
     return np.divide(sums, sums_expected, out=before.copy(), where=enough)
-
-
-def _range_bin(range_m: AnyFloats) -> Ints:
-    return np.asarray(np.searchsorted(_RANGE_EDGES_M, range_m, side="right") - 1)
-
-
-def _incidence_bin(cosine: AnyFloats) -> Ints:
-    return np.asarray((cosine * _INCIDENCE_BINS).astype(np.int64).clip(0, _INCIDENCE_BINS - 1))

@@ -14,7 +14,7 @@ from .alignment import AlignedSweeps
 from .held_out import HeldOutPulses, HeldOutRays
 from .moving_objects import find_tracks
 from .moving_rays import MovingRays, StationaryMasks, pulse_times_s
-from .object_surfels import RecordedObject, cast_to_objects, reconstruct_objects
+from .object_surfels import ObjectHits, RecordedObject, cast_to_objects, reconstruct_objects
 from .object_tracks import ObjectTrack, in_any_box
 from .reflectances import Reflectances, Response
 
@@ -169,9 +169,8 @@ class SubmapObjects:
             for index in np.unique(hits.object[is_first]).tolist():
                 chosen = is_first & (hits.object == index)
                 intensity[rows][chosen] = _intensities(
-                    reflectances[index], hits.surfel[chosen], hits.distance_m[chosen],
-                    hits.cosine[chosen],
-                )  # fmt: skip
+                    reflectances[index], hits, rays.ring[rows], chosen
+                )
         return replace(
             rays,
             simulated_m=simulated_m,
@@ -183,13 +182,14 @@ class SubmapObjects:
 
 
 def _intensities(
-    reflectances: Reflectances | None, surfel: Ints, distance_m: Floats, cosine: Floats
+    reflectances: Reflectances | None, hits: ObjectHits, ring: Ints, chosen: Bools
 ) -> Floats:
-    """Return the simulated intensities of hits on an object, or NaN if they are unknown."""
+    """Return the simulated intensities of the chosen hits, or NaN if they are unknown."""
     if reflectances is None:
-        return np.full(len(surfel), np.nan)
-    law = reflectances.response.model.white_intensities(distance_m, cosine)
-    return np.asarray(reflectances.surfels[surfel] * law * reflectances.response.scale)
+        return np.full(int(chosen.sum()), np.nan)
+    return reflectances.intensities(
+        hits.surfel[chosen], hits.distance_m[chosen], hits.cosine[chosen], ring[chosen]
+    )
 
 
 def _without_objects(

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from ..errors import LidarError
-from ..numerics.arrays import Bools, Floats, Ints
+from ..numerics.arrays import AnyFloats, Bools, Floats, Integers, Ints
 from ..numerics.elementary import cos, sin_cos
 from ..schema.checks import as_array, check_fields, check_number
 from ..schema.declared import about
@@ -49,13 +49,19 @@ class Beams:
         float64.
     intensity_factor
         Ratio of the reported to the received intensity of each beam, greater than 0; 1 by default.
-        It does not affect the detection of returns. Shape (c,), float64.
+        It does not affect the detection of returns. Shape (c,), or (c, k) with `intensity_range_m`,
+        float64.
+    intensity_range_m
+        Ascending ranges in meters at which `intensity_factor` is specified. Between these ranges,
+        the factors are interpolated linearly, and beyond them, they are constant. By default, the
+        factors do not depend on the range. Shape (k,), float64.
 
     Raises
     ------
     LidarError
-        If the lengths differ, a value is not finite, an intensity factor is not positive, there are
-        no beams or too many beams, or `blocked` refers to a beam that does not exist.
+        If the lengths differ, a value is not finite, an intensity factor is not positive, the
+        ranges of the factors are not ascending, there are no beams or too many beams, or `blocked`
+        refers to a beam that does not exist.
     """
 
     elevation: Floats
@@ -64,11 +70,14 @@ class Beams:
     origin: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     blocked: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     intensity_factor: Floats = field(default_factory=lambda: np.zeros(0))
+    intensity_range_m: Floats = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         count = as_array("Beams.elevation", self.elevation).size
+        knots = as_array("Beams.intensity_range_m", self.intensity_range_m).size
+        factor_shape = (count, knots) if knots else (count,)
         if not as_array("Beams.intensity_factor", self.intensity_factor).size:
-            object.__setattr__(self, "intensity_factor", np.ones(count))
+            object.__setattr__(self, "intensity_factor", np.ones(factor_shape))
         if not 1 <= count <= MAX_CHANNELS:
             raise LidarError(f"A sensor must have 1 to {MAX_CHANNELS} beams, but has {count}.")
         for name, shape in (
@@ -76,7 +85,8 @@ class Beams:
             ("azimuth", (count,)),
             ("time_ns", (count,)),
             ("origin", (count, 3)),
-            ("intensity_factor", (count,)),
+            ("intensity_range_m", (knots,)),
+            ("intensity_factor", factor_shape),
         ):
             object.__setattr__(self, name, _as_table(name, getattr(self, name), shape))
         blocked = as_array("Beams.blocked", self.blocked)
@@ -93,6 +103,11 @@ class Beams:
             raise LidarError(
                 "Beams.intensity_factor must be greater than 0 for each beam, but is "
                 f"{self.intensity_factor.min():g} for one of them."
+            )
+        if not (np.diff(self.intensity_range_m, prepend=0.0) > 0).all():
+            raise LidarError(
+                "Beams.intensity_range_m must contain ascending ranges greater than 0, but is "
+                f"{self.intensity_range_m.tolist()}."
             )
 
     def __len__(self) -> int:
@@ -132,14 +147,33 @@ class Beams:
         ordered = {
             column.name: getattr(self, column.name)[order]
             for column in fields(self)
-            if column.name != "blocked"
+            if column.name not in {"blocked", "intensity_range_m"}
         }
-        return Beams(**ordered, blocked=blocked)
+        return replace(self, **ordered, blocked=blocked)
 
     @property
     def has_intensity_factors(self) -> bool:
         """Whether the reported intensity of a beam differs from the received intensity."""
         return bool((self.intensity_factor != 1).any())
+
+    def intensity_factors(self, beam: Integers, range_m: AnyFloats) -> Floats:
+        """Return the ratio of the reported to the received intensity of returns.
+
+        Parameters
+        ----------
+        beam
+            Index of the beam of each return. Shape (n,).
+        range_m
+            Range of each return in meters. Shape (n,).
+        """
+        table = self.intensity_factor.reshape(len(self), -1)
+        if table.shape[1] == 1:
+            return table[beam, 0]
+        knots = self.intensity_range_m
+        row = np.clip(np.searchsorted(knots, range_m, "right") - 1, 0, len(knots) - 2)
+        weight = (np.clip(range_m, knots[0], knots[-1]) - knots[row]) / np.diff(knots)[row]
+        low = table[beam, row]
+        return np.asarray(low + weight * (table[beam, row + 1] - low))
 
     def is_blocked(self, beam: Ints, azimuth: Floats) -> Bools:
         """Return whether the platform blocks pulses.

@@ -87,7 +87,8 @@ class BeamTable(_ModelSection):
     origin_m: OffsetXYZ | tuple[OffsetXYZ, ...] = ()
     crossing_m: Annotated[float, Field(ge=0, le=1)] = 0.0
     blocked_deg: tuple[BlockedSector, ...] = ()
-    intensity_factor: Numbers = ()
+    intensity_factor: Numbers | tuple[Numbers, ...] = ()
+    intensity_range_m: Numbers = ()
 
     @model_validator(mode="after")
     def _check_blocked(self) -> BeamTable:
@@ -103,6 +104,12 @@ class BeamTable(_ModelSection):
     def _check_factors(self) -> BeamTable:
         if self.intensity_factor and not self.elevation_deg:
             raise ValueError("beams.intensity_factor requires beams.elevation_deg.")
+        by_range = any(isinstance(factor, tuple) for factor in self.intensity_factor)
+        if by_range != bool(self.intensity_range_m):
+            raise ValueError(
+                "beams.intensity_range_m requires a list of intensity factors for each beam, and "
+                "such lists require beams.intensity_range_m."
+            )
         return self
 
     def beams(self) -> Beams:
@@ -116,7 +123,26 @@ class BeamTable(_ModelSection):
             np.multiply(self.time_us, 1000.0),
             self.origins(count),
             self.blocked(),
+            *self.intensity_factors(),
+        )
+
+    def intensity_factors(self) -> tuple[Floats, Floats]:
+        """Return the fields `intensity_factor` and `intensity_range_m` of `Beams`.
+
+        Raises
+        ------
+        LidarError
+            If a beam does not have a factor for each range.
+        """
+        counts = {len(factor) for factor in self.intensity_factor if isinstance(factor, tuple)}
+        if counts - {len(self.intensity_range_m)}:
+            raise LidarError(
+                "Each list in beams.intensity_factor must have one factor for each of the "
+                f"{len(self.intensity_range_m)} ranges in beams.intensity_range_m."
+            )
+        return (
             np.array(self.intensity_factor, np.float64),
+            np.array(self.intensity_range_m, np.float64),
         )
 
     def blocked(self) -> Floats:
@@ -663,5 +689,5 @@ def _calibrate_beams(sensor_model: SensorModel, unit: Calibration) -> Beams:
         )
     times = beams.time_ns if beams.time_ns.any() else np.multiply(table.time_us, 1000.0)
     origin = beams.origin if beams.origin.any() else table.origins(len(beams))
-    factors = np.array(table.intensity_factor, np.float64)
-    return Beams(beams.elevation, beams.azimuth, times, origin, table.blocked(), factors)
+    factors = table.intensity_factors()
+    return Beams(beams.elevation, beams.azimuth, times, origin, table.blocked(), *factors)

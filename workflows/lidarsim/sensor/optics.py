@@ -22,6 +22,8 @@ from .reflectivity import SCALES
 
 LIGHT_M_NS = 0.299792458  # speed of light in vacuum; the speed in air is 0.03 % lower
 FWHM = sqrt(8 * log_of(2.0))  # full width at half maximum of a Gaussian, in standard deviations
+# Cosine of incidence below which the correction of reported intensities does not increase further.
+MIN_COSINE = 0.01
 # Width of a return in a waveform, in standard deviations of the system waveform.
 WINDOW_SIGMAS = 10
 # Number of standard deviations beyond which a return is set to 0, because it is less than 4e-6 of
@@ -75,6 +77,15 @@ class Optics(FileSection):
         Literal[tuple(SCALES)],  # type: ignore[valid-type]
         about("scale of the column `reflectivity`; Velodyne's if unknown"),
     ] = "velodyne"
+    incidence_exponent: Annotated[
+        float,
+        about(
+            "exponent of the cosine of incidence in reported intensities; 1 for received "
+            "intensities",
+            ge=0,
+            le=4,
+        ),
+    ] = 1.0
 
     __repr__ = one_line
 

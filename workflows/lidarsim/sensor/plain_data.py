@@ -30,7 +30,8 @@ _KINDS = {
         PacketSettings,
     )
 }
-_LEFT_OUT = ("optics", "noise", "returns", "intensity_factor")  # not part of the ray pattern
+# not part of the ray pattern
+_LEFT_OUT = ("optics", "noise", "returns", "intensity_factor", "intensity_range_m")
 
 
 def to_plain_data(value: Any, arrays: MutableMapping[str, AnyArray]) -> Any:

@@ -14,12 +14,12 @@ from ...columns.waveforms import column_type
 from ...errors import LidarError
 from ...media.materials import normal_incidence_energy
 from ...numerics.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, UInts32
-from ...numerics.elementary import arccos, arcsin, arctan2
+from ...numerics.elementary import arccos, arcsin, arctan2, power
 from ...numerics.random_numbers import normal
 from ...numerics.vectors import dot, rotate
 from ...scene.colors import unpack_colors
 from ...scene.scene import Scene
-from ...sensor.optics import LIGHT_M_NS
+from ...sensor.optics import LIGHT_M_NS, MIN_COSINE
 from ...sensor.reflectivity import COUNTS, SCALES
 from ...survey.survey import ScanSpec, Survey
 from ..casting.motion import CastPoses, Firings
@@ -465,15 +465,31 @@ class BatchPoints:
 
     @cached_property
     def intensity(self) -> Floats:
-        """Reported energy, which is the received energy times the intensity factor of the beam."""
+        """Reported energy, which is the received energy times the sensor's response."""
         return self._as_reported(self._energy)
 
     def _as_reported(self, energy: Floats) -> Floats:
-        """Multiply energies by the intensity factors of their beams."""
+        """Multiply energies by the sensor's response to the beam, the range and the incidence."""
         beams = self.sensor.beams
-        return (
-            energy * beams.intensity_factor[self.channel] if beams.has_intensity_factors else energy
-        )
+        if beams.has_intensity_factors:
+            energy = energy * beams.intensity_factors(self.channel, self.pulse_returns.distance)
+        if self.sensor.optics.incidence_exponent != 1:
+            energy = energy * self._incidence_factors
+        return energy
+
+    @cached_property
+    def _incidence_factors(self) -> Floats:
+        """Ratio of reported to received energies due to the angle of incidence.
+
+        It is 1 for returns without a normal, and for retroreflectors, whose received energy does
+        not depend on the incidence.
+        """
+        cosines = self._facing_normals[1]
+        diffuse = np.isfinite(cosines) & ~self._surfaces.materials.retro[self._kinds]
+        factors = np.ones(len(self))
+        exponent = self.sensor.optics.incidence_exponent - 1
+        factors[diffuse] = power(cosines[diffuse].clip(MIN_COSINE, 1.0), exponent)
+        return factors
 
     @cached_property
     def _energy(self) -> Floats:

@@ -69,7 +69,8 @@ def _device_column_names(scene: Scene, survey: Survey) -> set[str]:
         for m in survey.materials
     )
     has_factors = any(
-        carried.sensor.beams.has_intensity_factors for carried in survey.mounted_sensors
+        carried.sensor.beams.has_intensity_factors or carried.sensor.optics.incidence_exponent != 1
+        for carried in survey.mounted_sensors
     )
     computable = {column.name for column in _DEVICE_COLUMNS} - {
         *(_ENERGIES if hazy or textured_or_rough or has_factors else ())
