@@ -78,7 +78,9 @@ class Extents(NamedTuple):
         for _ in range(_CUTS):
             surfel = counts.surfel
             inside = extents.select(surfel).cells()
-            cuts = [_Cut.best(counts.ends * inside, counts.passes * inside, axis) for axis in (0, 1)]
+            cuts = [
+                _Cut.best(counts.ends * inside, counts.passes * inside, axis) for axis in (0, 1)
+            ]
             across = cuts[1].gain > cuts[0].gain
             is_cut = np.zeros(len(surfel), bool)
             for axis, better in ((0, ~across), (1, across)):

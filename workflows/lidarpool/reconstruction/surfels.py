@@ -236,7 +236,9 @@ class _View(NamedTuple):
         upward = np.array([0.0, 0.0, 1.0]) - directions[:, 2:] * directions
         upward /= np.maximum(np.linalg.norm(upward, axis=1), 1e-9)[:, None]
         rise_m = spread_m * np.abs(np.einsum("mi,mi->m", axes, upward))
-        return np.asarray(rise_m > _MIN_RISE_GAPS * self.gap_rad * np.linalg.norm(self.outward, axis=1))
+        return np.asarray(
+            rise_m > _MIN_RISE_GAPS * self.gap_rad * np.linalg.norm(self.outward, axis=1)
+        )
 
     def facing(self, axes: Floats, rows: Bools) -> Floats:
         """Return the axes (k, 3, 3) of planes that contain lines and face the sensor."""
