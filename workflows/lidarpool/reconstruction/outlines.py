@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.numerics.arrays import Bools, Bytes, Floats, Ints
+from lidarsim.numerics.arrays import Bools, Bytes, Floats, Ints, Ints32
 
 from .porosity import Crossings
 from .surfels import Surfels
@@ -162,7 +162,7 @@ class _CellCounts(NamedTuple):
 
 def _outcomes(
     sweeps: Sequence[Crossings], on_surfel_m: float
-) -> Iterator[tuple[Ints, Bytes, Bools]]:
+) -> Iterator[tuple[Ints32, Bytes, Bools]]:
     """Yield the surfels and cells that rays cross, and which rays end there.
 
     Surfels behind the return of a ray are omitted.
@@ -188,33 +188,32 @@ class _Cut(NamedTuple):
         If there are cells without rays between both parts, the cut is in the middle of them. `ends`
         and `passes` have shape (c, `CELLS`, `CELLS`).
         """
-        other = 2 - axis
-        before_ends = _cumulative(ends.sum(axis=other))
-        before_passes = _cumulative(passes.sum(axis=other))
-        all_ends, all_passes = before_ends[:, -1], before_passes[:, -1]
-        uncut = _log_likelihood(all_ends, all_passes)
+        counts = np.stack([ends, passes]).sum(axis=3 - axis)  # (2, c, CELLS)
+        before = np.cumsum(np.pad(counts, ((0, 0), (0, 0), (1, 0))), axis=2)
         best = np.zeros(len(ends))
         first, last = np.zeros((2, len(ends), 2))
         for start in range(CELLS):
             for stop in range(start + 1, CELLS + 1):
-                kept_ends = before_ends[:, stop] - before_ends[:, start]
-                kept_passes = before_passes[:, stop] - before_passes[:, start]
-                cut_ends = all_ends - kept_ends
-                cut_passes = all_passes - kept_passes
-                gain = _log_likelihood(kept_ends, kept_passes) - uncut
-                gain += _log_likelihood(cut_ends, cut_passes)
-                gain[cut_passes < _MIN_CUT_PASSING * (cut_ends + cut_passes)] = 0
-                gain[kept_passes * cut_ends >= cut_passes * kept_ends] = 0  # fewer gaps outside
+                gain = _gain(before[..., -1], before[..., stop] - before[..., start])
                 better = gain > best + _TINY
                 first[better] = start, stop
                 last[better | (gain > best - _TINY) & (best > 0)] = start, stop
                 best = np.maximum(best, gain)
-        return cls(*(first + last).T / 2, best)
+        start_cell, stop_cell = (first + last).T / 2
+        return cls(start_cell, stop_cell, best)
 
 
-def _cumulative(counts: Floats) -> Floats:
-    """Return the sums (c, n + 1) of the counts (c, n) before each cell."""
-    return np.asarray(np.cumsum(np.pad(counts, ((0, 0), (1, 0))), axis=1))
+def _gain(total: Floats, kept: Floats) -> Floats:
+    """Return how much a cut increases the log likelihood, or 0 if the rays do not show an edge.
+
+    `total` and `kept` are the numbers of ending and passing rays of c surfels and of their parts
+    that remain. Both have shape (2, c).
+    """
+    cut = total - kept
+    gain = _log_likelihood(*kept) + _log_likelihood(*cut) - _log_likelihood(*total)
+    gain[cut[1] < _MIN_CUT_PASSING * cut.sum(axis=0)] = 0
+    gain[kept[1] * cut[0] >= cut[1] * kept[0]] = 0  # The part that remains has more gaps.
+    return gain
 
 
 def _log_likelihood(ends: Floats, passes: Floats) -> Floats:

@@ -52,8 +52,12 @@ class Crossings(NamedTuple):
         order = np.argsort(~kept, axis=1, kind="stable")
         surfel = np.where(kept, self.surfel, -1).astype(np.int32)
         distance_m = np.where(kept, self.distance_m, np.inf).astype(np.float32)
-        ordered = (np.take_along_axis(part, order, 1) for part in (surfel, distance_m, self.cell))
-        return Crossings(*ordered, self.range_m)
+        return Crossings(
+            np.take_along_axis(surfel, order, 1),
+            np.take_along_axis(distance_m, order, 1),
+            np.take_along_axis(self.cell, order, 1),
+            self.range_m,
+        )
 
     def first_ends(self, dark: Bools, on_surfel_m: float) -> _RayCounts:
         """Count the rays, assuming that each ends on the first surfel close to its return."""
