@@ -24,8 +24,8 @@ from .surfels import Surfels
 
 CELLS = 8  # cells along each side of a surfel, in which rays are counted
 _MIN_PASSING = 0.05  # minimum share of passing rays of a surfel that may be cut
-_MIN_CUT_PASSING = 0.8  # minimum share of passing rays in the part that is cut off
-_MIN_GAIN = 4.0  # minimum difference of the log likelihoods with and without a cut
+_MIN_CUT_PASSING = 0.9  # minimum share of passing rays in the part that is cut off
+_MIN_GAIN = 8.0  # minimum difference of the log likelihoods with and without a cut
 _CUTS = 2  # maximum number of times that a surfel is cut, each time at one or both ends
 _MIN_REST = 0.2  # minimum share of a trimmed side that remains if its beam width is subtracted
 _TINY = 1e-9
