@@ -302,6 +302,7 @@ class _Building:
             compared=compared,
             voxel_m=self.voxel_m,
             drawn_share=0.0,
+            beam_rad=_beam_rad(self.base),
         )
         is_shared = not isinstance(recorded.source, Recording)
         count = len(submaps) if is_shared else 1
@@ -552,6 +553,16 @@ class _Building:
             "ring_offset_m": float(np.std(alignment.ring_offsets[:, 0])),
             "ring_offset_deg": float(np.degrees(np.std(alignment.ring_offsets[:, 1]))),
         }
+
+
+def _beam_rad(model: SensorModel | None) -> float:
+    """Return the mean divergence of a model's beams in radians.
+
+    It is 0 if it is unknown, because a twin is then simulated with thin rays.
+    """
+    if model is None or model.optics.divergence_mrad is None:
+        return 0.0
+    return 1e-3 * float(np.mean(model.optics.divergence_mrad))
 
 
 def _window_of(recorded: RecordedSweeps) -> int | None:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints, Ints32
+from lidarsim.numerics.arrays import Bools, Bytes, Floats, Floats32, Ints, Ints32
 
 _PRIOR_RAYS = 2.2  # weight of the prior, in rays
 _PRIOR_GAPS = 0.2  # rays of the prior that pass through, without observations nearby
@@ -35,12 +35,29 @@ class Crossings(NamedTuple):
 
     surfel: Ints32  # (n, k), -1 beyond the last surfel
     distance_m: Floats32  # (n, k), inf beyond the last surfel
-    range_m: Floats  # (n,), recorded range
+    cell: Bytes  # (n, k), cell of the surfel that the ray crosses, see `outlines.py`
+    range_m: Floats  # (n,), recorded range, inf for a lost pulse
 
     @property
     def present(self) -> Bools:
         """Mask of the surfels. Shape (n, k)."""
         return np.asarray(self.surfel >= 0)
+
+    def as_lost(self) -> Crossings:
+        """Return the crossings of lost pulses, whose ranges are inf."""
+        return self._replace(range_m=np.full(len(self.range_m), np.inf))
+
+    def select(self, kept: Bools) -> Crossings:
+        """Select crossings with a mask of shape (n, k)."""
+        order = np.argsort(~kept, axis=1, kind="stable")
+        surfel = np.where(kept, self.surfel, -1).astype(np.int32)
+        distance_m = np.where(kept, self.distance_m, np.inf).astype(np.float32)
+        return Crossings(
+            np.take_along_axis(surfel, order, 1),
+            np.take_along_axis(distance_m, order, 1),
+            np.take_along_axis(self.cell, order, 1),
+            self.range_m,
+        )
 
     def first_ends(self, dark: Bools, on_surfel_m: float) -> _RayCounts:
         """Count the rays, assuming that each ends on the first surfel close to its return."""

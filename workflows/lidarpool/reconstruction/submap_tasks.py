@@ -68,6 +68,8 @@ class BuildTask(SubmapTask):
         Share of the points that are drawn in the top view.
     objects
         Moving objects near the submap, or None if they are not reconstructed.
+    beam_rad
+        Divergence in radians of the beams with which the final scene is simulated, 0 for thin rays.
     """
 
     coverage: SensorCoverage
@@ -75,6 +77,7 @@ class BuildTask(SubmapTask):
     voxel_m: float
     drawn_share: float
     objects: SubmapObjects | None = None
+    beam_rad: float = 0.0
 
     def read(self) -> AlignedSweeps:
         """Read the sweeps of the submap and its surroundings into memory."""
@@ -215,7 +218,7 @@ def build_submap(task: BuildTask) -> BuiltSubmap:
     else:
         stationary = task.objects.stationary(sweeps)
     held_out, frames, images = compare_held_out_sweeps(sweeps, task, stationary)
-    surface_map = build_surface_map(sweeps, stationary, task.voxel_m)
+    surface_map = build_surface_map(sweeps, stationary, task.voxel_m, task.beam_rad)
     own = submap.owns(surface_map.surfels.centers, task.alignment.poses)
     observations = surface_map.observations(sweeps, stationary).select_surfels(
         own & ~surface_map.surfels.dark

@@ -5,8 +5,8 @@ corrects both. A ray of the recording that passes through a surfel that should h
 counts against the surfel. A ray that ends on a surfel supports it. Lost pulses count against
 surfels, too.
 
-Vegetation, fences and the outlines of objects have gaps, which are estimated at the end
-(`porosity.py`).
+At the end, surfels are trimmed at the outlines of objects (`outlines.py`), and the gaps in
+vegetation and fences are estimated (`porosity.py`).
 
 Windows and black cars return few pulses, and hide the surfaces behind them. Where pulses are lost
 between returns of the same surface, candidates for dark surfels are created. Lost pulses that hit a
@@ -32,6 +32,7 @@ from lidarsim.numerics.even_samples import even_indices
 from raybeam import RayCaster
 
 from .alignment import AlignedSweep, AlignedSweeps
+from .outlines import Extents, crossed_cells
 from .porosity import Crossings, Porosity
 from .surfels import Surfels
 
@@ -53,6 +54,9 @@ _END_VOTES = 4
 _MIN_LOST_RATIO = 2
 _POROSITY_SWEEPS = 24  # maximum number of sweeps from which gaps are determined
 _MAX_CROSSINGS = 6  # maximum number of surfels that a ray crosses
+# Distance between an edge and the center of a beam that still returns from it, relative to the
+# diameter of the beam.
+_BEAM_SHARE = 0.3
 _BEHIND_M = 1e-5  # distance behind a surfel from which a ray is cast again, as in simulations
 
 
@@ -175,6 +179,7 @@ class SurfaceMap:
         directions /= range_m[:, None]
         surfel = np.full((len(rows), _MAX_CROSSINGS), -1, np.int32)
         distance_m = np.full(surfel.shape, np.inf, np.float32)
+        cell = np.zeros(surfel.shape, np.uint8)
         active = np.arange(len(rows))
         start_m = np.zeros(len(rows))
         for layer in range(_MAX_CROSSINGS):
@@ -185,8 +190,10 @@ class SurfaceMap:
             start_m = start_m[met] + hits.distance[met]
             surfel[active, layer] = hits.triangle[met] // 2
             distance_m[active, layer] = start_m
+            points = origins[active] + start_m[:, None] * directions[active]
+            cell[active, layer] = crossed_cells(self.surfels, surfel[active, layer], points)
             start_m += _BEHIND_M
-        return Crossings(surfel, distance_m, range_m)
+        return Crossings(surfel, distance_m, cell, range_m)
 
     def _hits(
         self, sweep: AlignedSweep, rows: Ints, surfel: Ints, distance_m: Floats
@@ -200,15 +207,27 @@ class SurfaceMap:
         inward = np.einsum("ij,ij->i", directions, normals) / range_m
         return SurfelHits(rows, surfel, distance_m, range_m, off_plane_m, np.abs(inward), inward)
 
-    def with_porosity(self, sweeps: AlignedSweeps, stationary: Mapping[int, Bools]) -> SurfaceMap:
-        """Estimate the gaps of the surfels from the rays of several sweeps."""
-        crossings = [
-            self.crossings(sweeps.read(number), stationary[number])
-            for number in _evenly_chosen(stationary, _POROSITY_SWEEPS)
-        ]
-        surfels = self.surfels
-        porosity = Porosity.from_crossings(crossings, surfels.centers, surfels.dark, _ON_RAY_M)
-        return replace(self, porosity=porosity)
+    def trimmed(
+        self, sweeps: AlignedSweeps, stationary: Mapping[int, Bools], beam_rad: float
+    ) -> SurfaceMap:
+        """Trim the surfels at outlines and estimate their gaps, from the rays of several sweeps.
+
+        Beams with a divergence return from an object even if their centers miss it. The surfels are
+        trimmed such that beams with the divergence `beam_rad` in radians have the recorded returns.
+        """
+        crossings = []
+        lost_crossings = []
+        for number in _evenly_chosen(stationary, _POROSITY_SWEEPS):
+            sweep, lost = sweeps.read_with_lost(number)
+            crossings.append(self.crossings(sweep, stationary[number]))
+            lost_crossings.append(self.crossings(lost).as_lost())
+        dark = self.surfels.dark
+        extents = Extents.from_crossings([*crossings, *lost_crossings], dark, _ON_RAY_M)
+        inset_m = _BEAM_SHARE * beam_rad * _mean_ranges(crossings, len(dark))
+        surfels = extents.trim(self.surfels, inset_m)
+        crossings = [extents.crossings(one) for one in crossings]
+        porosity = Porosity.from_crossings(crossings, surfels.centers, dark, _ON_RAY_M)
+        return replace(SurfaceMap.from_surfels(surfels), porosity=porosity)
 
     def refine(self, sweeps: AlignedSweeps, stationary: Mapping[int, Bools]) -> Surfels:
         """Remove surfels that more rays contradict than support, and adjust the other surfels.
@@ -266,9 +285,15 @@ class SurfaceMap:
 
 
 def build_surface_map(
-    sweeps: AlignedSweeps, stationary: Mapping[int, Bools], voxel_m: float
+    sweeps: AlignedSweeps,
+    stationary: Mapping[int, Bools],
+    voxel_m: float,
+    beam_rad: float = 0.0,
 ) -> SurfaceMap:
     """Build a surface map from the stationary points.
+
+    The map has the recorded returns if it is simulated with beams of the divergence `beam_rad` in
+    radians, 0 for thin rays.
 
     Raises
     ------
@@ -291,7 +316,17 @@ def build_surface_map(
         surfels = surfels.with_dark(dark)
     for _ in range(_ROUNDS):  # Keep only one ray caster at a time, to save memory.
         surfels = SurfaceMap.from_surfels(surfels).refine(sweeps, stationary)
-    return SurfaceMap.from_surfels(surfels).with_porosity(sweeps, stationary)
+    return SurfaceMap.from_surfels(surfels).trimmed(sweeps, stationary, beam_rad)
+
+
+def _mean_ranges(sweeps: Sequence[Crossings], count: int) -> Floats:
+    """Return the mean range in meters at which rays cross each of `count` surfels, or 0."""
+    total_m, rays = np.zeros((2, count))
+    for one in sweeps:
+        surfel = one.surfel[one.present]
+        total_m += np.bincount(surfel, one.distance_m[one.present], count)
+        rays += np.bincount(surfel, minlength=count)
+    return np.asarray(total_m / np.maximum(rays, 1))
 
 
 def _lost_positions(

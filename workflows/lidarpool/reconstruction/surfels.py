@@ -34,6 +34,8 @@ _PLANE_GAPS = 0.55  # half a side across the rings relative to the gap between r
 _MAX_RADII = 1.0  # limit of this half side, relative to the distance of the farthest neighbor
 _MAX_GAPS = 1.0  # maximum half side elsewhere, relative to the gap between rays
 _MIN_COSINE = 0.1  # limit of the incidence by which gaps grow
+_MIN_RISE_GAPS = 1.0  # standard deviation of a thin object across the rings, in gaps
+_THIN_VOXELS = 0.5  # minimum half width of its surfels before they are trimmed, in voxels
 _BLOCK = 1 << 16  # surfels per block
 
 
@@ -65,6 +67,28 @@ class Surfels:
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         return np.asarray(normals / np.maximum(lengths, 1e-12))
+
+    @cached_property
+    def half_sides(self) -> Floats:
+        """Vectors from the centers of the surfels to the middles of two sides, in meters.
+
+        The array has shape (2, m, 3).
+        """
+        corners = self.mesh.vertices.reshape(-1, 4, 3)
+        return np.stack([corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]]) / 2
+
+    def resize(self, start: Floats, stop: Floats) -> Surfels:
+        """Return surfels with other extents in the same planes.
+
+        `start` and `stop` are positions along both half sides, relative to the center and to the
+        length of the half side. They have shape (m, 2), and are -1 and 1 for the same extents.
+        """
+        along, across = self.half_sides
+        corners = np.empty((len(self), 4, 3))
+        for corner, ends in enumerate(((start, start), (stop, start), (stop, stop), (start, stop))):
+            corners[:, corner] = self.centers
+            corners[:, corner] += ends[0][:, :1] * along + ends[1][:, 1:] * across
+        return replace(self, mesh=replace(self.mesh, vertices=corners.reshape(-1, 3)))
 
     def select(self, rows: Bools) -> Surfels:
         """Select surfels with a mask."""
@@ -152,7 +176,8 @@ class Surfels:
         corners = np.empty((count, 4, 3))
         for start in range(0, count, _BLOCK):
             block = slice(start, start + _BLOCK)
-            planes = _Planes.around(means[block], tree, means)
+            view = _View(mean_outward[block], gap_rad)
+            planes = _Planes.around(means[block], tree, means, view, voxel_m)
             corners[block] = planes.corners(means[block], mean_outward[block], voxel_m, gap_rad)
         mesh = SceneMesh(
             name,
@@ -191,6 +216,38 @@ def merge_surfels(meshes: Sequence[SceneMesh]) -> SceneMesh:
     )
 
 
+class _View(NamedTuple):
+    """Directions from which m points were observed."""
+
+    outward: AnyFloats  # (m, 3), vectors to the sensor, meters
+    gap_rad: float  # angle between neighboring rings
+
+    @property
+    def directions(self) -> Floats:
+        """Unit vectors to the sensor. Shape (m, 3)."""
+        return self.outward / np.maximum(np.linalg.norm(self.outward, axis=1), 1e-9)[:, None]
+
+    def crosses_rings(self, axes: Floats, spread_m: Floats) -> Bools:
+        """Mark lines that extend over several rings.
+
+        The lines have the given unit vectors (m, 3), and standard deviations (m,) along these.
+        """
+        directions = self.directions
+        upward = np.array([0.0, 0.0, 1.0]) - directions[:, 2:] * directions
+        upward /= np.maximum(np.linalg.norm(upward, axis=1), 1e-9)[:, None]
+        rise_m = spread_m * np.abs(np.einsum("mi,mi->m", axes, upward))
+        return np.asarray(
+            rise_m > _MIN_RISE_GAPS * self.gap_rad * np.linalg.norm(self.outward, axis=1)
+        )
+
+    def facing(self, axes: Floats, rows: Bools) -> Floats:
+        """Return the axes (k, 3, 3) of planes that contain lines and face the sensor."""
+        directions = self.directions[rows]
+        normals = directions - np.einsum("ki,ki->k", directions, axes)[:, None] * axes
+        normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-9)[:, None]
+        return np.stack([normals, np.cross(axes, normals), axes], axis=1)
+
+
 class _Planes(NamedTuple):
     """Planes fitted to the neighbors of m points."""
 
@@ -199,8 +256,14 @@ class _Planes(NamedTuple):
     radius_m: Floats  # (m,), distance of the farthest neighbor, or 0 if they are not in a plane
 
     @classmethod
-    def around(cls, centers: Floats, tree: object, means: Floats) -> _Planes:
-        """Fit a plane to the neighbors of each center. `tree` is a k-d tree of `means`."""
+    def around(
+        cls, centers: Floats, tree: object, means: Floats, view: _View, voxel_m: float
+    ) -> _Planes:
+        """Fit a plane to the neighbors of each center. `tree` is a k-d tree of `means`.
+
+        A thin object such as a pole is a line as well, but it crosses several rings. Its plane
+        faces the sensor.
+        """
         count = len(centers)
         axes = np.empty((count, 3, 3))
         halves = np.empty((count, 2))
@@ -218,7 +281,14 @@ class _Planes(NamedTuple):
             is_line = close[:, 0] < _MIN_WIDTH * close[:, 1]
             close[is_line, 0] = variances[is_line, 1]
             halves[left] = _EXTENT * np.sqrt(np.maximum(close, 0))
-            left = left[variances[:, 1] < _MIN_WIDTH * variances[:, 2]]
+            narrow = variances[:, 1] < _MIN_WIDTH * variances[:, 2]
+            if neighbors == _NEIGHBORS[0]:
+                thin = narrow & view.crosses_rings(found[:, 2], np.sqrt(variances[:, 2]))
+                axes[thin] = view.facing(found[thin, 2], thin)
+                halves[thin, 0] = np.maximum(halves[thin, 0], _THIN_VOXELS * voxel_m)
+                radius_m[thin] = 0.0
+                narrow &= ~thin
+            left = left[narrow]
             if not len(left):
                 break
         return cls(axes, halves, radius_m)
