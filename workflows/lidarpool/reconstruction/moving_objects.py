@@ -34,6 +34,7 @@ _MAX_RESIDUAL_M = 0.06  # maximum median distance of points from planes in a fur
 _MIN_MATCHED = 0.6  # minimum share of points in a further sweep that are close to the shape
 _LABEL_GAP_S = 0.3  # Labeled poses further from all observed poses are kept.
 _GROWTH_M = 1.5  # margin of a box in which points of clusters belong to the object
+_MIN_STEP_S = 1e-3  # minimum time between the poses of a track
 _TRIMMED_SWEEPS = 5  # Sweeps at the ends of a track whose clusters are often incomplete.
 _ACCELERATION_M_S2 = 3.0  # standard deviation of the acceleration
 _MAX_GAP_SWEEPS = 3  # maximum number of sweeps without points before an object is lost
@@ -149,7 +150,22 @@ def _sightings(rays: MovingRays, chosen: Bools) -> list[Sighting]:
     """Return the chosen returns of each sweep that has enough of them."""
     rows = np.flatnonzero(chosen)
     groups = np.split(rows, np.flatnonzero(np.diff(rays.sweep[rows])) + 1)
-    return [Sighting.from_rays(rays, group) for group in groups if len(group) >= _MIN_RETURNS]
+    sightings: list[Sighting] = []
+    for group in groups:
+        if len(group) >= _MIN_RETURNS:
+            sighting = Sighting.from_rays(rays, group)
+            if _is_later(sighting, sightings):
+                sightings.append(sighting)
+    return sightings
+
+
+def _is_later(sighting: Sighting, previous: Sequence[Sighting]) -> bool:
+    """Check whether a sighting is later than the previous ones.
+
+    If an object is where the sweeps begin and end, the mean time of its points can precede that of
+    the previous sweep.
+    """
+    return not previous or sighting.time_s - previous[-1].time_s >= _MIN_STEP_S
 
 
 def _with_poses(track: ObjectTrack, times_s: Floats, poses: Floats) -> ObjectTrack:
@@ -164,7 +180,7 @@ def _follow(
     sweep_s: float,
 ) -> ObjectTrack | None:
     """Return the track of an object, or None if it belongs to an object that is known already."""
-    sightings = []
+    sightings: list[Sighting] = []
     centers = []
     for number, position, cluster, index in zip(
         candidate.sweeps, candidate.path, candidate.clusters, candidate.indices, strict=True
@@ -174,7 +190,10 @@ def _follow(
         free = rows[~claimed[rows]]
         if len(free) < max(_MIN_UNCLAIMED * len(rows), _MIN_RETURNS):
             continue
-        sightings.append(Sighting.from_rays(rays, free))
+        sighting = Sighting.from_rays(rays, free)
+        if not _is_later(sighting, sightings):
+            continue
+        sightings.append(sighting)
         centers.append(np.append(position[:2], cluster.low[2]))
     if len(sightings) < MIN_SWEEPS:
         return None
@@ -295,6 +314,8 @@ def _further_pose(
     sighting = Sighting.from_rays(rays, chosen + rows.start)
     predicted = np.column_stack(moving.poses(np.array([sighting.time_s])))[0]
     step_s = sighting.time_s - track.times_s[end]
+    if (-step_s if end == 0 else step_s) < _MIN_STEP_S:
+        return None
     inner = 1 if end == 0 else -2
     velocity = np.append(track.positions[end] - track.positions[inner], 0.0)
     velocity /= track.times_s[end] - track.times_s[inner]
