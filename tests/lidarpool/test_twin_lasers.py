@@ -13,7 +13,7 @@ from lidarpool import Beams, Mounted, Pose, Sensor, Survey, load_sensor, twin
 from lidarpool.clouds.recording import Recording
 from lidarpool.reconstruction.alignment import AlignedSweeps, Alignment
 from lidarpool.reconstruction.free_space import RangeImage
-from lidarpool.reconstruction.lasers import RingLasers, unit_vectors
+from lidarpool.scan_patterns.lasers import RingLasers, unit_vectors
 from lidarpool.reconstruction.lost_pulses import SensorCoverage, lost_pulses
 from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import RecordedPoses

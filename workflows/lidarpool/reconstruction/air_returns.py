@@ -23,7 +23,7 @@ from lidarsim.numerics.even_samples import even_indices
 from .alignment import AlignedSweep, AlignedSweeps
 from .free_space import locate
 from .isolated_returns import MAX_START_M, isolated_and_solid
-from .lasers import RingLasers
+from ..scan_patterns.lasers import RingLasers
 
 _COLUMNS = 1024  # number of image columns
 _NEIGHBORHOOD = [(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1)]

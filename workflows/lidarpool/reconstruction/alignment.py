@@ -29,7 +29,7 @@ from lidarsim.sweeps.sweep_motion import FiringPoses
 
 from ..clouds.rings import MIN_RINGS
 from .blocked_directions import separated_sweeps
-from .lasers import RingLasers, unit_vectors
+from ..scan_patterns.lasers import RingLasers, unit_vectors
 from .lost_pulses import SensorCoverage, lost_pulses
 from .motion import Motion, MotionStep
 from .odometry import RecordedPoses

@@ -17,7 +17,7 @@ from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 
 from .blocked_directions import BlockedDirections, PulseCounts, azimuth_cells
-from .lasers import RingLasers
+from ..scan_patterns.lasers import RingLasers
 from .recorded_sweeps import RecordedSweeps, ring_starts
 
 _MIN_STEPS = 1.6  # minimum gap in steps, since motion within a sweep stretches steps

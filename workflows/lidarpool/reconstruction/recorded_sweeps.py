@@ -27,7 +27,7 @@ from ..comparing.lidar4d import WINDOWS, Window
 from ..recordings.opening import open_recording
 from .isolated_returns import NO_RANGES, IsolatedRanges
 from .labels import labels_of
-from .lasers import RingLasers
+from ..scan_patterns.lasers import RingLasers
 from .vehicle_returns import VehicleReturns
 
 _COLUMNS = {"channel", "class", "object", *STRENGTHS, *TIMES}  # columns that are used
