@@ -437,8 +437,8 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None
 @options.new_file(
     "--out",
     required=True,
-    help="Output sensor file (.yaml); a report is written next to it as .html. With --pattern, also "
-    ".npz, .csv or .parquet for a list of rays.",
+    help="Output sensor file (.yaml); a report is written next to it as .html. With --pattern, "
+    "without a report, and also .npz, .csv or .parquet for a list of rays.",
 )
 @click.option(
     "--pattern",

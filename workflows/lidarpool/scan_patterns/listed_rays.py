@@ -7,6 +7,7 @@ and pulses without a return are missing from it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -22,7 +23,9 @@ from .phases import RingSeries, ring_steps
 from .recorded_returns import RecordedReturns
 
 _SAME_PULSE_S = 1e-8  # returns of a channel that are closer in time belong to the same pulse
+_MIN_DISTINCT = 0.6  # minimum share of the returns of a channel with times of their own
 _MAX_OFF_GRID = 0.2  # maximum typical deviation of firing times from an even grid, in steps
+_MAX_TYPICAL_GAP = 10  # maximum typical gap between returns, in steps
 _PROBES = 400  # rays whose repetitions are searched
 _MAX_PROBES_RETURNS = 1_500_000
 _SAME_DIRECTION_RAD = np.radians(0.03)  # maximum angle between repetitions of a ray
@@ -78,10 +81,14 @@ class ListedRays:
     def from_returns(cls, returns: RecordedReturns) -> ListedRays:
         """Determine the rays from the returns of a recording."""
         pulses = _Pulses.from_returns(returns)
-        period_s = None if pulses.time_s is None else _repeat_time(pulses)
-        if period_s is None:
-            return _as_recorded(returns, pulses)
-        return _combined(returns, pulses, period_s)
+        grids = {} if pulses.time_s is None or pulses.is_coarse else _firing_grids(pulses)
+        are_even = bool(grids) and all(np.isfinite(grid.step_s) for grid in grids.values())
+        period_s = _repeat_time(pulses) if are_even else None
+        if period_s is not None:
+            combined = _combined(returns, pulses, grids, period_s)
+            if not combined.spread_rad > _SAME_DIRECTION_RAD:
+                return combined
+        return _as_recorded(returns, pulses, grids if are_even else {})
 
 
 class _Pulses(NamedTuple):
@@ -91,10 +98,16 @@ class _Pulses(NamedTuple):
     origin: Floats | None  # (n, 3), meters, or None if all pulses start at the sensor origin
     channel: Ints  # (n,)
     time_s: Floats | None  # (n,): since the first pulse
+    is_coarse: bool = False  # whether times were spread, because many pulses had the same time
 
     @classmethod
     def from_returns(cls, returns: RecordedReturns) -> _Pulses:
+        is_coarse = False
         if returns.time_s is not None:
+            spread_s = _spread_times(returns)
+            is_coarse = spread_s is not None
+            returns = returns if spread_s is None else replace(returns, time_s=spread_s)
+            assert returns.time_s is not None
             order = np.lexsort((returns.channel, returns.time_s))
             returns = returns.select(order)
         direction, origin = _directions(returns)
@@ -102,12 +115,39 @@ class _Pulses(NamedTuple):
         if time_s is None:
             return cls(direction, origin, returns.channel, None)
         # The returns of a pulse are adjacent, and the first of them represents the pulse.
+        if is_coarse:
+            return cls(direction, origin, returns.channel, time_s - time_s[0], is_coarse=True)
         is_first = np.diff(time_s, prepend=-np.inf) > _SAME_PULSE_S
         is_first |= np.diff(returns.channel, prepend=-1) != 0
         is_first[1:] |= _angles(direction[1:], direction[:-1]) > 10 * _SAME_DIRECTION_RAD
         first = np.flatnonzero(is_first)
         origin = None if origin is None else origin[first]
         return cls(direction[first], origin, returns.channel[first], (time_s - time_s[0])[first])
+
+
+def _spread_times(returns: RecordedReturns) -> Floats | None:
+    """Return times that are spread evenly where many returns of a channel have the same time.
+
+    Some drivers store the time of a packet for all its points. Returns None if this is not the
+    case.
+    """
+    assert returns.time_s is not None
+    order = np.lexsort((returns.time_s, returns.channel))
+    time_s, channel = returns.time_s[order], returns.channel[order]
+    is_new = (np.diff(time_s, prepend=-np.inf) > _SAME_PULSE_S) | (
+        np.diff(channel, prepend=-1) != 0
+    )
+    starts = np.flatnonzero(is_new)
+    if len(starts) > _MIN_DISTINCT * len(order):
+        return None
+    length_s = np.diff(time_s[starts], append=time_s[-1])
+    typical_s = float(np.median(length_s[length_s > 0])) if (length_s > 0).any() else 0.0
+    length_s = np.where((length_s > 0) & (length_s < 2 * typical_s), length_s, typical_s)
+    counts = np.diff(starts, append=len(order))
+    rank = np.arange(len(order)) - starts.repeat(counts)
+    spread_s = np.empty(len(order))
+    spread_s[order] = time_s + length_s.repeat(counts) * rank / counts.repeat(counts)
+    return spread_s
 
 
 def _directions(returns: RecordedReturns) -> tuple[Floats, Floats | None]:
@@ -139,14 +179,20 @@ def _firing_grids(pulses: _Pulses) -> dict[int, FiringGrid]:
             continue
         step_s = series.refine_step(step_s, _SAME_PULSE_S)
         gaps = np.diff(time_s) / step_s
-        even = len(gaps) > 0 and float(np.median(np.abs(gaps - np.rint(gaps)))) < _MAX_OFF_GRID
+        even = float(np.median(np.abs(gaps - np.rint(gaps)))) < _MAX_OFF_GRID
+        even &= 0.5 < float(np.median(gaps)) < _MAX_TYPICAL_GAP
         number = np.append(0, np.cumsum(np.rint(gaps).astype(np.int64)))
         grids[channel] = FiringGrid(step_s if even else float("nan"), number)
     return grids
 
 
-def _as_recorded(returns: RecordedReturns, pulses: _Pulses) -> ListedRays:
-    """Return the pulses of a pattern that does not repeat."""
+def _as_recorded(
+    returns: RecordedReturns, pulses: _Pulses, grids: dict[int, FiringGrid]
+) -> ListedRays:
+    """Return the pulses of a pattern that does not repeat.
+
+    `grids` are the firing grids of all channels, or empty if the times are not evenly spaced.
+    """
     notes = []
     count = len(pulses.direction)
     duration_s = returns.sweep_count * returns.sweep_times.period_s
@@ -161,13 +207,17 @@ def _as_recorded(returns: RecordedReturns, pulses: _Pulses) -> ListedRays:
     else:
         time_s = pulses.time_s
         duration_s = max(duration_s, float(time_s[-1]) * (1 + 1 / max(count - 1, 1)))
-        grids = _firing_grids(pulses)
-        if all(np.isfinite(grid.step_s) for grid in grids.values()):
+        if grids:
             missing = sum(int(grid.number[-1]) + 1 - len(grid.number) for grid in grids.values())
             share = missing / (missing + count)
             notes.append(
                 f"the pattern does not repeat within {duration_s:.4g} s. {missing:,} pulses "
                 f"without a return ({100 * share:.2g} %) are missing from the list"
+            )
+        elif pulses.is_coarse:
+            notes.append(
+                "many points have the same time, such as that of their packet. Their rays are "
+                "spread evenly until the next time, and pulses without a return are unknown"
             )
         else:
             notes.append(
@@ -234,9 +284,7 @@ def _repeat_time(pulses: _Pulses) -> float | None:
     rows = np.flatnonzero(pulses.channel == channels[counts.argmax()])[:_MAX_PROBES_RETURNS]
     time_s, direction = pulses.time_s[rows], pulses.direction[rows]
     early = np.flatnonzero(time_s < 0.4 * time_s[-1])
-    grid = _firing_grids(
-        _Pulses(direction, None, np.zeros(len(rows), np.int64), time_s)
-    )[0]
+    grid = _firing_grids(_Pulses(direction, None, np.zeros(len(rows), np.int64), time_s))[0]
     if not np.isfinite(grid.step_s) or len(early) < _PROBES:
         return None
     probes = early[even_indices(len(early), _PROBES)]
@@ -255,10 +303,8 @@ def _repeat_time(pulses: _Pulses) -> float | None:
     return _refined_period(first, direction, time_s, grid)
 
 
-def _refined_period(
-    lag: int, direction: Floats, time_s: Floats, grid: FiringGrid
-) -> float | None:
-    """Return the time between rays that are `lag` firings apart, if most have the same direction."""
+def _refined_period(lag: int, direction: Floats, time_s: Floats, grid: FiringGrid) -> float | None:
+    """Return the time between rays that are `lag` firings apart, if their directions agree."""
     place = np.searchsorted(grid.number, grid.number + lag)
     place = np.minimum(place, len(grid.number) - 1)
     rows = np.flatnonzero(grid.number[place] == grid.number + lag)
@@ -270,34 +316,22 @@ def _refined_period(
     return float(np.mean(time_s[place[rows]] - time_s[rows]))
 
 
-def _combined(returns: RecordedReturns, pulses: _Pulses, period_s: float) -> ListedRays:
+def _combined(
+    returns: RecordedReturns, pulses: _Pulses, grids: dict[int, FiringGrid], period_s: float
+) -> ListedRays:
     """Return one repetition of a pattern, in which the returns of all repetitions are combined."""
     assert pulses.time_s is not None
-    grids = _firing_grids(pulses)
-    parts = []
-    spreads = []
-    missing = filled = 0
-    repetitions = max(round(float(pulses.time_s[-1]) / period_s), 1)
+    folded = {}
     for channel, grid in grids.items():
         rows = np.flatnonzero(pulses.channel == channel)
-        rays = _FoldedRays.fold(pulses, rows, grid, period_s)
-        spreads.append(rays.spread_rad)
-        complete = rays.fill()
-        filled += complete.count - rays.count
-        missing += rays.firings - complete.count
-        parts.append(complete.pulses(channel))
+        folded[channel] = _FoldedRays.fold(pulses, rows, grid, period_s)
+    complete = {channel: rays.fill() for channel, rays in folded.items()}
+    filled = sum(complete[channel].count - rays.count for channel, rays in folded.items())
+    missing = sum(rays.firings - rays.count for rays in complete.values())
+    repetitions = max(round(float(pulses.time_s[-1]) / period_s), 1)
     # The numbers of the firings of a channel start at its first return.
-    time_s = np.concatenate([part.time_s for part in parts if part.time_s is not None])
     early_s = 0.25 * min(grid.step_s for grid in grids.values())
-    time_s = (time_s - pulses.time_s[0] + early_s) % period_s - early_s
-    order = np.argsort(time_s, kind="stable")
-    origins = [part.origin for part in parts if part.origin is not None]
-    listed = _Pulses(
-        np.concatenate([part.direction for part in parts])[order],
-        np.concatenate(origins)[order] if origins else None,
-        np.concatenate([part.channel for part in parts])[order],
-        time_s[order] - time_s.min(),
-    )
+    listed = _merged(complete, float(pulses.time_s[0]) - early_s, period_s)
     notes = [
         f"the pattern repeats every {period_s:.6g} s. {repetitions:,} repetitions are combined"
     ]
@@ -305,10 +339,28 @@ def _combined(returns: RecordedReturns, pulses: _Pulses, period_s: float) -> Lis
         notes.append(f"{plural(filled, 'ray')} without a return are interpolated")
     if missing:
         notes.append(f"{plural(missing, 'ray')} without a return are missing from the list")
-    cycle_s = max(period_s, float(np.max(listed.time_s)))
-    rays = _ray_list(returns, listed, cycle_s, repeats=True)
-    return ListedRays(
-        rays, float(np.nanmedian(spreads)), repetitions, missing, filled, tuple(notes)
+    spread_rad = float(np.nanmedian([rays.spread_rad for rays in folded.values()]))
+    listed_rays = _ray_list(returns, listed, period_s, repeats=True)
+    return ListedRays(listed_rays, spread_rad, repetitions, missing, filled, tuple(notes))
+
+
+def _merged(folded: Mapping[int, _FoldedRays], start_s: float, period_s: float) -> _Pulses:
+    """Return the rays of all channels whose directions are known, sorted by time.
+
+    A repetition of the pattern starts at `start_s`.
+    """
+    rows = {channel: np.flatnonzero(rays.known) for channel, rays in folded.items()}
+    time_s = np.concatenate([rays.time_s[rows[channel]] for channel, rays in folded.items()])
+    time_s = (time_s - start_s) % period_s
+    order = np.argsort(time_s, kind="stable")
+    origins = [
+        rays.origin[rows[channel]] for channel, rays in folded.items() if rays.origin is not None
+    ]
+    return _Pulses(
+        np.concatenate([rays.direction[rows[channel]] for channel, rays in folded.items()])[order],
+        np.concatenate(origins)[order] if origins else None,
+        np.repeat([*rows], [len(part) for part in rows.values()])[order],
+        time_s[order] - time_s.min(),
     )
 
 
@@ -326,9 +378,7 @@ class _FoldedRays:
     spread_rad: float
 
     @classmethod
-    def fold(
-        cls, pulses: _Pulses, rows: Ints, grid: FiringGrid, period_s: float
-    ) -> _FoldedRays:
+    def fold(cls, pulses: _Pulses, rows: Ints, grid: FiringGrid, period_s: float) -> _FoldedRays:
         """Average the directions of all repetitions of each ray."""
         assert pulses.time_s is not None
         count = max(round(period_s / grid.step_s), 1)
@@ -347,7 +397,7 @@ class _FoldedRays:
         angle = angle[several > 1] * np.sqrt(several / np.maximum(several - 1, 1))[several > 1]
         spread_rad = float(np.median(angle)) / _MEDIAN_ANGLE if len(angle) else float("nan")
         start_s = float(np.median(pulses.time_s[rows] - grid.step_s * grid.number))
-        time_s = start_s + grid.step_s * np.arange(count)
+        time_s = np.asarray(start_s + grid.step_s * np.arange(count), np.float64)
         return cls(direction, origin, known, time_s, spread_rad)
 
     @property
@@ -384,13 +434,6 @@ class _FoldedRays:
         if origin is not None:
             origin[unknown] = (1 - share) * origin[left] + share * origin[right]
         return replace(self, direction=direction, known=filled, origin=origin)
-
-    def pulses(self, channel: int) -> _Pulses:
-        """Return the rays whose directions are known."""
-        rows = np.flatnonzero(self.known)
-        origin = None if self.origin is None else self.origin[rows]
-        channels = np.full(len(rows), channel)
-        return _Pulses(self.direction[rows], origin, channels, self.time_s[rows])
 
 
 def _angles(first: Floats, second: Floats) -> Floats:

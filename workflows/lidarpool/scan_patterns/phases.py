@@ -1,4 +1,4 @@
-"""Periodic firing patterns: steps between pulses, and phases that the rings of sweeps have in common.
+"""Steps between the pulses of rings, and phases that the rings have in common.
 
 Pulses without a return are missing from a recording. Differences between consecutive returns of a
 ring are therefore whole multiples of the step, and all estimates are based on differences that
@@ -13,6 +13,7 @@ import numpy as np
 
 from lidarsim.numerics.arrays import Floats, Ints
 
+MIN_STEP_RAD = np.radians(0.02)  # closer returns of a ring belong to the same pulse
 _TURN = 2 * np.pi
 _MIN_GAPS = 8  # minimum number of gaps of a ring to determine its step
 _MAX_STEPS = 3.0  # maximum step of a ring relative to the typical step
@@ -60,6 +61,19 @@ def ring_steps(gaps: Floats, ring: Ints, ring_count: int) -> Floats:
     typical = np.median(steps[counts >= counts.max() / 2])
     is_known = (counts >= _MIN_GAPS) & (steps < _MAX_STEPS * typical)
     return np.where(is_known, steps, typical)
+
+
+def stride(gaps: Floats, step: float) -> int:
+    """Return the number of steps of which nearly all gaps of a ring are multiples.
+
+    Most gaps of a ring that rarely returns span several steps, but not a multiple of them.
+    """
+    steps = np.rint(gaps / step)
+    steps = steps[steps <= _MAX_STRIDE * _MAX_STEPS]
+    if len(steps) < _MIN_GAPS:
+        return 1
+    strides = range(_MAX_STRIDE, 1, -1)
+    return next((k for k in strides if (steps % k == 0).mean() > _MIN_MULTIPLES), 1)
 
 
 def _smallest_step(gaps: Floats) -> float:
@@ -112,19 +126,6 @@ class RingSeries(NamedTuple):
         if not used.any():
             return step
         return float(np.average(lengths[used] / counts[used], weights=counts[used]))
-
-    def stride(self, row: int, step: float, smallest: float) -> int:
-        """Return the number of steps of which nearly all gaps of a ring are multiples.
-
-        Most gaps of a ring that rarely returns span several steps, but not a multiple of them.
-        """
-        gaps, ring = self.gaps(smallest)
-        steps = np.rint(gaps[ring == row] / step)
-        steps = steps[steps <= _MAX_STRIDE * 3]
-        if len(steps) < _MIN_GAPS:
-            return 1
-        strides = range(_MAX_STRIDE, 1, -1)
-        return next((k for k in strides if (steps % k == 0).mean() > _MIN_MULTIPLES), 1)
 
 
 class RingPhases(NamedTuple):

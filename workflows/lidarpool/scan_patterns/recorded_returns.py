@@ -181,9 +181,7 @@ def _with_seconds(columns: dict[str, np.ndarray]) -> Columns:
     return {**columns, name: (columns[name] - columns[name].min()).astype(np.float64) * unit_s}
 
 
-def _rings(
-    recording: Recording, sweeps: Sequence[Sweep], points: Floats
-) -> tuple[Ints, Floats]:
+def _rings(recording: Recording, sweeps: Sequence[Sweep], points: Floats) -> tuple[Ints, Floats]:
     """Return the ring of each return and the median elevations of the rings."""
     rings = recording.rings
     if len(rings):
@@ -208,10 +206,10 @@ def _sweep_times(recording: Recording, count: int) -> SweepTimes:
     stamps_ns = recording.stamps_ns
     times = recording.point_times
     if stamps_ns is not None and count > 1 and (np.diff(stamps_ns[:count]) > 0).all():
-        starts_s = 1e-9 * (stamps_ns[:count] - stamps_ns[0])
+        starts_s = np.asarray(1e-9 * (stamps_ns[:count] - stamps_ns[0]), np.float64)
         return SweepTimes(starts_s, True, float(np.median(np.diff(starts_s))))
     period_s = _SWEEP_S if times is None else times.sweep_s
-    return SweepTimes(period_s * np.arange(count), False, period_s)
+    return SweepTimes(np.asarray(period_s * np.arange(count)), False, period_s)
 
 
 def _times_s(sweeps: Sequence[Sweep], sweep_times: SweepTimes) -> Floats | None:

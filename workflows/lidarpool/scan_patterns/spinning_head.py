@@ -18,11 +18,10 @@ from lidarsim.sensor.models import SensorModel
 from lidarsim.words import plural
 
 from .lasers import RingLasers
-from .phases import RingPhases, RingSeries, ring_steps
+from .phases import MIN_STEP_RAD, RingPhases, RingSeries, ring_steps
 from .recorded_returns import RecordedReturns
 
 _TURN = 2 * np.pi
-_SAME_PULSE_RAD = np.radians(0.01)  # closer returns of a ring belong to the same pulse
 _SAME_PULSE_S = 1e-8
 _MIN_RETURNS = 50  # minimum number of returns of a ring in a sweep to measure the rotation
 _MAX_SPREADS = 10.0  # maximum spread of the elevations of a ring relative to other rings
@@ -322,7 +321,7 @@ def _measure_firings(returns: RecordedReturns, azimuth: Floats) -> dict[str, Any
         notes.append("the direction of rotation is unknown. Counterclockwise is assumed")
     else:
         azimuth = _since_start(returns, azimuth, is_clockwise=is_clockwise)
-    step_rad, firings = _firing_phases(returns, azimuth, _SAME_PULSE_RAD, "azimuth steps")
+    step_rad, firings = _firing_phases(returns, azimuth, MIN_STEP_RAD, "azimuth steps")
     ring_rad = firings.ring_rad / _TURN * step_rad
     ordered_rad = _offsets_in_order(returns, azimuth, ring_rad, step_rad)
     if ordered_rad is None:

@@ -39,7 +39,9 @@ def check_stationary(recording: Recording, returns: RecordedReturns) -> tuple[st
     if speed is None:
         if returns.sweep_count > 1:
             return ()
-        return ("motion cannot be detected in a single sweep. The sensor must have been stationary",)
+        return (
+            "motion cannot be detected in a single sweep. The sensor must have been stationary",
+        )
     amounts = []
     if speed.shift_m > 0:
         amounts.append(f"{format_rounded(speed.shift_m, 2)} m")
@@ -103,34 +105,38 @@ def _register(fixed: Floats, moved: Floats) -> Floats | None:
     motion = np.zeros(6)
     still_m = sigma_m = np.inf
     for number in range(_ROUNDS):
-        angle = float(np.linalg.norm(motion[:3]))
-        points = _rotate(moved, motion[:3], angle) + motion[3:]
+        points = _transform(moved, motion)
         distance, near = tree.query(points, _PLANE_POINTS, distance_upper_bound=_MAX_DISTANCE_M)
         used = np.isfinite(distance).all(axis=1)
-        if used.sum() < _PLANE_POINTS:
-            return None
-        planes = fixed[near[used]]
-        center = planes.mean(axis=1)
-        _, lengths, axes = np.linalg.svd(planes - center[:, None], full_matrices=False)
-        is_flat = lengths[:, 2] < _MAX_FLATNESS * lengths[:, 1]
-        normal, points = axes[is_flat, 2], points[used][is_flat]
-        residual = np.einsum("ni,ni->n", normal, points - center[is_flat])
-        if not len(residual):
+        residual, design = _plane_distances(points[used], fixed[near[used]])
+        if len(residual) < _PLANE_POINTS:
             return None
         sigma_m = max(1.4826 * float(np.median(np.abs(residual))), _MIN_SIGMA_M)
         still_m = sigma_m if number == 0 else still_m
-        weight = 1 / (1 + np.square(residual / (2 * sigma_m)))
-        design = np.concatenate([np.cross(points, normal), normal], axis=1)
-        matrix = (design * weight[:, None]).T @ design
-        matrix += _DAMPING * len(residual) * np.eye(6)
-        motion -= np.linalg.solve(matrix, (design * weight[:, None]).T @ residual)
+        weighted = design / (1 + np.square(residual / (2 * sigma_m)))[:, None]
+        matrix = weighted.T @ design + _DAMPING * len(residual) * np.eye(6)
+        motion -= np.linalg.solve(matrix, weighted.T @ residual)
     return motion if sigma_m < _MIN_IMPROVEMENT * still_m or still_m == _MIN_SIGMA_M else None
 
 
-def _rotate(points: Floats, vector: Floats, angle: float) -> Floats:
-    """Rotate points by a rotation vector of the given length (Rodrigues)."""
-    if angle == 0:
-        return points
-    axis = vector / angle
+def _plane_distances(points: Floats, neighbors: Floats) -> tuple[Floats, Floats]:
+    """Return the distances of points to planes, and their derivatives with respect to a motion.
+
+    `neighbors` (n, k, 3) are the points of the plane of each point. Points are omitted if their
+    neighbors do not lie on a plane. The results have shapes (m,) and (m, 6).
+    """
+    center = neighbors.mean(axis=1)
+    _, lengths, axes = np.linalg.svd(neighbors - center[:, None], full_matrices=False)
+    is_flat = lengths[:, 2] < _MAX_FLATNESS * lengths[:, 1]
+    normal, points = axes[is_flat, 2], points[is_flat]
+    distance = np.einsum("ni,ni->n", normal, points - center[is_flat])
+    return distance, np.concatenate([np.cross(points, normal), normal], axis=1)
+
+
+def _transform(points: Floats, motion: Floats) -> Floats:
+    """Rotate points by a rotation vector, by the formula of Rodrigues, and translate them."""
+    angle = float(np.linalg.norm(motion[:3]))
+    axis = motion[:3] / (angle or 1.0)
     along = (points @ axis)[:, None] * axis
-    return along + np.cos(angle) * (points - along) + np.sin(angle) * np.cross(axis, points)
+    rotated = along + np.cos(angle) * (points - along) + np.sin(angle) * np.cross(axis, points)
+    return np.asarray(rotated + motion[3:])
