@@ -26,7 +26,7 @@ from ..clouds.recording import Recording
 from ..columns.parts import StoredCloud
 from ..recordings.opening import open_recording
 from .listed_rays import ListedRays
-from .recorded_returns import RecordedReturns
+from .pattern_returns import PatternReturns
 from .spinning_head import SpinningHead
 from .stationary import check_stationary
 
@@ -133,7 +133,7 @@ def fit_pattern(
     require_package("scipy", "fit", "Fitting sensor models")
     if not isinstance(recording, Recording):
         recording = open_recording(recording, sensor, name="the recording")
-    returns = RecordedReturns.read(recording)
+    returns = PatternReturns.read(recording)
     notes = [*returns.notes, *check_stationary(recording, returns)]
     if recording.compensated:
         notes.append("the recording states that its points are motion-compensated")
@@ -151,12 +151,12 @@ def _columns(recording: Recording) -> Sequence[str]:
     return [*recording[0].columns] if len(recording) else []
 
 
-def _summary(recording: Recording, returns: RecordedReturns) -> str:
+def _summary(recording: Recording, returns: PatternReturns) -> str:
     name = Path(recording.name).name
     return f"{name}: {plural(returns.sweep_count, 'sweep')}, {len(returns):,} returns"
 
 
-def _head_fit(returns: RecordedReturns) -> PatternFit:
+def _head_fit(returns: PatternReturns) -> PatternFit:
     """Return the fit of a spinning sensor."""
     head = SpinningHead.from_returns(returns)
     direction = "clockwise" if head.is_clockwise else "counterclockwise"
@@ -202,7 +202,7 @@ def _spread_words(spread_rad: Floats) -> str:
     return f"standard deviation {np.median(spread_deg):.4f}° (at most {spread_deg.max():.4f}°)"
 
 
-def _rays_fit(returns: RecordedReturns) -> PatternFit:
+def _rays_fit(returns: PatternReturns) -> PatternFit:
     """Return the fit of a list of rays."""
     listed = ListedRays.from_returns(returns)
     assert listed.rays.cycle_ns is not None

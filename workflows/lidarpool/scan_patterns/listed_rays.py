@@ -19,8 +19,8 @@ from lidarsim.sensor_files.fired_rays import RayList
 from lidarsim.words import plural
 
 from .lasers import RingLasers, unit_vectors
+from .pattern_returns import PatternReturns
 from .phases import RingSeries, ring_steps
-from .recorded_returns import RecordedReturns
 
 _SAME_PULSE_S = 1e-8  # returns of a channel that are closer in time belong to the same pulse
 _MIN_DISTINCT = 0.6  # minimum share of the returns of a channel with times of their own
@@ -78,7 +78,7 @@ class ListedRays:
     notes: tuple[str, ...]
 
     @classmethod
-    def from_returns(cls, returns: RecordedReturns) -> ListedRays:
+    def from_returns(cls, returns: PatternReturns) -> ListedRays:
         """Determine the rays from the returns of a recording."""
         pulses = _Pulses.from_returns(returns)
         grids = {} if pulses.time_s is None or pulses.is_coarse else _firing_grids(pulses)
@@ -101,7 +101,7 @@ class _Pulses(NamedTuple):
     is_coarse: bool = False  # whether times were spread, because many pulses had the same time
 
     @classmethod
-    def from_returns(cls, returns: RecordedReturns) -> _Pulses:
+    def from_returns(cls, returns: PatternReturns) -> _Pulses:
         is_coarse = False
         if returns.time_s is not None:
             spread_s = _spread_times(returns)
@@ -125,7 +125,7 @@ class _Pulses(NamedTuple):
         return cls(direction[first], origin, returns.channel[first], (time_s - time_s[0])[first])
 
 
-def _spread_times(returns: RecordedReturns) -> Floats | None:
+def _spread_times(returns: PatternReturns) -> Floats | None:
     """Return times that are spread evenly where many returns of a channel have the same time.
 
     Some drivers store the time of a packet for all its points. Returns None if this is not the
@@ -150,7 +150,7 @@ def _spread_times(returns: RecordedReturns) -> Floats | None:
     return spread_s
 
 
-def _directions(returns: RecordedReturns) -> tuple[Floats, Floats | None]:
+def _directions(returns: PatternReturns) -> tuple[Floats, Floats | None]:
     """Return the unit directions of the returns and their origins."""
     points = returns.points
     if len(returns.elevation_rad) and (returns.ring >= 0).all():
@@ -187,7 +187,7 @@ def _firing_grids(pulses: _Pulses) -> dict[int, FiringGrid]:
 
 
 def _as_recorded(
-    returns: RecordedReturns, pulses: _Pulses, grids: dict[int, FiringGrid]
+    returns: PatternReturns, pulses: _Pulses, grids: dict[int, FiringGrid]
 ) -> ListedRays:
     """Return the pulses of a pattern that does not repeat.
 
@@ -229,7 +229,7 @@ def _as_recorded(
 
 
 def _ray_list(
-    returns: RecordedReturns, pulses: _Pulses, cycle_s: float, *, repeats: bool
+    returns: PatternReturns, pulses: _Pulses, cycle_s: float, *, repeats: bool
 ) -> RayList:
     assert pulses.time_s is not None
     return RayList(
@@ -317,7 +317,7 @@ def _refined_period(lag: int, direction: Floats, time_s: Floats, grid: FiringGri
 
 
 def _combined(
-    returns: RecordedReturns, pulses: _Pulses, grids: dict[int, FiringGrid], period_s: float
+    returns: PatternReturns, pulses: _Pulses, grids: dict[int, FiringGrid], period_s: float
 ) -> ListedRays:
     """Return one repetition of a pattern, in which the returns of all repetitions are combined."""
     assert pulses.time_s is not None

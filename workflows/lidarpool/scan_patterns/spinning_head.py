@@ -18,8 +18,8 @@ from lidarsim.sensor.models import SensorModel
 from lidarsim.words import plural
 
 from .lasers import RingLasers
+from .pattern_returns import PatternReturns
 from .phases import MIN_STEP_RAD, RingPhases, RingSeries, ring_steps
-from .recorded_returns import RecordedReturns
 
 _TURN = 2 * np.pi
 _SAME_PULSE_S = 1e-8
@@ -89,7 +89,7 @@ class SpinningHead:
     notes: tuple[str, ...]
 
     @classmethod
-    def from_returns(cls, returns: RecordedReturns) -> SpinningHead:
+    def from_returns(cls, returns: PatternReturns) -> SpinningHead:
         """Estimate the pattern.
 
         Raises
@@ -163,7 +163,7 @@ LIST_ADVICE = "To save a list of its rays instead, use an output file such as ra
 
 
 def _uncertain_notes(
-    returns: RecordedReturns, lasers: RingLasers, spread_rad: list[float]
+    returns: PatternReturns, lasers: RingLasers, spread_rad: list[float]
 ) -> list[str]:
     """Return a note about rings whose angles are uncertain, if there are any."""
     counts = np.bincount(returns.ring, minlength=len(lasers))
@@ -184,7 +184,7 @@ def _degrees(angles: Floats) -> list[float]:
     return (np.degrees(angles).round(_ANGLE_DECIMALS) + 0.0).tolist()
 
 
-def _lasers(returns: RecordedReturns) -> RingLasers:
+def _lasers(returns: PatternReturns) -> RingLasers:
     """Determine the lasers, whose elevations are medians over all returns of their rings."""
     sweeps = [
         (returns.points[returns.sweep == number], returns.ring[returns.sweep == number])
@@ -193,7 +193,7 @@ def _lasers(returns: RecordedReturns) -> RingLasers:
     return RingLasers.from_sweeps(sweeps, returns.elevation_rad)
 
 
-def _measure_timed_firings(returns: RecordedReturns, azimuth: Floats) -> dict[str, Any]:
+def _measure_timed_firings(returns: PatternReturns, azimuth: Floats) -> dict[str, Any]:
     """Determine the rotation and the firing times of a recording with times."""
     assert returns.time_s is not None
     ring, sweep = returns.ring, returns.sweep
@@ -224,7 +224,7 @@ def _measure_timed_firings(returns: RecordedReturns, azimuth: Floats) -> dict[st
     }
 
 
-def _rough_rotation(returns: RecordedReturns, azimuth: Floats) -> float:
+def _rough_rotation(returns: PatternReturns, azimuth: Floats) -> float:
     """Return the approximate angular velocity in radians per second."""
     assert returns.time_s is not None
     order = np.lexsort((returns.time_s, returns.ring, returns.sweep))
@@ -245,7 +245,7 @@ def _rough_rotation(returns: RecordedReturns, azimuth: Floats) -> float:
 
 
 def _firing_phases(
-    returns: RecordedReturns, values: Floats, smallest: float, what: str
+    returns: PatternReturns, values: Floats, smallest: float, what: str
 ) -> tuple[float, RingPhases]:
     """Return the step between the firings of a ring, and the phases of its firings.
 
@@ -312,7 +312,7 @@ def _empty_sector(azimuth: Floats) -> tuple[float, float] | None:
     return float(ordered[widest]), float(ordered[(widest + 1) % len(ordered)])
 
 
-def _measure_firings(returns: RecordedReturns, azimuth: Floats) -> dict[str, Any]:
+def _measure_firings(returns: PatternReturns, azimuth: Floats) -> dict[str, Any]:
     """Determine the rotation of a recording without times."""
     ring, sweep = returns.ring, returns.sweep
     notes = ["the firing times within a column are unknown, because the points have no times"]
@@ -350,7 +350,7 @@ def _measure_firings(returns: RecordedReturns, azimuth: Floats) -> dict[str, Any
     }
 
 
-def _direction(returns: RecordedReturns, azimuth: Floats) -> bool | None:
+def _direction(returns: PatternReturns, azimuth: Floats) -> bool | None:
     """Return whether the sensor rotates clockwise, or None if the order of points is arbitrary."""
     order = np.lexsort((returns.ring, returns.sweep))  # stable, so the order in a ring remains
     turned = np.diff(azimuth[order])
@@ -360,7 +360,7 @@ def _direction(returns: RecordedReturns, azimuth: Floats) -> bool | None:
     return None if abs(mean) < 2 * _MIN_ORDER - 1 else mean < 0
 
 
-def _since_start(returns: RecordedReturns, azimuth: Floats, *, is_clockwise: bool) -> Floats:
+def _since_start(returns: PatternReturns, azimuth: Floats, *, is_clockwise: bool) -> Floats:
     """Return azimuths that do not jump within a sweep.
 
     If a revolution is not a whole number of firings, the azimuths of consecutive revolutions
@@ -373,7 +373,7 @@ def _since_start(returns: RecordedReturns, azimuth: Floats, *, is_clockwise: boo
 
 
 def _offsets_in_order(
-    returns: RecordedReturns, azimuth: Floats, ring_rad: Floats, step_rad: float
+    returns: PatternReturns, azimuth: Floats, ring_rad: Floats, step_rad: float
 ) -> Floats | None:
     """Return the azimuth offsets of rings, including whole steps, if points are in firing order.
 

@@ -15,7 +15,7 @@ from ..clouds.recording import Recording
 from ..comparing.fit.known_poses import KnownPoses
 from ..comparing.fit.stack import SweepStack
 from ..comparing.fit.standstill import Speed, find_motion, sweep_period_ns
-from .recorded_returns import RecordedReturns
+from .pattern_returns import PatternReturns
 
 _MAX_POINTS = 40_000  # maximum number of points of each part of a recording to register
 _PLANE_POINTS = 10  # number of neighboring points that determine a plane
@@ -29,7 +29,7 @@ _MIN_TURN_DEG = 0.3
 _MIN_IMPROVEMENT = 0.9  # maximum ratio of the residuals with and without motion
 
 
-def check_stationary(recording: Recording, returns: RecordedReturns) -> tuple[str, ...]:
+def check_stationary(recording: Recording, returns: PatternReturns) -> tuple[str, ...]:
     """Raise LidarError if the sensor moves, and return notes for the user.
 
     If the rings are known, sweeps are compared as in `fit`. Otherwise, the first third of the
@@ -55,7 +55,7 @@ def check_stationary(recording: Recording, returns: RecordedReturns) -> tuple[st
     )
 
 
-def _speed(recording: Recording, returns: RecordedReturns) -> Speed | None:
+def _speed(recording: Recording, returns: PatternReturns) -> Speed | None:
     if recording.is_cloud or returns.sweep_count < 2:
         return None
     poses = KnownPoses.from_recording(recording, None, None)
@@ -68,7 +68,7 @@ def _speed(recording: Recording, returns: RecordedReturns) -> Speed | None:
     return _registered_speed(returns)
 
 
-def _registered_speed(returns: RecordedReturns) -> Speed | None:
+def _registered_speed(returns: PatternReturns) -> Speed | None:
     """Determine the motion between the first and the last third of the sweeps."""
     count = returns.sweep_count
     third = max(count // 3, 1)

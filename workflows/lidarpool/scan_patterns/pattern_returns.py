@@ -35,7 +35,7 @@ class SweepTimes(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedReturns:
+class PatternReturns:
     """Returns of consecutive sweeps, in the order of the recording.
 
     Attributes
@@ -84,7 +84,7 @@ class RecordedReturns:
         """Range limit of the sensor, which is a tenth more than the longest recorded range."""
         return float(np.ceil(1.1 * np.linalg.norm(self.points, axis=1).max()))
 
-    def select(self, rows: Ints) -> RecordedReturns:
+    def select(self, rows: Ints) -> PatternReturns:
         """Return a copy with only some of the returns."""
         return replace(
             self,
@@ -96,7 +96,7 @@ class RecordedReturns:
         )
 
     @classmethod
-    def read(cls, recording: Recording) -> RecordedReturns:
+    def read(cls, recording: Recording) -> PatternReturns:
         """Read the first sweeps of a recording.
 
         Raises
