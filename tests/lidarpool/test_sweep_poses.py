@@ -12,10 +12,10 @@ from lidarpool.comparing.fit.smooth_surfaces import find_surfaces
 from lidarpool.reconstruction.alignment import Alignment
 from lidarpool.reconstruction.free_space import RangeImage
 from lidarpool.reconstruction.labels import SurfelMaterial, labels_of, split_by_object
-from lidarpool.reconstruction.lasers import RingLasers
 from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import RecordedPoses
 from lidarpool.reconstruction.porosity import Porosity
+from lidarpool.scan_patterns.lasers import RingLasers
 from lidarpool.scenario.point_scene import CLASS_MATERIAL, surfel_faces
 from lidarsim.columns.sweep import Sweep
 from lidarsim.scene.face_materials import FaceMaterials

@@ -34,12 +34,12 @@ from lidarpool.clouds.point_times import PointTimes
 from lidarpool.clouds.recording import Recording
 from lidarpool.clouds.rings import Rings
 from lidarpool.reconstruction.alignment import Alignment
-from lidarpool.reconstruction.lasers import RingLasers
 from lidarpool.reconstruction.lost_pulses import SensorCoverage, lost_pulses
 from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import find_poses
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.recordings.opening import open_recording
+from lidarpool.scan_patterns.lasers import RingLasers
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city

@@ -12,7 +12,6 @@ from tests.lidarpool.test_twin_lasers import recorded_drive, room_sweep, true_la
 from lidarpool import Sensor, load_sensor, twin
 from lidarpool.clouds.recording import Recording
 from lidarpool.reconstruction.alignment import AlignedSweeps, Alignment, align
-from lidarpool.reconstruction.lasers import RingLasers, unit_vectors
 from lidarpool.reconstruction.lost_pulses import SensorCoverage
 from lidarpool.reconstruction.motion import Motion
 from lidarpool.reconstruction.odometry import RecordedPoses
@@ -20,6 +19,7 @@ from lidarpool.reconstruction.range_noise import estimate_range_noise
 from lidarpool.reconstruction.recorded_sensor import SweepTiming
 from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.recordings.opening import open_recording
+from lidarpool.scan_patterns.lasers import RingLasers, unit_vectors
 from lidarscenes.procedural.city import city
 from lidarsim.columns.sweep import Sweep
 

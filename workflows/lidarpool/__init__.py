@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from .run.pipeline.stage_messages import ScanFrame
     from .run.run_result import CampaignRun
     from .run.store.run_store import remove_run
+    from .scan_patterns import PatternFit, fit_pattern
     from .scenario.job import Job
     from .viewers.scanner_view import Foxglove, Rerun
 
@@ -82,6 +83,7 @@ __all__ = [
     "Noise",
     "Optics",
     "Packets",
+    "PatternFit",
     "Plan",
     "Planning",
     "Pose",
@@ -107,6 +109,7 @@ __all__ = [
     "box",
     "compare",
     "fit",
+    "fit_pattern",
     "load_robot",
     "load_sensor",
     "load_trajectory",
@@ -145,6 +148,7 @@ _MODULES = {
     ".comparing.comparison": ("Comparison",),
     ".comparing.two_clouds": ("compare",),
     ".comparing.fit": ("Fit", "fit"),
+    ".scan_patterns": ("PatternFit", "fit_pattern"),
     ".reconstruction.building": ("twin",),
     ".reconstruction.twin": ("Twin",),
     ".run.run_result": ("CampaignRun",),

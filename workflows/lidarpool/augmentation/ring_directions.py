@@ -18,18 +18,13 @@ from lidarsim.numerics.even_samples import even_indices
 
 from ..clouds.recording import Recording
 from ..clouds.rings import elevations
+from ..scan_patterns.phases import MIN_STEP_RAD, RingSeries, ring_steps
 from .nearest_pulse_loops import CandidateRings, SortedReturns, find_pulses, sort_returns
 
 SECTORS = 36  # azimuth sectors in which the elevation of a ring is measured
 _REFERENCE_SWEEPS = 5  # sweeps from which the directions are measured
-_MIN_STEP_RAD = np.radians(0.02)  # Closer returns belong to the same pulse.
-_MIN_RETURNS = 8  # minimum number of returns to determine the step of a ring
-_MAX_STEPS = 3.0  # maximum step of a ring relative to the typical step
 _MAX_GAP_RAD = np.radians(60)  # A wider sector without returns is outside the field of view.
 _MAX_COLUMNS = 4096  # maximum number of cells per ring in which returns are sorted
-_SMALL_GAPS = 0.1  # quantile of the gaps in a ring that contain no lost pulses
-_MAX_DEVIATION = 0.5  # maximum relative deviation of gaps without lost pulses from the step
-_REFINEMENTS = 5
 _SPREAD_QUANTILE = 0.99
 
 
@@ -241,40 +236,12 @@ def _sectors_at(azimuth: Floats) -> tuple[Ints, Ints, Floats]:
 
 
 def _steps_rad(sweeps: list[tuple[Floats, Ints]], ring_count: int) -> Floats:
-    """Return the azimuth step of each ring, from the points and rings of several sweeps.
-
-    In some sensors, certain rings fire at half the rate of the others. The step of a ring with few
-    returns is assumed to be the typical step. In a ring that hits trees or the sky, most gaps may
-    contain lost pulses. Gaps of several steps are therefore ignored.
-    """
-    rings = []
-    gaps = []
-    for points, ring in sweeps:
-        azimuth = np.arctan2(points[:, 1], points[:, 0])
-        order = np.lexsort((azimuth, ring))
-        gap = np.diff(azimuth[order])
-        is_step = (np.diff(ring[order]) == 0) & (gap > _MIN_STEP_RAD) & (ring[order][1:] >= 0)
-        rings.append(ring[order][1:][is_step])
-        gaps.append(gap[is_step])
-    ring, gap = np.concatenate(rings), np.concatenate(gaps)
-    if not len(gap):
+    """Return the azimuth step of each ring, from the points and rings of several sweeps."""
+    points = np.concatenate([points for points, _ in sweeps])
+    ring = np.concatenate([ring for _, ring in sweeps])
+    sweep = np.arange(len(sweeps)).repeat([len(ring) for _, ring in sweeps])
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    gaps = RingSeries.from_values(azimuth, ring, sweep).gaps(MIN_STEP_RAD)
+    if not len(gaps[0]):
         raise LidarError("The sweeps have too few points to determine the azimuth step of a ring.")
-    counts = np.bincount(ring, minlength=ring_count)
-    steps = np.array(
-        [_smallest_step(gap[ring == row]) if counts[row] else 0.0 for row in range(ring_count)]
-    )
-    typical = np.median(steps[counts >= counts.max() / 2])
-    is_known = (counts >= _MIN_RETURNS) & (steps < _MAX_STEPS * typical)
-    return np.where(is_known, steps, typical)
-
-
-def _smallest_step(gaps: Floats) -> float:
-    """Return the typical gap without lost pulses.
-
-    The smallest gaps are too small if azimuths are noisy, so the estimate is refined.
-    """
-    step = float(np.quantile(gaps, _SMALL_GAPS, method="inverted_cdf"))
-    for _ in range(_REFINEMENTS):
-        near = gaps[np.abs(gaps / step - 1) < _MAX_DEVIATION]
-        step = float(np.median(near))
-    return step
+    return ring_steps(*gaps, ring_count)

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -26,20 +25,18 @@ from lidarsim.words import plural
 
 from ..clouds.recording import Recording
 from ..clouds.rings import Rings, elevations, summarize_rings
+from ..scan_patterns.phases import MIN_STEP_RAD, RingSeries, ring_steps, stride
 from .sensor_motion import SensorMotion
 
 if TYPE_CHECKING:
     from .grid_loops import ChannelTables, SweepReturns, SweepRotation
 
 _REFERENCE_SWEEPS = 5  # number of sweeps from which the pattern is determined
-_MIN_STEP_RAD = np.radians(0.02)  # closer returns of a ring belong to the same pulse
 _SAME_PULSE_RAD = 1e-4  # maximum angle between the returns of a pulse
 _MIN_SEVERAL = 0.005  # minimum fraction of returns that are further returns of a pulse
 _MIN_STEPS = 8  # minimum number of steps of a ring from which its step is determined
 _MAX_STEPS = 3  # maximum number of steps in a gap from which the step is determined
 _MAX_OFF_STEP = 0.3  # maximum deviation of such a gap from whole steps
-_MAX_STRIDE = 4  # maximum ratio of the step of a ring to the smallest step
-_MIN_MULTIPLES = 0.9  # minimum fraction of gaps that are multiples of the step of a ring
 _MAX_STEP_CHANGE = 0.1  # maximum relative deviation of the step of a sweep
 _PHASE_SAMPLE = 8  # one in this many returns determines the phase of a sweep
 _MIN_RESULTANT = 0.5  # minimum resultant length of azimuths minus the rotation
@@ -509,38 +506,16 @@ class _RingSteps(NamedTuple):
     @classmethod
     def from_returns(cls, azimuth: Floats, channel: Ints, count: int) -> _RingSteps | None:
         """Determine the steps of rings, or return None if no ring has enough returns."""
-        order = np.lexsort((azimuth, channel))
-        gaps = np.diff(azimuth[order])
-        ring = channel[order]
-        same = (np.diff(ring) == 0) & (ring[:-1] >= 0)
-        is_step = same & (gaps > _MIN_STEP_RAD)
-        bounds = np.searchsorted(ring[:-1][is_step], np.arange(count + 1))
-        parts = [gaps[is_step][start:stop] for start, stop in pairwise(bounds)]
-        ring_rad = np.array(
-            [
-                _refined_step(part, float(np.median(part))) if len(part) >= _MIN_STEPS else np.nan
-                for part in parts
-            ]
-        )
-        if np.isnan(ring_rad).all():
+        series = RingSeries.from_values(azimuth, channel, np.zeros(len(channel), np.int64))
+        gaps, ring = series.gaps(MIN_STEP_RAD)
+        counts = np.bincount(ring, minlength=count)
+        if counts.max(initial=0) < _MIN_STEPS:
             return None
-        several = int((same & (gaps < _SAME_PULSE_RAD)).sum())
-        smallest_rad = float(np.nanquantile(ring_rad, 0.2))
-        stride = np.array([_stride(part, smallest_rad) for part in parts])
-        return cls(smallest_rad, stride, several)
-
-
-def _stride(gaps: Floats, step_rad: float) -> int:
-    """Return the number of steps of which nearly all gaps of a ring are multiples.
-
-    Most gaps of a ring that rarely returns span several steps, but not a multiple of them.
-    """
-    steps = np.rint(gaps / step_rad)
-    steps = steps[steps <= _MAX_STRIDE * _MAX_STEPS]
-    if len(steps) < _MIN_STEPS:
-        return 1
-    strides = range(_MAX_STRIDE, 1, -1)
-    return next((k for k in strides if (steps % k == 0).mean() > _MIN_MULTIPLES), 1)
+        ring_rad = ring_steps(gaps, ring, count)[counts >= _MIN_STEPS]
+        several = int((series.is_same & (np.diff(series.values) < _SAME_PULSE_RAD)).sum())
+        smallest_rad = float(np.quantile(ring_rad, 0.2))
+        strides = [stride(gaps[ring == row], smallest_rad) for row in range(count)]
+        return cls(smallest_rad, np.array(strides), several)
 
 
 def _refined_step(gaps: Floats, step_rad: float) -> float:
@@ -555,7 +530,7 @@ def _sweep_step(azimuth: Floats, channel: Ints, step_rad: float) -> float:
     """Return the step of one sweep, from the ring with the most returns."""
     counts = np.bincount(channel[channel >= 0], minlength=1)
     gaps = np.diff(np.sort(azimuth[channel == counts.argmax()]))
-    gaps = gaps[gaps > _MIN_STEP_RAD]
+    gaps = gaps[gaps > MIN_STEP_RAD]
     refined = _refined_step(gaps, step_rad) if len(gaps) else step_rad
     return round(refined if abs(refined / step_rad - 1) < _MAX_STEP_CHANGE else step_rad, _DIGITS)
 

@@ -437,7 +437,13 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None
 @options.new_file(
     "--out",
     required=True,
-    help="Output sensor file (.yaml); a report is written next to it as .html.",
+    help="Output sensor file (.yaml); a report is written next to it as .html. With --pattern, "
+    "without a report, and also .npz, .csv or .parquet for a list of rays.",
+)
+@click.option(
+    "--pattern",
+    is_flag=True,
+    help="Estimate the ray directions and firing times of an unknown sensor instead of its noise.",
 )
 @click.option(
     "--model",
@@ -459,9 +465,16 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None
 )
 @options.as_json
 def fit(
-    recording: Path, out: Path, pose: Sequence[Sequence[float]], as_json: bool, **settings: Any
+    recording: Path,
+    out: Path,
+    pattern: bool,
+    pose: Sequence[Sequence[float]],
+    as_json: bool,
+    **settings: Any,
 ) -> None:
     """Estimate noise, dropout and false alarms from a recording.
+
+    With --pattern, estimate the scan pattern of a sensor that has no model.
 
     RECORDING can have any format that `lidarpool compare` reads, and must contain sweeps and rings.
     The sensor must be stationary unless the scene is given with --scene and its poses are known.
@@ -472,11 +485,34 @@ def fit(
       lidarpool fit sweeps --white-intensity 255 --out mine.yaml
       lidarpool fit recording.mcap --scene hall.glb --pose 2,0,1.5 --out mine.yaml
       lidarpool fit drive.mcap --scene twin/place.glb --out mine.yaml
+      lidarpool fit --pattern recording.pcd --out mine.yaml
     """  # noqa: D301 - Click requires the character \b
     from ..comparing.fit import fit as fitted
     from ..processes.fork_server import keep_freed_memory
 
     keep_freed_memory()
+    if pattern:
+        _fit_pattern(recording, out, as_json, pose=pose, **settings)
+        return
     fitted_sensor = fitted(recording, pose=[*pose] or None, **settings)
     lines = [repr(fitted_sensor), *map(click.format_filename, fitted_sensor.save(out))]
     options.print_results(fitted_sensor.figures, lines, as_json)
+
+
+def _fit_pattern(
+    recording: Path, out: Path, as_json: bool, *, sensor: str | None = None, **settings: Any
+) -> None:
+    """Estimate a scan pattern. The extension of the output file selects its form."""
+    from lidarsim.sensor.models import MODEL_FILES
+
+    from ..scan_patterns.fitting import check_pattern_file, fit_pattern
+
+    unused = [name for name, value in settings.items() if value]
+    if unused:
+        option = {"white": "white-intensity"}.get(unused[0], unused[0])
+        raise click.UsageError(f"--{option} cannot be combined with --pattern.")
+    as_rays = out.suffix.lower() not in MODEL_FILES
+    check_pattern_file(out, as_rays=as_rays)
+    fitted = fit_pattern(recording, as_rays=as_rays, sensor=sensor)
+    lines = [repr(fitted), *map(click.format_filename, fitted.save(out))]
+    options.print_results(fitted.figures, lines, as_json)

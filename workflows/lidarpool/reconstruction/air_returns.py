@@ -20,10 +20,10 @@ import numpy as np
 from lidarsim.numerics.arrays import AnyFloats, Bools, Floats, Floats32, Ints
 from lidarsim.numerics.even_samples import even_indices
 
+from ..scan_patterns.lasers import RingLasers
 from .alignment import AlignedSweep, AlignedSweeps
 from .free_space import locate
 from .isolated_returns import MAX_START_M, isolated_and_solid
-from .lasers import RingLasers
 
 _COLUMNS = 1024  # number of image columns
 _NEIGHBORHOOD = [(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1)]

@@ -28,8 +28,8 @@ from lidarsim.numerics.even_samples import even_indices
 from lidarsim.sweeps.sweep_motion import FiringPoses
 
 from ..clouds.rings import MIN_RINGS
+from ..scan_patterns.lasers import RingLasers, unit_vectors
 from .blocked_directions import separated_sweeps
-from .lasers import RingLasers, unit_vectors
 from .lost_pulses import SensorCoverage, lost_pulses
 from .motion import Motion, MotionStep
 from .odometry import RecordedPoses

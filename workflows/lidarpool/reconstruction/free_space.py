@@ -16,8 +16,8 @@ import numpy as np
 from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
 
 from ..clouds.rings import elevations
+from ..scan_patterns.lasers import RingLasers
 from .alignment import AlignedSweeps
-from .lasers import RingLasers
 
 _COLUMNS = 1024  # number of image columns, more than the pulses per ring of nearly all sensors
 _ROW_RAD = np.radians(0.5)  # height of an image row for a sensor without rings

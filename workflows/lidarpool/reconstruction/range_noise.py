@@ -18,8 +18,8 @@ import numpy as np
 from lidarsim.columns.sweep import Sweep
 from lidarsim.numerics.arrays import Bools, Floats, Ints
 
+from ..scan_patterns.lasers import RingLasers
 from .alignment import AlignedSweep, AlignedSweeps
-from .lasers import RingLasers
 from .voxel_planes import VoxelPlanes
 
 _MIN_COUNT = 200  # minimum number of deviations for an estimate

@@ -19,9 +19,9 @@ from lidarsim.words import plural
 
 from ..clouds.recording import Recording
 from ..comparing.fit import Fit, fit
+from ..scan_patterns.lasers import RingLasers
 from .alignment import AlignedSweeps, Alignment
 from .blocked_directions import BlockedDirections
-from .lasers import RingLasers
 from .lost_pulses import firings_per_turn
 from .motion import Motion
 from .range_noise import RangeNoise, estimate_range_noise

@@ -55,6 +55,8 @@ class RayList:
         Whether the sensor itself repeats these rays exactly, apart from incomplete firings.
     light
         Optical properties of the light, or None if unknown.
+    notes
+        Notes on how the rays were determined.
     """
 
     directions: Floats
@@ -67,6 +69,7 @@ class RayList:
     name: str = ""
     repeats: bool = True
     light: Light | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not len(self.channels):

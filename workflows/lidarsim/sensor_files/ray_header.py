@@ -48,6 +48,7 @@ def header_of(
         "cycle_ns": rays.cycle_ns,
         "repeats": rays.repeats,
         "not_in_this_file": list(left_out),
+        **({"notes": list(rays.notes)} if rays.notes else {}),
     }
 
 
