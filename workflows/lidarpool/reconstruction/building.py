@@ -445,18 +445,21 @@ class _Building:
             ),
             "errors": draw_errors(figures),
         }
+        spreads = np.zeros(sum(len(mesh.faces) for mesh in meshes.values()) // 2)
         if response is not None:
+            reflectances = {
+                index: response.reflectances(self._load_observations(index), surfel_centers(mesh))
+                for index, mesh in meshes.items()
+            }
+            spreads = np.concatenate([one.spreads for one in reflectances.values()])
             meshes = {
-                index: color_by_reflectance(
-                    mesh,
-                    response.reflectances(self._load_observations(index), surfel_centers(mesh)),
-                )
+                index: color_by_reflectance(mesh, reflectances[index])
                 for index, mesh in meshes.items()
             }
         return Twin(
             scene=Scene.from_meshes(
                 [
-                    *split_by_object(merge_surfels([*meshes.values()]), built.porosity()),
+                    *split_by_object(merge_surfels([*meshes.values()]), built.porosity(), spreads),
                     *built.dark(),
                 ]
             ),
