@@ -74,8 +74,8 @@ def test_a_layer_beyond_the_range_of_the_sensor_has_no_returns():
 
 @pytest.mark.parametrize("backend", CPU)
 def test_reflectances_have_the_mean_and_the_spread_of_the_material(backend):
-    """The logarithm of the reflectance is normally distributed."""
-    spread = 0.4
+    """The reflectances are normally distributed."""
+    spread = 0.3
     materials = [Material("Hedge", 0.5, reflectance_spread=spread)]
     columns = ("range", "reflectance", "intensity", "reflectivity")
     found = cast(
@@ -85,15 +85,24 @@ def test_reflectances_have_the_mean_and_the_spread_of_the_material(backend):
     assert found["range"] == pytest.approx(4, abs=1e-4)
     factor = found["reflectance"] / 0.5
     assert factor.mean() == pytest.approx(1, abs=SIGMA * spread / np.sqrt(RAYS))
-    assert factor.std() == pytest.approx(spread, rel=0.03)
-    logarithm = np.log(factor)
-    sigma = np.sqrt(np.log1p(spread**2))
-    assert logarithm.mean() == pytest.approx(-(sigma**2) / 2, abs=SIGMA * sigma / np.sqrt(RAYS))
-    assert logarithm.std() == pytest.approx(sigma, rel=SIGMA / np.sqrt(2 * RAYS))
+    assert factor.std() == pytest.approx(spread, rel=0.01)
+    for sigmas, probability in ((-1, 0.1587), (0, 0.5), (2, 0.9772)):
+        below = factor < 1 + sigmas * spread
+        assert abs(share(below) - probability) < SIGMA * standard_error(probability)
+    assert factor.min() >= 0.019 and factor.max() <= 1.981
     assert found["intensity"] / found["intensity"].mean() == pytest.approx(
         factor / factor.mean(), rel=1e-3
     )
     assert np.corrcoef(found["reflectivity"], factor)[0, 1] > 0.98
+
+
+def test_the_largest_spread_keeps_the_mean_and_all_returns():
+    materials = [Material("Hedge", 0.5, reflectance_spread=0.5)]
+    found = cast([HEDGE], beam_along_x(RAYS), materials=materials)
+    assert len(found["range"]) == RAYS
+    factor = found["reflectance"] / 0.5
+    assert factor.mean() == pytest.approx(1, abs=SIGMA * 0.5 / np.sqrt(RAYS))
+    assert factor.std() == pytest.approx(0.5, rel=0.06)
 
 
 def test_subrays_average_the_spread():
@@ -177,7 +186,7 @@ def test_materials_without_gaps_are_unchanged():
         ({"gap_fraction": 0.3, "transparent": "pass"}, "cannot be combined with transparent"),
         ({"range_spread_m": 0.1, "leaf_area_density": 1.0}, "leaf_area_density"),
         ({"reflectance_spread": -0.1}, "reflectance_spread"),
-        ({"reflectance_spread": 11}, "reflectance_spread"),
+        ({"reflectance_spread": 0.6}, "reflectance_spread"),
         ({"reflectance_spread": 0.1, "transparent": "pass"}, "reflectance_spread cannot be"),
         ({"reflectance_spread": 0.1, "leaf_area_density": 1.0}, "leaf_area_density"),
     ],

@@ -59,7 +59,7 @@ class SurfelMaterial(NamedTuple):
         if self.range_spread_m:
             parts.append(f"spread {self.range_spread_m:.2f}")
         if self.reflectance_spread:
-            parts.append(f"contrast {self.reflectance_spread:.2f}")
+            parts.append(f"contrast {self.reflectance_spread:.1f}")
         return ", ".join(parts)
 
     @classmethod

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lidarsim.media.materials import MAX_REFLECTANCE_SPREAD
 from lidarsim.numerics.arrays import AnyFloats, Floats, Integers, Ints
 from lidarsim.sensor.beams import Beams
 from lidarsim.sensor.optics import MIN_COSINE
@@ -42,8 +43,7 @@ _MAX_EXPONENT = 4.0
 _MIN_INCIDENCE_VARIANCE = 0.003
 _NEIGHBORS = 9  # surfels whose mean reflectance supplements surfels with few rays
 _PRIOR_RAYS = 3.0  # weight of this mean, in rays
-_SPREAD_STEP = 0.25  # step to which the spreads of reflectances are rounded
-_MAX_SPREAD = 1.0
+_SPREAD_STEP = 0.1  # step to which the spreads of reflectances are rounded
 
 
 class IntensityModel(StrEnum):
@@ -148,7 +148,7 @@ class Response:
         with np.errstate(divide="ignore", invalid="ignore"):  # surfels without rays
             surfels = np.nan_to_num(recorded / white)
             nearby = recorded[neighbors].sum(axis=1) / white[neighbors].sum(axis=1)
-        spreads = _spreads(rays.surfel, intensity, expected * surfels[rays.surfel], neighbors)
+        spreads = _spreads(rays, intensity, expected * surfels[rays.surfel], neighbors)
         surfels = (ray_count * surfels + _PRIOR_RAYS * nearby) / (ray_count + _PRIOR_RAYS)
         known = np.isfinite(surfels)
         if known.any():
@@ -342,13 +342,20 @@ class _RingFactors(NamedTuple):
         return _RingFactors(*fitted), product
 
 
-def _spreads(surfel: Integers, intensity: Floats, mean: Floats, neighbors: Ints) -> Floats:
+def _spreads(
+    rays: Observations, intensity: Floats, mean: Floats, neighbors: Ints
+) -> Floats:
     """Return the standard deviation of the intensities of each surfel relative to their mean.
+
+    It is derived from the differences between successive rays of the same ring, so that patterns of
+    the surface and errors of the response hardly contribute.
 
     Parameters
     ----------
-    surfel, intensity, mean
-        Surfel, recorded intensity and mean simulated intensity of each ray. Shape (n,).
+    rays
+        Rays in the order in which they were recorded.
+    intensity, mean
+        Recorded intensity and mean simulated intensity of each ray. Shape (n,).
     neighbors
         Surfels whose rays supplement those of each surfel. Shape (m, q).
 
@@ -358,15 +365,20 @@ def _spreads(surfel: Integers, intensity: Floats, mean: Floats, neighbors: Ints)
         Standard deviations in a few steps, because each becomes a material. Shape (m,).
     """
     count = len(neighbors)
-    rays = np.bincount(surfel, minlength=count)
-    squares = np.bincount(surfel, np.square(intensity - mean), count)
-    mean_square = np.bincount(surfel, np.square(mean), count) / np.maximum(rays, 1)
-    degrees = np.maximum(rays - 1.0, 0.0)
+    order = np.lexsort((rays.ring, rays.surfel))
+    surfel, ring = rays.surfel[order], rays.ring[order]
+    pairs = np.flatnonzero((surfel[1:] == surfel[:-1]) & (ring[1:] == ring[:-1]))
+    deviation = (intensity - mean)[order]
+    half_squares = 0.5 * np.square(deviation[pairs + 1] - deviation[pairs])
+    squares = np.bincount(surfel[pairs], half_squares, count)
+    pair_count = np.bincount(surfel[pairs], minlength=count)
+    mean_square = np.bincount(surfel, np.square(mean)[order], count)
+    mean_square /= np.maximum(np.bincount(surfel, minlength=count), 1)
     relative = np.divide(squares, mean_square, out=np.zeros(count), where=mean_square > 0)
-    relative = np.minimum(relative, degrees * _MAX_SPREAD**2)
-    nearby = relative[neighbors].sum(axis=1) / np.maximum(degrees[neighbors].sum(axis=1), 1.0)
-    variance = (relative + _PRIOR_RAYS * nearby) / (degrees + _PRIOR_RAYS)
-    return dithered(np.sqrt(variance), _SPREAD_STEP).clip(max=_MAX_SPREAD)
+    relative = np.minimum(relative, pair_count * MAX_REFLECTANCE_SPREAD**2)
+    nearby = relative[neighbors].sum(axis=1) / np.maximum(pair_count[neighbors].sum(axis=1), 1)
+    variance = (relative + _PRIOR_RAYS * nearby) / (pair_count + _PRIOR_RAYS)
+    return dithered(np.sqrt(variance), _SPREAD_STEP).clip(max=MAX_REFLECTANCE_SPREAD)
 
 
 def _relative_difference(intensity: Floats, expected: Floats) -> float:

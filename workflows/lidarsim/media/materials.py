@@ -52,6 +52,8 @@ NEAR_NM = 905.0
 FAR_NM = 1550.0
 POLISHED = 0.04  # reflection of plastic, paint and wet surfaces at normal incidence (n = 1.5)
 DARKEST = 1e-3  # minimum reflectance of a color, so that every hit results in a return
+# Factors of a normal distribution with a larger spread would often be negative.
+MAX_REFLECTANCE_SPREAD = 0.5
 
 SemanticClass = Annotated[int, Field(ge=0, le=65_535)]
 Transparent = Literal["none", "pass"]
@@ -239,7 +241,7 @@ class Material(FileSection):
             "for surfaces with unresolved structure, such as vegetation",
             0.3,
             ge=0,
-            le=10,
+            le=MAX_REFLECTANCE_SPREAD,
         ),
     ] = 0.0
     material: Annotated[

@@ -26,7 +26,6 @@ from ...numerics.arrays import (
     UInts32,
     to_writable,
 )
-from ...numerics.elementary import exp, log1p
 from ...numerics.random_numbers import Purpose, normal, raw, uniform
 from ...numerics.vectors import dot, rotate_into_frames
 from ...scene.colors import luminance
@@ -45,6 +44,7 @@ SPREAD = Purpose(33, "depth of a return in a porous surface")
 REFLECTANCE = Purpose(34, "reflectance of a surface for a sub-ray")
 GHOST = CAUSES.index("ghost")
 _TINY = 1e-300  # avoids division by zero for surfaces without gaps
+_MIN_FACTOR = 0.02  # minimum factor of a reflectance with a spread
 MAX_PASSES = 16  # number of surfaces that light can pass before it is dropped
 MAX_LEAFY_PASSES = 64  # limit with crowns, whose surface light passes twice
 MAX_REFLECTIONS = 2  # number of times that light can be reflected; each may divide the light
@@ -474,16 +474,17 @@ class CastStep(PulseStep):
     ) -> None:
         """Multiply energies by random factors if the reflectances of their surfaces have a spread.
 
-        The factors have a log-normal distribution with mean 1. All arrays have shape (n,).
+        The factors are normally distributed with mean 1, and clipped symmetrically so that they are
+        positive. All arrays have shape (n,).
         """
         if not self.setup.has_reflectance_spread:
             return
         table = self.surfaces.at_wavelength(self._sensor_light.wavelength_nm)
         spread = table.reflectance_spread[kinds]
         rows = np.flatnonzero(spread > 0)
-        variance = log1p(np.square(spread[rows]))  # of the logarithm
         deviation = normal(self._seed, REFLECTANCE, *self._random_key(batch, ray[rows]))
-        energy[rows] *= exp(np.sqrt(variance) * deviation - 0.5 * variance)
+        factors = 1 + spread[rows] * deviation
+        energy[rows] *= np.minimum(np.maximum(factors, _MIN_FACTOR), 2 - _MIN_FACTOR)
 
     def _meet_leaves(self, cast: CastLight, batch: PulseBatch) -> tuple[CastLight, Leaves | None]:
         """Shorten light paths at the leaves that they hit. Return the paths and the leaves.
