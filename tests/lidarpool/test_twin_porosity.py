@@ -109,7 +109,7 @@ def contrast(cloud, wall_y):
     """Relative standard deviation of the reflectances of a wall along x."""
     x, y, z = cloud.positions.T
     on_wall = (np.abs(x) < 10) & (np.abs(y - wall_y) < 0.3) & (z > 0.3) & (z < 1.9)
-    sensor_x = 4 * cloud.columns["time"] - 4
+    sensor_x = 4e-9 * cloud.columns["time"] - 4
     range_m = np.sqrt((x - sensor_x) ** 2 + y**2 + (z - 1.8) ** 2)
     # Energies decrease with the square of the range, and with the cosine y / range_m.
     brightness = (cloud.columns["intensity"] * range_m**3)[on_wall]

@@ -78,9 +78,7 @@ def test_reflectances_have_the_mean_and_the_spread_of_the_material(backend):
     spread = 0.3
     materials = [Material("Hedge", 0.5, reflectance_spread=spread)]
     columns = ("range", "reflectance", "intensity", "reflectivity")
-    found = cast(
-        [HEDGE], beam_along_x(RAYS), backend=backend, materials=materials, columns=columns
-    )
+    found = cast([HEDGE], beam_along_x(RAYS), backend=backend, materials=materials, columns=columns)
     assert len(found["range"]) == RAYS
     assert found["range"] == pytest.approx(4, abs=1e-4)
     factor = found["reflectance"] / 0.5
@@ -129,9 +127,7 @@ def test_gaps_and_spread_depend_only_on_the_scan_and_the_beam():
         steps=6,
         columns=("ray", "range", "class", "intensity"),
         materials=[
-            Material(
-                "Layer*", 0.5, gap_fraction=0.5, range_spread_m=0.05, reflectance_spread=0.3
-            ),
+            Material("Layer*", 0.5, gap_fraction=0.5, range_spread_m=0.05, reflectance_spread=0.3),
             Material("*", 0.5, reflectance_spread=0.2),
         ],
         noise=Noise(seed=3),

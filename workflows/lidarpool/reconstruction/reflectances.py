@@ -342,9 +342,7 @@ class _RingFactors(NamedTuple):
         return _RingFactors(*fitted), product
 
 
-def _spreads(
-    rays: Observations, intensity: Floats, mean: Floats, neighbors: Ints
-) -> Floats:
+def _spreads(rays: Observations, intensity: Floats, mean: Floats, neighbors: Ints) -> Floats:
     """Return the standard deviation of the intensities of each surfel relative to their mean.
 
     It is derived from the differences between successive rays of the same ring, so that patterns of
