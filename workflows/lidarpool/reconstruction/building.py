@@ -445,6 +445,26 @@ class _Building:
             ),
             "errors": draw_errors(figures),
         }
+        return Twin(
+            scene=self._scene(built, meshes, response),
+            poses=alignment.poses,
+            times_s=poses.times_s,
+            start=start,
+            stop=stop,
+            origin=poses.origin,
+            model=model,
+            figures=figures,
+            pictures=pictures,
+            actors=actors,
+        )
+
+    def _scene(
+        self, built: _Built, meshes: Mapping[int, SceneMesh], response: Response | None
+    ) -> Scene:
+        """Return the scene, given the surfels of each submap that return pulses.
+
+        If there are intensities, the colors of the surfels are their reflectances.
+        """
         spreads = np.zeros(sum(len(mesh.faces) for mesh in meshes.values()) // 2)
         if response is not None:
             reflectances = {
@@ -456,22 +476,9 @@ class _Building:
                 index: color_by_reflectance(mesh, reflectances[index])
                 for index, mesh in meshes.items()
             }
-        return Twin(
-            scene=Scene.from_meshes(
-                [
-                    *split_by_object(merge_surfels([*meshes.values()]), built.porosity(), spreads),
-                    *built.dark(),
-                ]
-            ),
-            poses=alignment.poses,
-            times_s=poses.times_s,
-            start=start,
-            stop=stop,
-            origin=poses.origin,
-            model=model,
-            figures=figures,
-            pictures=pictures,
-            actors=actors,
+        surfels = merge_surfels([*meshes.values()])
+        return Scene.from_meshes(
+            [*split_by_object(surfels, built.porosity(), spreads), *built.dark()]
         )
 
     def _actors(
