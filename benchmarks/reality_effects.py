@@ -33,9 +33,9 @@ _VARIANTS = {
     "with beam width": _RUN._replace(beam_width=True),
     "without range noise": _RUN._replace(range_noise=False),
     "without reflectances": _RUN._replace(reflectances=False),
-    "without detection limits": _RUN._replace(detection_limits=False),
+    "without reflectance spread": _RUN._replace(reflectance_spread=False),
     "without gaps": _RUN._replace(gaps=False),
-    "none": Effects(range_noise=False, reflectances=False, detection_limits=False, gaps=False),
+    "none": Effects(range_noise=False, reflectances=False, reflectance_spread=False, gaps=False),
     "without motion within the sweep": _RUN._replace(motion=False),
 }
 

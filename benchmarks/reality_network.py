@@ -34,8 +34,9 @@ _CLASSES = 20
 _BLOCK = 4  # edge length of the blocks that the network groups, in cells
 _NO_POINT = -1
 _VARIANTS = {
-    "no effects, as surfaces": Effects(range_noise=False, detection_limits=False, gaps=False),
-    "gaps": Effects(range_noise=False, detection_limits=False),
+    "no effects, as surfaces": Effects(range_noise=False, reflectance_spread=False, gaps=False),
+    "gaps": Effects(range_noise=False, reflectance_spread=False),
+    "without reflectance spread": Effects(reflectance_spread=False),
     "all, as in a run": Effects(),
 }
 # Assigns a class, or _NO_POINT, to each cell of the images of sweeps (n, 4): x, y, z, intensity.

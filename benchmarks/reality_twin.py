@@ -51,7 +51,7 @@ class Effects(NamedTuple):
     beam_width: bool = False
     range_noise: bool = True
     reflectances: bool = True
-    detection_limits: bool = True
+    reflectance_spread: bool = True
     gaps: bool = True
     motion: bool = True
 
@@ -120,10 +120,12 @@ class HalfTwin:
         )
         mesh = surfels.mesh("scene")
         response = None
+        spreads = np.zeros(len(surfels.corners))
         if reflectances is not None:
             response = reflectances.response
+            spreads = reflectances.spreads[~is_dark]
             mesh = color_by_reflectance(
-                mesh, replace(reflectances, surfels=reflectances.surfels[~is_dark])
+                mesh, replace(reflectances, surfels=reflectances.surfels[~is_dark], spreads=spreads)
             )
         dark = [surfel_mesh(NO_RETURN, surfels.dark_corners)] if is_dark.any() else []
         timing = SweepTiming.from_sweeps(sweeps)
@@ -135,7 +137,7 @@ class HalfTwin:
             sweeps=sweeps,
             held_out=np.array([*stationary]),
             stationary=stationary,
-            scene=Scene.from_meshes([*split_by_object(mesh, surfels.porosity), *dark]),
+            scene=Scene.from_meshes([*split_by_object(mesh, surfels.porosity, spreads), *dark]),
             model=fitted.model,
             timing=timing,
             intensity_column="reflectance" if is_compensated else "intensity",
@@ -148,10 +150,10 @@ class HalfTwin:
 
     def effective(self, effects: Effects) -> Effects:
         """Return the effects without those that the recording does not have."""
-        noise = self._sensor().noise
+        has_reflectances = bool(self.scene.has_colors.any())
         return effects._replace(
-            reflectances=effects.reflectances and bool(self.scene.has_colors.any()),
-            detection_limits=effects.detection_limits and noise is not None and noise.loses_returns,
+            reflectances=effects.reflectances and has_reflectances,
+            reflectance_spread=effects.reflectance_spread and has_reflectances,
             motion=effects.motion and self.is_as_fired,
         )
 
@@ -195,8 +197,6 @@ class HalfTwin:
         if noise is not None:
             if not effects.range_noise:
                 noise = replace(noise, range_m=0.0, range_per_m=0.0, angle_deg=0.0)
-            if not effects.detection_limits:
-                noise = replace(noise, dropout=0.0, detection_range_m=None)
             settings["noise"] = noise
         return settings
 
@@ -205,10 +205,17 @@ class HalfTwin:
         reflectance: Literal["texture"] | None = "texture" if is_textured else None
         materials = self.scene.materials
         names = set() if materials is None else {*chain.from_iterable(materials.names)}
-        porous = [SurfelMaterial.from_name(name).entry() for name in sorted(names - {""})]
+        entries = []
+        for name in sorted(names - {""}):
+            surfels = SurfelMaterial.from_name(name)
+            if not effects.gaps:
+                surfels = surfels._replace(gap_fraction=0.0, range_spread_m=0.0)
+            if not effects.reflectance_spread:
+                surfels = surfels._replace(reflectance_spread=0.0)
+            entries.append(surfels.entry() | {"material": name})
         return [
             Material(NO_RETURN, reflectance=0),
-            *(Material(reflectance=reflectance, **entry) for entry in porous if effects.gaps),
+            *(Material(reflectance=reflectance, **entry) for entry in entries),
             Material("*", reflectance=reflectance),
         ]
 

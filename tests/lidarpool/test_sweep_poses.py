@@ -178,23 +178,27 @@ def test_surfels_are_divided_by_the_objects_and_classes_of_their_labels():
     index = np.repeat(np.searchsorted(rows, labels), 2).astype(np.int32)
     mesh = SceneMesh("SurfaceMap", corners, surfel_faces(5), materials=FaceMaterials(names, index))
     porosity = Porosity(np.array([0, 0, 0.2, 0, 0.4]), np.array([0, 0, 0, 0, 0.06]))
-    parts = split_by_object(mesh, porosity)
+    parts = split_by_object(mesh, porosity, np.array([0, 0, 0, 0, 0.2]))
     assert [part.name for part in parts] == ["object 0", "object 2", "SurfaceMap"]
     surfels = corners.reshape(5, 4, 3)
     for part, expected in zip(parts, ([1, 4], [0, 3], [2]), strict=True):
         np.testing.assert_array_equal(part.vertices.reshape(-1, 4, 3), surfels[expected])
-    assert parts[0].materials.names == ("", "gaps 0.4, spread 0.06")  # no class above 65,535
+    assert parts[0].materials.names == (
+        "",
+        "gaps 0.4, spread 0.06, contrast 0.2",
+    )  # no class above 65,535
     np.testing.assert_array_equal(parts[0].materials.index, [0, 0, 1, 1])
     assert parts[1].materials.names == (f"{CLASS_MATERIAL}7",)
     assert parts[2].materials.names == (f"{CLASS_MATERIAL}9, gaps 0.2",)
     for part in parts:
         for name in part.materials.names[-1:]:
             assert SurfelMaterial.from_name(name).name == name
-    assert SurfelMaterial(7, 0.4, 0.06).entry() == {
-        "material": "class 7, gaps 0.4, spread 0.06",
+    assert SurfelMaterial(7, 0.4, 0.06, 0.2).entry() == {
+        "material": "class 7, gaps 0.4, spread 0.06, contrast 0.2",
         "class": 7,
         "gap_fraction": 0.4,
         "range_spread_m": 0.06,
+        "reflectance_spread": 0.2,
     }
 
 

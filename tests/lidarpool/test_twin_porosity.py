@@ -23,6 +23,7 @@ pytest.importorskip("scipy")
 SWEEPS = 12
 GAPS = 0.4
 SPREAD_M = 0.05
+REFLECTANCE_SPREAD = 0.4
 HEDGE_Y = 5.0
 HOUSE_Y = 9.0
 
@@ -76,7 +77,13 @@ def recorded():
         steps=36 * SWEEPS,
         columns=["time", "intensity"],
         materials=[
-            Material("hedge", 0.5, gap_fraction=GAPS, range_spread_m=SPREAD_M),
+            Material(
+                "hedge",
+                0.5,
+                gap_fraction=GAPS,
+                range_spread_m=SPREAD_M,
+                reflectance_spread=REFLECTANCE_SPREAD,
+            ),
             Material("*", 0.5),
         ],
         precision_m=1e-3,
@@ -98,6 +105,17 @@ def shares(world):
     return house.sum() / hedge.sum(), float(y[hedge].std())
 
 
+def contrast(cloud, wall_y):
+    """Relative standard deviation of the reflectances of a wall along x."""
+    x, y, z = cloud.positions.T
+    on_wall = (np.abs(x) < 10) & (np.abs(y - wall_y) < 0.3) & (z > 0.3) & (z < 1.9)
+    sensor_x = 4e-9 * cloud.columns["time"] - 4
+    range_m = np.sqrt((x - sensor_x) ** 2 + y**2 + (z - 1.8) ** 2)
+    # Energies decrease with the square of the range, and with the cosine y / range_m.
+    brightness = (cloud.columns["intensity"] * range_m**3)[on_wall]
+    return float(brightness.std() / brightness.mean())
+
+
 @pytest.mark.extended
 def test_hedges_have_the_gaps_and_depths_of_the_recording(recorded, tmp_path):
     place = twin(recorded)
@@ -113,5 +131,8 @@ def test_hedges_have_the_gaps_and_depths_of_the_recording(recorded, tmp_path):
     assert recorded_share > 0.2
     assert share == pytest.approx(recorded_share, rel=0.15)
     assert spread_m == pytest.approx(recorded_spread_m, rel=0.3)
+    assert contrast(recorded, HEDGE_Y) == pytest.approx(REFLECTANCE_SPREAD, rel=0.1)
+    assert contrast(simulated, HEDGE_Y) == pytest.approx(REFLECTANCE_SPREAD, rel=0.2)
+    assert contrast(simulated, -7.0) == pytest.approx(contrast(recorded, -7.0), abs=0.05)
     opposite = (np.abs(recorded.positions[:, 1] + 7) < 0.3).mean()
     assert (np.abs(simulated.positions[:, 1] + 7) < 0.3).mean() == pytest.approx(opposite, rel=0.03)

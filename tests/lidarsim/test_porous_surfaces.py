@@ -72,15 +72,63 @@ def test_a_layer_beyond_the_range_of_the_sensor_has_no_returns():
     assert len(found["range"]) / RAYS == pytest.approx(0.5, abs=SIGMA * standard_error(0.5))
 
 
+@pytest.mark.parametrize("backend", CPU)
+def test_reflectances_have_the_mean_and_the_spread_of_the_material(backend):
+    """The reflectances are normally distributed."""
+    spread = 0.3
+    materials = [Material("Hedge", 0.5, reflectance_spread=spread)]
+    columns = ("range", "reflectance", "intensity", "reflectivity")
+    found = cast([HEDGE], beam_along_x(RAYS), backend=backend, materials=materials, columns=columns)
+    assert len(found["range"]) == RAYS
+    assert found["range"] == pytest.approx(4, abs=1e-4)
+    factor = found["reflectance"] / 0.5
+    assert factor.mean() == pytest.approx(1, abs=SIGMA * spread / np.sqrt(RAYS))
+    assert factor.std() == pytest.approx(spread, rel=0.01)
+    for sigmas, probability in ((-1, 0.1587), (0, 0.5), (2, 0.9772)):
+        below = factor < 1 + sigmas * spread
+        assert abs(share(below) - probability) < SIGMA * standard_error(probability)
+    assert factor.min() >= 0.019 and factor.max() <= 1.981
+    assert found["intensity"] / found["intensity"].mean() == pytest.approx(
+        factor / factor.mean(), rel=1e-3
+    )
+    assert np.corrcoef(found["reflectivity"], factor)[0, 1] > 0.98
+
+
+def test_the_largest_spread_keeps_the_mean_and_all_returns():
+    materials = [Material("Hedge", 0.5, reflectance_spread=0.5)]
+    found = cast([HEDGE], beam_along_x(RAYS), materials=materials)
+    assert len(found["range"]) == RAYS
+    factor = found["reflectance"] / 0.5
+    assert factor.mean() == pytest.approx(1, abs=SIGMA * 0.5 / np.sqrt(RAYS))
+    assert factor.std() == pytest.approx(0.5, rel=0.06)
+
+
+def test_subrays_average_the_spread():
+    materials = [Material("Hedge", 0.5, reflectance_spread=0.4)]
+    found = cast(
+        [HEDGE], beam_along_x(4000), returns=Returns(subrays=7, divergence_mrad=1.0),
+        materials=materials,
+    )  # fmt: skip
+    assert found["reflectance"].mean() == pytest.approx(0.5, rel=0.02)
+    assert found["reflectance"].std() == pytest.approx(0.5 * 0.4 / np.sqrt(7), rel=0.1)
+
+
+def test_the_detection_threshold_applies_to_the_varied_reflectances():
+    materials = [Material("Hedge", 0.1, reflectance_spread=0.4)]
+    noise = Noise(detection_range_m=4.0)
+    found = cast([HEDGE], beam_along_x(RAYS), materials=materials, noise=noise)
+    assert 0.2 < len(found["range"]) / RAYS < 0.8
+
+
 def test_gaps_and_spread_depend_only_on_the_scan_and_the_beam():
     survey = Survey(
         Sensor.grid(90, 16, vertical_fov_deg=40),
         poses=[(0, 0, 0)],
         steps=6,
-        columns=("ray", "range", "class"),
+        columns=("ray", "range", "class", "intensity"),
         materials=[
-            Material("Layer*", 0.5, gap_fraction=0.5, range_spread_m=0.05),
-            Material("*", 0.5),
+            Material("Layer*", 0.5, gap_fraction=0.5, range_spread_m=0.05, reflectance_spread=0.3),
+            Material("*", 0.5, reflectance_spread=0.2),
         ],
         noise=Noise(seed=3),
     )
@@ -133,6 +181,10 @@ def test_materials_without_gaps_are_unchanged():
         ({"range_spread_m": -1}, "range_spread_m"),
         ({"gap_fraction": 0.3, "transparent": "pass"}, "cannot be combined with transparent"),
         ({"range_spread_m": 0.1, "leaf_area_density": 1.0}, "leaf_area_density"),
+        ({"reflectance_spread": -0.1}, "reflectance_spread"),
+        ({"reflectance_spread": 0.6}, "reflectance_spread"),
+        ({"reflectance_spread": 0.1, "transparent": "pass"}, "reflectance_spread cannot be"),
+        ({"reflectance_spread": 0.1, "leaf_area_density": 1.0}, "leaf_area_density"),
     ],
 )
 def test_values_without_a_meaning_are_rejected(fields, words):

@@ -83,7 +83,7 @@ def test_random_numbers_belong_to_one_step():
         *range(1, 6),
         *range(10, 19),
         *range(20, 24),
-        *range(30, 34),
+        *range(30, 35),
         50,
         51,
         60,

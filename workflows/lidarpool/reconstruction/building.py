@@ -445,21 +445,8 @@ class _Building:
             ),
             "errors": draw_errors(figures),
         }
-        if response is not None:
-            meshes = {
-                index: color_by_reflectance(
-                    mesh,
-                    response.reflectances(self._load_observations(index), surfel_centers(mesh)),
-                )
-                for index, mesh in meshes.items()
-            }
         return Twin(
-            scene=Scene.from_meshes(
-                [
-                    *split_by_object(merge_surfels([*meshes.values()]), built.porosity()),
-                    *built.dark(),
-                ]
-            ),
+            scene=self._scene(built, meshes, response),
             poses=alignment.poses,
             times_s=poses.times_s,
             start=start,
@@ -469,6 +456,29 @@ class _Building:
             figures=figures,
             pictures=pictures,
             actors=actors,
+        )
+
+    def _scene(
+        self, built: _Built, meshes: Mapping[int, SceneMesh], response: Response | None
+    ) -> Scene:
+        """Return the scene, given the surfels of each submap that return pulses.
+
+        If there are intensities, the colors of the surfels are their reflectances.
+        """
+        spreads = np.zeros(sum(len(mesh.faces) for mesh in meshes.values()) // 2)
+        if response is not None:
+            reflectances = {
+                index: response.reflectances(self._load_observations(index), surfel_centers(mesh))
+                for index, mesh in meshes.items()
+            }
+            spreads = np.concatenate([one.spreads for one in reflectances.values()])
+            meshes = {
+                index: color_by_reflectance(mesh, reflectances[index])
+                for index, mesh in meshes.items()
+            }
+        surfels = merge_surfels([*meshes.values()])
+        return Scene.from_meshes(
+            [*split_by_object(surfels, built.porosity(), spreads), *built.dark()]
         )
 
     def _actors(

@@ -41,15 +41,16 @@ def labels_of(sweep: Sweep) -> Ints | None:
 
 
 class SurfelMaterial(NamedTuple):
-    """Class and porosity of surfels, which determine their material in the scene."""
+    """Class, porosity and spread of surfels, which determine their material in the scene."""
 
     semantic_class: int  # 0 without a class
     gap_fraction: float
     range_spread_m: float
+    reflectance_spread: float
 
     @property
     def name(self) -> str:
-        """Name of the material, which is empty for opaque surfels without a class."""
+        """Name of the material, which is empty for opaque, uniform surfels without a class."""
         parts = []
         if self.semantic_class:
             parts.append(f"{CLASS_MATERIAL}{self.semantic_class}")
@@ -57,6 +58,8 @@ class SurfelMaterial(NamedTuple):
             parts.append(f"gaps {self.gap_fraction:.1f}")
         if self.range_spread_m:
             parts.append(f"spread {self.range_spread_m:.2f}")
+        if self.reflectance_spread:
+            parts.append(f"contrast {self.reflectance_spread:.1f}")
         return ", ".join(parts)
 
     @classmethod
@@ -69,6 +72,7 @@ class SurfelMaterial(NamedTuple):
             int(values.get(CLASS_MATERIAL.strip(), 0)),
             values.get("gaps", 0.0),
             values.get("spread", 0.0),
+            values.get("contrast", 0.0),
         )
 
     def entry(self) -> dict[str, Any]:
@@ -83,12 +87,14 @@ def class_of(label: int) -> int:
     return label & _MAX_CLASS
 
 
-def split_by_object(mesh: SceneMesh, porosity: Porosity) -> list[SceneMesh]:
-    """Split a surfel mesh by object, and name its materials by class and porosity.
+def split_by_object(
+    mesh: SceneMesh, porosity: Porosity, reflectance_spreads: Floats
+) -> list[SceneMesh]:
+    """Split a surfel mesh by object, and name its materials (`SurfelMaterial`).
 
     Objects are in ascending order of their numbers. Surfels without an object are last, and keep
-    the name of the mesh. Class 0 means that there is no class. Opaque surfels without a class have
-    no material.
+    the name of the mesh. Class 0 means that there is no class. Opaque surfels without a class and
+    without a spread have no material.
     """
     count = len(mesh.faces) // 2
     labels = np.zeros(count, np.int64)
@@ -98,7 +104,7 @@ def split_by_object(mesh: SceneMesh, porosity: Porosity) -> list[SceneMesh]:
         index = mesh.materials.index
         labels[:] = label[0] if index is None else label[index[::2]]
     number = (labels >> _CLASS_BITS) - 1
-    kinds = np.column_stack([labels & _MAX_CLASS, *porosity])
+    kinds = np.column_stack([labels & _MAX_CLASS, *porosity, reflectance_spreads])
     parts = []
     for value in sorted(np.unique(number).tolist(), key=lambda value: (value < 0, value)):
         surfels = np.flatnonzero(number == value)
@@ -108,7 +114,7 @@ def split_by_object(mesh: SceneMesh, porosity: Porosity) -> list[SceneMesh]:
 
 
 def _part(mesh: SceneMesh, name: str, surfels: Ints, kinds: Floats) -> SceneMesh:
-    """Return the given surfels as a mesh whose materials are named by class and porosity.
+    """Return the given surfels as a mesh with named materials.
 
     `kinds` has the fields of `SurfelMaterial` as columns.
     """

@@ -141,7 +141,7 @@ class Porosity(NamedTuple):
                 one.expected_ends(gap_fraction, dark, on_surfel_m) for one in sweeps
             )
         gap_fraction = np.where(dark, 0, counts.gap_fraction(neighbors))
-        gap_fraction = _dithered(gap_fraction, _GAP_STEP).clip(max=_MAX_GAP_FRACTION)
+        gap_fraction = dithered(gap_fraction, _GAP_STEP).clip(max=_MAX_GAP_FRACTION)
         porous = gap_fraction > 0
         spread_m = np.where(porous, counts.spread_m(porous), 0)
         return cls(gap_fraction, np.round(_SPREAD_STEP_M * np.rint(spread_m / _SPREAD_STEP_M), 6))
@@ -206,7 +206,7 @@ class _RayCounts(NamedTuple):
         return np.asarray(np.sqrt(variance_m2 / (degrees + _PRIOR_SPREAD_RAYS)))
 
 
-def _dithered(values: Floats, step: float) -> Floats:
+def dithered(values: Floats, step: float) -> Floats:
     """Round values to multiples of a step, up or down such that their mean is preserved."""
     thresholds = np.arange(len(values)) * _GOLDEN % 1
     return np.round(step * np.floor(values / step + thresholds), 6)

@@ -36,6 +36,8 @@ _ANGLE_DECIMALS = 3
 # Median offset over the rings, in meters and radians, from which ring offsets are significant.
 _MIN_RING_OFFSETS = (0.005, np.radians(0.02), np.radians(0.02))
 _NOISE_DECIMALS = 5
+# Limits of the detection. The map already lacks the surfaces that the sensor did not detect.
+_DETECTION = ("detection", "dropout", "false_alarms", "precision", "range_at_threshold_m")
 _RANGE_NOISE = ("range_m", "range_per_m", "range_at_threshold_m", "precision")
 _MIN_LEAD = 0.01  # minimum time from the first point to the timestamp, in revolutions
 
@@ -202,7 +204,8 @@ def fit_sensor(
     """Fit a sensor's noise to its pulses that hit reconstructed surfaces.
 
     The range noise is determined from neighboring returns on planes instead, because differences to
-    the reconstructed surfaces contain errors of the map.
+    the reconstructed surfaces contain errors of the map. The detection threshold and random losses
+    are omitted, because the map already contains their effects.
 
     Parameters
     ----------
@@ -238,10 +241,10 @@ def fit_sensor(
     else:
         if fitted.model.performance is not None:
             biases = {name: value for name, value in stated.items() if name == "channel_bias_m"}
-            stated = biases | _stated(fitted.model.performance)
-        dropout = fitted.figures["figures"].get("dropout")
-        if dropout is not None and not dropout["low"] > 0:
-            stated.pop("dropout", None)
+            found = _stated(fitted.model.performance)
+            stated = biases | {
+                name: value for name, value in found.items() if name not in _DETECTION
+            }
     if noise is not None:  # without the errors of the map
         stated = {name: value for name, value in stated.items() if name not in _RANGE_NOISE}
         stated["range_m"] = round(noise.range_m, _NOISE_DECIMALS)

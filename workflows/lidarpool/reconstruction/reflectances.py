@@ -16,10 +16,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lidarsim.media.materials import MAX_REFLECTANCE_SPREAD
 from lidarsim.numerics.arrays import AnyFloats, Floats, Integers, Ints
 from lidarsim.sensor.beams import Beams
 from lidarsim.sensor.optics import MIN_COSINE
 
+from .porosity import dithered
 from .surface_map import Observations
 
 _ROUNDS = 12  # iterations of fitting the response and the reflectances
@@ -41,6 +43,7 @@ _MAX_EXPONENT = 4.0
 _MIN_INCIDENCE_VARIANCE = 0.003
 _NEIGHBORS = 9  # surfels whose mean reflectance supplements surfels with few rays
 _PRIOR_RAYS = 3.0  # weight of this mean, in rays
+_SPREAD_STEP = 0.1  # step to which the spreads of reflectances are rounded
 
 
 class IntensityModel(StrEnum):
@@ -145,6 +148,7 @@ class Response:
         with np.errstate(divide="ignore", invalid="ignore"):  # surfels without rays
             surfels = np.nan_to_num(recorded / white)
             nearby = recorded[neighbors].sum(axis=1) / white[neighbors].sum(axis=1)
+        spreads = _spreads(rays, intensity, expected * surfels[rays.surfel], neighbors)
         surfels = (ray_count * surfels + _PRIOR_RAYS * nearby) / (ray_count + _PRIOR_RAYS)
         known = np.isfinite(surfels)
         if known.any():
@@ -152,7 +156,7 @@ class Response:
             surfels[~known] = surfels[known][nearest]
         else:
             surfels[:] = self.typical
-        return Reflectances(np.clip(surfels, _MIN_REFLECTANCE, 1.0), self)
+        return Reflectances(np.clip(surfels, _MIN_REFLECTANCE, 1.0), spreads, self)
 
     def figures(self) -> dict[str, Any]:
         """Return the response as a dictionary for the report."""
@@ -170,12 +174,13 @@ class Reflectances:
     """Reflectances of surfels, and the sensor response that converts them to intensities."""
 
     surfels: Floats  # (m,), 0.01 to 1
+    spreads: Floats  # (m,), relative standard deviation of the intensities of the rays
     response: Response
 
     def intensities(
         self, surfel: Ints, range_m: AnyFloats, cosine: AnyFloats, ring: Integers
     ) -> Floats:
-        """Simulate the intensities of rays that hit surfels, on the scale of the recording.
+        """Simulate the mean intensities of rays that hit surfels, on the scale of the recording.
 
         All arrays have shape (n,).
         """
@@ -335,6 +340,43 @@ class _RingFactors(NamedTuple):
             product = others * ratios[row]
             fitted.append(ratios)
         return _RingFactors(*fitted), product
+
+
+def _spreads(rays: Observations, intensity: Floats, mean: Floats, neighbors: Ints) -> Floats:
+    """Return the standard deviation of the intensities of each surfel relative to their mean.
+
+    It is derived from the differences between successive rays of the same ring, so that patterns of
+    the surface and errors of the response hardly contribute.
+
+    Parameters
+    ----------
+    rays
+        Rays in the order in which they were recorded.
+    intensity, mean
+        Recorded intensity and mean simulated intensity of each ray. Shape (n,).
+    neighbors
+        Surfels whose rays supplement those of each surfel. Shape (m, q).
+
+    Returns
+    -------
+    array
+        Standard deviations in a few steps, because each becomes a material. Shape (m,).
+    """
+    count = len(neighbors)
+    order = np.lexsort((rays.ring, rays.surfel))
+    surfel, ring = rays.surfel[order], rays.ring[order]
+    pairs = np.flatnonzero((surfel[1:] == surfel[:-1]) & (ring[1:] == ring[:-1]))
+    deviation = (intensity - mean)[order]
+    half_squares = 0.5 * np.square(deviation[pairs + 1] - deviation[pairs])
+    squares = np.bincount(surfel[pairs], half_squares, count)
+    pair_count = np.bincount(surfel[pairs], minlength=count)
+    mean_square = np.bincount(surfel, np.square(mean)[order], count)
+    mean_square /= np.maximum(np.bincount(surfel, minlength=count), 1)
+    relative = np.divide(squares, mean_square, out=np.zeros(count), where=mean_square > 0)
+    relative = np.minimum(relative, pair_count * MAX_REFLECTANCE_SPREAD**2)
+    nearby = relative[neighbors].sum(axis=1) / np.maximum(pair_count[neighbors].sum(axis=1), 1)
+    variance = (relative + _PRIOR_RAYS * nearby) / (pair_count + _PRIOR_RAYS)
+    return dithered(np.sqrt(variance), _SPREAD_STEP).clip(max=MAX_REFLECTANCE_SPREAD)
 
 
 def _relative_difference(intensity: Floats, expected: Floats) -> float:

@@ -52,6 +52,8 @@ NEAR_NM = 905.0
 FAR_NM = 1550.0
 POLISHED = 0.04  # reflection of plastic, paint and wet surfaces at normal incidence (n = 1.5)
 DARKEST = 1e-3  # minimum reflectance of a color, so that every hit results in a return
+# Factors of a normal distribution with a larger spread would often be negative.
+MAX_REFLECTANCE_SPREAD = 0.5
 
 SemanticClass = Annotated[int, Field(ge=0, le=65_535)]
 Transparent = Literal["none", "pass"]
@@ -232,6 +234,16 @@ class Material(FileSection):
             le=10,
         ),
     ] = 0.0
+    reflectance_spread: Annotated[
+        float,
+        about(
+            "standard deviation of the reflectance from sub-ray to sub-ray relative to its mean, "
+            "for surfaces with unresolved structure, such as vegetation",
+            0.3,
+            ge=0,
+            le=MAX_REFLECTANCE_SPREAD,
+        ),
+    ] = 0.0
     material: Annotated[
         str | Sequence[str] | None,
         scenario_type(TextOrTexts | None),
@@ -318,11 +330,17 @@ class Material(FileSection):
             )
 
     def _check_gaps(self) -> None:
-        """Check that gaps and a range spread are only set for surfaces without a medium."""
+        """Check that gaps and spreads are only set for surfaces without a medium."""
         if self.is_porous and (self.transparent != "none" or self.leaf_area_density is not None):
             raise LidarError(
                 "gap_fraction and range_spread_m cannot be combined with transparent or "
                 "leaf_area_density."
+            )
+        if self.reflectance_spread and (
+            self.transparent != "none" or self.leaf_area_density is not None
+        ):
+            raise LidarError(
+                "reflectance_spread cannot be combined with transparent or leaf_area_density."
             )
 
     @property
@@ -690,6 +708,7 @@ class MaterialTable:
     leaf_angles: tuple[str | float, ...]
     gap_fraction: Floats  # fraction of the sub-rays that pass through gaps
     range_spread_m: Floats  # standard deviation of the ranges of returns
+    reflectance_spread: Floats  # relative standard deviation of the reflectances of returns
 
     @classmethod
     def build(
@@ -755,6 +774,7 @@ class MaterialTable:
             leaf_angles=angles,
             gap_fraction=np.array([m.gap_fraction for m in entries], np.float64)[first],
             range_spread_m=np.array([m.range_spread_m for m in entries], np.float64)[first],
+            reflectance_spread=np.array([m.reflectance_spread for m in entries], np.float64)[first],
         )
 
     @property

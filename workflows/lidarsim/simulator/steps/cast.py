@@ -41,8 +41,10 @@ from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 GAP = Purpose(32, "gaps in surfaces that light passes")
 SPREAD = Purpose(33, "depth of a return in a porous surface")
+REFLECTANCE = Purpose(34, "reflectance of a surface for a sub-ray")
 GHOST = CAUSES.index("ghost")
 _TINY = 1e-300  # avoids division by zero for surfaces without gaps
+_MIN_FACTOR = 0.02  # minimum factor of a reflectance with a spread
 MAX_PASSES = 16  # number of surfaces that light can pass before it is dropped
 MAX_LEAFY_PASSES = 64  # limit with crowns, whose surface light passes twice
 MAX_REFLECTIONS = 2  # number of times that light can be reflected; each may divide the light
@@ -215,7 +217,7 @@ class CastStep(PulseStep):
     )
     writes = *RETURN_COLUMNS, "velocity"
     causes = (GHOST,)
-    purposes = LEAF, CROWN, GAP, SPREAD
+    purposes = LEAF, CROWN, GAP, SPREAD, REFLECTANCE
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: SceneSurfaces) -> None:
         super().__init__(setup, caster, surfaces)
@@ -421,6 +423,7 @@ class CastStep(PulseStep):
             normals[leaves.row_indices] = light.directions[leaves.row_indices]
             energy[leaves.row_indices] = self._leaf_energy(leaves, triangle, distance, color)
         energy *= light.share
+        self._vary_reflectances(energy, kinds, light.ray, batch)
         if light.in_media is not None:
             light.in_media.advance(step_m)
             energy *= light.in_media.energy_factor(light.directions, distance)
@@ -465,6 +468,23 @@ class CastStep(PulseStep):
             distance[rows] + spread_m[rows] * depth_m, self.setup.sensor.min_range_m
         )
         return distance, gaps
+
+    def _vary_reflectances(
+        self, energy: Floats, kinds: Ints32, ray: Ints, batch: PulseBatch
+    ) -> None:
+        """Multiply energies by random factors if the reflectances of their surfaces have a spread.
+
+        The factors are normally distributed with mean 1, and clipped symmetrically so that they are
+        positive. All arrays have shape (n,).
+        """
+        if not self.setup.has_reflectance_spread:
+            return
+        table = self.surfaces.at_wavelength(self._sensor_light.wavelength_nm)
+        spread = table.reflectance_spread[kinds]
+        rows = np.flatnonzero(spread > 0)
+        deviation = normal(self._seed, REFLECTANCE, *self._random_key(batch, ray[rows]))
+        factors = 1 + spread[rows] * deviation
+        energy[rows] *= np.minimum(np.maximum(factors, _MIN_FACTOR), 2 - _MIN_FACTOR)
 
     def _meet_leaves(self, cast: CastLight, batch: PulseBatch) -> tuple[CastLight, Leaves | None]:
         """Shorten light paths at the leaves that they hit. Return the paths and the leaves.

@@ -110,6 +110,11 @@ class Setup:
         return any(m.is_porous for m in self.survey.materials)
 
     @property
+    def has_reflectance_spread(self) -> bool:
+        """Whether the reflectance of surfaces varies from sub-ray to sub-ray."""
+        return any(m.reflectance_spread > 0 for m in self.survey.materials)
+
+    @property
     def has_mirrors(self) -> bool:
         """Whether surfaces reflect light specularly."""
         return self.survey.wet > 0 or any(m.specular for m in self.survey.materials)
@@ -131,12 +136,16 @@ class Setup:
 
     @property
     def return_count_varies(self) -> bool:
-        """Whether a ray that hits a surface may have several returns or none."""
+        """Whether a ray that hits a surface may have several returns, none, or a random energy."""
         if self.is_recorded or self.has_role(Role.CHANGES | Role.RECEIVES):
             return True
         dark = any(material.reflectance == 0 for material in self.survey.materials)
         return (
-            self.reporting.subrays > 1 or self.has_onward_light or dark or self.noise.loses_returns
+            self.reporting.subrays > 1
+            or self.has_onward_light
+            or self.has_reflectance_spread
+            or dark
+            or self.noise.loses_returns
         )
 
     @property
