@@ -370,8 +370,8 @@ def _spreads(rays: Observations, intensity: Floats, mean: Floats, neighbors: Int
     half_squares = 0.5 * np.square(deviation[pairs + 1] - deviation[pairs])
     squares = np.bincount(surfel[pairs], half_squares, count)
     pair_count = np.bincount(surfel[pairs], minlength=count)
-    mean_square = np.bincount(surfel, np.square(mean)[order], count)
-    mean_square /= np.maximum(np.bincount(surfel, minlength=count), 1)
+    ray_count = np.maximum(np.bincount(surfel, minlength=count), 1)
+    mean_square = np.bincount(surfel, np.square(mean)[order], count) / ray_count
     relative = np.divide(squares, mean_square, out=np.zeros(count), where=mean_square > 0)
     relative = np.minimum(relative, pair_count * MAX_REFLECTANCE_SPREAD**2)
     nearby = relative[neighbors].sum(axis=1) / np.maximum(pair_count[neighbors].sum(axis=1), 1)
