@@ -104,6 +104,16 @@ def test_an_object_that_was_parked_is_present_before_it_starts(track):
     )
 
 
+@pytest.mark.parametrize("number", [22, 29])
+def test_a_sighting_before_the_previous_one_is_omitted(rays, number):
+    """If an object is where sweeps begin and end, its times can be those of another revolution."""
+    early = rays.time_s - 1.2 * PERIOD_S * (rays.sweep == number)
+    (found,) = find_tracks(rays._replace(time_s=early), None, PERIOD_S)
+    assert (np.diff(found.times_s) > 0).all()
+    times_s = np.arange(0.5, 2.6, 0.1)
+    np.testing.assert_allclose(found.poses(times_s)[0], true_pose(times_s), atol=0.15)
+
+
 def test_labeled_boxes_are_adjusted_to_the_points(rays):
     random = np.random.default_rng(1)
     times_s = np.arange(0, 3, 0.1)
