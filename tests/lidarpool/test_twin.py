@@ -300,8 +300,8 @@ def test_surfaces_are_as_bright_as_they_were(place):
     light = LINEAR[colors.mean_colors()].mean(axis=1)
     floor = np.median(light[middles[:, 2] < 0.05])
     walls = np.median(light[(np.abs(middles[:, 1]) > 7.3) & (middles[:, 2] > 1)])
-    # On level ground, the angle of incidence follows from the range, so the reflectance of the floor
-    # and the exponent of the incidence cannot be told apart exactly.
+    # On level ground, the angle of incidence follows from the range, so the reflectance of the
+    # floor and the exponent of the incidence cannot be told apart exactly.
     np.testing.assert_allclose(floor / walls, FLOOR / WALLS, rtol=0.2)
 
 
