@@ -25,7 +25,7 @@ from lidarsim.words import plural
 
 from ..clouds.recording import Recording
 from ..clouds.rings import Rings, elevations, summarize_rings
-from ..scan_patterns.phases import MIN_STEP_RAD, RingSeries, ring_steps, stride
+from ..scan_patterns.phases import MIN_STEP_RAD, RingSeries, stride
 from .sensor_motion import SensorMotion
 
 if TYPE_CHECKING:
@@ -511,10 +511,16 @@ class _RingSteps(NamedTuple):
         counts = np.bincount(ring, minlength=count)
         if counts.max(initial=0) < _MIN_STEPS:
             return None
-        ring_rad = ring_steps(gaps, ring, count)[counts >= _MIN_STEPS]
+        # Motion within a sweep changes the steps, so the smallest gaps are not used.
+        parts = [gaps[ring == row] for row in range(count)]
+        ring_rad = [
+            _refined_step(part, float(np.median(part)))
+            for part in parts
+            if len(part) >= _MIN_STEPS
+        ]
         several = int((series.is_same & (np.diff(series.values) < _SAME_PULSE_RAD)).sum())
         smallest_rad = float(np.quantile(ring_rad, 0.2))
-        strides = [stride(gaps[ring == row], smallest_rad) for row in range(count)]
+        strides = [stride(part, smallest_rad) for part in parts]
         return cls(smallest_rad, np.array(strides), several)
 
 

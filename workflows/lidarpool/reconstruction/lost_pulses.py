@@ -17,12 +17,13 @@ from lidarsim.numerics.arrays import AnyArray, Bools, Floats, Ints
 from lidarsim.numerics.even_samples import even_indices
 
 from ..scan_patterns.lasers import RingLasers
-from ..scan_patterns.phases import MIN_STEP_RAD, ring_steps
+from ..scan_patterns.phases import MIN_STEP_RAD
 from .blocked_directions import BlockedDirections, PulseCounts, azimuth_cells
 from .recorded_sweeps import RecordedSweeps, ring_starts
 
 _MIN_STEPS = 1.6  # minimum gap in steps, since motion within a sweep stretches steps
-_MIN_RETURNS = 8  # minimum number of returns of a sweep
+_MAX_STEPS = 3.0  # maximum step of a ring relative to the typical step
+_MIN_RETURNS = 8  # minimum number of returns of a sweep, and to determine the step of a ring
 _MAX_GAP_M = 5.0  # maximum width of a gap on a surface without returns, such as the side of a car
 # Maximum range difference across such a gap, as a constant and per meter of range.
 _MAX_STEP_M = 0.5
@@ -136,8 +137,12 @@ class _Gaps(NamedTuple):
         following[lasts] = starts
         gap_rad = azimuth[following] - azimuth
         gap_rad[lasts] += 2 * np.pi
-        is_step = gap_rad > MIN_STEP_RAD
-        step_rad = ring_steps(gap_rad[is_step], ring[is_step], len(lasers))[ring]
+        # In some sensors, certain rings fire at half the rate of the others. A ring with few
+        # returns is uninformative.
+        steps_rad = np.array([_step_rad(part) for part in np.split(gap_rad, starts[1:])])
+        typical_rad = float(np.median(steps_rad[counts >= counts.max() / 2]))
+        is_known = (counts >= _MIN_RETURNS) & (steps_rad < _MAX_STEPS * typical_rad)
+        step_rad = np.where(is_known, steps_rad, typical_rad).repeat(counts)
         range_m = lasers.ranges(sweep.points[order], ring)
         return cls(azimuth, elevation[order], range_m, ring, following, gap_rad, step_rad)
 
@@ -167,6 +172,15 @@ class _Gaps(NamedTuple):
         is_one = np.abs(from_m - to_m) < _MAX_STEP_M + _MAX_STEP_PER_M * nearer_m
         range_m = 1 / ((1 - share) / from_m + share / to_m)  # of a plane
         return np.where(is_narrow & is_one, range_m, np.nan)
+
+
+def _step_rad(gap_rad: Floats) -> float:
+    """Return the median azimuth step of a ring, ignoring steps between returns of one pulse.
+
+    The azimuths of motion-compensated points depend on their ranges, so the smallest gaps, between
+    returns at different ranges, are much smaller than a step.
+    """
+    return float(np.median(gap_rad[gap_rad > MIN_STEP_RAD]))
 
 
 def _received(gaps: _Gaps, ring_count: int) -> Bools:

@@ -128,7 +128,14 @@ def fit_pattern(
 
     Examples
     --------
-    >>> fit_pattern("recording.pcd").save("mine.yaml")  # doctest: +SKIP
+    >>> from lidarpool import Scanner, Scene, load_sensor
+    >>> sensor = load_sensor("velodyne/vlp16")
+    >>> scanner = Scanner(Scene.seed(), sensor, columns=["time"], coordinates="sensor")
+    >>> fitted = fit_pattern(scanner.sweep((0, 0, 2)))
+    >>> fitted.model.clockwise, round(fitted.model.rate_hz)
+    (True, 10)
+    >>> np.round(fitted.model.beams.elevation_deg[:3])
+    array([-15., -13., -11.])
     """
     require_package("scipy", "fit", "Fitting sensor models")
     if not isinstance(recording, Recording):
