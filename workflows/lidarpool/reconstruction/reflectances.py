@@ -32,7 +32,7 @@ _MIN_RAYS = 200  # A factor with fewer rays is not changed.
 _WHITE_QUANTILE = 0.999  # quantile of the intensities above which a surface counts as white
 _WHITE_SHARE = 0.99  # quantile of the reflectances, weighted by rays, that counts as white
 _MIN_REFLECTANCE = 0.01  # for surfaces that were recorded as black
-_MAX_DIFFERENCE = 0.9  # maximum error of the energy model relative to the compensated model
+_MAX_DIFFERENCE = 0.9  # maximum error of a model relative to that of the simpler model
 _WHITE_RANGE_M = 10.0  # range at which a white surface has a simulated intensity of 1
 _FACTOR_DECIMALS = 3
 _EXPONENT_DECIMALS = 2
@@ -219,7 +219,7 @@ def fit_response(
     if not (observations.intensity > 0).any():
         return None
     models = (IntensityModel.ENERGIES,) if are_energies else tuple(IntensityModel)
-    fits = [_Fit.to_rays(observations, model, ring_count) for model in models]
+    fits = [_Fit.best_of(observations, model, ring_count) for model in models]
     best = fits[0]
     if fits[-1].difference < _MAX_DIFFERENCE * best.difference:
         best = fits[-1]
@@ -254,7 +254,27 @@ class _Fit(NamedTuple):
     difference: float  # mean relative difference between modeled and recorded intensities
 
     @classmethod
-    def to_rays(cls, observations: Observations, model: IntensityModel, ring_count: int) -> _Fit:
+    def best_of(cls, observations: Observations, model: IntensityModel, ring_count: int) -> _Fit:
+        """Fit the response, and the incidence exponent only if it clearly improves the fit.
+
+        Errors of the normals bias the exponent, and on level ground the ranges have the same effect
+        as the angles of incidence.
+        """
+        stated, fitted = (
+            cls.to_rays(observations, model, ring_count, fits_exponent=fits_exponent)
+            for fits_exponent in (False, True)
+        )
+        return fitted if fitted.difference < _MAX_DIFFERENCE * stated.difference else stated
+
+    @classmethod
+    def to_rays(
+        cls,
+        observations: Observations,
+        model: IntensityModel,
+        ring_count: int,
+        *,
+        fits_exponent: bool,
+    ) -> _Fit:
         """Alternately fit the response and the reflectances to the intensities of rays.
 
         A surface is observed at few ranges, incidences and rings, so what they do not determine
@@ -271,6 +291,8 @@ class _Fit(NamedTuple):
         for _ in range(_ROUNDS):
             reflectance = _ratios(surfel, intensity, product, unknown)
             factors, product = factors.fit(observations, intensity, product, reflectance[surfel])
+            if not fits_exponent:
+                continue
             reflectance = _ratios(surfel, intensity, product, unknown)
             step = _exponent_step(slopes, intensity / product, reflectance[surfel])
             step = float(np.clip(exponent + step, 0, _MAX_EXPONENT)) - exponent
