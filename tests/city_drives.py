@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tests.simulated_drives import simulated_drive
 
 from lidarpool import (
     Actor,
@@ -22,11 +23,7 @@ from lidarpool import (
 )
 from lidarscenes.procedural.cars import MODELS, car
 from lidarscenes.procedural.city import city
-from lidarsim.columns.table import SCAN
 from lidarsim.numerics.arrays import Floats
-from lidarsim.simulator.points.batch_columns import columns_of
-from lidarsim.simulator.rig import Rig
-from lidarsim.sweeps.sweeps import Sweeps
 
 SPEED_M_S = 4.0
 # Start, speed and acceleration along x, lateral position and start time of moving cars.
@@ -73,7 +70,4 @@ def _drive(
         columns=["time", "intensity", "class", "ray", "range"],
         precision_m=precision_m,
     )
-    part = columns_of(list(Rig(scene, survey, "auto").cast(0, survey.scan_count)))
-    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
-    sweeps = Sweeps.from_survey(survey, scene)
-    return replace(cloud, sweeps=lambda: sweeps)
+    return simulated_drive(scene, survey)

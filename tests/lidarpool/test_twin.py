@@ -12,6 +12,7 @@ from benchmarks import reality
 from benchmarks.odometry import left_turn
 from click.testing import CliRunner
 from scipy.spatial import cKDTree
+from tests.simulated_drives import simulated_drive, simulated_points
 
 from lidarpool import (
     Actor,
@@ -100,10 +101,7 @@ def survey():
 @pytest.fixture(scope="module")
 def drive(street, survey):
     """Return the recorded sweeps of the drive: a cloud in memory."""
-    part = columns_of(list(Rig(street, survey, "auto").cast(0, survey.scan_count)))
-    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, street.origin)
-    sweeps = Sweeps.from_survey(survey, street)
-    return replace(cloud, sweeps=lambda: sweeps)
+    return simulated_drive(street, survey)
 
 
 @pytest.fixture(scope="module")
@@ -144,10 +142,7 @@ def city_drive(model, options, sweeps, trajectory=left_turn, triangles=5_000):
         columns=["time", "intensity", "class", "reflectivity", "ray", "range"],
         precision_m=1e-4,
     )
-    part = columns_of(list(Rig(scene, survey, "auto").cast(0, survey.scan_count)))
-    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
-    sweeps_of_survey = Sweeps.from_survey(survey, scene)
-    return replace(cloud, sweeps=lambda: sweeps_of_survey)
+    return simulated_drive(scene, survey)
 
 
 def without_poses(drive, rows=None):
@@ -622,10 +617,7 @@ def test_classes_of_the_recording_are_labels_of_the_place(drive, tmp_path):
 def scanned(folder):
     """Return the scan of a twin that was saved, and the names of its objects."""
     job = prepare(Scenario.load(folder / "scenario.yaml"))
-    scans = columns_of(list(Rig(job.scene, job.survey, "auto").cast(0, job.survey.scan_count)))
-    table = (SCAN, *job.survey.stored_columns[3:])
-    cloud = scans.cloud(table, job.survey.precision_m, job.scene.origin)
-    return cloud, np.array(job.scene.names)
+    return simulated_points(job.scene, job.survey), np.array(job.scene.names)
 
 
 CLASSES = {10: "car", 11: "floor", 50: "house", 51: "wall", 52: "shed", 80: "post"}
@@ -640,11 +632,7 @@ def test_labels_of_exports_are_labels_of_simulated_points(street, survey, file, 
     ]
     columns = ["time", "intensity", "class", "reflectivity"]
     labeled = replace(survey, columns=columns, materials=materials, classes=CLASSES)
-    part = columns_of(list(Rig(street, labeled, "auto").cast(0, labeled.scan_count)))
-    table = (SCAN, *labeled.stored_columns[3:])
-    sweeps = Sweeps.from_survey(labeled, street)
-    cloud = part.cloud(table, labeled.precision_m, street.origin)
-    recorded = replace(cloud, sweeps=lambda: sweeps)
+    recorded = simulated_drive(street, labeled)
     save_cloud(recorded, tmp_path / file, format=file)
     # Sweeps of KITTI are compensated and have no rings.
     model = tmp_path / "sensor.yaml"
@@ -694,17 +682,14 @@ def test_a_window_returns_nothing_in_the_place(street, survey, tmp_path):
     window = SceneMesh("window", np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
     scene = Scene.from_meshes([*street.meshes(), body, window])
     seen = replace(survey, materials=[Material("window", 0.0), *survey.materials])
-    part = columns_of(list(Rig(scene, seen, "auto").cast(0, seen.scan_count)))
-    cloud = part.cloud((SCAN, *seen.stored_columns[3:]), seen.precision_m, scene.origin)
+    cloud = simulated_points(scene, seen)
     sweeps = Sweeps.from_survey(seen, scene)
     found = twin(replace(cloud, sweeps=lambda: sweeps))
     assert found.figures["dark_surfels"] > 50
     assert found.figures["held_out"]["no_return"]["f1"] > 0.85
     found.save(tmp_path / "twin")
     job = prepare(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
-    scan = columns_of(list(Rig(job.scene, job.survey, "auto").cast(0, job.survey.scan_count)))
-    names = (SCAN, *job.survey.stored_columns[3:])
-    again = scan.cloud(names, job.survey.precision_m, job.scene.origin).positions
+    again = simulated_points(job.scene, job.survey).positions
     on_van = (np.abs(again[:, 1] - 4.9) < 0.2) & (again[:, 0] > -1) & (again[:, 0] < 5)
     inside = (np.abs(again[:, 0] - 2) < 1.3) & (np.abs(again[:, 2] - 1.5) < 0.7)
     share = job.survey.scan_count / seen.scan_count  # the last pose is at the start of a sweep

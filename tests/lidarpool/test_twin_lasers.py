@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from benchmarks.odometry import left_turn
+from tests.simulated_drives import simulated_drive
 
 from lidarpool import Beams, Mounted, Pose, Sensor, Survey, load_sensor, twin
 from lidarpool.clouds.recording import Recording
@@ -21,10 +22,6 @@ from lidarpool.recordings.opening import open_recording
 from lidarpool.scan_patterns.lasers import RingLasers, unit_vectors
 from lidarscenes.procedural.city import city
 from lidarsim.columns.sweep import Sweep
-from lidarsim.columns.table import SCAN
-from lidarsim.simulator.points.batch_columns import columns_of
-from lidarsim.simulator.rig import Rig
-from lidarsim.sweeps.sweeps import Sweeps
 
 pytest.importorskip("scipy")
 
@@ -243,10 +240,7 @@ def recorded_drive(street, sensor):
         columns=["time", "intensity"],
         precision_m=1e-5,
     )
-    part = columns_of(list(Rig(street, survey, "auto").cast(0, survey.scan_count)))
-    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, street.origin)
-    sweeps = Sweeps.from_survey(survey, street)
-    return replace(cloud, sweeps=lambda: sweeps)
+    return simulated_drive(street, survey)
 
 
 def as_fired(drive):

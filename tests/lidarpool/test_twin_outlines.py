@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from tests.shapes import wall
+from tests.simulated_drives import simulated_points
 
 from lidarpool import (
     Mounted,
@@ -26,9 +27,6 @@ from lidarpool.reconstruction.porosity import Crossings
 from lidarpool.reconstruction.surfels import Surfels, surfel_mesh
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.columns.table import SCAN
-from lidarsim.simulator.points.batch_columns import columns_of
-from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 
 pytest.importorskip("scipy")
@@ -163,11 +161,6 @@ def write_model(path, divergence_mrad):
     return path
 
 
-def simulate(scene, survey):
-    part = columns_of(list(Rig(scene, survey, "auto").cast(0, survey.scan_count)))
-    return part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
-
-
 def on_poles(world):
     """Numbers of the points on the poles and in their surroundings."""
     x, y, z = world.T
@@ -190,11 +183,13 @@ def test_poles_keep_their_width_with_and_without_beam_width(divergence_mrad, tol
         returns=Returns(subrays=7) if divergence_mrad else None,
         precision_m=1e-3,
     )
-    recorded = simulate(scene, survey)
+    recorded = simulated_points(scene, survey)
     sweeps = Sweeps.from_survey(survey, scene)
     place = twin(replace(recorded, sweeps=lambda: sweeps), model=model, actors="none")
     place.save(tmp_path / "twin")
     job = prepare(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
     assert job.survey.sensors[0].returns.subrays == (7 if divergence_mrad else 1)
-    widths = on_poles(simulate(job.scene, job.survey).positions) / on_poles(recorded.positions)
+    widths = on_poles(simulated_points(job.scene, job.survey).positions) / on_poles(
+        recorded.positions
+    )
     assert widths == pytest.approx(1, abs=tolerance)

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import yaml
 from tests.shapes import wall
+from tests.simulated_drives import simulated_drive, simulated_points
 
 from lidarpool import Material, Mounted, Pose, Scene, SceneMesh, Sensor, Survey, Track, twin
 from lidarpool.reconstruction.porosity import Crossings, Porosity
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.columns.table import SCAN
-from lidarsim.simulator.points.batch_columns import columns_of
-from lidarsim.simulator.rig import Rig
-from lidarsim.sweeps.sweeps import Sweeps
 
 pytest.importorskip("scipy")
 
@@ -88,10 +83,7 @@ def recorded():
         ],
         precision_m=1e-3,
     )
-    part = columns_of(list(Rig(scene, survey, "auto").cast(0, survey.scan_count)))
-    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
-    sweeps = Sweeps.from_survey(survey, scene)
-    return replace(cloud, sweeps=lambda: sweeps)
+    return simulated_drive(scene, survey)
 
 
 def shares(world):
@@ -124,8 +116,7 @@ def test_hedges_have_the_gaps_and_depths_of_the_recording(recorded, tmp_path):
     fractions = {entry.get("gap_fraction", 0) for entry in scenario["materials"]}
     assert {0, 0.4} <= fractions
     job = prepare(Scenario.load(tmp_path / "scenario.yaml"))
-    part = columns_of(list(Rig(job.scene, job.survey, "auto").cast(0, job.survey.scan_count)))
-    simulated = part.cloud((SCAN, *job.survey.stored_columns[3:]), 1e-3, job.scene.origin)
+    simulated = simulated_points(job.scene, job.survey)
     recorded_share, recorded_spread_m = shares(recorded.positions)
     share, spread_m = shares(simulated.positions)
     assert recorded_share > 0.2

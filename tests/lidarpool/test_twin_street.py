@@ -5,11 +5,10 @@ The street has a hedge, a fence, a house with windows, posts and two moving cars
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from tests.shapes import wall
+from tests.simulated_drives import simulated_drive
 
 from lidarpool import (
     Actor,
@@ -26,10 +25,6 @@ from lidarpool import (
 )
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.columns.table import SCAN
-from lidarsim.simulator.points.batch_columns import columns_of
-from lidarsim.simulator.rig import Rig
-from lidarsim.sweeps.sweeps import Sweeps
 
 pytest.importorskip("scipy")
 pytestmark = pytest.mark.extended
@@ -91,19 +86,12 @@ def recorded(street):
         ],
         precision_m=1e-3,
     )
-    return points_of(street, survey)
+    return simulated_drive(street, survey)
 
 
 @pytest.fixture(scope="module")
 def found(recorded):
     return twin(recorded)
-
-
-def points_of(scene, survey):
-    part = columns_of(list(Rig(scene, survey, "auto").cast(0, survey.scan_count)))
-    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
-    sweeps = Sweeps.from_survey(survey, scene)
-    return replace(cloud, sweeps=lambda: sweeps)
 
 
 def in_box(points, *bounds):
@@ -154,7 +142,7 @@ def test_both_cars_are_actors_on_their_paths(found):
 def test_each_part_of_the_street_has_as_many_points_as_recorded(found, recorded, tmp_path):
     found.save(tmp_path)
     job = prepare(Scenario.load(tmp_path / "scenario.yaml"))
-    simulated = counts(points_of(job.scene, job.survey).positions)
+    simulated = counts(simulated_drive(job.scene, job.survey).positions)
     expected = counts(recorded.positions)
     assert min(expected[name] for name in expected.keys() - {"windows"}) > 1000
     for name in ("hedge", "behind the fence", "walls"):

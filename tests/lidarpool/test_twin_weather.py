@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.simulated_drives import simulated_drive
 
 from lidarpool import (
     Actor,
@@ -32,10 +33,7 @@ from lidarpool.reconstruction.recorded_sweeps import RecordedSweeps
 from lidarpool.reconstruction.vehicle_detection import find_vehicle_returns
 from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.sweep import Sweep
-from lidarsim.columns.table import CAUSES, SCAN
-from lidarsim.simulator.points.batch_columns import columns_of
-from lidarsim.simulator.rig import Rig
-from lidarsim.sweeps.sweeps import Sweeps
+from lidarsim.columns.table import CAUSES
 
 pytest.importorskip("scipy")
 
@@ -88,10 +86,7 @@ def drive(scene, **weather):
         noise=Noise(range_m=0.01, detection_range_m=90.0, overlap_m=5.0, seed=1),
         **weather,
     )
-    part = columns_of(list(Rig(scene, survey, "auto").cast(0, survey.scan_count)))
-    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
-    sweeps = Sweeps.from_survey(survey, scene)
-    return replace(cloud, sweeps=lambda: sweeps)
+    return simulated_drive(scene, survey)
 
 
 def aligned(recording):

@@ -514,9 +514,7 @@ class _RingSteps(NamedTuple):
         # Motion within a sweep changes the steps, so the smallest gaps are not used.
         parts = [gaps[ring == row] for row in range(count)]
         ring_rad = [
-            _refined_step(part, float(np.median(part)))
-            for part in parts
-            if len(part) >= _MIN_STEPS
+            _refined_step(part, float(np.median(part))) for part in parts if len(part) >= _MIN_STEPS
         ]
         several = int((series.is_same & (np.diff(series.values) < _SAME_PULSE_RAD)).sum())
         smallest_rad = float(np.quantile(ring_rad, 0.2))

@@ -67,7 +67,7 @@ class Extents(NamedTuple):
         Parameters
         ----------
         sweeps
-            Crossings of the rays of several sweeps. Lost pulses have the range inf.
+            Crossings of the rays in several sweeps. The ranges of lost pulses are infinite.
         dark
             Surfels that return no pulses, which are not trimmed. Shape (m,).
         on_surfel_m
@@ -183,9 +183,9 @@ class _Cut(NamedTuple):
 
     @classmethod
     def best(cls, ends: Floats, passes: Floats, axis: int) -> _Cut:
-        """Find the cut along an axis that explains the rays in the cells best.
+        """Find the cut along an axis that best explains the rays in the cells.
 
-        If there are cells without rays between both parts, the cut is in the middle of them. `ends`
+        The cut is in the middle of any cells without rays between the two parts. `ends`
         and `passes` have shape (c, `CELLS`, `CELLS`).
         """
         counts = np.stack([ends, passes]).sum(axis=3 - axis)  # (2, c, CELLS)

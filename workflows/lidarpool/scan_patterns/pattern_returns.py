@@ -1,4 +1,4 @@
-"""Returns of a stationary recording with their rings and times, read into single arrays."""
+"""Returns of all sweeps in a stationary recording, with their rings and times."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class PatternReturns:
     points
         Positions in the sensor frame in meters, of shape (n, 3), not compensated for motion.
     sweep
-        Number of the sweep of each return, of shape (n,).
+        Sweep number of each return. Shape (n,).
     ring
         Ring of each return, from the highest to the lowest, or -1 if it is unknown. Shape (n,).
     channel
