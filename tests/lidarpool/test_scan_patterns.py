@@ -214,6 +214,7 @@ def test_files_contain_the_accuracy(room, tmp_path):
         rays.save(tmp_path / "mine.yaml")
 
 
+@pytest.mark.extended(keep=("velodyne/vlp16",))
 @pytest.mark.parametrize("name", ["velodyne/vlp16", "livox/avia"])
 def test_a_moving_sensor_is_refused(room, name):
     track = Track([0, 1], [(-3, 0, 4), (3, 2, 4)])

@@ -86,6 +86,7 @@ def eight(start):
     return start({name: {} for name in "abcdefgh"})
 
 
+@pytest.mark.extended
 def test_the_division_follows_the_running_times_and_each_item_arrives_once(
     eight, quickly, make_pipe, monkeypatch, wait_until
 ):

@@ -100,6 +100,7 @@ def test_a_mesh_needs_no_scenario_and_a_number_may_be_more_than_needed(hall, lid
     assert Scenario.load(hall / "stations-stations/stations.yaml").sensor.model == "velodyne/vlp16"
 
 
+@pytest.mark.extended
 def test_a_sensor_file_is_relative_to_the_folder_of_its_scenario(hall, lidarpool):
     folder = hall / "plan"
     folder.mkdir()

@@ -84,6 +84,7 @@ def stop_after(count):
     return progress
 
 
+@pytest.mark.extended
 def test_bytes_do_not_depend_on_the_number_of_processes(augmentation, tmp_path):
     alone = augmentation.run(tmp_path / "alone", workers=1)
     together = augmentation.run(tmp_path / "together", workers=3)
