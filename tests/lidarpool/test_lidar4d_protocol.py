@@ -332,6 +332,7 @@ def run_compare(*arguments):
     return done.output
 
 
+@pytest.mark.extended
 def test_compare_averages_the_metrics_of_frames(recordings, pair, tmp_path):
     output = run_compare(*recordings, "--protocol", "lidar4d", "--out", tmp_path / "out")
     found = json.loads((tmp_path / "out" / "compare.json").read_text())["lidar4d"]

@@ -210,6 +210,7 @@ def test_sensors_within_the_points_are_marked_from_above(write):
     assert "the sensor positions in red" in page.text_content()
 
 
+@pytest.mark.extended
 def test_the_title_has_the_scenario_where_no_sensor_has_a_model(write):
     assert "<h1>hall, from 2 positions</h1>" in write()[0]
     assert "<h1>Sensor with 16 channels from 2 positions</h1>" in write(scenario=None)[0]
@@ -313,6 +314,7 @@ def test_figures_have_the_digits_that_are_read(write):
     assert told["overlap of survey and planning"] == "0 s"
 
 
+@pytest.mark.extended
 def test_scanning_of_a_flight_is_on_its_lines(write):
     """Of 20 s, a turn of 4 s."""
     rates = np.radians(np.where((np.arange(401) > 160) & (np.arange(401) <= 240), 45, 0))
@@ -365,6 +367,7 @@ def test_points_by_object_are_all_accounted_for(write):
     assert int(more[1]) + 25 + (int(missed[1]) if missed else 0) == 300
 
 
+@pytest.mark.extended
 def test_points_by_class_have_the_names_of_classes(write):
     assert "Points by class" not in write()[0]
     cloud = cloud_of(500, 2, 120, 16)

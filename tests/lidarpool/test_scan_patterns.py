@@ -158,7 +158,9 @@ def test_points_sorted_by_ring_lack_whole_azimuth_steps(room):
     assert fitted.figures["clockwise"]
 
 
-@pytest.mark.parametrize("name", ["livox/mid360", "livox/avia"])
+@pytest.mark.parametrize(
+    "name", ["livox/mid360", pytest.param("livox/avia", marks=pytest.mark.extended)]
+)
 @pytest.mark.parametrize("lost", [0.0, pytest.param(0.3, marks=pytest.mark.extended)])
 def test_a_pattern_that_does_not_repeat_is_listed(room, tmp_path, name, lost):
     sensor = load_sensor(name)
@@ -179,6 +181,7 @@ def test_a_pattern_that_does_not_repeat_is_listed(room, tmp_path, name, lost):
     assert fitted.figures["spread_deg"] < 0.003
 
 
+@pytest.mark.extended
 def test_repetitions_are_combined(room, tmp_path):
     sensor = Sensor.grid(512, 32, 40, max_range_m=100)
     fitted = fit_pattern(record(room, sensor, 4, lost=0.3), as_rays=True)
@@ -195,6 +198,7 @@ def test_repetitions_are_combined(room, tmp_path):
     assert error_deg.max() < 0.03  # of an interpolated ray, which is between rays 1.4° apart
 
 
+@pytest.mark.extended
 def test_times_of_packets_are_spread(room):
     sensor = load_sensor("livox/avia")
     fitted = fit_pattern(record(room, sensor, 3, time_decimals=3), as_rays=True)
@@ -203,6 +207,7 @@ def test_times_of_packets_are_spread(room):
     assert fitted.figures["missing"] is None
 
 
+@pytest.mark.extended
 def test_files_contain_the_accuracy(room, tmp_path):
     recording = record(room, load_sensor("velodyne/vlp16"))
     text = fit_pattern(recording).save(tmp_path / "mine.yaml")[0].read_text()
@@ -228,6 +233,7 @@ def test_a_single_sweep_cannot_show_motion(room):
     assert "motion cannot be detected in a single sweep" in repr(fitted)
 
 
+@pytest.mark.extended
 def test_a_pattern_without_rings_is_no_sensor_model(room):
     recording = record(room, load_sensor("livox/mid360"))
     with pytest.raises(LidarError, match=r"rings of recording are unknown.*such as rays\.npz"):

@@ -436,6 +436,7 @@ def test_rings_are_found_in_the_order_of_points(drive):
     np.testing.assert_array_equal(rows, ordered[0] - ordered)
 
 
+@pytest.mark.extended
 def test_times_of_points_have_one_unit_and_tell_the_period(drive):
     opened = open_recording(drive, name="drive")
 

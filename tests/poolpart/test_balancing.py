@@ -169,6 +169,7 @@ def test_bounds_of_each_partition_and_of_its_rule(eight, quickly, wait_until):
             wait_until(lambda: sizes(parts) == [1, 3, 4])
 
 
+@pytest.mark.extended
 def test_other_partitions_give_and_receive_nothing(start, quickly, wait_until):
     client = start({name: {} for name in "abcdef"} | {"gpu": {"resources": {"GPU": 1}}})
     a, b = divide(client, A=3, B=3)
