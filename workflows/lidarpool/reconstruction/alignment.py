@@ -15,6 +15,7 @@ In array shapes, s is the number of sweeps, r the number of rings, and n the num
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
@@ -28,6 +29,7 @@ from lidarsim.numerics.even_samples import even_indices
 from lidarsim.sweeps.sweep_motion import FiringPoses
 
 from ..clouds.rings import MIN_RINGS
+from ..processes.processors import processor_count
 from ..scan_patterns.lasers import RingLasers, unit_vectors
 from .blocked_directions import separated_sweeps
 from .lost_pulses import SensorCoverage, lost_pulses
@@ -440,7 +442,9 @@ def _motion(sweeps: RecordedSweeps, poses: RecordedPoses, voxel_m: float) -> Mot
     name = sweeps.recording.name
     local = poses.select(window)
     trial = partial(_filled_voxels, sweeps, samples, local, voxel_m)
-    filled = {motion: trial(motion) for motion in candidates}
+    # Sorting and nearest-neighbor queries release the GIL.
+    with ThreadPoolExecutor(min(len(candidates), processor_count())) as threads:
+        filled = dict(zip(candidates, threads.map(trial, candidates), strict=True))
     best = min(candidates, key=filled.__getitem__)
     if filled[best] > _MAX_SHARE_OF_VOXELS * filled[candidates[0]]:
         best = candidates[0]

@@ -245,7 +245,9 @@ def _boxed(sightings: Sequence[Sighting], poses: Floats) -> ObjectTrack:
 
 def _on_ground(track: ObjectTrack, rays: MovingRays) -> ObjectTrack:
     """Lower the underside of a box to the ground around it, if the ground returned pulses."""
-    still = np.flatnonzero(rays.returned & ~rays.moved & track.is_present(rays.time_s))
+    reach_m = float(np.hypot(*(track.size[:2] / 2 + _AROUND_M)))
+    still = track.rows_near(rays.ends, rays.time_s, reach_m)
+    still = still[(rays.returned & ~rays.moved)[still]]
     local = track.to_object(rays.ends[still], rays.time_s[still])
     apart = np.abs(local[:, :2]) - track.size[:2] / 2
     around = (apart < _AROUND_M).all(axis=1) & (apart > 0).any(axis=1)

@@ -8,8 +8,7 @@ classified nor compared with a shape, so any object is found that moves far enou
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -153,10 +152,22 @@ def bounding_boxes(points: Floats, cluster: Ints) -> dict[int, PointCluster]:
 class ClusterTrack:
     """Clusters of an object in several sweeps."""
 
-    sweeps: list[int]
-    times_s: list[float]
-    clusters: list[PointCluster]
-    indices: list[int]  # indices of the clusters in their sweeps
+    sweeps: list[int] = field(default_factory=list)
+    times_s: list[float] = field(default_factory=list)
+    clusters: list[PointCluster] = field(default_factory=list)
+    indices: list[int] = field(default_factory=list)  # indices of the clusters in their sweeps
+    _path: list[Floats] = field(default_factory=list)
+
+    def append(self, sweep: int, time_s: float, cluster: PointCluster, index: int) -> None:
+        """Add the cluster of the object in a later sweep."""
+        position = cluster.center
+        if self.clusters:
+            position = self._path[-1] + cluster.offset_from(self.clusters[-1])
+        self._path.append(position)
+        self.sweeps.append(sweep)
+        self.times_s.append(time_s)
+        self.clusters.append(cluster)
+        self.indices.append(index)
 
     @property
     def points(self) -> int:
@@ -176,8 +187,7 @@ class ClusterTrack:
     @property
     def path(self) -> Floats:
         """Positions of a point of the object in meters. Shape (k, 3)."""
-        steps = [new.offset_from(old) for old, new in pairwise(self.clusters)]
-        return np.cumsum([self.clusters[0].center, *steps], axis=0)
+        return np.array(self._path)
 
     def cost(self, time_s: float, cluster: PointCluster) -> float:
         """Return the cost of a further observation, which is high if it is implausible."""
@@ -190,7 +200,7 @@ class ClusterTrack:
             cost += _SPEED_COST * np.hypot(*offset)
             limit = _SPEED_COST * _MAX_SPEED_M_S * step_s + _FIRST_GATE_M
         else:
-            recent = self.path[-_FITTED:, :2]
+            recent = np.array(self._path[-_FITTED:])[:, :2]
             velocity = (recent[-1] - recent[0]) / (self.times_s[-1] - self.times_s[-len(recent)])
             cost += np.hypot(*(offset - velocity * step_s))
             limit = _GATE_M + _GATE_M_S * step_s
@@ -232,10 +242,7 @@ def track_clusters(
         for column, (index, cluster) in enumerate(clusters.items()):
             track = pairs.get(column)
             if track is None:
-                track = ClusterTrack([], [], [], [])
+                track = ClusterTrack()
                 active.append(track)
-            track.sweeps.append(number)
-            track.times_s.append(time_s)
-            track.clusters.append(cluster)
-            track.indices.append(index)
+            track.append(number, time_s, cluster, index)
     return [track for track in [*ended, *active] if track.is_moving]

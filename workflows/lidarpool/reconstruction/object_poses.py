@@ -105,9 +105,8 @@ class Shape:
         """Create a shape from points in the object frame, of shape (n, 3)."""
         from scipy.spatial import cKDTree
 
-        cells = np.floor(points / _VOXEL_M).astype(np.int64)
-        _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-        sums = [np.bincount(cell.ravel(), column) for column in points.T]
+        _, cell, counts = np.unique(_voxel_numbers(points), return_inverse=True, return_counts=True)
+        sums = [np.bincount(cell, column) for column in points.T]
         means = np.stack(sums, axis=1) / counts[:, None]
         tree = cKDTree(means)
         count = min(_NEIGHBORS, len(means))
@@ -156,6 +155,16 @@ class Shape:
             -jacobian.T @ (weight * residual),
             residual_m,
         )
+
+
+def _voxel_numbers(points: Floats) -> Ints:
+    """Return a number for the voxel of each point.
+
+    Sorting one integer per point is several times as fast as sorting rows of three.
+    """
+    cells = np.floor(points / _VOXEL_M).astype(np.int64)
+    cells -= cells.min(axis=0)
+    return np.asarray(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)))
 
 
 def _jacobian(normals: Floats, points: Floats) -> Floats:

@@ -83,11 +83,16 @@ def _reconstruct(
 
 def _near(track: ObjectTrack, rays: MovingRays) -> Ints:
     """Return the rays that pass through the surroundings of an object at their times."""
-    rows = np.flatnonzero(track.is_present(rays.time_s))
+    rows = track.rows_toward(rays.origins, rays.ends, rays.time_s, _reach_m(track))
     origins = track.to_object(rays.origins[rows], rays.time_s[rows])
     ends = track.to_object(rays.ends[rows], rays.time_s[rows])
     rows = rows[_enters_box(track, origins, ends - origins)]
     return np.asarray(rows[even_indices(len(rows), _MAX_RAYS)])
+
+
+def _reach_m(track: ObjectTrack) -> float:
+    """Return the horizontal radius in meters of the surroundings of an object."""
+    return float(np.hypot(*(track.size[:2] / 2 + _REACH_M)))
 
 
 def _enters_box(track: ObjectTrack, origins: Floats, directions: Floats) -> Bools:
@@ -161,7 +166,7 @@ def cast_to_objects(
         np.full(count, np.inf), np.full(count, -1), np.full(count, -1), np.zeros(count)
     )
     for index, one in enumerate(objects):
-        rows = np.flatnonzero(one.track.is_present(times_s))
+        rows = one.track.rows_toward(origins, ends, times_s, _reach_m(one.track))
         local_origins = one.track.to_object(origins[rows], times_s[rows])
         directions = one.track.to_object(ends[rows], times_s[rows]) - local_origins
         inside = _enters_box(one.track, local_origins, directions)

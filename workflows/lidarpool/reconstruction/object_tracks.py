@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.numerics.arrays import Bools, Floats
+from lidarsim.numerics.arrays import Bools, Floats, Ints
 
 _MAX_BEYOND_S = 0.15  # maximum time before the first and after the last pose
 _SPEED_S = 0.05  # time before and after, between which a speed is measured
 _MARGIN_M = 0.1  # margin around a box, since boxes are tight or inaccurate
+_TICK_S = 0.01  # time step of approximate positions
 _BOTTOM_M = 0.05  # Points closer to the underside of a box belong to the ground.
 
 
@@ -115,6 +116,49 @@ class ObjectTrack:
         height = local[:, 2]
         return np.asarray(inside & (height > _BOTTOM_M) & (height <= self.size[2] + margin_m))
 
+    def rows_near(self, points: Floats, times_s: Floats, reach_m: float) -> Ints:
+        """Return the rows of the points that may be close to the object at their times.
+
+        Omitted points are farther than `reach_m` from the vertical axis of the object frame, or the
+        object is not present. The points have shape (n, 3), and the times have shape (n,).
+        """
+        rows = np.flatnonzero(self.is_present(times_s))
+        if not len(rows):
+            return rows
+        positions, error_m = self._approximate_positions(times_s[rows])
+        offsets = points[rows, :2] - positions
+        return rows[np.einsum("ij,ij->i", offsets, offsets) < (reach_m + error_m) ** 2]
+
+    def rows_toward(self, origins: Floats, ends: Floats, times_s: Floats, reach_m: float) -> Ints:
+        """Return the rows of the rays that may pass close to the object at their times.
+
+        `origins` and `ends` are positions on the rays, of shape (n, 3). Omitted rays keep a
+        distance of `reach_m` from the vertical axis of the object frame, or the object is not
+        present.
+        """
+        rows = np.flatnonzero(self.is_present(times_s))
+        if not len(rows):
+            return rows
+        positions, error_m = self._approximate_positions(times_s[rows])
+        toward = positions - origins[rows, :2]
+        directions = (ends[rows] - origins[rows])[:, :2]
+        length_2 = np.maximum(np.einsum("ij,ij->i", directions, directions), 1e-12)
+        along = np.maximum(np.einsum("ij,ij->i", toward, directions), 0.0) / length_2
+        apart = toward - along[:, None] * directions
+        return rows[np.einsum("ij,ij->i", apart, apart) < (reach_m + error_m) ** 2]
+
+    def _approximate_positions(self, times_s: Floats) -> tuple[Floats, float]:
+        """Return horizontal positions at rounded times, and the maximum error in meters.
+
+        Looking up a table is much faster than evaluating the curve at millions of times.
+        """
+        first_s = float(times_s.min())
+        tick = ((times_s - first_s) / _TICK_S).astype(np.int64)
+        ticks_s = np.asarray(first_s + _TICK_S * np.arange(int(tick.max()) + 2), np.float64)
+        positions = self.poses(ticks_s)[0][:, :2]
+        steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        return positions[tick], 2 * float(steps_m.max())
+
     def select(self, rows: Bools | slice) -> ObjectTrack:
         """Select poses with a mask or a slice."""
         return replace(
@@ -141,13 +185,8 @@ def in_any_box(
     """Mark points in the world frame that are in the box of an object at their times."""
     inside = np.zeros(len(points), bool)
     for track in tracks:
-        rows = np.flatnonzero(track.is_present(times_s))
-        if not len(rows):
-            continue
-        positions, _ = track.poses(times_s[rows])
-        reach_m = np.hypot(*track.size[:2]) / 2 + 2 * margin_m
-        offsets = points[rows, :2] - positions[:, :2]
-        rows = rows[np.einsum("ij,ij->i", offsets, offsets) < reach_m**2]
+        reach_m = float(np.hypot(*track.size[:2])) / 2 + 2 * margin_m
+        rows = track.rows_near(points, times_s, reach_m)
         if len(rows):
             inside[rows] |= track.contains(track.to_object(points[rows], times_s[rows]), margin_m)
     return inside

@@ -31,6 +31,10 @@ _UNLIMITED = dict.fromkeys(
 )
 
 
+# Parts of a recording are processed one after the other, so large tasks do not accumulate.
+_LARGE_TASKS = {"distributed.admin.large-graph-warning-threshold": "1 GiB"}
+
+
 class LostWorkersError(LidarError):
     """Raised if the cluster is lost, or if an item repeatedly kills its workers."""
 
@@ -66,12 +70,16 @@ def parallel_map(
         workers = min(CPU_COUNT, max(1, memory() // worker_bytes))
     workers = min(count, workers)
     if client is not None:
-        yield partial(_map, client)
+        with dask.config.set(_LARGE_TASKS):
+            yield partial(_map, client)
     elif workers <= 1:
         yield map
     else:
         check_starts_workers()
-        with client_of(_local_cluster(workers, forks=start_fork_server())) as own:
+        with (
+            dask.config.set(_LARGE_TASKS),
+            client_of(_local_cluster(workers, forks=start_fork_server())) as own,
+        ):
             yield partial(_map, own)
 
 
