@@ -146,6 +146,17 @@ def test_the_ground_lies_under_poses_trajectories_and_actors(scenario, text, rec
         )
 
 
+@pytest.mark.parametrize("source", ["file: path.csv", LANE.strip("{}") % ""])
+def test_a_translation_shifts_all_positions_of_a_trajectory(scenario, tmp_path, source):
+    (tmp_path / "path.csv").write_text("time_s,x,y,z\n0,-8,0,1\n9,40,0,1\n")
+    text = "scene: seed\nposes: [[0, 0, 1]]\nactors: [{name: A, box: [1, 1, 1], trajectory: {%s}}]"
+    shifted = f"{source}, translation: [2, 1.5, -0.25]"
+    tracks = [
+        prepare(scenario(text % fields)).scene.actors[0].trajectory for fields in (source, shifted)
+    ]
+    assert np.allclose(tracks[1].positions - tracks[0].positions, (2, 1.5, -0.25))
+
+
 def test_a_ground_under_nothing_is_refused(scenario):
     with pytest.raises(LidarError, match=r"s\.yaml: The extent of `scene\.ground` .* Add `poses`"):
         prepare(scenario("scene: {ground: {}}"))

@@ -27,6 +27,7 @@ from lidarsim.schema.declared import (
     Several,
     Text,
     TextOrTexts,
+    Triple,
     about,
     accept_text,
     declared_values,
@@ -209,6 +210,9 @@ class TrajectorySection(Section):
         about("interpolation of positions and rotations; an IMU requires smooth"),
     ] = "linear"
     offset_s: Annotated[Seconds, about("offset in seconds that is added to all times")] = 0.0
+    translation: Annotated[
+        Triple, about("translation in meters that is added to all positions")
+    ] = (0, 0, 0)
     start_s: Annotated[
         Seconds | None,
         about("time at which the survey starts (default: the start of the trajectory)"),
@@ -322,7 +326,7 @@ class TrajectorySection(Section):
                 **self.model_dump(include=_READING_OPTIONS),
                 **options,
             )
-            return replace(track, positions=track.positions - origin)
+            return replace(track, positions=track.positions - origin + self.translation)
         angles = [[p.yaw_deg, p.pitch_deg, p.roll_deg] for p in self.points]
         has_angles = any(
             {"yaw_deg", "pitch_deg", "roll_deg"} & p.model_fields_set for p in self.points
@@ -333,7 +337,7 @@ class TrajectorySection(Section):
             raise LidarError(f"points: {error}.") from error
         return Track(
             seconds + self.offset_s,
-            np.array([p.position for p in self.points]) - origin,
+            np.array([p.position for p in self.points]) - origin + self.translation,
             quaternions_of(rotations_of(np.array(angles))) if has_angles else None,
             **options,
         )
