@@ -41,6 +41,7 @@ from .follow_command import follow
 from .play_command import play
 from .result_commands import compare, export, fit, plot, view
 from .scenario_commands import check, import_, init, scene, schema, sensors
+from .serve_command import serve
 from .stations_command import stations
 from .twin_command import twin
 
@@ -230,7 +231,7 @@ class _Commands(click.Group):
     cls=_Commands,
     commands=[
         *(init, import_, check, schema, scene, sensors, stations),
-        *(view, play, follow, plot, export, compare, fit, twin, augment),
+        *(view, play, follow, serve, plot, export, compare, fit, twin, augment),
     ],
     context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]},
 )

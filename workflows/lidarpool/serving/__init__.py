@@ -1,0 +1,1 @@
+"""Serve simulated sweeps to simulators over gRPC."""
