@@ -11,7 +11,7 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -30,6 +30,7 @@ grpc = pytest.importorskip("grpc")
 descriptor_pb2 = pytest.importorskip("google.protobuf.descriptor_pb2")
 
 from lidarpool.serving import service as service_module  # noqa: E402
+from lidarpool.serving.conversion import sweep_request  # noqa: E402
 from lidarpool.serving.messages import METHODS, SERVICE, message_class, proto_text  # noqa: E402
 from lidarpool.serving.served_scene import load_served_scene  # noqa: E402
 from lidarpool.serving.server import SensorServer  # noqa: E402
@@ -81,11 +82,11 @@ def serving(path: Path, models: dict[int, str], **options: Any) -> Iterator[Clie
     notes: list[str] = []
     scene = load_served_scene(path, models, notes.append)
     service = SensorService(scene, notes.append, **options)
-    with SensorServer(service, **{"listen": "127.0.0.1:0", **settings}) as server:
-        with Client(server.address.port) as client:
-            client.notes = notes
-            client.service = service
-            yield client
+    server = SensorServer(service, **{"listen": "127.0.0.1:0", **settings})
+    with server, Client(server.address.port) as client:
+        client.notes = notes
+        client.service = service
+        yield client
 
 
 class Client:
@@ -263,16 +264,40 @@ def test_equal_requests_have_equal_replies_and_random_numbers_depend_on_the_time
         assert client.render_lidar(**fields) == first
 
 
-def test_requests_at_the_same_time_do_not_mix(client):
-    def points(y: float) -> np.ndarray:
-        car = moving("car", (4 + y, y, 0), (4 + y, y, 0))
-        return xyz(client.render_lidar(**request(((0, y, 0), 0), STILL, dynamic_objects=[car])))
+def beside_a_car(y: float) -> dict[str, Any]:
+    car = moving("car", (4 + y, y, 0), (4 + y, y, 0))
+    return request(((0, y, 0), 0), STILL, dynamic_objects=[car])
 
-    places = [0.1 * number for number in range(12)]
-    expected = [points(y) for y in places]
-    with ThreadPoolExecutor(12) as pool:
-        for found, wanted in zip(pool.map(points, places), expected, strict=True):
-            assert np.array_equal(found, wanted)
+
+def test_a_sweep_waits_until_the_one_before_has_ended(folder):
+    path, models = folder / "yard.yaml", {PANDAR128: str(folder / "line.yaml")}
+    sensor = load_served_scene(path, models, lambda note: None).sensors[PANDAR128]
+    first, second = (
+        sweep_request(message_class("LidarRenderRequest")(**beside_a_car(y))) for y in (0.0, 1.0)
+    )
+    expected = [sensor.simulate(one).positions for one in (first, second)]
+    with ThreadPoolExecutor(1) as pool:
+        later = []
+
+        def is_alone() -> bool:
+            later.append(pool.submit(sensor.simulate, second))
+            return not wait(later, timeout=0.3).done
+
+        points = sensor.simulate(first, is_alone)
+        assert points is not None, "the other sweep was simulated meanwhile"
+        assert np.array_equal(points.positions, expected[0])
+        assert np.array_equal(later[0].result().positions, expected[1])
+    assert sensor.simulate(first, lambda: False) is None
+
+
+def test_several_clients_are_served_at_the_same_time(client):
+    def points(y: float) -> np.ndarray:
+        with Client(int(client.address.rpartition(":")[2])) as other:
+            return xyz(other.render_lidar(**beside_a_car(y)))
+
+    with ThreadPoolExecutor(8) as pool:
+        for y, found in zip(range(8), pool.map(points, range(8)), strict=True):
+            assert np.array_equal(found, xyz(client.render_lidar(**beside_a_car(y))))
 
 
 def test_an_aggregated_request_has_a_reply_for_each_sweep(client):

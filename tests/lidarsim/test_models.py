@@ -81,9 +81,25 @@ def test_angles_are_those_of_the_source(name, channels):
         assert off[channel] == pytest.approx(aside, abs=1e-6)
 
 
+def test_an_at128_fires_in_the_directions_of_its_driver():
+    """The driver computes azimuths clockwise from y, for each angle of the mirror."""
+    sensor = load_sensor("hesai/at128")
+    firings = np.array([0, 1, 600, 1199, 1200])
+    directions = sensor.directions(firings)
+    mirror_deg = 15 + 0.05 * (firings % 1200)  # since the start of a facet
+    for channel, elevation_deg, offset_deg in ((127, 12.8834, -2.4), (0, -12.4227, -0.65)):
+        azimuth, elevation = np.radians(2 * mirror_deg - offset_deg), np.radians(elevation_deg)
+        expected = np.stack([np.sin(azimuth), np.cos(azimuth)], axis=1) * np.cos(elevation)
+        assert np.abs(directions[:, channel, :2] - expected).max() < 1e-9
+        assert np.abs(directions[:, channel, 2] - np.sin(elevation)).max() < 1e-9
+    assert sensor.begins_ns(firings) / 1e6 == pytest.approx([0, 1 / 24, 25, 1199 / 24, 100])
+    assert sensor.beams.time_ns.max() == 14_928
+
+
 @pytest.mark.parametrize(
     ("name", "field", "rate"),
     [
+        ("hesai/at128", "124.7°, -12.4° to 12.9°", "10 Hz, 1,536,000 rays/s"),
         ("velodyne/vlp16", "360°, -15° to 15°", "10 Hz, 289,440 rays/s"),
         ("ouster/os1-64", "360°, -21.8° to 20.7°", "10 Hz, 655,360 rays/s"),
         ("robosense/rs-helios", "360°, -55° to 15°", "10 Hz, 576,000 rays/s"),

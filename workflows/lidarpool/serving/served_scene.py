@@ -25,7 +25,6 @@ from lidarsim.words import format_rounded, name_hint, printable
 
 from ..reconstruction.recorded_actors import FOLDER as ACTORS_FOLDER
 from ..reconstruction.twin import FIGURES_FILE, SCENARIO_FILE
-from ..scenario.advice import advice
 from ..scenario.prepare import prepare
 from ..scenario.scenario import Scenario
 from ..scenario.sections import OutputSection, SensorSection
@@ -167,7 +166,7 @@ class ServedSensor:
 
     def prepare(self) -> None:
         """Compile the loops for a moving sensor and moving actors, so that no request waits."""
-        positions = self._scanner.origin + [[0, 0, 1], [0.1, 0, 1]]
+        positions = np.array([[0.0, 0, 1], [0.1, 0, 1]]) + self._scanner.origin
         poses = FramePoses(positions, np.tile([0.0, 0, 0, 1], (2, 1)))
         objects = dict.fromkeys([*self._idle][:1], poses)
         self.simulate(SweepRequest(0, round(self.period_s * 1e6), poses, objects))
@@ -265,7 +264,7 @@ def load_served_scene(
             )
     scenario = Scenario.load(file).model_copy(update={"output": OutputSection(write=())})
     prepared = prepare(scenario, plans=False)
-    for note in advice(prepared):
+    for note in prepared.findings.notes:
         report(note)
     scene = prepared.scene
     centers = _box_centers(scenario)
