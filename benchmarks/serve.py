@@ -4,7 +4,7 @@
 
 The service runs in its own process, in a city of 100,000 triangles. The client drives through the
 city at 10 m/s among 20 cars that move as well, and requests one sweep after the other. For each
-sensor, the CPU time of the service is compared with that of a `Scanner` with the same poses.
+sensor, the CPU time of the service is compared with that of the same sweeps without a server.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def measure(scene: Path, model: str, count: int) -> dict[str, Any]:
         "reply_mb": round(32e-6 * float(np.mean(points[_WARM:])), 2),
         "service_cpu_ms": round(1e3 * float(np.mean(cpu_s[_WARM:])), 1),
         "wall_ms": round(1e3 * float(np.median(wall_s[_WARM:])), 1),
-        "scanner_cpu_ms": round(1e3 * scanner_cpu_s(scene, model, count), 1),
+        "local_cpu_ms": round(1e3 * local_cpu_s(scene, model, count), 1),
     }
 
 
@@ -127,7 +127,7 @@ def service(scene: Path, model: str) -> Iterator[tuple[psutil.Process, str]]:
             process.terminate()
 
 
-def scanner_cpu_s(scene: Path, model: str, count: int) -> float:
+def local_cpu_s(scene: Path, model: str, count: int) -> float:
     """Return the CPU time of a sweep without the service."""
     sensor = load_served_scene(scene, {0: model}, lambda note: None).sensors[0]
     for number in range(_WARM + count):

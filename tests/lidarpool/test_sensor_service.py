@@ -452,6 +452,7 @@ def test_a_request_that_is_canceled_does_not_disturb_others(client):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        ([], "Missing argument 'SCENE'"),
         (["none.yaml"], "none.yaml"),
         (["."], "contains no scenario.yaml"),
         (["yard.yaml", "--sensor", "VLP16=velodyne/vlp16"], "unknown device 'VLP16'"),
@@ -462,7 +463,7 @@ def test_a_request_that_is_canceled_does_not_disturb_others(client):
 def test_wrong_arguments_are_explained(folder, monkeypatch, arguments, message):
     monkeypatch.chdir(folder)
     result = CliRunner().invoke(cli, ["serve", *arguments])
-    assert message in str(result.exception)
+    assert message in f"{result.exception}{result.output}"
 
 
 def test_the_box_of_a_recorded_actor_is_that_of_the_twin(folder, tmp_path):
@@ -536,10 +537,12 @@ def published_protocol() -> Path:
     pytest.skip("needs alpasim_grpc, installed or in the folder ALPASIM_GRPC")
 
 
-def test_the_protocol_that_is_printed_is_the_one_that_is_served(tmp_path):
-    result = CliRunner().invoke(cli, ["serve", "--proto"])
-    assert result.exit_code == 0 and result.output == proto_text()
-    (tmp_path / "sensorsim.proto").write_text(result.output)
+def test_the_protocol_that_is_written_is_the_one_that_is_served(tmp_path):
+    file = tmp_path / "sensorsim.proto"
+    assert CliRunner().invoke(cli, ["serve", "--proto", str(file)]).exit_code == 0
+    assert file.read_text() == proto_text()
+    result = CliRunner().invoke(cli, ["serve", "--proto", str(file)])
+    assert "already exists" in str(result.exception)
     printed = compiled(tmp_path, "sensorsim.proto")
     service = printed[f".{SERVICE}"]
     assert [method.name for method in service.method] == [*METHODS]
@@ -665,3 +668,18 @@ def test_the_command_serves_until_ctrl_c_while_clients_are_killed(folder, tmp_pa
     assert "Traceback" not in errors
     assert "sweeps with" in errors
     assert server.returncode == 130
+
+
+@pytest.mark.extended
+def test_the_example_of_the_documentation_runs(tmp_path, monkeypatch):
+    page = (Path(__file__).parents[2] / "docs/how-to/sensor-service.md").read_text("utf-8")
+    blocks = dict(re.findall(r'^```\w+ title="(.*?)"\n(.*?)^```$', page, re.M | re.S))
+    (tmp_path / "crossing.yaml").write_text(blocks["crossing.yaml"])
+    (tmp_path / "sensorsim.proto").write_text(proto_text())
+    monkeypatch.chdir(tmp_path)
+    assert CliRunner().invoke(cli, ["scene", "city", "city.glb"]).exit_code == 0
+    with serving(tmp_path / "crossing.yaml", {PANDAR128: "hesai/pandar128"}) as client:
+        text = blocks["client.py"].replace("127.0.0.1:50051", client.address)
+        lines = run_generated_client(tmp_path, ["sensorsim.proto"], text, client.address)
+    counts = [int(line.split()[2]) for line in lines.splitlines()[1:]]
+    assert len(counts) == 5 and counts == sorted(counts) and counts[0] > 300

@@ -23,19 +23,8 @@ def _require_grpc() -> None:
         require_package(package, _EXTRA, "The sensor service")
 
 
-def _print_proto(context: click.Context, parameter: click.Parameter, value: bool) -> None:
-    """Print the protocol, and exit."""
-    if not value or context.resilient_parsing:
-        return
-    _require_grpc()
-    from ..serving.messages import proto_text
-
-    click.echo(proto_text(), nl=False)
-    context.exit()
-
-
 @click.command()
-@click.argument("scene", metavar="SCENE", type=click.Path(path_type=Path))
+@click.argument("scene", metavar="SCENE", type=click.Path(path_type=Path), required=False)
 @click.option(
     "--sensor",
     "models",
@@ -66,23 +55,17 @@ def _print_proto(context: click.Context, parameter: click.Parameter, value: bool
     help="Ignore moving objects that the scene does not have (default: refuse the request).",
 )
 @options.backend
-@click.option(
-    "--proto",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_print_proto,
-    help="Print the protocol as a .proto file and exit.",
-)
+@options.new_file("--proto", help="Write the protocol to FILE (.proto) and exit.")
 def serve(
     *,
-    scene: Path,
+    scene: Path | None,
     models: tuple[str, ...],
     name: str | None,
     listen: str | None,
     token_file: Path | None,
     ignore_unknown_objects: bool,
     backend: str | None,
+    proto: Path | None,
 ) -> None:
     """Simulate sweeps for simulators that request them over gRPC.
 
@@ -97,10 +80,15 @@ def serve(
       lidarpool serve drive.yaml --sensor ouster/os1-128 --listen 127.0.0.1:50052
       lidarpool serve twin --sensor PANDAR128=hesai/pandar128 --sensor AT128=my-sensor.yaml
       lidarpool serve twin --listen 0.0.0.0:50051 --token-file token.txt
-      lidarpool serve --proto > sensorsim.proto
+      lidarpool serve --proto sensorsim.proto
     """  # noqa: D301 - Click requires the character \b
-    print_first_step("reading the scene")
     _require_grpc()
+    if proto is not None:
+        _write_proto(proto)
+        return
+    if scene is None:
+        raise click.UsageError("Missing argument 'SCENE'.")
+    print_first_step("reading the scene")
     from ..processes.fork_server import keep_freed_memory
     from ..serving.messages import DEVICES
     from ..serving.served_scene import load_served_scene
@@ -124,6 +112,17 @@ def serve(
             f"ready: scene {served.name} on {server.address}, {sensors}. Press Ctrl-C to stop."
         )
         server.wait()
+
+
+def _write_proto(path: Path) -> None:
+    from ..serving.messages import proto_text
+
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(proto_text())
+    except FileExistsError as error:
+        raise LidarError(f"{path} already exists. Remove it, or specify another file.") from error
+    click.echo(str(path))
 
 
 def _models(texts: tuple[str, ...]) -> dict[str, Any]:

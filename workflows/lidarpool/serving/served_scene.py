@@ -247,7 +247,7 @@ def load_served_scene(
     name
         Name of the scene in requests. The default is that of the file or folder.
     backend
-        Ray-casting backend, as in `Scanner`.
+        Ray-casting backend, as in `Scanner`. The default is that of the scenario.
 
     Raises
     ------
@@ -268,13 +268,12 @@ def load_served_scene(
         report(note)
     scene = prepared.scene
     centers = _box_centers(scenario)
+    chosen = backend or scenario.pool.backend
     built: dict[str, ServedSensor] = {}  # by model
     for model in dict.fromkeys(models.values()):
         sensor = _with_model(scenario, model)
         options = {**sensor.options, "materials": prepared.survey.materials}
-        built[model] = ServedSensor(
-            scene, sensor._replace(options=options), centers, backend or "auto"
-        )
+        built[model] = ServedSensor(scene, sensor._replace(options=options), centers, chosen)
     for served in built.values():
         served.prepare()
     trajectory = prepared.survey.trajectory
