@@ -415,6 +415,17 @@ def test_unknown_objects_can_be_ignored(folder):
         ]
 
 
+def test_fields_that_have_no_effect_are_reported(folder):
+    fields = "faults: [{kind: dirt, transmission: 0.3}]\n"
+    text = YARD.replace("precision_m: 0.0001", "precision_m: 0.0001, keep_every: 3")
+    (folder / "thinned.yaml").write_text(text + fields)
+    notes: list[str] = []
+    load_served_scene(folder / "thinned.yaml", {PANDAR128: str(folder / "line.yaml")}, notes.append)
+    assert [note.partition(": ")[2] for note in notes] == [
+        "These fields are not used: cloud.keep_every, faults."
+    ]
+
+
 def test_a_token_is_required_for_other_machines(folder, tmp_path):
     token = tmp_path / "token.txt"
     token.write_text("0123456789abcdef\n")

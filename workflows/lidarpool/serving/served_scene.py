@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -146,7 +146,8 @@ class ServedSensor:
         if not abs(frame_s / self.period_s - 1) <= _MAX_STRETCH:
             raise LidarError(
                 f"The frame lasts {format_rounded(frame_s * 1e3)} ms, but a sweep of {self.name} "
-                f"lasts {format_rounded(self.period_s * 1e3)} ms. Set frame_end_us accordingly."
+                f"lasts {format_rounded(self.period_s * 1e3)} ms. Set frame_end_us "
+                "accordingly, or serve a sensor with this duration."
             )
         times_s = np.array([0.0, self.period_s])
         poses = request.sensor
@@ -165,11 +166,13 @@ class ServedSensor:
         return SensorPoints(positions.astype(np.float32), intensities)
 
     def prepare(self) -> None:
-        """Compile the loops for a moving sensor and moving actors, so that no request waits."""
-        positions = np.array([[0.0, 0, 1], [0.1, 0, 1]]) + self._scanner.origin
-        poses = FramePoses(positions, np.tile([0.0, 0, 0, 1], (2, 1)))
-        objects = dict.fromkeys([*self._idle][:1], poses)
-        self.simulate(SweepRequest(0, round(self.period_s * 1e6), poses, objects))
+        """Compile the loops by simulating sweeps, so that no request waits for it."""
+        duration_us = round(self.period_s * 1e6)
+        for distance_m in (0.0, 0.1):
+            positions = np.array([[0.0, 0, 1], [distance_m, 0, 1]]) + self._scanner.origin
+            poses = FramePoses(positions, np.tile([0.0, 0, 0, 1], (2, 1)))
+            objects = dict.fromkeys([*self._idle][:1], poses)
+            self.simulate(SweepRequest(0, duration_us, poses, objects))
 
     def _object_tracks(
         self, times_s: Floats, objects: Mapping[str, FramePoses]
@@ -264,7 +267,7 @@ def load_served_scene(
             )
     scenario = Scenario.load(file).model_copy(update={"output": OutputSection(write=())})
     prepared = prepare(scenario, plans=False)
-    for note in prepared.findings.notes:
+    for note in (*prepared.findings.notes, *_unused_fields(scenario)):
         report(note)
     scene = prepared.scene
     centers = _box_centers(scenario)
@@ -283,6 +286,16 @@ def load_served_scene(
         tuple(actor.name for actor in scene.actors),
         _drive(trajectory, scene.origin) if isinstance(trajectory, Track) else None,
     )
+
+
+def _unused_fields(scenario: Scenario) -> Iterator[str]:
+    """Yield a note about the fields of a scenario that would change points, but are not used."""
+    names = [
+        name for name in SensorsFile.from_scenario(scenario).unused if name.startswith("cloud.")
+    ]
+    names += ["faults"] if scenario.faults else []
+    if names:
+        yield f"{scenario.source}: These fields are not used: {', '.join(names)}."
 
 
 def _with_model(scenario: Scenario, model: str) -> SensorOnFrame:
