@@ -49,7 +49,7 @@ def test_models_with_rings_say_the_rays_from_one_firing_of_a_channel_to_its_next
         for name, sensor in ringed.items()
         if type(sensor) is Sensor and isinstance(sensor.head, Spin) and sensor.channels < 1_000
     }
-    assert len(ringed) == 24
+    assert len(ringed) == 25
     for name, sensor in ringed.items():
         directions = sensor.directions(np.arange(40)).reshape(-1, 3)
         step = sensor.ring_step
