@@ -33,7 +33,7 @@ from lidarpool.serving import service as service_module  # noqa: E402
 from lidarpool.serving.conversion import sweep_request  # noqa: E402
 from lidarpool.serving.messages import METHODS, SERVICE, message_class, proto_text  # noqa: E402
 from lidarpool.serving.served_scene import load_served_scene  # noqa: E402
-from lidarpool.serving.server import SensorServer  # noqa: E402
+from lidarpool.serving.server import Endpoint, SensorServer  # noqa: E402
 from lidarpool.serving.service import SensorService  # noqa: E402
 
 WALL = "v 10 -50 -5\nv 10 50 -5\nv 10 50 5\nv 10 -50 5\nf 1 2 3\nf 1 3 4\n"
@@ -82,7 +82,8 @@ def serving(path: Path, models: dict[int, str], **options: Any) -> Iterator[Clie
     notes: list[str] = []
     scene = load_served_scene(path, models, notes.append)
     service = SensorService(scene, notes.append, **options)
-    server = SensorServer(service, **{"listen": "127.0.0.1:0", **settings})
+    endpoint = Endpoint.choose(**{"listen": "127.0.0.1:0", **settings})
+    server = SensorServer(service, endpoint)
     with server, Client(server.address.port) as client:
         client.notes = notes
         client.service = service
@@ -426,6 +427,22 @@ def test_fields_that_have_no_effect_are_reported(folder):
     ]
 
 
+def test_the_rate_of_the_sensor_can_be_set(folder):
+    models = {PANDAR128: "velodyne/vlp16"}
+    scene = load_served_scene(folder / "yard.yaml", models, lambda note: None, rate_hz=20)
+    fields = request(frame_end_us=1_050_000)
+    one = sweep_request(message_class("LidarRenderRequest")(**fields))
+    points = scene.sensors[PANDAR128].simulate(one)
+    scanner = Scanner(
+        prepare(Scenario.load(folder / "yard.yaml")).scene,
+        load_sensor("velodyne/vlp16", rate_hz=20),
+        precision_m=0.0001,
+    )
+    scanner.move("car", (0, 0, 500))
+    expected = scanner.sweep((0, 0, 0), number=20, start_s=0.0)
+    assert np.array_equal(points.positions, expected.positions.astype(np.float32))
+
+
 def test_a_token_is_required_for_other_machines(folder, tmp_path):
     token = tmp_path / "token.txt"
     token.write_text("0123456789abcdef\n")
@@ -439,15 +456,21 @@ def test_a_token_is_required_for_other_machines(folder, tmp_path):
         with Client(int(client.address.rpartition(":")[2]), "0123456789abcdef") as right:
             assert right.get_version().version_id
     with pytest.raises(LidarError, match=r"Other machines can connect to 0\.0\.0\.0:0"):
-        SensorServer(client.service, "0.0.0.0:0")
+        Endpoint.choose("0.0.0.0:0")
     token.write_text("short")
     with pytest.raises(LidarError, match="at least 16 ASCII characters"):
-        SensorServer(client.service, "127.0.0.1:0", token)
+        Endpoint.choose("127.0.0.1:0", token)
 
 
 def test_a_second_server_does_not_share_the_port(client):
-    with pytest.raises(LidarError):
-        SensorServer(client.service, client.address)
+    with pytest.raises(LidarError, match="cannot be used"):
+        Endpoint.choose(client.address)
+    endpoint = Endpoint.choose("127.0.0.1:0")
+    port = int(client.address.rpartition(":")[2])
+    with pytest.raises(LidarError, match="cannot listen on"):
+        SensorServer(
+            client.service, endpoint._replace(address=endpoint.address._replace(port=port))
+        )
 
 
 def test_a_request_that_is_canceled_does_not_disturb_others(client):

@@ -35,6 +35,12 @@ def _require_grpc() -> None:
     "without DEVICE, for both (default: the model of the same name).",
 )
 @click.option(
+    "--rate-hz",
+    type=click.FloatRange(0, 1000, min_open=True),
+    metavar="RATE",
+    help="Sweeps per second of the sensors (default: from the models).",
+)
+@click.option(
     "--scene-id",
     "name",
     metavar="NAME",
@@ -60,6 +66,7 @@ def serve(
     *,
     scene: Path | None,
     models: tuple[str, ...],
+    rate_hz: float | None,
     name: str | None,
     listen: str | None,
     token_file: Path | None,
@@ -92,16 +99,17 @@ def serve(
     from ..processes.fork_server import keep_freed_memory
     from ..serving.messages import DEVICES
     from ..serving.served_scene import load_served_scene
-    from ..serving.server import SensorServer
+    from ..serving.server import Endpoint, SensorServer
     from ..serving.service import SensorService
     from .terminal import Terminal
 
     keep_freed_memory()
     report = Terminal().report
+    endpoint = Endpoint.choose(listen, token_file)
     chosen = {DEVICES[device]: model for device, model in _models(models).items()}
-    served = load_served_scene(scene, chosen, report, name=name, backend=backend)
+    served = load_served_scene(scene, chosen, report, name=name, rate_hz=rate_hz, backend=backend)
     service = SensorService(served, report, ignores_unknown=ignore_unknown_objects)
-    server = SensorServer(service, listen, token_file)
+    server = SensorServer(service, endpoint)
     with options.summary_at_end(lambda: service.summary), server:
         sensors = ", ".join(
             f"{device} is {served.sensors[number].name}"

@@ -147,7 +147,7 @@ class ServedSensor:
             raise LidarError(
                 f"The frame lasts {format_rounded(frame_s * 1e3)} ms, but a sweep of {self.name} "
                 f"lasts {format_rounded(self.period_s * 1e3)} ms. Set frame_end_us "
-                "accordingly, or serve a sensor with this duration."
+                "accordingly, or serve the sensor with another --rate-hz."
             )
         times_s = np.array([0.0, self.period_s])
         poses = request.sensor
@@ -235,6 +235,7 @@ def load_served_scene(
     report: Callable[[str], None],
     *,
     name: str | None = None,
+    rate_hz: float | None = None,
     backend: str | None = None,
 ) -> ServedScene:
     """Read the scenario of a scene, and build its sensors.
@@ -249,6 +250,8 @@ def load_served_scene(
         Function that is called with notes about the scene.
     name
         Name of the scene in requests. The default is that of the file or folder.
+    rate_hz
+        Sweeps per second of all sensors. The default is that of each model.
     backend
         Ray-casting backend, as in `Scanner`. The default is that of the scenario.
 
@@ -274,7 +277,7 @@ def load_served_scene(
     chosen = backend or scenario.pool.backend
     built: dict[str, ServedSensor] = {}  # by model
     for model in dict.fromkeys(models.values()):
-        sensor = _with_model(scenario, model)
+        sensor = _with_model(scenario, model, rate_hz)
         options = {**sensor.options, "materials": prepared.survey.materials}
         built[model] = ServedSensor(scene, sensor._replace(options=options), centers, chosen)
     for served in built.values():
@@ -298,10 +301,12 @@ def _unused_fields(scenario: Scenario) -> Iterator[str]:
         yield f"{scenario.source}: These fields are not used: {', '.join(names)}."
 
 
-def _with_model(scenario: Scenario, model: str) -> SensorOnFrame:
+def _with_model(scenario: Scenario, model: str, rate_hz: float | None) -> SensorOnFrame:
     """Return a sensor with the given model, and with the noise and weather of a scenario."""
     is_file = model.endswith((".yaml", ".yml"))
-    section = SensorSection(model=str(Path(model).absolute()) if is_file else model)
+    section = SensorSection(
+        model=str(Path(model).absolute()) if is_file else model, rate_hz=rate_hz
+    )
     update = {"sensor": section, "sensors": {}, "mount": None}
     (sensor,) = SensorsFile.from_scenario(scenario).model_copy(update=update).sensors_on_frames()
     return sensor

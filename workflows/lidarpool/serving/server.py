@@ -6,7 +6,7 @@ import secrets
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import grpc
 
@@ -25,27 +25,28 @@ _MIN_TOKEN_LETTERS = 16
 _STOP_S = 2.0  # time for replies in progress when the server stops
 
 
-class SensorServer:
-    """A server that answers requests while its context is entered.
+class Endpoint(NamedTuple):
+    """Address on which a server listens, and the token that clients need, or None."""
 
-    Parameters
-    ----------
-    service
-        The service.
-    listen
-        Address and port. Without a token, only this machine can be served.
-    token_file
-        File with a token that every request must contain, or None.
+    address: Address
+    token: str | None
 
-    Raises
-    ------
-    LidarError
-        If the address cannot be used, or if it requires a token.
-    """
+    @classmethod
+    def choose(cls, listen: str | None = None, token_file: Path | None = None) -> Endpoint:
+        """Check an address and read the token.
 
-    def __init__(
-        self, service: SensorService, listen: str | None = None, token_file: Path | None = None
-    ) -> None:
+        Parameters
+        ----------
+        listen
+            Address and port. The default is a free port on 127.0.0.1.
+        token_file
+            File with the token. Without a token, only this machine can be served.
+
+        Raises
+        ------
+        LidarError
+            If the address cannot be used, if it requires a token, or if the token is unsuitable.
+        """
         address = Address.choose(listen, PORT)
         token = None if token_file is None else _read_token(token_file)
         if token is None and not address.is_loopback:
@@ -53,6 +54,27 @@ class SensorServer:
                 f"Other machines can connect to {address}, so a token is required. Pass a file "
                 "with a token as --token-file, or listen on 127.0.0.1."
             )
+        return cls(address, token)
+
+
+class SensorServer:
+    """A server that answers requests while its context is entered.
+
+    Parameters
+    ----------
+    service
+        The service.
+    endpoint
+        Address and token.
+
+    Raises
+    ------
+    LidarError
+        If another program listens on the address.
+    """
+
+    def __init__(self, service: SensorService, endpoint: Endpoint) -> None:
+        address, token = endpoint
         self._server = grpc.server(
             ThreadPoolExecutor(_THREADS, "sensor-service"),
             handlers=[service.handler()],
