@@ -45,7 +45,7 @@ from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 
-COLUMNS = [column.name for column in OPTIONAL]
+COLUMNS = [column.name for column in OPTIONAL if not column.name.startswith("flow")]
 VLP16 = load_sensor("velodyne/vlp16")
 FEW = Sensor.grid(300, layers=4)
 GRID = Sensor.grid(rays_per_revolution=120, layers=8, step_deg=30, max_range_m=40)

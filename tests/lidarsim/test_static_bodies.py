@@ -31,7 +31,7 @@ from lidarsim.simulator.casting.clipping import box_planes, clip_triangles
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 
-COLUMNS = [column.name for column in OPTIONAL]
+COLUMNS = [column.name for column in OPTIONAL if not column.name.startswith("flow")]
 GRID = Sensor.grid(rays_per_revolution=120, layers=8, step_deg=30, max_range_m=40)
 HERE = Pose((0.5, -0.3, 1.1), 20, 3, -2)
 PHYSICS = {

@@ -19,7 +19,7 @@ from lidarpool import (
 from lidarsim.columns.table import OPTIONAL
 
 OPTIONS = {
-    "columns": [column.name for column in OPTIONAL],
+    "columns": [column.name for column in OPTIONAL if not column.name.startswith("flow")],
     "materials": [Material("Bowl", specular_reflectance=1), Material("*", 0.4, semantic_class=3)],
     "returns": Returns("dual", subrays=7, divergence_mrad=10),
     "noise": Noise(0.02, angle_deg=0.05, dropout=0.1, seed=5),

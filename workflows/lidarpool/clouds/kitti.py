@@ -13,6 +13,7 @@ import yaml
 
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.sweep import Sweep
+from lidarsim.columns.table import FLOW
 from lidarsim.environment.extras import reading
 from lidarsim.errors import LidarError
 from lidarsim.io.input_files import read_input, read_input_text
@@ -33,7 +34,7 @@ from . import kitti_boxes
 from .boxes import Boxes
 from .cloud_format import Entry, PointColumns
 from .job_reader import JobReader
-from .multi_file_format import FileContent, MultiFileFormat, as_bytes
+from .multi_file_format import FileContent, MultiFileFormat, as_bytes, as_npy
 from .recording import Recording, RecordingSource, sweep_from_columns
 
 _MATRIX_NUMBERS = [f"m{row}{column}" for row in range(3) for column in range(4)]
@@ -44,7 +45,8 @@ CLASS_FILE = "semantic-kitti.yaml"
 _CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 _FILE_PATTERN = (
     r"semantic-kitti\.yaml|(poses|label_02)/[^/]+\.txt|"
-    r"sequences/[^/]+/((poses|times|calib)\.txt|(velodyne|labels|label_2)/\d+\.(bin|label|txt))"
+    r"sequences/[^/]+/((poses|times|calib)\.txt|(velodyne|labels|label_2)/\d+\.(bin|label|txt)|"
+    r"flow/\d+/pc[12]\.npy)"
 )
 
 
@@ -59,6 +61,8 @@ class KITTI(MultiFileFormat):
     - `labels/000000.label`: uint32 with the instance (object number + 1) in the upper 16 bits and
       the class in the lower 16 bits.
     - `label_2/000000.txt`: boxes of the actors that have points, in surveys with actors.
+    - `flow/000000/pc1.npy` and `pc2.npy`: scene flow, if the cloud has the columns `flow_x`,
+      `flow_y` and `flow_z` (see `flow_arrays`).
     - `poses.txt`: 3 x 4 matrices relative to the first pose.
     - `times.txt`: times in seconds.
     - `calib.txt`: calibration.
@@ -71,14 +75,14 @@ class KITTI(MultiFileFormat):
     sensor is tilted, because KITTI only rotates boxes about the vertical axis of the camera.
     KITTI's own tools expect poses in `poses/00.txt`, so they are stored there, too.
 
-    Behley et al., SemanticKITTI, 2019; Geiger et al., 2012.
+    Behley et al., SemanticKITTI, 2019; Geiger et al., 2012; Gu et al., HPLFlowNet, 2019.
     """
 
     title = "KITTI"
     by_sweep = True
     frame = "sweep"
     required = ("object", "reflectivity", "class")
-    stored = required
+    stored = (*required, *FLOW)
     actor_boxes = True
     file_pattern = _FILE_PATTERN
     separate_sweeps = True
@@ -95,6 +99,8 @@ class KITTI(MultiFileFormat):
         self.sequences = [f"sequences/{name}" for name in self.names]
         kinds = ("velodyne", "labels", *(["label_2"] if sweeps.actors else []))
         self.folders = [f"{folder}/{kind}" for folder in self.sequences for kind in kinds]
+        if {*FLOW} <= {column.name for column in cloud.table}:
+            self.folders += [self._flow_folder(number) for number in range(len(sweeps))]
         self.cameras = [_camera(sweeps, sensor) for sensor in range(len(sweeps.sensors))]
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, FileContent], Boxes | None]:
@@ -110,6 +116,15 @@ class KITTI(MultiFileFormat):
             f"{folder}/velodyne/{name}.bin": as_bytes(rows),
             f"{folder}/labels/{name}.label": as_bytes(labels),
         }
+        if {*FLOW} <= points.columns.keys():
+            camera = self.cameras[sweeps.sensor[number]]
+            columns = sweeps.columns_compensated(number, points)
+            flow = np.stack([columns[axis] for axis in FLOW], axis=1)
+            arrays = flow_arrays(rows[:, :3], flow, camera)
+            files |= {
+                f"{self._flow_folder(number)}/{key}.npy": as_npy(array)
+                for key, array in arrays.items()
+            }
         if not sweeps.actors:
             return files, None
         boxes = Boxes.from_points(sweeps, number, points)
@@ -118,6 +133,11 @@ class KITTI(MultiFileFormat):
         lines = (f"{kind} 0.00 {values}\n" for _, kind, values in labels_of_actors)
         files[f"{folder}/label_2/{name}.txt"] = "".join(lines).encode()
         return files, boxes
+
+    def _flow_folder(self, number: int) -> str:
+        """Return the folder with the scene flow of a sweep."""
+        sweeps = self.sweeps
+        return f"{self.sequences[sweeps.sensor[number]]}/flow/{sweeps.numbers[number]:06}"
 
     def shared_files(self, boxes: Sequence[Boxes | None]) -> dict[str, bytes]:
         """Return the files with poses, times, calibrations and tracks."""
@@ -201,6 +221,30 @@ class KITTI(MultiFileFormat):
 def kitti_intensity(points: Cloud) -> Floats32:
     """Return the reflectivity of points, from 0 to 1. KITTI stores it as intensity."""
     return np.asarray(points["reflectivity"] / np.float32(255), np.float32)
+
+
+def flow_arrays(points: Floats32, flow: Floats32, camera: Floats) -> dict[str, Floats32]:
+    """Return the scene flow of a sweep in the layout in which HPLFlowNet stores KITTI.
+
+    Row i of `pc1` is a point, and row i of `pc2` is the same point in the next sweep, each in the
+    frame of its own sweep, whose axes point to the left, up and forward. Points whose flow is
+    unknown are omitted. Both arrays have shape (k, 3).
+
+    Parameters
+    ----------
+    points, flow
+        Points of the sweep and their flow in the sensor frame, each (n, 3) in meters.
+    camera
+        Rotation from the sensor frame to the camera frame, whose axes point to the right, down and
+        forward. Shape (3, 3).
+    """
+    known = np.isfinite(flow).all(axis=1)
+    axes = (camera * np.array([[-1.0], [-1], [1]])).T
+    starts = points[known].astype(np.float64)
+    return {
+        "pc1": (starts @ axes).astype(np.float32),
+        "pc2": ((starts + flow[known]) @ axes).astype(np.float32),
+    }
 
 
 def _names(sweeps: Sweeps, entry: Entry | None) -> list[str]:

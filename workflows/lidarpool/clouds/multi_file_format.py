@@ -5,6 +5,7 @@ Threads or workers can write the files in parallel.
 
 from __future__ import annotations
 
+import io
 import os
 import secrets
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -12,6 +13,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.environment.plugins import Plugin
@@ -203,6 +206,13 @@ class RangeWriter:
 def as_bytes(array: AnyArray) -> FileContent:
     """Return the bytes of an array without copying them."""
     return array.data.cast("B") if array.size else b""
+
+
+def as_npy(array: AnyArray) -> bytes:
+    """Return the content of an NPY file with an array."""
+    file = io.BytesIO()
+    np.lib.format.write_array(file, np.ascontiguousarray(array), (1, 0), allow_pickle=False)
+    return file.getvalue()
 
 
 # Function that writes ranges on workers, and returns the results for those that were written.

@@ -26,7 +26,7 @@ from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
 from .boxes import Boxes, SweepBoxes
 from .cloud_format import Entry, PointColumns
 from .job_reader import JobReader
-from .multi_file_format import MultiFileFormat, PieceRange, WrittenRange
+from .multi_file_format import MultiFileFormat, PieceRange, WrittenRange, as_npy
 from .recording import Recording, RecordingSource
 
 MAX_SHARD_BYTES = 1_000_000_000  # bytes of a tar file, unless a single sweep has more
@@ -147,7 +147,7 @@ class WebDataset(MultiFileFormat):
             description["materials"] = sweeps.materials
         if faults := sweeps.faults_in(number):
             description["faults"] = [fault.to_dict() for fault in faults]
-        files = {f"{name}.npy": _npy(array) for name, array in arrays.items()}
+        files = {f"{name}.npy": as_npy(array) for name, array in arrays.items()}
         files["json"] = json.dumps(description).encode()
         key = f"{self.names[sweeps.sensor[number]]}-{sweeps.numbers[number]:06}"
         for name, data in files.items():
@@ -201,12 +201,6 @@ def _offsets(job: JobReader) -> Ints:
             return arrays["at"]
 
     return job.get_or_compute("offsets", read)
-
-
-def _npy(array: AnyArray) -> bytes:
-    file = io.BytesIO()
-    np.lib.format.write_array(file, np.ascontiguousarray(array), (1, 0), allow_pickle=False)
-    return file.getvalue()
 
 
 def _shard(entry: Entry | None, start: int) -> str:

@@ -30,8 +30,10 @@ VELOCITY = "radial_velocity"
 COORDINATES = ("world", "sensor")  # coordinate systems in which points can be stored
 NORMAL = ("normal_x", "normal_y", "normal_z")
 ORIGIN = ("origin_x", "origin_y", "origin_z")
-VECTORS = (NORMAL, ORIGIN)  # columns that must be selected together
-SURFACE_COLUMNS = (*NORMAL, "incidence_deg", *ORIGIN)
+FLOW = ("flow_x", "flow_y", "flow_z")
+FLOW_EGO = ("flow_ego_x", "flow_ego_y", "flow_ego_z")
+VECTORS = (NORMAL, ORIGIN, FLOW, FLOW_EGO)  # columns that must be selected together
+SURFACE_COLUMNS = (*NORMAL, "incidence_deg", *ORIGIN, *FLOW, *FLOW_EGO)
 _OPEN3D = ("positions", "normals", "colors")  # names to which Open3D assigns three numbers
 
 
@@ -281,6 +283,28 @@ OPTIONAL = (
             "float64",
             "m",
             f"{axis} coordinate of the ray origin",
+            coordinates="world",
+        )
+        for axis in "xyz"
+    ),
+    *(
+        Column(
+            f"flow_{axis}",
+            "float32",
+            "m",
+            f"{axis} component of the scene flow, the displacement of the surface point relative "
+            "to the sensor until the next sweep; NaN if there is no surface or no next sweep",
+            coordinates="world",
+        )
+        for axis in "xyz"
+    ),
+    *(
+        Column(
+            f"flow_ego_{axis}",
+            "float32",
+            "m",
+            f"{axis} component of the scene flow without the motion of the platform; 0 for static "
+            "surfaces, NaN as in flow_x",
             coordinates="world",
         )
         for axis in "xyz"

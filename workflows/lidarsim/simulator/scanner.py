@@ -16,7 +16,7 @@ from pydantic import Field
 from raybeam.poses import check_poses
 
 from ..columns.cloud import Cloud
-from ..columns.table import AXES, SCAN, Column
+from ..columns.table import AXES, FLOW, FLOW_EGO, SCAN, Column
 from ..errors import LidarError
 from ..media.materials import Material
 from ..media.weather import FOG_LIDAR_RATIO_SR
@@ -148,6 +148,7 @@ class Scanner:
             wet=wet,
             spray_g_m3=spray_g_m3,
         )
+        _check_columns(survey)
         warn_of_gray(scene, survey)
         warn_of_reach(scene, survey)
         self._assemble(scene, survey, {"backend": backend, "threads": threads, "device": device})
@@ -549,6 +550,16 @@ class Scanner:
             with self._lock:
                 self._casts -= 1
                 self._lock.notify_all()
+
+
+def _check_columns(survey: Survey) -> None:
+    """Raise LidarError if a column depends on the next sweep, which a scanner does not know."""
+    names = [column.name for column in survey.stored_columns if column.name in (*FLOW, *FLOW_EGO)]
+    if names:
+        raise LidarError(
+            f"The column {names[0]!r} depends on the next sweep, which a Scanner does not know. "
+            "Use `simulate` to obtain scene flow, or omit the column."
+        )
 
 
 def _span_ns(rig: Rig, specs: list[ScanSpec]) -> tuple[float, float]:

@@ -98,6 +98,26 @@ class FiringPoses:
         return inside @ self.rotation.T
 
 
+@dataclass(frozen=True, eq=False)
+class FlowFrames:
+    """Sensor frames between which scene flow is defined, one pair for each of k points.
+
+    The flow of a point is its position in the later frame minus its position in the current frame.
+    """
+
+    current: FiringPoses
+    later: FiringPoses  # in the next sweep
+
+    def flow(self, starts: Floats, ends: Floats) -> Floats:
+        """Return the flow of points, given their current and later world positions."""
+        flow: Floats = self.later.to_body_frame(ends) - self.current.to_body_frame(starts)
+        return flow
+
+    def end_points(self, starts: Floats, flow: Floats) -> Floats:
+        """Return the later world positions of points, given their current positions and flow."""
+        return self.later.to_world(self.current.to_body_frame(starts) + flow)
+
+
 def _turned(vectors: Floats, quaternions: Floats, sign: float) -> Floats:
     """Rotate vectors by unit quaternions, or by their inverses if `sign` is -1.
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..columns.cloud import Cloud, CloudLike
-from ..columns.table import NORMAL, ORIGIN, TABLE
+from ..columns.table import FLOW, FLOW_EGO, NORMAL, ORIGIN, TABLE
 from ..errors import LidarError
 from ..io.archives import open_archive, pack_arrays
 from ..motion.rotations import matrices, quaternions_of
@@ -30,7 +30,7 @@ from ..survey.survey import Survey, nanoseconds
 from .actor_sweeps import NO_ROWS, ActorSweeps
 from .instruments import Instruments
 from .lidar_traits import LidarTraits
-from .sweep_motion import STILL, FiringPoses, compute_knots, interpolate_poses
+from .sweep_motion import STILL, FiringPoses, FlowFrames, compute_knots, interpolate_poses
 
 SWEEPS_FILE = "sweeps.npz"
 MIXED_UP = (
@@ -210,7 +210,12 @@ class Sweeps:
         if self.coordinates == "sensor":
             return dict(points.columns)
         poses = self.firing_poses(sweep, points)
-        return _with_vectors(points, poses.rotate_to_body_frame, poses.to_body_frame)
+        return _with_vectors(
+            points,
+            poses.rotate_to_body_frame,
+            poses.to_body_frame,
+            partial(self._flow_as_fired, sweep, points),
+        )
 
     def columns_compensated(self, sweep: int, points: Cloud) -> dict[str, AnyArray]:
         """Return the columns of a sweep, with vectors in the sensor frame at its start.
@@ -224,7 +229,41 @@ class Sweeps:
             points,
             lambda normals: poses.rotate_to_world(normals) @ self.pose.rotations[sweep],
             lambda origins: self.pose.to_body_frame(sweep, poses.to_world(origins)),
+            partial(self._flow_compensated, sweep, points),
         )
+
+    def _flow_as_fired(self, sweep: int, points: Cloud, flow: Floats) -> Floats:
+        """Convert the flow of points in world coordinates to the frames at the firing times."""
+        start = points.positions.astype(np.float64)
+        ends = self._flow_frames(sweep, points).end_points(start, flow @ self.pose.rotations[sweep])
+        return self._flow_frames(sweep, points, as_fired=True).flow(start, ends)
+
+    def _flow_compensated(self, sweep: int, points: Cloud, flow: Floats) -> Floats:
+        """Convert the flow of points in the sensor frame to the frames at the starts of sweeps."""
+        fired = self._flow_frames(sweep, points, as_fired=True)
+        start = fired.current.to_world(points.positions.astype(np.float64))
+        return self._flow_frames(sweep, points).flow(start, fired.end_points(start, flow))
+
+    def _flow_frames(self, sweep: int, points: Cloud, *, as_fired: bool = False) -> FlowFrames:
+        """Return the sensor frames of a sweep and the next sweep.
+
+        The frames are those at the firing time of each point, or those at the start of the sweeps.
+        """
+        following = self._following(sweep)
+        if as_fired:
+            return FlowFrames(
+                self.firing_poses(sweep, points),
+                self._sensor_firing_poses(following, self._shares(sweep, points, following)),
+            )
+        current, later = (
+            FiringPoses(self.pose.positions[number], self.pose.rotations[number])
+            for number in (sweep, following)
+        )
+        return FlowFrames(current, later)
+
+    def _following(self, sweep: int) -> int:
+        """Return the next sweep, or the last sweep if there is none, in which case flow is NaN."""
+        return min(sweep + 1, len(self) - 1)
 
     def as_fired(self, sweep: int, points: Cloud) -> Floats:
         """Return the points of a sweep in the sensor frame at the firing time of each point."""
@@ -256,9 +295,13 @@ class Sweeps:
         firing_ns = self.lidars[self.sensor[sweep]].firing_ns if self.lidars else 0.0
         return float(self.ends_ns[sweep] - self.begins_ns[sweep]) + firing_ns
 
-    def _shares(self, sweep: int, points: Cloud) -> Floats:
-        """Return the fraction of the sweep that has elapsed when each point is fired."""
-        return np.clip(self.since_ns(sweep, points) / max(self.span_ns(sweep), 1.0), 0, 1)
+    def _shares(self, sweep: int, points: Cloud, span_of: int | None = None) -> Floats:
+        """Return the fraction of the sweep that has elapsed when each point is fired.
+
+        If `span_of` is set, the fractions are those of the corresponding firings in that sweep.
+        """
+        span_ns = self.span_ns(sweep if span_of is None else span_of)
+        return np.clip(self.since_ns(sweep, points) / max(span_ns, 1.0), 0, 1)
 
     def _sensor_firing_poses(self, sweep: int, shares: Floats) -> FiringPoses:
         """Return the sensor poses at the given fractions of a sweep."""
@@ -333,11 +376,52 @@ class Sweeps:
         positions = points.positions.astype(np.float64)
         positions[rows] = at_start(positions[rows])
         columns = dict(points.columns)
-        for name, values in _with_vectors(moved, turned, lambda origins: origins).items():
-            if name in NORMAL:
+        converted = _with_vectors(moved, turned, lambda origins: origins)
+        converted |= self._flow_of_actors_at_start(sweep, moved, masks)
+        for name, values in converted.items():
+            if name in (*NORMAL, *FLOW, *FLOW_EGO):
                 columns[name] = columns[name].copy()
                 columns[name][rows] = values
         return replace(points, positions=positions, columns=columns)
+
+    def _flow_of_actors_at_start(
+        self, sweep: int, points: Cloud, masks: Mapping[int, Bools]
+    ) -> dict[str, AnyArray]:
+        """Return the flow of points on actors from the start of a sweep to that of the next sweep.
+
+        `masks` has the points (k,) of each actor.
+        """
+        names = [name for name in (FLOW, FLOW_EGO) if points.columns.keys() >= {*name}]
+        if not names:
+            return {}
+        in_sensor = self.coordinates == "sensor"
+        frames = self._flow_frames(sweep, points, as_fired=in_sensor)
+        start = points.positions.astype(np.float64)
+        start = frames.current.to_world(start) if in_sensor else start
+        vectors = _stacked(points.columns, names[0])
+        if not in_sensor:
+            vectors = frames.current.rotate_to_body_frame(vectors)
+        ends = (
+            frames.end_points(start, vectors)
+            if names[0] == FLOW
+            else start + frames.current.rotate_to_world(vectors)
+        )
+        following = self._following(sweep)
+        shares = self._shares(sweep, points), self._shares(sweep, points, following)
+        for actor, mask in masks.items():
+            now = self._actor_firing_poses(actor, sweep, shares[0][mask])
+            later = self._actor_firing_poses(actor, following, shares[1][mask])
+            start[mask] = now.move_to_start(start[mask])
+            ends[mask] = later.move_to_start(ends[mask])
+        values = {FLOW: frames.flow(start, ends)}
+        values[FLOW_EGO] = frames.current.rotate_to_body_frame(ends - start)
+        if not in_sensor:
+            values = {name: frames.current.rotate_to_world(v) for name, v in values.items()}
+        return {
+            component: axis.astype(TABLE[component].dtype)
+            for name in names
+            for component, axis in zip(name, values[name].T, strict=True)
+        }
 
     def since_ns(self, sweep: int, points: Cloud) -> Floats:
         """Return the firing times of points in nanoseconds since the start of their sweep.
@@ -736,15 +820,25 @@ def _poses_of(positions: Floats, rotations: Floats) -> SweepPoses:
 
 def _with_vectors(
     points: Cloud,
-    turn_normals: Callable[[Floats], Floats],
+    turn: Callable[[Floats], Floats],
     move_origins: Callable[[Floats], Floats],
+    convert_flow: Callable[[Floats], Floats] | None = None,
 ) -> dict[str, AnyArray]:
-    """Return the columns of points, converting normals and ray origins to another frame."""
+    """Return the columns of points, converting vectors and ray origins to another frame.
+
+    `turn` rotates vectors. `convert_flow` converts the flow relative to the sensor (default:
+    `turn`).
+    """
     columns = dict(points.columns)
-    for names, convert in ((NORMAL, turn_normals), (ORIGIN, move_origins)):
+    conversions = {NORMAL: turn, ORIGIN: move_origins, FLOW: convert_flow or turn, FLOW_EGO: turn}
+    for names, convert in conversions.items():
         if not columns.keys() >= {*names}:
             continue
-        vectors = np.stack([columns[name] for name in names], axis=1).astype(np.float64)
-        for name, axis in zip(names, convert(vectors).T, strict=True):
+        for name, axis in zip(names, convert(_stacked(columns, names)).T, strict=True):
             columns[name] = axis.astype(TABLE[name].dtype)
     return columns
+
+
+def _stacked(columns: Mapping[str, AnyArray], names: Sequence[str]) -> Floats:
+    """Return the vectors (n, 3) whose components are in the given columns."""
+    return np.stack([columns[name] for name in names], axis=1).astype(np.float64)

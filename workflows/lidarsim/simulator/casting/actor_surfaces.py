@@ -104,6 +104,43 @@ class ActorSurfaces:
             weights = _weights(deformed.corners, points[deformed_rows])
             points[deformed_rows] = matvec(deformed.at_rest.transpose(0, 2, 1), weights)
 
+    def moved_points(
+        self,
+        triangle: Integers,
+        points: Floats,
+        times: Floats,
+        later: Floats,
+        trajectories: ActorTrajectories,
+    ) -> Floats:
+        """Return the positions at later times of points that are fixed to surfaces.
+
+        `points` (n, 3) and the result are in the scene frame. `times` and `later` (n,) are in
+        nanoseconds. Points on static surfaces do not move. A point on a deforming actor keeps its
+        barycentric coordinates. Positions are NaN if the actor is absent at the later time.
+        """
+        moved = points.copy()
+        on_actors, actor = self._actor_rows(triangle, trajectories)
+        if not len(on_actors):
+            return moved
+        before = times[on_actors]
+        after = later[on_actors]
+        absent = ~trajectories.is_present(actor, after)
+        after = np.where(absent, before, after)
+        positions, rotations = trajectories.poses(actor, before)
+        in_frames = rotate_into_frames(points[on_actors] - positions, rotations)
+        if len(deforming := trajectories.deforming_rows(actor)):
+            stored_rows = self._triangles.locate(triangle[on_actors[deforming]]).row
+            start, end = (
+                self.deformed_corners(stored_rows, actor[deforming], at[deforming], trajectories)
+                for at in (before, after)
+            )
+            steps = (end.corners - start.corners).transpose(0, 2, 1)
+            in_frames[deforming] += matvec(steps, _weights(start.corners, in_frames[deforming]))
+        positions, rotations = trajectories.poses(actor, after)
+        moved[on_actors] = matvec(rotations, in_frames) + positions
+        moved[on_actors[absent]] = np.nan
+        return moved
+
     def velocities(
         self,
         triangle: Integers,

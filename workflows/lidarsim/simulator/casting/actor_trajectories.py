@@ -21,7 +21,7 @@ from ...motion.trajectory import (
     find_batch,
     presence_ns,
 )
-from ...numerics.arrays import Floats, Indices, Integers, Ints, to_writable
+from ...numerics.arrays import Bools, Floats, Indices, Integers, Ints, to_writable
 from ...scene.actors import Actor
 
 if TYPE_CHECKING:
@@ -164,6 +164,14 @@ class ActorTrajectories(tuple[Trajectory, ...]):
             for trajectory in self
         ]
         return np.array(presence, np.float64).reshape(-1, 2)
+
+    def is_present(self, number: Integers, times_ns: Floats) -> Bools:
+        """Return whether each actor is in the scene at the given time.
+
+        `number` (n,) are actor numbers, and `times_ns` (n,) are nanoseconds.
+        """
+        first, last = self.presence_ns[number].T
+        return np.asarray((first <= times_ns) & (times_ns <= last))
 
     def table(self, number: Integers, times_ns: Floats) -> Floats:
         """Return the poses of the given trajectories at the given times.

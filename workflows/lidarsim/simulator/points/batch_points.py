@@ -29,6 +29,7 @@ from ..returns import require_column
 from ..steps.cast import GHOST
 from ..steps.doppler import VELOCITY, radial_velocities
 from ..steps.step_list import received_causes
+from .scene_flow import SceneFlow, SurfacePoints, compute_flow
 
 BLOCK_HITS = 1 << 16  # number of hits whose normals are computed at a time
 MIN_REMAINING = (
@@ -436,6 +437,66 @@ class BatchPoints:
     def normal_z(self) -> Floats:
         """The z component of the normals."""
         return self.normals[:, 2]
+
+    @cached_property
+    def scene_flow(self) -> SceneFlow:
+        """Displacements of the surface points until the next sweep of the sensor, in meters.
+
+        The displacements are in the frame of the survey's points. They are NaN for returns without
+        a surface, for ghosts, for points without a next sweep, and for sweeps that a frozen sensor
+        sends again.
+        """
+        flow = SceneFlow(*np.full((2, len(self), 3), np.nan))
+        if self.specs[0].repeats is not None:
+            return flow
+        on_surface = self.pulse_returns.triangle >= 0
+        if self.pulse_returns.cause is not None:
+            on_surface &= self.pulse_returns.cause != GHOST
+        row_indices = np.flatnonzero(on_surface)
+        steps = self.directions[row_indices] * self.pulse_returns.distance[row_indices, None]
+        points = SurfacePoints(
+            self.pulse_returns.triangle[row_indices],
+            self.origins[row_indices] + steps,
+            self._firing_times_ns[row_indices].astype(np.float64),
+            self.scan[row_indices],
+        )
+        on_actors = self._surfaces.on_actors
+        found = compute_flow(
+            self.survey, self.specs[0], points, on_actors, self._poses.actor_trajectories
+        )
+        flow.relative[row_indices] = found.relative
+        flow.world[row_indices] = found.world
+        return flow
+
+    @property
+    def flow_x(self) -> Floats:
+        """The x component of the scene flow relative to the sensor."""
+        return self.scene_flow.relative[:, 0]
+
+    @property
+    def flow_y(self) -> Floats:
+        """The y component of the scene flow relative to the sensor."""
+        return self.scene_flow.relative[:, 1]
+
+    @property
+    def flow_z(self) -> Floats:
+        """The z component of the scene flow relative to the sensor."""
+        return self.scene_flow.relative[:, 2]
+
+    @property
+    def flow_ego_x(self) -> Floats:
+        """The x component of the scene flow in the world."""
+        return self.scene_flow.world[:, 0]
+
+    @property
+    def flow_ego_y(self) -> Floats:
+        """The y component of the scene flow in the world."""
+        return self.scene_flow.world[:, 1]
+
+    @property
+    def flow_ego_z(self) -> Floats:
+        """The z component of the scene flow in the world."""
+        return self.scene_flow.world[:, 2]
 
     @property
     def incidence_deg(self) -> Floats:
