@@ -2,16 +2,59 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from types import EllipsisType
+from typing import Any
 
 import numpy as np
 
 from lidarsim.columns.cloud import Cloud
 from lidarsim.motion.rotations import matrices
-from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints, Ints32
+from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints, Ints32, Records
 from lidarsim.numerics.vectors import matvec
 from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
+
+
+@dataclass(frozen=True, eq=False)
+class BoxVisibility:
+    """How well a sensor sees the actors in a sweep.
+
+    If several sweeps are stored, arrays have a leading axis for the sweep.
+    """
+
+    # (a,): fraction of the rays which would hit the actor in an empty scene that hit it first; NaN
+    # if no ray would hit it.
+    visible_fraction: Floats32
+    truncation: Floats32  # (a,): fraction of the box outside the field of view or range
+    # (a,): distance in meters between the box and the nearest ray; 0 if a ray would hit the actor.
+    nearest_ray_m: Floats32
+
+    @classmethod
+    def from_rays(cls, records: Records) -> BoxVisibility:
+        """Compute the visibility from records of type `ACTOR_RAYS`."""
+        rays = records["rays"]
+        fraction = np.full(rays.shape, np.nan, np.float32)
+        np.divide(records["visible"], rays, out=fraction, where=rays > 0, casting="same_kind")
+        return cls(fraction, records["truncated"], records["nearest_m"])
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Floats32]) -> BoxVisibility | None:
+        """Create the visibility from arrays by name, or return None if they are missing."""
+        names = [entry.name for entry in fields(cls)]
+        return cls(**{name: arrays[name] for name in names}) if names[0] in arrays else None
+
+    def __getitem__(self, index: Any) -> BoxVisibility:
+        """Select actors, or sweeps."""
+        return BoxVisibility(
+            self.visible_fraction[index], self.truncation[index], self.nearest_ray_m[index]
+        )
+
+    @property
+    def arrays(self) -> dict[str, Floats32]:
+        """All fields by name."""
+        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +76,7 @@ class Boxes:
     points: Ints  # (a,): number of points in the sweep that belong to the actor
     # (a,): True if the actor is in the scene at the start, or appears later and has points.
     present: Bools
+    visibility: BoxVisibility | None = None  # None unless the survey determines it
 
     @classmethod
     def from_points(cls, sweeps: Sweeps, sweep: int, points: Cloud) -> Boxes:
@@ -44,7 +88,10 @@ class Boxes:
         lower, upper = sweeps.actor_bounds.transpose(1, 0, 2)
         middle = matvec(matrices(quaternion), (lower + upper) / 2)
         present = sweeps.actor_there[:, sweep] | (sweeps.actor_comes[:, sweep] & (counts > 0))
-        return cls(position + middle, quaternion, upper - lower, counts, present)
+        visibility = None
+        if sweeps.actor_rays.size:
+            visibility = BoxVisibility.from_rays(sweeps.actor_rays[:, sweep])
+        return cls(position + middle, quaternion, upper - lower, counts, present, visibility)
 
     def to_sensor_frame(self, pose: SweepPoses, index: int | slice) -> Boxes:
         """Transform the boxes from world coordinates to the sensor frame at the start of a sweep.
@@ -54,7 +101,7 @@ class Boxes:
         quaternions = self.quaternions @ pose.quaternion_matrices[index]
         quaternions *= np.where(quaternions[..., 3:] < 0, -1, 1)  # such that w >= 0
         centers = (self.centers - pose.positions[index][..., None, :]) @ pose.rotations[index]
-        return Boxes(centers, quaternions, self.sizes, self.points, self.present)
+        return replace(self, centers=centers, quaternions=quaternions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +118,10 @@ class SweepBoxes:
     quaternions: Floats  # (k, 4): x, y, z, w of the rotation from the box to the sensor frame
     sizes: Floats  # (k, 3): length, width and height in meters
     points: Ints  # (k,): number of points in the sweep that belong to the actor
+    # (k,), as in `BoxVisibility`. None unless the survey determines the visibility of actors.
+    visible_fraction: Floats32 | None = None
+    truncation: Floats32 | None = None
+    nearest_ray_m: Floats32 | None = None
 
     @classmethod
     def select(
@@ -101,6 +152,7 @@ class SweepBoxes:
                 points=np.empty(0, np.int64),
             )
         actors = rows.tolist()
+        visibility = {} if boxes.visibility is None else boxes.visibility[index][rows].arrays
         return cls(
             names=tuple(sweeps.actors[actor] for actor in actors),
             types=tuple(sweeps.actor_types[actor] for actor in actors),
@@ -109,10 +161,21 @@ class SweepBoxes:
             quaternions=boxes.quaternions[index][rows],
             sizes=boxes.sizes[index][rows],
             points=boxes.points[index][rows],
+            **visibility,
         )
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def visibility(self) -> dict[str, Floats32]:
+        """Arrays of `BoxVisibility` by name, or an empty dictionary if they are unknown."""
+        arrays = {
+            "visible_fraction": self.visible_fraction,
+            "truncation": self.truncation,
+            "nearest_ray_m": self.nearest_ray_m,
+        }
+        return {name: values for name, values in arrays.items() if values is not None}
 
     @property
     def yaw(self) -> Floats:
@@ -131,3 +194,39 @@ class SweepBoxes:
         The shape is (k, 7), and the dtype is float32.
         """
         return np.column_stack([self.centers, self.sizes, self.yaw]).astype(np.float32)
+
+
+def summarize_boxes(boxes: Sequence[Boxes]) -> dict[str, int | float]:
+    """Summarize the visibility of the boxes in several sweeps.
+
+    Returns
+    -------
+    dict
+        The number of boxes, and of those with points; the mean visible fraction of boxes that a ray
+        would hit in an empty scene; the mean truncation; and the mean distance from the nearest ray
+        of boxes without points, in meters. A mean of nothing is omitted. The dictionary is empty if
+        the visibility was not determined.
+    """
+    found = [(box, box.visibility) for box in boxes if box.visibility is not None]
+    if not found:
+        return {}
+    points = np.concatenate([box.points[box.present] for box, _ in found])
+    arrays = {
+        name: np.concatenate([visibility.arrays[name][box.present] for box, visibility in found])
+        for name in found[0][1].arrays
+    }
+    arrays["nearest_ray_m"] = arrays["nearest_ray_m"][points == 0]
+    summary: dict[str, int | float] = {
+        "boxes": len(points),
+        "boxes_with_points": int(np.count_nonzero(points)),
+    }
+    for name, values in arrays.items():
+        known = values[np.isfinite(values)].astype(np.float64)
+        if len(known):
+            summary[name] = float(f"{math.fsum(known) / len(known):.6g}")
+    return summary
+
+
+def json_number(value: float) -> float | None:
+    """Return a number with six digits, or None for NaN, which JSON cannot represent."""
+    return None if math.isnan(value) else float(f"{value:.6g}")

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import io
+from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -43,6 +44,11 @@ CALIBRATION_FILE = kitti_boxes.CALIBRATION_FILE
 CLASS_FILE = "semantic-kitti.yaml"
 # Rotation from a level sensor to a KITTI camera, whose axes point to the right, down and forward.
 _CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+# Upper limits of the truncation levels 0 and 1, which are those of easy and hard objects in the
+# detection benchmark, and of the hidden fraction for the occlusion levels 0 and 1.
+_TRUNCATIONS = (0.15, 0.5)
+_OCCLUSIONS = (0.2, 0.6)
+_UNKNOWN = 3
 _FILE_PATTERN = (
     r"semantic-kitti\.yaml|(poses|label_02)/[^/]+\.txt|"
     r"sequences/[^/]+/((poses|times|calib)\.txt|(velodyne|labels|label_2)/\d+\.(bin|label|txt)|"
@@ -130,7 +136,10 @@ class KITTI(MultiFileFormat):
         boxes = Boxes.from_points(sweeps, number, points)
         camera = self.cameras[sweeps.sensor[number]]
         labels_of_actors = _labels(sweeps, number, boxes, camera)
-        lines = (f"{kind} 0.00 {values}\n" for _, kind, values in labels_of_actors)
+        lines = (
+            f"{label.kind} {label.truncation:.2f} {label.occlusion} {label.values}\n"
+            for label in labels_of_actors
+        )
         files[f"{folder}/label_2/{name}.txt"] = "".join(lines).encode()
         return files, boxes
 
@@ -174,9 +183,12 @@ class KITTI(MultiFileFormat):
             boxes_of_sweep = boxes[number]
             assert boxes_of_sweep is not None  # there are actors
             camera = self.cameras[sweeps.sensor[number]]
-            for actor, kind, values in _labels(sweeps, number, boxes_of_sweep, camera):
-                instance = len(sweeps.objects) + actor + 1
-                lines.append(f"{frame} {instance} {kind} 0 {values}\n")
+            for label in _labels(sweeps, number, boxes_of_sweep, camera):
+                instance = len(sweeps.objects) + label.actor + 1
+                level = bisect_left(_TRUNCATIONS, label.truncation)
+                lines.append(
+                    f"{frame} {instance} {label.kind} {level} {label.occlusion} {label.values}\n"
+                )
         return "".join(lines).encode()
 
     @classmethod
@@ -278,14 +290,21 @@ def _camera(sweeps: Sweeps, sensor: int) -> Floats:
     return np.asarray(_CAMERA @ (axes / np.linalg.norm(axes, axis=1, keepdims=True)))
 
 
-def _labels(
-    sweeps: Sweeps, sweep: int, boxes: Boxes, camera: Floats
-) -> Iterator[tuple[int, str, str]]:
-    """Yield the number, type and label values of each actor that has points.
+class _Label(NamedTuple):
+    """Label of an actor that has points."""
 
-    The label values start with the occlusion. There are no images, so the occlusion is 3 (unknown)
-    and the image box is zero. The position is the center of the bottom face. Boxes are only rotated
-    about the y axis of the camera.
+    actor: int  # number of the actor
+    kind: str
+    truncation: float  # from 0 to 1
+    occlusion: int  # 0 fully visible, 1 partly occluded, 2 largely occluded, 3 unknown
+    values: str  # remaining values of a line
+
+
+def _labels(sweeps: Sweeps, sweep: int, boxes: Boxes, camera: Floats) -> Iterator[_Label]:
+    """Yield the label of each actor that has points.
+
+    There are no images, so the image box is zero. The position is the center of the bottom face.
+    Boxes are only rotated about the y axis of the camera.
     """
     rotation = camera @ matrices(sweeps.pose.quaternions[sweep, None])[0].T
     forward = (rotation @ matrices(boxes.quaternions))[:, :, 0]  # headings of the actors
@@ -299,7 +318,13 @@ def _labels(
     rows = np.column_stack([alpha, image_boxes, sizes, positions, rotation_y])
     for actor in np.flatnonzero(boxes.present & (boxes.points > 0)).tolist():
         values = " ".join(f"{value:.4f}" for value in rows[actor])
-        yield actor, sweeps.actor_types[actor], f"3 {values}"
+        truncation = 0.0
+        occlusion = _UNKNOWN
+        if boxes.visibility is not None:
+            truncation = float(boxes.visibility.truncation[actor])
+            hidden = 1 - float(boxes.visibility.visible_fraction[actor])
+            occlusion = _UNKNOWN if np.isnan(hidden) else bisect_left(_OCCLUSIONS, hidden)
+        yield _Label(actor, sweeps.actor_types[actor], truncation, occlusion, values)
 
 
 # -- reading ---------------------------------------------------------------------------------

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import io
 import json
+from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from hashlib import md5
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from lidarsim.scene.transform import affine
 from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
 
 from ..identity.fingerprint import fingerprint
-from .boxes import Boxes
+from .boxes import Boxes, json_number
 from .cloud_format import Entry, PointColumns
 from .job_reader import JobReader
 from .multi_file_format import FileContent, MultiFileFormat, as_bytes
@@ -55,7 +56,15 @@ _MAX_CLASSES = 255  # labels are bytes, and 0 represents points without a class
 _NO_CLASS = "none"
 _SWEEP_TABLE = "sample_data.json"
 _Row = Mapping[str, Any]  # row of a table
-_SHARED = ("category", "log", "map", "sensor")  # tables whose rows are shared by all jobs
+# Limits of the visibility levels, whose tokens are 1 to 4.
+_VISIBILITIES = (0.4, 0.6, 0.8)
+_SHARED = (
+    "category",
+    "log",
+    "map",
+    "sensor",
+    "visibility",
+)  # tables whose rows are shared by all jobs
 
 
 class NuScenes(MultiFileFormat):
@@ -480,6 +489,8 @@ class _Tables:
         """
         kinds = _actor_categories(self.sweeps)
         self.rows |= {"category": [], "instance": [], "sample_annotation": []}
+        if self.sweeps.actor_rays.size:
+            self.rows["visibility"] = _visibility_rows()
         for kind in dict.fromkeys(kinds):
             self._add("category", kind, name=kind, description="")
         for actor, kind in enumerate(kinds):
@@ -497,6 +508,7 @@ class _Tables:
             )
             chain = self._chain("sample_annotation", annotation_keys)
             for number, beside in zip(samples, chain, strict=True):
+                visibility = _visibility(boxes[number], actor)
                 at_stamp = boxes[number][0]  # the sweeps of the first sensor are the samples
                 x, y, z, w = at_stamp.quaternions[actor].tolist()
                 length, width, height = at_stamp.sizes[actor].tolist()
@@ -505,15 +517,49 @@ class _Tables:
                     (actor, number),
                     sample_token=self._token("sample", number),
                     instance_token=self._token("instance", actor),
-                    visibility_token="",
+                    visibility_token=_visibility_token(visibility),
                     attribute_tokens=[],
                     translation=at_stamp.centers[actor].tolist(),
                     size=[width, length, height],
                     rotation=[w, x, y, z],
                     num_lidar_pts=int(sum(keys.points[actor] for keys in boxes[number])),
                     num_radar_pts=0,
+                    **visibility,
                     **beside,
                 )
+
+
+def _visibility_rows() -> list[dict[str, Any]]:
+    """Return the table of visibility levels, which is the same as in nuScenes."""
+    percent = [0, *(round(100 * limit) for limit in _VISIBILITIES), 100]
+    return [
+        {
+            "token": str(number),
+            "level": f"v{lower}-{upper}",
+            "description": f"visibility of whole object is between {lower} and {upper}%",
+        }
+        for number, (lower, upper) in enumerate(pairwise(percent), 1)
+    ]
+
+
+def _visibility(key_frames: Sequence[Boxes], actor: int) -> dict[str, float | None]:
+    """Return the visibility of an actor in a sample, in the lidar that sees it best.
+
+    The dictionary is empty if the visibility was not determined. Its entries are not part of
+    nuScenes.
+    """
+    found = [boxes.visibility[actor] for boxes in key_frames if boxes.visibility is not None]
+    if not found:
+        return {}
+    best = min(found, key=lambda box: (-np.nan_to_num(box.visible_fraction), box.nearest_ray_m))
+    return {name: json_number(float(value)) for name, value in best.arrays.items()}
+
+
+def _visibility_token(visibility: Mapping[str, float | None]) -> str:
+    """Return the token of a visibility level, or an empty string if the visibility is unknown."""
+    if not visibility:
+        return ""
+    return str(1 + bisect_right(_VISIBILITIES, visibility["visible_fraction"] or 0.0))
 
 
 # -- reading ---------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from lidarsim.io.storage import Storage
 from lidarsim.numerics.arrays import AnyArray, Ints
 from lidarsim.sweeps.sweeps import Sweeps, make_identifiers
 
-from .boxes import Boxes, SweepBoxes
+from .boxes import Boxes, SweepBoxes, json_number
 from .cloud_format import Entry, PointColumns
 from .job_reader import JobReader
 from .multi_file_format import MultiFileFormat, PieceRange, WrittenRange, as_npy
@@ -142,6 +142,10 @@ class WebDataset(MultiFileFormat):
             "box_types": present.types,
             "box_objects": present.objects.tolist(),
             "box_points": present.points.tolist(),
+            **{
+                f"box_{name}": [json_number(value) for value in values.tolist()]
+                for name, values in present.visibility.items()
+            },
         }
         if "material" in columns:
             description["materials"] = sweeps.materials

@@ -9,6 +9,7 @@ column, with rows ordered by scan and ray, and these additional arrays:
 - `.samples`: end points of sample rays
 - `.triangles`: hit counters (see `Scene.counters`) that are not zero
 - `.hits`: number of hits of each of these counters
+- `.actor_rays`: how the rays of the scans meet actors, as bytes of records (`ACTOR_RAYS`)
 
 `x`, `y` and `z` are integer multiples of the precision, relative to the scene's local origin, so
 coordinates are rounded only once.
@@ -27,6 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
+from lidarsim.columns.actor_rays import ACTOR_RAYS
 from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudDisplay
 from lidarsim.columns.part_columns import PartColumns, cell_positions
 from lidarsim.columns.table import AXES, SCAN, Column
@@ -35,7 +37,7 @@ from lidarsim.errors import LidarError
 from lidarsim.io.archives import Piece, archive_pieces, read_arrays, read_npy
 from lidarsim.io.input_files import open_input
 from lidarsim.io.storage import Storage, final_name
-from lidarsim.numerics.arrays import AnyArray, Floats, Integers, Ints, Ints32
+from lidarsim.numerics.arrays import AnyArray, Floats, Integers, Ints, Ints32, Records
 from lidarsim.numerics.even_samples import even_indices
 
 # Names of a run's files in the folder of parts. Each name starts with the mark of the run.
@@ -114,6 +116,7 @@ def pack(part: PartColumns) -> list[Piece]:
             ".hits": part.hits,
             ".scan_hits": part.scan_hits,
             ".samples": part.samples,
+            ".actor_rays": part.actor_rays.view(np.uint8),
             **part.columns,
         }
     )
@@ -129,8 +132,12 @@ def unpack(data: bytes) -> PartColumns:
         arrays = read_arrays(data)
         first, stop = arrays.pop(".scans").tolist()
         named = ("counts", "triangles", "hits", "scan_hits", "samples")
+        actor_rays = arrays.pop(".actor_rays").view(ACTOR_RAYS)
         part = PartColumns(
-            first, columns=arrays, **{name: arrays.pop(f".{name}") for name in named}
+            first,
+            columns=arrays,
+            actor_rays=actor_rays,
+            **{name: arrays.pop(f".{name}") for name in named},
         )
         if (
             part.stop != stop
@@ -138,6 +145,7 @@ def unpack(data: bytes) -> PartColumns:
             or part.triangles.shape != part.hits.shape
             or part.scan_hits.shape != part.counts.shape
             or part.samples.shape[:1] + part.samples.shape[2:] != (len(part.counts), 3)
+            or part.actor_rays.ndim != 1
             or any(array.shape != (len(part),) for array in part.columns.values())
         ):
             raise ValueError("its arrays do not have matching shapes")
@@ -182,10 +190,26 @@ def read_hit_counts(storage: Storage, name: str) -> tuple[Ints32, Ints]:
     if not storage.is_local:
         part = read_part(storage, name)
         return part.triangles, part.hits
+    counters, hits = _read_arrays(storage, name, "triangles", "hits")
+    return counters, hits
+
+
+def read_actor_rays(storage: Storage, name: str) -> Records:
+    """Read how the rays of a part meet actors without reading its columns.
+
+    Returns records of type `ACTOR_RAYS`. Raises the same errors as `read_part`.
+    """
+    if not storage.is_local:
+        return read_part(storage, name).actor_rays
+    (data,) = _read_arrays(storage, name, "actor_rays")
+    return data.view(ACTOR_RAYS)
+
+
+def _read_arrays(storage: Storage, name: str, *arrays: str) -> list[AnyArray]:
+    """Read some arrays of a part in a local folder."""
     try:
         with open_input(storage.local(name)) as file, zipfile.ZipFile(file) as archive:
-            counters = read_npy(archive.read(".triangles.npy"), "triangles")
-            return counters, read_npy(archive.read(".hits.npy"), "hits")
+            return [read_npy(archive.read(f".{array}.npy"), array) for array in arrays]
     except Exception as error:  # zipfile and NumPy raise many types of errors
         raise LidarError(
             f"The part {storage.path(name)} cannot be used ({error}). {_AGAIN}"

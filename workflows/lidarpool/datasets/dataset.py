@@ -30,7 +30,7 @@ from lidarsim.schema.checks import check_fields
 from lidarsim.schema.value_texts import one_line
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
-from ..clouds.boxes import Boxes
+from ..clouds.boxes import Boxes, summarize_boxes
 from ..clouds.cloud_format import CloudFormat, Entry
 from ..clouds.folder import local_folder
 from ..clouds.format_table import DATA_SETS, LAYOUTS, load_format
@@ -222,6 +222,7 @@ class DataSet:
                     for sweep, points in enumerate(sweeps.points(cloud))
                 ]
                 files[job_file(self.format, name, BOXES_FILE)] = _packed(boxes)
+                row = replace(row, boxes=summarize_boxes(boxes))
             for file, data in files.items():
                 storage.write(file, data)
             sweeps_per_sensor = np.bincount(sweeps.sensor, minlength=len(sweeps.sensors)).tolist()
@@ -473,11 +474,13 @@ def _write_pieces(output: MultiFileFormat, storage: Storage) -> list[Any]:
 def _packed(boxes: Sequence[Boxes]) -> bytes:
     """Encode the boxes of all sweeps as a NumPy archive with one array per field."""
     # The sizes of the boxes are stored with the sweeps.
-    return pack_arrays(
-        {
-            "centers": np.stack([boxes_of_sweep.centers for boxes_of_sweep in boxes]),
-            "quaternions": np.stack([boxes_of_sweep.quaternions for boxes_of_sweep in boxes]),
-            "points": np.stack([boxes_of_sweep.points for boxes_of_sweep in boxes]),
-            "there": np.stack([boxes_of_sweep.present for boxes_of_sweep in boxes]),
-        }
-    )
+    arrays = {
+        "centers": np.stack([boxes_of_sweep.centers for boxes_of_sweep in boxes]),
+        "quaternions": np.stack([boxes_of_sweep.quaternions for boxes_of_sweep in boxes]),
+        "points": np.stack([boxes_of_sweep.points for boxes_of_sweep in boxes]),
+        "there": np.stack([boxes_of_sweep.present for boxes_of_sweep in boxes]),
+    }
+    visibility = [box.visibility.arrays for box in boxes if box.visibility is not None]
+    for name in visibility[0] if visibility else ():
+        arrays[name] = np.stack([fields[name] for fields in visibility])
+    return pack_arrays(arrays)

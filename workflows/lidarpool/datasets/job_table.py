@@ -1,11 +1,11 @@
 """Job table of a data set, and point statistics of a job.
 
 `jobs.csv` contains one row per job. The columns are number, name and split, then the varied values,
-then the results, then the number of points of each class. Varied values are written as in JSON,
-such as ``12``, ``0.5`` or ``true``, so that they keep their type. A string is written without
-quotes unless it could be mistaken for such a value, as in ``"12"``. The cell is empty if the job
-has no such value. Text that a spreadsheet would interpret as a formula is prefixed with an
-apostrophe, as OWASP recommends against CSV injection.
+then the results, then the number of points of each class, then the visibility of boxes. Varied
+values are written as in JSON, such as ``12``, ``0.5`` or ``true``, so that they keep their type. A
+string is written without quotes unless it could be mistaken for such a value, as in ``"12"``. The
+cell is empty if the job has no such value. Text that a spreadsheet would interpret as a formula is
+prefixed with an apostrophe, as OWASP recommends against CSV injection.
 """
 
 from __future__ import annotations
@@ -54,6 +54,14 @@ _TAIL = {
     "points": int,
     "sha256": str,
 }
+# Columns of the visibility of boxes, if the jobs determine it (see `summarize_boxes`).
+_BOXES = {
+    "boxes": int,
+    "boxes_with_points": int,
+    "visible_fraction": float,
+    "truncation": float,
+    "nearest_ray_m": float,
+}
 _CLASS = re.compile(r"class_(\d+)", re.ASCII)
 _UTF8 = codecs.getwriter("utf-8")
 _ESCAPED = "backslashreplace"  # preserves parts of names that are not valid UTF-8
@@ -91,6 +99,9 @@ class JobRow:
         Hash of the points (see `Tally`), which is the same on any cluster.
     classes
         {class: number of points}. Empty if the points have no ``class`` column.
+    boxes
+        Visibility of the boxes in all sweeps as returned by `summarize_boxes`. Empty if the survey
+        does not determine it.
     """
 
     number: int
@@ -106,6 +117,7 @@ class JobRow:
     seconds: float | None = None
     sha256: str = ""
     classes: Mapping[int, int] = field(default_factory=dict)
+    boxes: Mapping[str, int | float] = field(default_factory=dict)
 
     @property
     def done(self) -> bool:
@@ -119,11 +131,13 @@ class JobRow:
         Raises ValueError if a field is missing, unknown or has the wrong type, or if the name or
         the split is not a plain file name.
         """
+        data = {"boxes": {}, **data}  # which rows of earlier versions lack
         if differing := data.keys() ^ {entry.name for entry in fields(cls)}:
             raise ValueError(
                 f"a job row has a missing or unknown entry, such as {min(differing)!r}"
             )
         kinds = {**_HEAD, **_TAIL, "seconds": int | float | None, "values": dict, "classes": dict}
+        kinds["boxes"] = dict
         for name, kind in kinds.items():
             if not isinstance(data[name], kind):
                 raise ValueError(f"the {name} of a job has the invalid value {data[name]!r}")
@@ -233,13 +247,14 @@ def write_table(
         f"The job table cannot be written to {storage}",
         "free some disk space, or check the permissions of the folder",
     ):
-        classes, kinds = _columns(names, jobs())
-        header = [*_HEAD, *map(_column_of, names), *_TAIL, *(f"class_{n}" for n in classes)]
+        classes, kinds, has_boxes = _columns(names, jobs())
+        boxes = [*_BOXES] if has_boxes else []
+        header = [*_HEAD, *map(_column_of, names), *_TAIL, *(f"class_{n}" for n in classes), *boxes]
         with storage.writing(TABLE_FILE) as file:
             writer = csv.writer(_UTF8(file, _ESCAPED), lineterminator="\n")
             writer.writerow(map(_shielded, header))
             for row in jobs():
-                writer.writerow(_cells(row, names, classes))
+                writer.writerow(_cells(row, names, classes, boxes))
         if find_spec("pyarrow") is not None:
             with storage.writing(PARQUET_FILE) as file:
                 _write_parquet(file, header, names, kinds, iter(jobs()))
@@ -286,7 +301,8 @@ def read_table(storage: Storage, checksum: Sequence[int] | None = None) -> Itera
             if header[:first] != [*_HEAD] or tail != [*_TAIL]:
                 raise ValueError("it is not a job table")
             counted = header[last + len(_TAIL) :]
-            if unknown := next((name for name in counted if not _CLASS.fullmatch(name)), None):
+            unknown = next((name for name in counted if not _is_counted(name)), None)
+            if unknown is not None:
                 raise ValueError(f"it has the unknown column {unknown!r}")
             if len(set(header)) < len(header):
                 raise ValueError("it has two columns with the same name")
@@ -306,14 +322,20 @@ def read_table(storage: Storage, checksum: Sequence[int] | None = None) -> Itera
 
 
 def _column_of(name: str) -> str:
-    ambiguous = name in _HEAD or name in _TAIL or _CLASS.fullmatch(name) or name.startswith(_VARIED)
+    ambiguous = name in _HEAD | _TAIL or _is_counted(name) or name.startswith(_VARIED)
     return f"{_VARIED}{name}" if ambiguous else name
+
+
+def _is_counted(name: str) -> bool:
+    """Return whether a column has the points of a class, or the visibility of boxes."""
+    return bool(_CLASS.fullmatch(name)) or name in _BOXES
 
 
 def _columns(
     names: Sequence[str], jobs: Iterable[JobRow]
-) -> tuple[list[int], dict[str, set[type]]]:
-    """Return all classes in the rows, and the types of the values of each varied quantity."""
+) -> tuple[list[int], dict[str, set[type]], bool]:
+    """Return all classes in the rows, the types of the varied values, and whether boxes occur."""
+    has_boxes = False
     classes: set[int] = set()
     kinds: dict[str, set[type]] = {name: set() for name in names}
     for row in jobs:
@@ -323,13 +345,16 @@ def _columns(
                 f"quantity. The varied quantities are {join_names(names) or 'none'}."
             )
         classes.update(row.classes)
+        has_boxes = has_boxes or bool(row.boxes)
         for name, value in row.values.items():
             if value is not None:
                 kinds[name].add(_kind(value))
-    return sorted(classes), kinds
+    return sorted(classes), kinds, has_boxes
 
 
-def _cells(row: JobRow, names: Sequence[str], classes: Sequence[int]) -> Iterator[str]:
+def _cells(
+    row: JobRow, names: Sequence[str], classes: Sequence[int], boxes: Sequence[str]
+) -> Iterator[str]:
     for name, kind in (_HEAD | _TAIL).items():
         if name == "error":
             for value in names:
@@ -342,6 +367,8 @@ def _cells(row: JobRow, names: Sequence[str], classes: Sequence[int]) -> Iterato
             yield json.dumps(entry)
     for number in classes:
         yield str(int(row.classes.get(number, 0)))
+    for name in boxes:
+        yield format_cell(row.boxes.get(name))
 
 
 def _row(header: Sequence[str], names: Sequence[str], cells: Sequence[str]) -> JobRow:
@@ -362,9 +389,10 @@ def _row(header: Sequence[str], names: Sequence[str], cells: Sequence[str]) -> J
         for name, text in fixed.items()
         if (match := _CLASS.fullmatch(name)) and text != "0"
     }
+    boxes = {name: kind(fixed[name]) for name, kind in _BOXES.items() if fixed.get(name)}
     varied = zip(names, cells[first:stop], strict=True)
     values = {name: _read(text) if text else None for name, text in varied}
-    return _with_plain_names(JobRow(values=values, classes=classes, **entries))
+    return _with_plain_names(JobRow(values=values, classes=classes, boxes=boxes, **entries))
 
 
 def _with_plain_names(row: JobRow) -> JobRow:
@@ -465,13 +493,15 @@ def _write_parquet(
         return pa.float64() if kinds_of_name == {int, float} else pa.string()
 
     types = {_column_of(name): type_of(name) for name in names}
-    types |= {name: plain[kind] for name, kind in (_HEAD | _TAIL).items()}
+    types |= {name: plain[kind] for name, kind in (_HEAD | _TAIL | _BOXES).items()}
     schema = pa.schema([(name, types.get(name, pa.int64())) for name in header])
     columns = {_column_of(name): name for name in names}
 
     def cell(row: JobRow, name: str) -> Any:
         if match := _CLASS.fullmatch(name):
             return row.classes.get(int(match[1]), 0)
+        if name in _BOXES:
+            return row.boxes.get(name)
         value = getattr(row, name) if name not in columns else row.values.get(columns[name])
         if value is None or types[name] != pa.string():
             plain = _plain(value)

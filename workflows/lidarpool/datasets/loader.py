@@ -28,7 +28,7 @@ from lidarsim.schema.checks import check_list, check_number
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarsim.words import did_you_mean, join_names, plural
 
-from ..clouds.boxes import Boxes
+from ..clouds.boxes import Boxes, BoxVisibility
 from ..clouds.cloud_format import Entry
 from ..clouds.folder import check_exists
 from ..clouds.format_table import DATA_SETS
@@ -211,6 +211,7 @@ class _OpenJob:
                     sizes,
                     arrays["points"],
                     present=arrays["there"],
+                    visibility=BoxVisibility.from_arrays(arrays),
                 )
                 self.boxes = boxes.to_sensor_frame(self.sweeps.pose, slice(None))
         entry = Entry(job.number, job.name, job.split)

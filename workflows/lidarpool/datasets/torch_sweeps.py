@@ -106,6 +106,7 @@ def tensors(sweep: Sweep) -> dict[str, Any]:
     }
     arrays |= {"points": sweep.points, "pose": np.asarray(sweep.pose), "boxes": boxes.rows}
     arrays["box_objects"] = boxes.objects.astype(np.int64)
+    arrays |= {f"box_{name}": values for name, values in boxes.visibility.items()}
     return {
         **{name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()},
         "box_types": list(boxes.types),

@@ -262,7 +262,7 @@ class SurveyOutput:
         target = Storage.at(self.target)
         earlier = read_earlier(target).files
         further = optional_files(result.survey, self.formats)
-        sweeps = Sweeps.from_survey(result.survey, result.scene)
+        sweeps = _sweeps_of(result)
         sent: list[ExportSpec] = []  # formats that workers write directly to the storage
         if workers is not None and isinstance(self.target, Storage):
             sent = [entry for entry in self.formats if entry.has_many_files]
@@ -325,6 +325,14 @@ class SurveyOutput:
             from .result_pictures import draw_pictures  # imports Matplotlib
 
             list(draw_pictures(shown, staged, staged, show=show))
+
+
+def _sweeps_of(result: RunResult) -> Sweeps:
+    """Return the sweeps of a result, including what the run determined for them."""
+    if result.points.sweeps is None:
+        return Sweeps.from_survey(result.survey, result.scene)
+    sweeps: Sweeps = result.points.sweeps()
+    return sweeps
 
 
 def _write_cloud(

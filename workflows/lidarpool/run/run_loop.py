@@ -402,7 +402,7 @@ class RunLoop:
             # The casting time of scans from an earlier run is not known.
             seconds=None if stored.resumed else casting.seconds,
         )
-        return WriteRequest(row, stored.points(), job.sweeps, job.input_files)
+        return WriteRequest(row, stored.points(), stored.sweeps(), job.input_files)
 
     def _fail(self, number: int, error: LidarError) -> None:
         """Record the row of a failed job, or raise the error if the run is a survey."""

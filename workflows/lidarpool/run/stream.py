@@ -162,6 +162,8 @@ class _StreamedSweeps:
         columns = {column.name: np.array(in_sensor[column.name]) for column in table}
         if self.keep.format == "kitti":  # files in this format have a different intensity
             columns["intensity"] = kitti_intensity(cloud)
+        if survey.actor_visibility:
+            sweeps = sweeps.with_actor_rays(part.actor_rays for part in parts)
         boxes = Boxes.from_points(sweeps, number, cloud) if sweeps.actors else None
         boxes = boxes and boxes.to_sensor_frame(sweeps.pose, number)
         row = JobRow(job.number, job.name, job.split, job.values)

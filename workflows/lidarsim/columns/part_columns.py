@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from ..numerics.arrays import AnyArray, Floats, Floats32, Integers, Ints, Ints32, UInts32
+from ..numerics.arrays import AnyArray, Floats, Floats32, Integers, Ints, Ints32, Records, UInts32
 from ..numerics.elementary import decade
+from .actor_rays import NO_ACTOR_RAYS
 from .cloud import Cloud
 from .table import AXES, SCAN, Column
 from .waveforms import WAVEFORM
@@ -36,6 +37,8 @@ class PartColumns:
     scan_hits: UInts32 = field(default_factory=lambda: np.zeros(0, np.uint32))  # (scans,)
     # (scans, samples, 3), end points of sampled rays in local coordinates, meters; NaN if unused
     samples: Floats32 = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))
+    # (k,), how rays of the scans meet actors, of type `ACTOR_RAYS`
+    actor_rays: Records = field(default_factory=NO_ACTOR_RAYS.copy)
 
     def __len__(self) -> int:
         return int(self.counts.sum())

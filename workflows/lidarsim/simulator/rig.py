@@ -11,14 +11,16 @@ import numpy as np
 
 from raybeam import Pattern
 
+from ..columns.actor_rays import NO_ACTOR_RAYS
 from ..errors import LidarError
 from ..motion.trajectory import Trajectory
-from ..numerics.arrays import Floats, Floats32, Integers
+from ..numerics.arrays import Floats, Floats32, Integers, Records
 from ..numerics.vectors import rotate
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Sensor
 from ..survey.survey import ScanSpec, Survey
+from .actor_visibility import ActorVisibility
 from .casting.actor_trajectories import ActorTrajectories
 from .casting.motion import CastPoses, FiringClock, Firings, check_trajectory, poses_of_firings
 from .casting.scene_caster import SceneCaster, casters_of_sensors, move_instances
@@ -188,6 +190,11 @@ class Rig:
             PulseCaster(number, caster, scene, survey, surfaces)
             for number, caster in enumerate(casters)
         ]
+        self._visibilities = [
+            ActorVisibility(scene, survey, number, caster, surfaces.triangles)
+            for number, caster in enumerate(casters)
+            if survey.actor_visibility and scene.actors
+        ]
         self._device: DeviceColumns | None = None
         if casters[0].on_device and not any(pulses.steps for pulses in self.pulse_casters):
             self._device = DeviceColumns(casters, scene, survey, surfaces)
@@ -262,12 +269,16 @@ class Rig:
         window = (start, start + (stop - first) * channels)
         groups = np.array([spec.firings[0] - first for spec in specs]) * channels
         if self._device is not None:
-            return self._device.returns(specs, pattern, poses, window, groups)
-        first_key = (
-            specs[0].scan + specs[0].random_offset
-        )  # scan number in the keys of random numbers
+            points = self._device.returns(specs, pattern, poses, window, groups)
+            return replace(points, actor_rays=self._actor_rays(specs, pattern, poses, window))
         scanned = self.pulse_casters[number].scan(
-            first_key, pattern, poses, window, groups, firings, tally=tally
+            specs[0].scan + specs[0].random_offset,  # scan number in the keys of random numbers
+            pattern,
+            poses,
+            window,
+            groups,
+            firings,
+            tally=tally,
         )
         return BatchPoints(
             self.scene,
@@ -278,7 +289,16 @@ class Rig:
             pattern=pattern,
             start=start,
             poses=poses,
+            actor_rays=self._actor_rays(specs, pattern, poses, window),
         )
+
+    def _actor_rays(
+        self, specs: list[ScanSpec], pattern: Pattern, poses: CastPoses, window: tuple[int, int]
+    ) -> Records:
+        """Return how the rays of scans meet actors, if the survey determines their visibility."""
+        if not self._visibilities:
+            return NO_ACTOR_RAYS
+        return self._visibilities[specs[0].sensor].count(specs, pattern, poses, window)
 
     def _poses(
         self, firings: Firings, path: Trajectory, late_ns: float, *, by_head: bool

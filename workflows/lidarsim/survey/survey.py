@@ -191,6 +191,13 @@ class CloudOptions(FileSection):
             ["time", "range", "intensity"],
         ),
     ] = ()
+    actor_visibility: Annotated[
+        bool,
+        about(
+            "whether to determine the visible fraction, the truncation and the distance from the "
+            "nearest ray for the box of each actor in each sweep"
+        ),
+    ] = False
     waveform_samples: Annotated[
         int,
         about(

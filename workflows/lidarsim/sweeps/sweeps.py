@@ -13,13 +13,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..columns.actor_rays import ACTOR_RAYS, NO_ACTOR_RAYS, merge_actor_rays
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import FLOW, FLOW_EGO, NORMAL, ORIGIN, TABLE
 from ..errors import LidarError
 from ..io.archives import open_archive, pack_arrays
 from ..motion.rotations import matrices, quaternions_of
 from ..motion.trajectory import full_poses
-from ..numerics.arrays import AnyArray, AnyFloats, Bools, Bytes, Floats, Floats32, Ints, Ints32
+from ..numerics.arrays import (
+    AnyArray,
+    AnyFloats,
+    Bools,
+    Bytes,
+    Floats,
+    Floats32,
+    Ints,
+    Ints32,
+    Records,
+)
 from ..scene.scene import Scene
 from ..scene.transform import affine
 from ..sensor import Sensor
@@ -178,11 +189,19 @@ class Sweeps:
     # The array is empty if no actor moves.
     actor_rows: Ints32 = field(default_factory=lambda: NO_ROWS)
     actor_knots: Floats32 = field(default_factory=lambda: STILL)  # (r, k, 7); see `ActorSweeps`
+    # (a, n), how the rays of each sweep meet each actor, of type `ACTOR_RAYS`. The array is empty
+    # if the survey does not determine the visibility of actors.
+    actor_rays: Records = field(default_factory=lambda: NO_ACTOR_RAYS[None])
     # Whether `points` moves points on actors to their positions at the start of the sweep.
     actors_at_start: bool = False
 
     def __len__(self) -> int:
         return len(self.begins_ns)
+
+    def with_actor_rays(self, parts: Iterable[Records]) -> Sweeps:
+        """Return a copy with the visibility of actors, given the records of all scans."""
+        table = merge_actor_rays(parts, len(self.actors), len(self))
+        return replace(self, actor_rays=table)
 
     def in_sensor(self, sweep: int, points: AnyFloats) -> Floats:
         """Return the points of a sweep in the sensor frame at the start of the sweep.
@@ -686,6 +705,8 @@ class Sweeps:
         for prefix, poses in poses_by_prefix.items():
             arrays[f"{prefix}positions"] = poses.positions
             arrays[f"{prefix}quaternions"] = poses.quaternions
+        if self.actor_rays.size:
+            arrays["actor_rays"] = self.actor_rays.view(np.uint8)
         if self.fired is not None and (sensors := to_plain_data(self.fired.sensors, arrays)):
             rays = {
                 "sensors": sensors,
@@ -723,6 +744,8 @@ class Sweeps:
                 sensors = from_plain_data(rays["sensors"], arrays)
                 returns, seeds = tuple(rays["returns"]), tuple(rays["seeds"])
                 fired = FiredRays(sensors, returns, arrays["steps"], seeds)
+            if "actor_rays" in arrays:
+                values["actor_rays"] = arrays["actor_rays"].view(ACTOR_RAYS)
             return cls(
                 fired=fired,
                 pose=pose,
@@ -735,6 +758,7 @@ class Sweeps:
                 materials=tuple(values.get("materials", ())),
                 **{name: arrays[name] for name in _ARRAY_FIELDS},
                 **{name: values[name] for name in _JSON_FIELDS},
+                **{name: values[name] for name in ("actor_rays",) if name in values},
             )
 
 

@@ -168,6 +168,9 @@ class SurveyMessages:
         if self._actors:
             boxes = Boxes.from_points(sweeps, sweep, points)
             yield _sent("/actors", self._make.markers(boxes, self._actors, time_ns), time_ns)
+            if boxes.visibility is not None:
+                topic = f"{sweep_topic(sweeps, sweep).removesuffix('points')}actor_visibility"
+                yield _sent(topic, self._make.visibility(boxes, self._actors, time_ns), time_ns)
         yield from self._frames_within(sweep)
 
     def sensor_messages(self, sweep: int, points: Cloud) -> Iterator[RosMessage]:
@@ -466,6 +469,21 @@ class _Messages:
             )
         ]
         return self._types["visualization_msgs/msg/MarkerArray"](cubes)
+
+    def visibility(self, boxes: Boxes, actors: list[str], time_ns: int) -> Any:
+        """Return a DiagnosticArray with the visibility of the actors that are present."""
+        array, status, pair = self.types_of(
+            "diagnostic_msgs", "DiagnosticArray", "DiagnosticStatus", "KeyValue"
+        )
+        assert boxes.visibility is not None
+        items = []
+        for actor in np.flatnonzero(boxes.present).tolist():
+            values = {"points": str(boxes.points[actor])} | {
+                name: f"{value:.6g}" for name, value in boxes.visibility[actor].arrays.items()
+            }
+            pairs = [pair(name, value) for name, value in values.items()]
+            items.append(status(status.OK, actors[actor], "", "lidar", pairs))
+        return array(self.header(WORLD, time_ns), items)
 
     def sweep_markers(self, boxes: SweepBoxes, namespace: str, header: Any) -> Any:
         """Return a MarkerArray with boxes in the frame of a header. It removes earlier markers."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -15,7 +15,7 @@ from lidarsim.io.storage import Storage
 from lidarsim.numerics.arrays import Floats32, Ints
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ...columns.parts import StoredCloud, read_hit_counts, read_part, unpack
+from ...columns.parts import StoredCloud, read_actor_rays, read_hit_counts, read_part, unpack
 from ...plan import Trial
 from ...scenario.job import Job
 from ..pipeline.committed_results import CommittedParts, CommittedResults
@@ -136,8 +136,15 @@ class StoredJob:
             precision_m=job.survey.precision_m,
             origin=job.scene.origin if world else np.zeros(3),
             keeper=self.keeper,
-            sweeps=partial(Sweeps.from_survey, job.survey, job.scene),
+            sweeps=partial(_sweeps, job, self.storage, [part.name for part in parts]),
         )
+
+    def sweeps(self) -> Sweeps:
+        """Return the sweeps of the job, with the visibility of actors if the survey determines it.
+
+        All scans must have been committed.
+        """
+        return _sweeps(self.job, self.storage, [part.name for part in self.parts.ordered])
 
     def read_scan(self, scan: int) -> Cloud:
         """Return the points of a committed scan."""
@@ -210,3 +217,10 @@ class StoredJob:
                     starts = np.broadcast_to(start, end_points.shape)
                     rays.append(np.stack([starts, end_points], axis=1))
         return np.concatenate(rays)
+
+
+def _sweeps(job: Job, storage: Storage, names: Sequence[str]) -> Sweeps:
+    """Return the sweeps of a job whose parts have the given names."""
+    if not job.survey.actor_visibility:
+        return job.sweeps
+    return job.sweeps.with_actor_rays(read_actor_rays(storage, name) for name in names)

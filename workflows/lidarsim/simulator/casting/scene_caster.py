@@ -42,7 +42,7 @@ from .visibility import static_key, unseen_objects
 
 AUTO_ADVICE = "The backend 'auto' selects one that is available."
 _MAX_ROOM_RAYS = 1 << 18  # maximum number of rays that are stored for both casts: 13 MB
-_NEVER_NS = np.array([np.inf, -np.inf])  # presence of an actor that is never in the scene
+NEVER_NS = np.array([np.inf, -np.inf])  # presence of an actor that is never in the scene
 REACHED = 1e-3  # a ray reaches a point if it gets this close, as a fraction of the distance
 
 
@@ -327,6 +327,26 @@ class SceneCaster:
         triangle = triangle + part_triangle + self._actor_triangles[actor]
         return ExternalHits(ray.astype(np.uint32), distance, triangle)
 
+    def rays_on_actor(self, actor: int, scan: Scan, poses: CastPoses) -> Ints:
+        """Return the rays of a scan that would hit an actor if nothing else were in the scene."""
+        moving, _ = self._moving_actors(poses)
+
+        def table(body: Ints, times: Floats) -> Floats:
+            return moving.poses(np.full(len(body), actor), times)
+
+        def frames(body: Ints, times: Floats) -> Floats:
+            assert moving.frames is not None
+            return moving.frames(np.full(len(body), actor), times)
+
+        alone = replace(
+            moving,
+            shape=moving.shape[[actor]],
+            presence=moving.presence[[actor]],
+            poses=table,
+            frames=frames,
+        )
+        return body_hits(alone, scan, poses.times).ray.astype(np.int64)
+
     def _moving_actors(self, poses: CastPoses) -> tuple[MovingBodies, _ActorShapes]:
         """Return the actors as moving bodies, together with their shapes."""
         shapes = self._shapes
@@ -338,7 +358,7 @@ class SceneCaster:
 
         presence_ns = trajectories.presence_ns
         if self._unseen_actors is not None:
-            presence_ns = np.where(self._unseen_actors[:, None], _NEVER_NS, presence_ns)
+            presence_ns = np.where(self._unseen_actors[:, None], NEVER_NS, presence_ns)
         moving = MovingBodies(
             shapes.casters,
             shapes.boxes,

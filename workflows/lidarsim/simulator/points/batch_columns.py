@@ -36,6 +36,7 @@ def columns_of(batches: Sequence[BatchPoints | DevicePoints]) -> PartColumns:
         columns,
         counters.astype(np.int32),
         hits,
+        actor_rays=_joined([returns.actor_rays for returns in batches]),
     )
 
 

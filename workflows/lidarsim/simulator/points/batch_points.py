@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern
 
+from ...columns.actor_rays import NO_ACTOR_RAYS
 from ...columns.table import Column
 from ...columns.waveforms import column_type
 from ...errors import LidarError
@@ -55,6 +56,7 @@ class BatchPoints:
         pattern: Pattern,
         start: int,  # row of ray 0 in the pattern
         poses: CastPoses,
+        actor_rays: Records = NO_ACTOR_RAYS,
     ) -> None:
         self.scene = scene
         self.survey = survey
@@ -67,6 +69,7 @@ class BatchPoints:
         counters = np.flatnonzero(counter_hits)
         self.tally = counters, counter_hits[counters]
         self.pulse_returns = scanned.returns
+        self.actor_rays = actor_rays  # how rays meet actors, of type `ACTOR_RAYS`
         self.hit_counts = scanned.hit_counts  # (scans,): returns of each scan before thinning
         self._surfaces = surfaces
         self._pattern = pattern

@@ -13,7 +13,7 @@ from __future__ import annotations
 import importlib.resources
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -30,9 +30,10 @@ from raybeam.device import (
 )
 from raybeam.scan import Scan, check_scan
 
+from ...columns.actor_rays import NO_ACTOR_RAYS
 from ...columns.table import AXES, CHANNEL, OBJECT, TABLE, Column
 from ...media.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN
-from ...numerics.arrays import AnyArray, Floats, Floats32, Indices, Ints
+from ...numerics.arrays import AnyArray, Floats, Floats32, Indices, Ints, Records
 from ...scene.scene import Scene
 from ...survey.survey import ScanSpec, Survey
 from ..casting.motion import CastPoses
@@ -99,6 +100,7 @@ class DevicePoints:
     tally: tuple[Indices, Ints]  # nonzero hit counters, and their hits
     columns: dict[str, AnyArray]  # {column name: values}
     returns: BatchPoints | None  # returns on the host, if NumPy computes columns
+    actor_rays: Records = field(default_factory=NO_ACTOR_RAYS.copy)  # of type `ACTOR_RAYS`
 
     def __len__(self) -> int:
         return int(self.counts.sum())

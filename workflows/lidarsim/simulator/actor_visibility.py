@@ -1,0 +1,287 @@
+"""Visibility of actors, determined with the sensor's own rays.
+
+Each pulse is represented by its central ray. A ray counts for an actor if it would hit the actor in
+an empty scene, within the range limits of the sensor. It is visible if it also hits the actor first
+in the full scene. Pulses that the platform blocks do not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from raybeam import Pattern
+from raybeam.scan import Scan, check_scan, host_rays
+
+from ..columns.actor_rays import ACTOR_RAYS
+from ..motion.trajectory import full_poses, presence_ns
+from ..numerics.arrays import Bools, Floats, Indices, Ints, Records
+from ..numerics.elementary import arctan2
+from ..numerics.vectors import hypot, matmul, matvec, norm, rotate
+from ..scene.scene import Scene
+from ..sensor import Sensor
+from ..survey.survey import ScanSpec, Survey
+from .casting.motion import CastPoses
+from .casting.scene_caster import NEVER_NS, SceneCaster
+from .casting.stored_triangles import StoredTriangles
+
+_CHUNK_RAYS = 1 << 17  # rays whose distances from boxes are computed at a time
+_FIELD_RAYS = 1_000_000  # maximum number of rays from which a field of view is determined
+_CELLS = 8  # number of cells along each axis of a box, whose centers are in or out of the field
+# A gap between azimuths limits the field of view if it is this wide and at least twice as wide as
+# all other gaps.
+_MIN_GAP_RAD = np.radians(10.0)
+_SLACK_RAD = 1e-9  # rounding errors of angles
+
+
+@dataclass(frozen=True)
+class FieldOfView:
+    """Limits of the directions and ranges of a sensor's rays in the sensor frame."""
+
+    azimuth: tuple[float, float]  # start and width of the sector in radians
+    elevation: tuple[float, float]  # radians
+    range_m: tuple[float, float]
+
+    @classmethod
+    def from_sensor(cls, sensor: Sensor) -> FieldOfView:
+        """Determine the field of view from the directions of the first revolution."""
+        steps = sensor.steps_of_revolution(0)
+        stop = sensor.firings(steps[-1])[1]
+        step = max(1, stop * sensor.channels // _FIELD_RAYS)
+        firings = np.unique(np.append(np.arange(0, stop, step, dtype=np.int64), stop - 1))
+        x, y, z = sensor.directions(firings).reshape(-1, 3).T
+        elevation = arctan2(z, hypot(x, y))
+        limits = float(elevation.min()), float(elevation.max())
+        ranges = sensor.min_range_m, sensor.max_range_m
+        return cls(_sector_of(arctan2(y, x)), limits, ranges)
+
+    def contains(self, points: Floats) -> Bools:
+        """Return whether points (n, 3) in the sensor frame are in the field of view."""
+        x, y, z = points.T
+        start, width = self.azimuth
+        from_start = (arctan2(y, x) - start) % (2 * np.pi)
+        elevation = arctan2(z, hypot(x, y))
+        distance = norm(points)
+        lowest, highest = self.elevation
+        inside = (from_start <= width + _SLACK_RAD) | (from_start >= 2 * np.pi - _SLACK_RAD)
+        inside &= (lowest - _SLACK_RAD <= elevation) & (elevation <= highest + _SLACK_RAD)
+        return np.asarray(inside & (self.range_m[0] <= distance) & (distance <= self.range_m[1]))
+
+
+def _sector_of(azimuths: Floats) -> tuple[float, float]:
+    """Return the start and the width of the smallest sector with the given azimuths in radians."""
+    ordered = np.unique(azimuths % (2 * np.pi))
+    gaps = np.diff(np.append(ordered, ordered[0] + 2 * np.pi))
+    widest = int(gaps.argmax())
+    others = np.delete(gaps, widest).max(initial=0.0)
+    if gaps[widest] < max(_MIN_GAP_RAD, 2 * others):
+        return 0.0, 2 * np.pi
+    start = float(ordered[(widest + 1) % len(ordered)])
+    return start, 2 * np.pi - float(gaps[widest])
+
+
+class _SweepRays(NamedTuple):
+    """Rays of a sweep in consecutive scans, and their records."""
+
+    sweep: int  # number among the sweeps of the sensor
+    records: Records  # (k,), one for each actor that is present
+    rays: Ints  # rays that are not blocked, in ascending order
+    stop: int  # end of the rays of the sweep
+
+
+class _Boxes(NamedTuple):
+    """Boxes of k actors in the scene frame."""
+
+    centers: Floats  # (k, 3), meters
+    halves: Floats  # (k, 3), half sizes, meters
+    rotations: Floats  # (k, 3, 3), from the box to the scene frame
+
+    def select(self, rows: Indices) -> _Boxes:
+        """Return the boxes in the given rows."""
+        return _Boxes(self.centers[rows], self.halves[rows], self.rotations[rows])
+
+
+class ActorVisibility:
+    """Counts the rays of a sensor that meet each actor."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        survey: Survey,
+        number: int,
+        caster: SceneCaster,
+        triangles: StoredTriangles,
+    ) -> None:
+        self._scene = scene
+        self._survey = survey
+        self._number = number
+        self._caster = caster
+        self._triangles = triangles
+        self._sensor = survey.mounted_sensors[number].sensor
+
+    @cached_property
+    def _field_of_view(self) -> FieldOfView:
+        return FieldOfView.from_sensor(self._sensor)
+
+    def count(
+        self, specs: Sequence[ScanSpec], pattern: Pattern, poses: CastPoses, window: tuple[int, int]
+    ) -> Records:
+        """Return the records (k,) of consecutive scans at one station, of type `ACTOR_RAYS`.
+
+        `window` has the first row of the rays in the pattern, and one past the last.
+        """
+        sensor = self._sensor
+        limits: dict[str, Any] = {
+            "window": window,
+            "t_min": sensor.min_range_m,
+            "t_max": sensor.max_range_m,
+            "out": np.empty((6, window[1] - window[0])),  # rays, which are computed only once
+        }
+        scan = check_scan(pattern, **poses.caster_arguments, **limits)
+        hits = self._caster.scan(pattern, poses, **limits)
+        hit_actors = self._triangles.objects(hits.triangle) - self._triangles.static_objects
+        on_actors = np.flatnonzero(hit_actors >= 0)
+        visible = hits.ray[on_actors].astype(np.int64)
+        visible_actors = hit_actors[on_actors]
+        allowed = ~self._is_blocked(specs, len(scan))
+        parts = []
+        for sweep, first_ray, stop_ray in self._sweeps_of(specs, len(scan)):
+            actors = self._present_actors(sweep)
+            records = np.zeros(len(actors), ACTOR_RAYS)
+            records["actor"] = actors
+            records["sweep"] = self._first_sweep + sweep
+            rays = np.flatnonzero(allowed[first_ray:stop_ray]) + first_ray
+            in_sweep = (first_ray <= visible) & (visible < stop_ray) & allowed[visible]
+            seen = np.bincount(visible_actors[in_sweep], minlength=len(self._scene.actors))
+            records["visible"] = seen[actors]
+            parts.append(_SweepRays(sweep, records, rays, stop_ray))
+        self._count_alone(parts, scan, poses)
+        for part in parts:
+            self._measure_boxes(part, scan)
+        return np.concatenate([part.records for part in parts])
+
+    @cached_property
+    def _first_sweep(self) -> int:
+        """Number of sweeps of the preceding sensors."""
+        return sum(len(sweeps.firsts) for sweeps in self._survey.sweeps_each[: self._number])
+
+    @cached_property
+    def _presence_ns(self) -> Floats:
+        """First and last time at which the sensor could see each actor, in nanoseconds.
+
+        The shape is (actors, 2).
+        """
+        presence = np.array([presence_ns(actor.trajectory) for actor in self._scene.actors])
+        if self._caster.unseen is not None:
+            presence[self._caster.unseen[len(self._scene.names) :]] = NEVER_NS
+        return presence
+
+    def _is_blocked(self, specs: Sequence[ScanSpec], count: int) -> Bools:
+        """Return whether the platform blocks each ray."""
+        if not len(self._sensor.beams.blocked):
+            return np.zeros(count, np.bool_)
+        firing, channel = np.divmod(np.arange(count, dtype=np.int64), self._sensor.channels)
+        return self._sensor.is_blocked(specs[0].firings[0] + firing, channel)
+
+    def _sweeps_of(self, specs: Sequence[ScanSpec], count: int) -> list[tuple[int, int, int]]:
+        """Return the sweeps of scans, each with its first ray and the end of its rays."""
+        firsts = self._survey.sweeps_each[self._number].firsts
+        sweeps = np.searchsorted(firsts, [spec.scan for spec in specs], "right") - 1
+        begin = specs[0].firings[0]
+        starts = [(spec.firings[0] - begin) * self._sensor.channels for spec in specs]
+        first_scans = np.flatnonzero(np.diff(sweeps, prepend=-1)).tolist()
+        cuts = [*(starts[scan] for scan in first_scans), count]
+        return [(int(sweeps[scan]), cuts[k], cuts[k + 1]) for k, scan in enumerate(first_scans)]
+
+    def _present_actors(self, sweep: int) -> Ints:
+        """Return the visible actors that are in the scene during a sweep."""
+        _, starts_ns, stops_ns = self._survey.sweeps_each[self._number]
+        appears, leaves = self._presence_ns.T
+        present = (appears <= stops_ns[sweep]) & (starts_ns[sweep] <= leaves)
+        return np.flatnonzero(present)
+
+    def _count_alone(self, parts: Sequence[_SweepRays], scan: Scan, poses: CastPoses) -> None:
+        """Set the number of rays that would hit each actor if it were alone."""
+        is_counted = np.zeros(len(scan), np.bool_)
+        for part in parts:
+            is_counted[part.rays] = True
+        stops = [part.stop for part in parts]
+        actors = np.unique(np.concatenate([part.records["actor"] for part in parts]))
+        for actor in actors.tolist():
+            hits = self._caster.rays_on_actor(actor, scan, poses)
+            counts = np.diff(np.searchsorted(np.sort(hits[is_counted[hits]]), stops), prepend=0)
+            for part, count in zip(parts, counts.tolist(), strict=True):
+                part.records["rays"][part.records["actor"] == actor] = count
+
+    def _measure_boxes(self, part: _SweepRays, scan: Scan) -> None:
+        """Set the truncation of boxes, and the distance of rays from actors that no ray hits."""
+        records = part.records
+        boxes = self._boxes(part.sweep, records["actor"])
+        records["truncated"] = self._truncations(part.sweep, boxes)
+        missed = np.flatnonzero(records["rays"] == 0)
+        if len(missed):
+            records["nearest_m"][missed] = _nearest_m(scan, part.rays, boxes.select(missed))
+
+    def _boxes(self, sweep: int, actors: Ints) -> _Boxes:
+        """Return the boxes of actors at the start of a sweep.
+
+        If an actor appears or leaves during the sweep, its pose is the first or last one.
+        """
+        start_ns = float(self._survey.sweeps_each[self._number].starts_ns[sweep])
+        boxes = _Boxes(*np.empty((2, len(actors), 3)), np.empty((len(actors), 3, 3)))
+        for row, number in enumerate(actors.tolist()):
+            actor = self._scene.actors[number]
+            at_ns = np.array([np.clip(start_ns, *self._presence_ns[number])])
+            positions, rotations = full_poses(actor.trajectory, 0, at_ns)
+            boxes.rotations[row] = rotations[0]
+            boxes.centers[row] = positions[0] + matvec(rotations[0], actor.bounds.mean(axis=0))
+            boxes.halves[row] = np.ptp(actor.bounds, axis=0) / 2
+        return boxes
+
+    def _truncations(self, sweep: int, boxes: _Boxes) -> Floats:
+        """Return the fraction of each box's cells that are outside the field of view."""
+        steps = (np.arange(_CELLS) + 0.5) / _CELLS * 2 - 1
+        cells = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+        position, axes = self._sensor_pose(sweep)
+        truncations = np.empty(len(boxes.centers))
+        for row, half in enumerate(boxes.halves):
+            in_scene = rotate(cells * half, boxes.rotations[row]) + boxes.centers[row]
+            inside = self._field_of_view.contains(rotate(in_scene - position, axes.T))
+            truncations[row] = 1.0 - np.count_nonzero(inside) / len(inside)
+        return truncations
+
+    def _sensor_pose(self, sweep: int) -> tuple[Floats, Floats]:
+        """Return the position (3,) and rotation (3, 3) of the sensor at the start of a sweep."""
+        survey = self._survey
+        sweeps = survey.sweeps_each[self._number]
+        station = sweep // (len(sweeps.firsts) // survey.path.stations)
+        mount = survey.mounted_sensors[self._number].mount
+        since_ns = sweeps.starts_ns[[sweep]] - station * survey.station_ns
+        positions, rotations = full_poses(survey.path, station, since_ns)
+        position = positions[0] + matvec(rotations[0], np.array(mount.position))
+        return position, matmul(rotations[0], mount.rotation_matrix)
+
+
+def _nearest_m(scan: Scan, rays: Ints, boxes: _Boxes) -> Floats:
+    """Return the distance in meters between each box (k,) and the nearest of the given rays."""
+    from . import box_distance_loops as loops  # imported here because numba takes half a second
+
+    squares = np.full(len(boxes.centers), np.inf)
+    for start in range(0, len(rays), _CHUNK_RAYS):
+        chunk = rays[start : start + _CHUNK_RAYS]
+        first = int(chunk[0])
+        columns = host_rays(scan, first, int(chunk[-1]) + 1)[:, chunk - first]
+        loops.nearest_boxes(
+            np.ascontiguousarray(columns),
+            boxes.centers,
+            boxes.rotations,
+            boxes.halves,
+            scan.t_min,
+            scan.t_max,
+            squares,
+        )
+    return np.sqrt(squares)
