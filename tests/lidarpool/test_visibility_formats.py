@@ -27,7 +27,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 
 @cache
 def drive():
-    """The cloud of a sensor on a turning platform among five actors."""
+    """The cloud of a sensor on a turning platform among seven actors."""
     scene = street()
     survey = Survey(
         sensors=[Mounted(SENSOR, MOUNT, "lidar")], trajectory=turning(2.0, 1.5), steps=12,

@@ -10,11 +10,11 @@ import pytest
 from tests.lidarsim.test_scene_flow import straight, turning
 from tests.shapes import block, level, wall
 
-from lidarpool import Mounted, Pose, Scene, Sensor, Survey
+from lidarpool import Mounted, Pose, Scene, Sensor, Survey, load_sensor
 from lidarsim import Actor, box
 from lidarsim.columns.actor_rays import merge_actor_rays
 from lidarsim.motion.trajectory import full_poses
-from lidarsim.simulator.actor_visibility import FieldOfView
+from lidarsim.simulator.casting.actor_visibility import FieldOfView
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.survey.faults import Fault
@@ -63,13 +63,15 @@ def nearest_to_box(origins, directions, half):
 
 
 def street():
-    """A car behind a fence, a car that turns, one that leaves, and one that no ray meets."""
+    """Cars behind a fence and in view, one that leaves, and small ones between the rays."""
     actors = [
         Actor(box("Car 1", (4.5, 2.0, 1.5)), straight((3, 8, -1), (-6, 0, 0))),
         Actor(box("Car 2", (4.5, 2.0, 1.5)), straight((12, 6, -1), (0, -9, 0))),
         Actor(block("Turning", (5, 1, 2), (6, 0, 0)), turning(0.0, 1.0)),
         Actor(box("Leaving", (2, 2, 2)), straight((-9, 0, -1), (0, 3, 0), 0.16, beyond="absent")),
         Actor(box("Far", (1, 1, 1)), straight((59, 0, 30), (0, 1, 0))),
+        Actor(box("Ball", (0.1, 0.2, 0.1)), straight((14, -8, 1), (0, 1, 0))),
+        Actor(box("Bird", (0.2, 0.1, 0.1)), turning(16.0, -0.2)),
     ]
     fence = wall("Fence", 9, (3, 7), (-1, 1))
     return Scene.from_meshes([level("Ground", -1), fence]).with_actors(actors)
@@ -121,6 +123,8 @@ def test_counts_and_distances_by_brute_force():
                 (origins[of_sweep] - center) @ turn[0], directions[of_sweep] @ turn[0], half
             )
             assert record["nearest_m"] == pytest.approx(expected, abs=2e-5)
+    between = table[5:][table["rays"][5:] == 0]
+    assert ((between["nearest_m"] > 0) & (between["nearest_m"] < 1)).sum() >= 3
     rays, visible = table["rays"], table["visible"]
     assert (0 < visible[1, 0] < rays[1, 0]) and visible[0].sum() > 20  # behind the fence, or seen
     assert not rays[4].any() and (table["nearest_m"][4] > 1).all()
@@ -134,7 +138,7 @@ def test_records_do_not_depend_on_batches_or_backends():
         trajectory=turning(2.0, 1.5), steps=10, actor_visibility=True,
     )  # fmt: skip
     whole = records_of(scene, survey)
-    assert whole.shape == (5, 6)
+    assert whole.shape == (7, 6)
     cut = records_of(scene, survey, [0, 1, 3, 9, 13, 14, 20], "tiles")
     assert cut.tobytes() == whole.tobytes()
 
@@ -188,3 +192,15 @@ def test_a_frozen_sensor_repeats_its_records():
     table = records_of(scene, survey)
     np.testing.assert_array_equal(table["rays"][:, 0], table["rays"][:, 1])
     assert (table["rays"][:, 2] != table["rays"][:, 0]).any()
+
+
+@pytest.mark.extended
+def test_many_rays_are_cast_in_chunks_with_the_same_result():
+    scene = street()
+    sensor = load_sensor("ouster/os1-64")
+    survey = Survey(sensor, trajectory=turning(2.0, 1.5), steps=108, actor_visibility=True)
+    assert survey.ray_count > 1 << 17  # more than a chunk
+    whole = records_of(scene, survey, backend="tiles")
+    by_sweep = records_of(scene, survey, [0, 36, 72, 108], backend="tiles")
+    assert by_sweep.tobytes() == whole.tobytes()
+    assert (whole["rays"].sum(axis=0) > 1000).all()

@@ -218,6 +218,8 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
         yield "`weather.fog_lidar_ratio_sr` has no effect without `weather.visibility_km`"
     if scenario.weather.spray_g_m3 and not (scenario.actors or scenario.traffic):
         yield "`weather.spray_g_m3` has no effect without moving actors or traffic"
+    if scenario.cloud.actor_visibility and not (scenario.actors or scenario.traffic):
+        yield "`cloud.actor_visibility` has no effect without actors or traffic"
     if scenario.noise.stray_light and not any(entry.retro for entry in scenario.materials):
         yield "`noise.stray_light` has no effect without a material with `retro: true`"
     trajectory = scenario.trajectory

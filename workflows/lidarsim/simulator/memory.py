@@ -12,6 +12,7 @@ from ..scene.actors import distinct_meshes
 from ..scene.scene import Scene
 from ..sensor.optics import TWO_RETURNS
 from ..survey.survey import Survey
+from .casting.actor_visibility import CHUNK_RAYS as VISIBILITY_RAYS
 from .casting.visibility import static_key, unseen_objects
 from .points.device_columns import needs_hits
 from .pulses import CHUNK_RAYS
@@ -43,6 +44,7 @@ RETURNS_LEAFY = 3.8  # same if all are reported and sub-rays meet leaves; 3.3 in
 # Bytes per point, and per byte of its columns, because column sources are float64.
 POINT = 64
 POINT_BYTE = 3.2
+VISIBILITY = 160  # bytes per ray that is cast at a time to determine the visibility of actors
 COLOR = 16  # bytes per ray if reflectance comes from colors
 # Copies of the columns that come from a device: CuPy rounds page-locked memory up to a power of
 # two, and columns of several groups of scans are concatenated.
@@ -113,8 +115,9 @@ def _bytes(setup: Setup, scans: int, on_device: bool) -> float:
     memory = _casting_memory(setup, sizes, firings, on_device)
     casting = memory.casting + memory.counting
     point = _point_bytes(setup, scans, on_device)
+    visibility = VISIBILITY * min(rays, VISIBILITY_RAYS) * survey.actor_visibility
     small = SCAN * scans + STATION * (1 + scans // survey.steps_each[setup.number])
-    return memory.retained + max(casting, point * sizes.points) + small
+    return memory.retained + max(casting, point * sizes.points, visibility) + small
 
 
 def _casting_memory(setup: Setup, sizes: Sizes, firings: int, on_device: bool) -> Memory:

@@ -20,8 +20,8 @@ from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Sensor
 from ..survey.survey import ScanSpec, Survey
-from .actor_visibility import ActorVisibility
 from .casting.actor_trajectories import ActorTrajectories
+from .casting.actor_visibility import ActorVisibility
 from .casting.motion import CastPoses, FiringClock, Firings, check_trajectory, poses_of_firings
 from .casting.scene_caster import SceneCaster, casters_of_sensors, move_instances
 from .casting.surfaces import SceneSurfaces

@@ -7,7 +7,7 @@ in the full scene. Pulses that the platform blocks do not count.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -15,21 +15,21 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from raybeam import Pattern
-from raybeam.scan import Scan, check_scan, host_rays
+from raybeam.scan import Scan, check_scan
 
-from ..columns.actor_rays import ACTOR_RAYS
-from ..motion.trajectory import full_poses, presence_ns
-from ..numerics.arrays import Bools, Floats, Indices, Ints, Records
-from ..numerics.elementary import arctan2
-from ..numerics.vectors import hypot, matmul, matvec, norm, rotate
-from ..scene.scene import Scene
-from ..sensor import Sensor
-from ..survey.survey import ScanSpec, Survey
-from .casting.motion import CastPoses
-from .casting.scene_caster import NEVER_NS, SceneCaster
-from .casting.stored_triangles import StoredTriangles
+from ...columns.actor_rays import ACTOR_RAYS
+from ...motion.trajectory import full_poses, presence_ns
+from ...numerics.arrays import Bools, Floats, Indices, Ints, Records
+from ...numerics.elementary import arctan2
+from ...numerics.vectors import hypot, matmul, matvec, norm, rotate
+from ...scene.scene import Scene
+from ...sensor import Sensor
+from ...survey.survey import ScanSpec, Survey
+from .motion import CastPoses
+from .scene_caster import NEVER_NS, SceneCaster
+from .stored_triangles import StoredTriangles
 
-_CHUNK_RAYS = 1 << 17  # rays whose distances from boxes are computed at a time
+CHUNK_RAYS = 1 << 17  # number of rays that are cast at a time
 _FIELD_RAYS = 1_000_000  # maximum number of rays from which a field of view is determined
 _CELLS = 8  # number of cells along each axis of a box, whose centers are in or out of the field
 # A gap between azimuths limits the field of view if it is this wide and at least twice as wide as
@@ -84,25 +84,52 @@ def _sector_of(azimuths: Floats) -> tuple[float, float]:
     return start, 2 * np.pi - float(gaps[widest])
 
 
-class _SweepRays(NamedTuple):
-    """Rays of a sweep in consecutive scans, and their records."""
+@dataclass(frozen=True, eq=False)
+class _SweepRays:
+    """Rays of a sweep in consecutive scans, and the records of the actors that are present."""
 
-    sweep: int  # number among the sweeps of the sensor
-    records: Records  # (k,), one for each actor that is present
-    rays: Ints  # rays that are not blocked, in ascending order
-    stop: int  # end of the rays of the sweep
+    number: int  # among the sweeps of the sensor
+    records: Records  # (k,)
+    first: int  # first ray, counted from the first scan
+    stop: int  # end of the rays
+
+    @classmethod
+    def empty(cls, number: int, sweep: int, actors: Ints, first: int, stop: int) -> _SweepRays:
+        """Create the rays of a sweep without counts. `sweep` is its number among all sweeps."""
+        records = np.zeros(len(actors), ACTOR_RAYS)
+        records["actor"] = actors
+        records["sweep"] = sweep
+        return cls(number, records, first, stop)
+
+
+@dataclass(frozen=True, eq=False)
+class _RayChunk:
+    """Consecutive rays, which are cast together."""
+
+    start: int  # number of the first ray, counted from the first scan
+    scan: Scan
+    pattern: Pattern
+    poses: CastPoses
+    limits: dict[str, Any]  # further arguments of `SceneCaster.scan`
+    allowed: Bools  # (n,), False for pulses that the platform blocks
+
+    def computed_rays(self) -> Floats:
+        """Compute the origins in meters and the directions of the rays, in shape (6, n)."""
+        self.scan.rays(0, len(self.scan))  # writes the rays to `out`
+        assert self.scan.out is not None
+        return self.scan.out
 
 
 class _Boxes(NamedTuple):
     """Boxes of k actors in the scene frame."""
 
     centers: Floats  # (k, 3), meters
-    halves: Floats  # (k, 3), half sizes, meters
     rotations: Floats  # (k, 3, 3), from the box to the scene frame
+    halves: Floats  # (k, 3), half sizes, meters
 
     def select(self, rows: Indices) -> _Boxes:
         """Return the boxes in the given rows."""
-        return _Boxes(self.centers[rows], self.halves[rows], self.rotations[rows])
+        return _Boxes(self.centers[rows], self.rotations[rows], self.halves[rows])
 
 
 class ActorVisibility:
@@ -134,35 +161,35 @@ class ActorVisibility:
 
         `window` has the first row of the rays in the pattern, and one past the last.
         """
-        sensor = self._sensor
-        limits: dict[str, Any] = {
-            "window": window,
-            "t_min": sensor.min_range_m,
-            "t_max": sensor.max_range_m,
-            "out": np.empty((6, window[1] - window[0])),  # rays, which are computed only once
-        }
-        scan = check_scan(pattern, **poses.caster_arguments, **limits)
-        hits = self._caster.scan(pattern, poses, **limits)
-        hit_actors = self._triangles.objects(hits.triangle) - self._triangles.static_objects
-        on_actors = np.flatnonzero(hit_actors >= 0)
-        visible = hits.ray[on_actors].astype(np.int64)
-        visible_actors = hit_actors[on_actors]
-        allowed = ~self._is_blocked(specs, len(scan))
-        parts = []
-        for sweep, first_ray, stop_ray in self._sweeps_of(specs, len(scan)):
-            actors = self._present_actors(sweep)
-            records = np.zeros(len(actors), ACTOR_RAYS)
-            records["actor"] = actors
-            records["sweep"] = self._first_sweep + sweep
-            rays = np.flatnonzero(allowed[first_ray:stop_ray]) + first_ray
-            in_sweep = (first_ray <= visible) & (visible < stop_ray) & allowed[visible]
-            seen = np.bincount(visible_actors[in_sweep], minlength=len(self._scene.actors))
-            records["visible"] = seen[actors]
-            parts.append(_SweepRays(sweep, records, rays, stop_ray))
-        self._count_alone(parts, scan, poses)
-        for part in parts:
-            self._measure_boxes(part, scan)
-        return np.concatenate([part.records for part in parts])
+        sweeps = [
+            _SweepRays.empty(sweep, self._first_sweep + sweep, self._present_actors(sweep), *span)
+            for sweep, *span in self._sweeps_of(specs, window[1] - window[0])
+        ]
+        for chunk in self._chunks(specs, pattern, poses, window):
+            self._count_visible(sweeps, chunk)
+            self._count_alone(sweeps, chunk)
+        for sweep in sweeps:
+            self._measure_boxes(sweep, self._chunks(specs, pattern, poses, window))
+        return np.concatenate([sweep.records for sweep in sweeps])
+
+    def _chunks(
+        self, specs: Sequence[ScanSpec], pattern: Pattern, poses: CastPoses, window: tuple[int, int]
+    ) -> Iterator[_RayChunk]:
+        """Yield the rays of scans in chunks, which limits the memory."""
+        first, stop = window
+        step = max(1, CHUNK_RAYS // (poses.rays_per_pose or 1)) * (poses.rays_per_pose or 1)
+        for start in range(0, stop - first, step):
+            count = min(step, stop - first - start)
+            limits: dict[str, Any] = {
+                "window": (first + start, first + start + count),
+                "t_min": self._sensor.min_range_m,
+                "t_max": self._sensor.max_range_m,
+                "out": np.empty((6, count)),  # rays, which are computed only once
+            }
+            chunk_poses = poses.for_subrays(start, start + count, 1)
+            scan = check_scan(pattern, **chunk_poses.caster_arguments, **limits)
+            allowed = ~self._is_blocked(specs, start, count)
+            yield _RayChunk(start, scan, pattern, chunk_poses, limits, allowed)
 
     @cached_property
     def _first_sweep(self) -> int:
@@ -180,11 +207,12 @@ class ActorVisibility:
             presence[self._caster.unseen[len(self._scene.names) :]] = NEVER_NS
         return presence
 
-    def _is_blocked(self, specs: Sequence[ScanSpec], count: int) -> Bools:
-        """Return whether the platform blocks each ray."""
+    def _is_blocked(self, specs: Sequence[ScanSpec], start: int, count: int) -> Bools:
+        """Return whether the platform blocks each of `count` rays from ray `start` on."""
         if not len(self._sensor.beams.blocked):
             return np.zeros(count, np.bool_)
-        firing, channel = np.divmod(np.arange(count, dtype=np.int64), self._sensor.channels)
+        rays = np.arange(start, start + count, dtype=np.int64)
+        firing, channel = np.divmod(rays, self._sensor.channels)
         return self._sensor.is_blocked(specs[0].firings[0] + firing, channel)
 
     def _sweeps_of(self, specs: Sequence[ScanSpec], count: int) -> list[tuple[int, int, int]]:
@@ -204,27 +232,48 @@ class ActorVisibility:
         present = (appears <= stops_ns[sweep]) & (starts_ns[sweep] <= leaves)
         return np.flatnonzero(present)
 
-    def _count_alone(self, parts: Sequence[_SweepRays], scan: Scan, poses: CastPoses) -> None:
-        """Set the number of rays that would hit each actor if it were alone."""
-        is_counted = np.zeros(len(scan), np.bool_)
-        for part in parts:
-            is_counted[part.rays] = True
-        stops = [part.stop for part in parts]
-        actors = np.unique(np.concatenate([part.records["actor"] for part in parts]))
-        for actor in actors.tolist():
-            hits = self._caster.rays_on_actor(actor, scan, poses)
-            counts = np.diff(np.searchsorted(np.sort(hits[is_counted[hits]]), stops), prepend=0)
-            for part, count in zip(parts, counts.tolist(), strict=True):
-                part.records["rays"][part.records["actor"] == actor] = count
+    def _count_visible(self, sweeps: Sequence[_SweepRays], chunk: _RayChunk) -> None:
+        """Add the number of rays that hit each actor first."""
+        hits = self._caster.scan(chunk.pattern, chunk.poses, **chunk.limits)
+        actors = self._triangles.objects(hits.triangle) - self._triangles.static_objects
+        rays = hits.ray.astype(np.int64)
+        counted = (actors >= 0) & chunk.allowed[rays]
+        rays = chunk.start + rays[counted]
+        actors = actors[counted]
+        for sweep in sweeps:
+            in_sweep = (sweep.first <= rays) & (rays < sweep.stop)
+            counts = np.bincount(actors[in_sweep], minlength=len(self._scene.actors))
+            sweep.records["visible"] += counts[sweep.records["actor"]]
 
-    def _measure_boxes(self, part: _SweepRays, scan: Scan) -> None:
+    def _count_alone(self, sweeps: Sequence[_SweepRays], chunk: _RayChunk) -> None:
+        """Add the number of rays that would hit each actor if it were alone."""
+        actors = np.unique(np.concatenate([sweep.records["actor"] for sweep in sweeps]))
+        for actor in actors.tolist():
+            rays = self._caster.rays_on_actor(actor, chunk.scan, chunk.poses)
+            rays = chunk.start + rays[chunk.allowed[rays]]
+            for sweep in sweeps:
+                count = np.count_nonzero((sweep.first <= rays) & (rays < sweep.stop))
+                sweep.records["rays"][sweep.records["actor"] == actor] += count
+
+    def _measure_boxes(self, sweep: _SweepRays, chunks: Iterable[_RayChunk]) -> None:
         """Set the truncation of boxes, and the distance of rays from actors that no ray hits."""
-        records = part.records
-        boxes = self._boxes(part.sweep, records["actor"])
-        records["truncated"] = self._truncations(part.sweep, boxes)
+        from . import box_distance_loops as loops  # imported here because numba is slow to import
+
+        records = sweep.records
+        boxes = self._boxes(sweep.number, records["actor"])
+        records["truncated"] = self._truncations(sweep.number, boxes)
         missed = np.flatnonzero(records["rays"] == 0)
-        if len(missed):
-            records["nearest_m"][missed] = _nearest_m(scan, part.rays, boxes.select(missed))
+        if not len(missed):
+            return
+        squares = np.full(len(missed), np.inf)
+        for chunk in chunks:
+            rays = chunk.start + np.flatnonzero(chunk.allowed)
+            rays = rays[(sweep.first <= rays) & (rays < sweep.stop)] - chunk.start
+            if len(rays):
+                limits = chunk.scan.t_min, chunk.scan.t_max
+                columns = np.ascontiguousarray(chunk.computed_rays()[:, rays])
+                loops.nearest_boxes(columns, *boxes.select(missed), *limits, squares)
+        records["nearest_m"][missed] = np.sqrt(squares)
 
     def _boxes(self, sweep: int, actors: Ints) -> _Boxes:
         """Return the boxes of actors at the start of a sweep.
@@ -232,7 +281,8 @@ class ActorVisibility:
         If an actor appears or leaves during the sweep, its pose is the first or last one.
         """
         start_ns = float(self._survey.sweeps_each[self._number].starts_ns[sweep])
-        boxes = _Boxes(*np.empty((2, len(actors), 3)), np.empty((len(actors), 3, 3)))
+        shape = len(actors), 3
+        boxes = _Boxes(np.empty(shape), np.empty((*shape, 3)), np.empty(shape))
         for row, number in enumerate(actors.tolist()):
             actor = self._scene.actors[number]
             at_ns = np.array([np.clip(start_ns, *self._presence_ns[number])])
@@ -264,24 +314,3 @@ class ActorVisibility:
         positions, rotations = full_poses(survey.path, station, since_ns)
         position = positions[0] + matvec(rotations[0], np.array(mount.position))
         return position, matmul(rotations[0], mount.rotation_matrix)
-
-
-def _nearest_m(scan: Scan, rays: Ints, boxes: _Boxes) -> Floats:
-    """Return the distance in meters between each box (k,) and the nearest of the given rays."""
-    from . import box_distance_loops as loops  # imported here because numba takes half a second
-
-    squares = np.full(len(boxes.centers), np.inf)
-    for start in range(0, len(rays), _CHUNK_RAYS):
-        chunk = rays[start : start + _CHUNK_RAYS]
-        first = int(chunk[0])
-        columns = host_rays(scan, first, int(chunk[-1]) + 1)[:, chunk - first]
-        loops.nearest_boxes(
-            np.ascontiguousarray(columns),
-            boxes.centers,
-            boxes.rotations,
-            boxes.halves,
-            scan.t_min,
-            scan.t_max,
-            squares,
-        )
-    return np.sqrt(squares)
