@@ -37,6 +37,7 @@ from . import completion
 from . import shared_options as shared
 from .augment_command import augment
 from .first_step import print_first_step
+from .flight_command import flight
 from .follow_command import follow
 from .play_command import play
 from .result_commands import compare, export, fit, plot, view
@@ -230,7 +231,7 @@ class _Commands(click.Group):
 @click.group(
     cls=_Commands,
     commands=[
-        *(init, import_, check, schema, scene, sensors, stations),
+        *(init, import_, check, schema, scene, sensors, stations, flight),
         *(view, play, follow, serve, plot, export, compare, fit, twin, augment),
     ],
     context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]},

@@ -16,6 +16,7 @@ from lidarsim.io.storage import Storage
 from lidarsim.words import format_rounded, format_scan_counts, list_names, plural
 
 from ..identity.job_errors import summarize_errors
+from ..plan.flight_density import expected_density, summarize_density
 from ..report.result_files import check_existing
 from ..run.forecast import forecast
 from ..run.job_source import SingleJob
@@ -25,7 +26,7 @@ from ..scenario.advice import advice, unlabeled_notes
 from ..scenario.campaign_file import is_campaign
 from ..scenario.job import Job
 from ..scenario.plausibility import plausibility_warnings
-from ..scenario.prepare import prepare
+from ..scenario.prepare import PreparedScenario, prepare
 from ..scenario.scenario import Scenario
 from .shared_options import world_lines
 from .terminal import Terminal
@@ -111,6 +112,7 @@ def forecast_scenario(
         figures["notes"] += advice(prepared)
         figures["warnings"] += plausibility_warnings(prepared)
         figures["sources"] = dict(prepared.findings.sources)
+        figures["flight"] = _flight_figures(prepared)
         if campaign is not None:
             file_format = campaign.keep.export_spec
             figures["notes"] += file_format.frame_notes(scenario.cloud.coordinates)
@@ -125,6 +127,17 @@ def forecast_scenario(
         return figures, _job_lines(job, figures)
     figures = _campaign_figures(campaign, out, lambda number: forecast_job(number)[1])
     return figures, _campaign_lines(campaign, figures)
+
+
+def _flight_figures(prepared: PreparedScenario) -> dict[str, Any] | None:
+    """Compare the expected density with the flight plan, or return None if there is no plan."""
+    plan = prepared.scenario.flight
+    if plan is None:
+        return None
+    scene = prepared.scene.with_world_origin((0, 0, 0))
+    expected = expected_density(scene, prepared.survey, plan.area)
+    density = summarize_density(expected, plan.area, plan.density_m2)
+    return density and density._asdict()
 
 
 def _check_existing(job: Job, out: Path | Storage) -> None:
@@ -247,6 +260,12 @@ def _job_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
     if drive := figures["drive"]:
         yield from _drive_lines(drive)
     yield from _return_lines(job, figures)
+    if flight := figures["flight"]:
+        yield (
+            f"density     {flight['mean_m2']:.3g} points per m² in the planned area, of which 95 % "
+            f"has at least {flight['low_m2']:.3g} (plan: {flight['planned_m2']:.3g}; cells of "
+            f"{flight['cell_m']:g} m)"
+        )
     yield f"planning    {f'{job.trials:,} trials' if job.trials else 'none'}"
     yield from _resource_lines(figures)
     yield from _remarks(figures)

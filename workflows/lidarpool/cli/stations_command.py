@@ -6,11 +6,8 @@ With `--cloud`, the command measures the coverage of an existing scan instead.
 from __future__ import annotations
 
 import math
-import os
 import shlex
-import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +20,7 @@ from lidarsim.words import join_names, plural, printable
 from . import completion
 from . import shared_options as options
 from .first_step import print_first_step
+from .planned_scene import comment_lines, prepared_with_notes, scene_sections, sensor_entry
 from .shared_options import overwrite
 
 if TYPE_CHECKING:
@@ -216,7 +214,7 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
     sensor = load_sensor(model)
     sensor_elevations(sensor)  # an unsuitable sensor is reported before the scene is read
     terminal = Terminal(quiet=as_json)
-    prepared, notes = _prepared_with_notes(scenario, terminal)
+    prepared, notes = prepared_with_notes(scenario, terminal)
     with terminal.status("computing the visibility from all candidate positions"):
         plan = plan_stations(prepared.scene.with_world_origin((0, 0, 0)), sensor, **settings)
     text = _stations_scenario(scenario, folder, model, plan, settings["targets"], terminal.warnings)
@@ -286,7 +284,7 @@ def _show_coverage(
         )
     recording = open_recording(cloud)
     terminal = Terminal(quiet=as_json)
-    prepared, notes = _prepared_with_notes(scenario, terminal)
+    prepared, notes = prepared_with_notes(scenario, terminal)
     if len(prepared.survey.mounted_sensors) > 1:
         raise LidarError(
             "`--cloud` requires a scenario with a single sensor, but the scenario has several."
@@ -357,28 +355,6 @@ def _object_figures(
     }
 
 
-def _prepared_with_notes(
-    scenario: Scenario, terminal: Terminal
-) -> tuple[PreparedScenario, list[str]]:
-    """Prepare a scenario, and print its notes and warnings.
-
-    Notes about default poses are omitted. Returns the prepared scenario with the notes and
-    warnings.
-    """
-    from ..scenario.advice import advice
-    from ..scenario.default_poses import SensorPlacement
-    from ..scenario.prepare import prepare
-
-    with terminal.status("reading the scene", logged=False):
-        prepared = prepare(scenario, plans=False)
-    notes = advice(replace(prepared, placement=SensorPlacement(())))
-    for note in notes:
-        terminal.report(note)
-    if problem := prepared.job.location_warning:
-        terminal.warn(problem)
-    return prepared, [*notes, *terminal.warnings]
-
-
 def _target_phrase(targets: Sequence[str]) -> str:
     return f" of {join_names(targets)}" if targets else ""
 
@@ -447,20 +423,9 @@ def _stations_scenario(
     """Return the text of a scenario file with stations as poses and warnings as comments."""
     import yaml
 
-    def relative(file: Path) -> str:
-        return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
-
-    entry = scenario.scene.model_dump(exclude_unset=True, mode="json", by_alias=True)
-    copies = entry.get("copies", [])
-    named = [*entry.get("files", []), *(c.get(kind) for c in copies for kind in ("file", "table"))]
-    for file_entry in filter(None, named):
-        file_entry["file"] = relative(scenario.path(file_entry["file"]))
-    world = scenario.world.model_dump(exclude_unset=True, mode="json")
-    is_file = model.endswith((".yaml", ".yml"))
     data = {
-        **({"scene": entry} if entry else {}),
-        **({"world": world} if world else {}),
-        "sensor": {"model": relative(Path(model)) if is_file else model},
+        **scene_sections(scenario, folder),
+        "sensor": {"model": sensor_entry(model, folder)},
         "poses": [[round(float(part), 3) for part in position] for position in plan.stations],
         "steps": 36,
         "cloud": {"columns": ["range"]},
@@ -470,9 +435,7 @@ def _stations_scenario(
         f"They cover {plan.coverage[-1]:.1%} of the\n# reachable area{_target_phrase(targets)}. "
         "Each station scans one revolution in steps of 10 degrees.\n"
     )
-    for warning in warnings:
-        lines = textwrap.wrap(f"Warning: {warning}", 96, break_on_hyphens=False)
-        head += "".join(f"# {line}\n" for line in lines)
+    head += comment_lines([f"Warning: {warning}" for warning in warnings])
     return head + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
 
 

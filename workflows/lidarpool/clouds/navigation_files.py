@@ -1,21 +1,25 @@
-"""Measurement files for a vehicle's IMU (imu.csv) and GNSS receiver (gnss.csv).
+"""Measurement files for a vehicle's IMU (imu.csv), GNSS receiver (gnss.csv) and trajectory.
 
 The files are stored next to the cloud and contain one row per sample, sorted by time. Bags are
-created from these files, so that all formats contain the same values.
+created from these files, so that all formats contain the same values. trajectory.csv contains the
+measured trajectory if the points are georeferenced by it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 
-from lidarsim.motion.navigation import gnss_fixes, imu_samples, to_geodetic
+from lidarsim.motion.navigation import BLOCK, gnss_fixes, imu_samples, to_geodetic
+from lidarsim.motion.rotations import quaternions_of
+from lidarsim.motion.trajectory import full_poses
 from lidarsim.numerics.arrays import Floats
 from lidarsim.survey.survey import Survey
-from lidarsim.sweeps.instruments import IMU_FILE, Instruments
+from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, TRAJECTORY_FILE, Instruments
 
 _IMU = (
     "time_ns",
@@ -24,6 +28,9 @@ _IMU = (
 )
 _POSITION = ("time_ns", "x_m", "y_m", "z_m")
 _GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
+# Columns that `trajectory.file` of a scenario reads.
+_TRAJECTORY = ("time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+_TRAJECTORY_HZ = 200.0  # poses per second without an IMU
 
 # Maximum sizes of a sample in bytes.
 _ROW_BYTES = 120  # row in a CSV file
@@ -43,6 +50,8 @@ def instrument_bytes(survey: Survey, bags: int) -> int:
         for instrument in (navigation.imu, navigation.gnss)
         if instrument is not None
     ]
+    if survey.measured is not None:
+        rates.append(_trajectory_rate_hz(survey))
     samples = sum(rates) * survey.duration_ns / 1e9
     return int(samples * (_ROW_BYTES + bags * _MESSAGE_BYTES))
 
@@ -65,9 +74,14 @@ def write_instruments(folder: Path, survey: Survey, origin: Floats) -> None:
         If a file cannot be written.
     """
     instruments = Instruments.from_survey(survey)
+    lines_of = {
+        IMU_FILE: lambda: _imu_lines(survey),
+        GNSS_FILE: lambda: _gnss_lines(survey, origin),
+        TRAJECTORY_FILE: lambda: _trajectory_lines(survey, origin),
+    }
     for name in () if instruments is None else instruments.files:
         with (folder / name).open("w", encoding="ascii", newline="\n") as file:
-            for line in _imu_lines(survey) if name == IMU_FILE else _gnss_lines(survey, origin):
+            for line in lines_of[name]():
                 file.write(line)
 
 
@@ -88,6 +102,28 @@ def _gnss_lines(survey: Survey, origin: Floats) -> Iterator[str]:
         world = positions + origin
         columns = [*world.T, *(() if to_geodetic is None else to_geodetic(world).T)]
         rows = zip(times.tolist(), *(column.tolist() for column in columns), strict=True)
+        yield "".join(form % row for row in rows)
+
+
+def _trajectory_rate_hz(survey: Survey) -> float:
+    """Return the number of poses per second in the file of the measured trajectory."""
+    imu = survey.navigation and survey.navigation.imu
+    return imu.rate_hz if imu else _TRAJECTORY_HZ
+
+
+def _trajectory_lines(survey: Survey, origin: Floats) -> Iterator[str]:
+    yield ",".join(_TRAJECTORY) + "\n"
+    form = "%.6f" + ",%.5f" * 3 + ",%.9f" * 4 + "\n"
+    rate_hz = _trajectory_rate_hz(survey)
+    duration_ns = min(survey.path.duration_ns, survey.duration_ns + 1e9 / rate_hz)
+    count = math.floor(duration_ns * rate_hz / 1e9 + 1e-6) + 1
+    for first in range(0, count, BLOCK):
+        times_ns = np.arange(first, min(first + BLOCK, count)) * 1e9 / rate_hz
+        positions, rotations = full_poses(
+            survey.reported_path, 0, np.minimum(times_ns, survey.path.duration_ns)
+        )
+        columns = [times_ns / 1e9, *(positions + origin).T, *quaternions_of(rotations).T]
+        rows = zip(*(column.tolist() for column in columns), strict=True)
         yield "".join(form % row for row in rows)
 
 

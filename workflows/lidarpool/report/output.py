@@ -43,7 +43,7 @@ from ..scenario.scenario import Scenario
 from .cloud_counts import CloudCounts
 from .growing_cloud import GrowingCloud, write_cloud
 from .picture_content import picture_content
-from .report import make_report
+from .report import describe_flight, make_report
 from .result_files import (
     CLOUD,
     FILES,
@@ -288,6 +288,7 @@ class SurveyOutput:
             if workers:
                 result = workers.with_range_tasks(result)
             report = make_report(result, counts)
+            report |= describe_flight(self.scenario, result.scene, counts)
             for output_format in self.formats:
                 report["notes"] += output_format.notes(result.points, sweeps, self._requested)
             if full_scales:

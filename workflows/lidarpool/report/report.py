@@ -23,11 +23,13 @@ from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import CloudOptions, Survey
 
 from ..clouds.flight_lines import summarize_flight_lines
+from ..plan.flight_density import CELL_POINTS, summarize_density
 from ..plan.planning import Search
 from ..run.pipeline.stage_names import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ..run.pipeline.task_book import StageTotals, union
 from ..run.planning_trials import TRIAL
 from ..run.run_result import RunResult
+from ..scenario.scenario import Scenario
 from .cloud_counts import CloudCounts
 
 ELEVATION_RAYS = 20_000  # number of rays from which the elevation range is computed
@@ -47,7 +49,7 @@ _PACKAGES = (
 # Entries of the report that `--json` prints.
 _SUMMARY_ENTRIES = (
     "backend", "notes", "scans", "sweeps", "rays", "hits", "points", "points_by_object", "seconds",
-    "placement_violations", "replayed", "resumed_scans",
+    "placement_violations", "replayed", "resumed_scans", "flight",
 )  # fmt: skip
 _PLANNING = ("trials", "best_length", "shortest_possible", "collision_free")
 
@@ -117,13 +119,30 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
     }
 
 
+def describe_flight(scenario: Scenario | None, scene: Scene, cloud: CloudCounts) -> dict[str, Any]:
+    """Compare the density of a cloud with the flight plan of its scenario.
+
+    The result has the entry `flight`, or is empty if there is no plan. The value is None if the
+    points are not in world coordinates, or if the planned area is too small.
+    """
+    if scenario is None or scenario.flight is None:
+        return {}
+    plan = scenario.flight
+    found = None
+    if scenario.cloud.coordinates == "world" and cloud.point_count:
+        counts = cloud.density_map((CELL_POINTS / plan.density_m2) ** 0.5)
+        counts = counts._replace(corner=counts.corner - scene.world_origin[:2])
+        found = summarize_density(counts, plan.area, plan.density_m2)
+    return {"flight": found and found._asdict()}
+
+
 def summarize_report(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:
     """Return the main statistics and the file paths of a report, as `--json` prints them."""
     planning = report["planning"]
     return {
         "folder": str(folder),
         "files": {name: f"{folder}/{name}" for name in report["files"]},
-        **{name: report[name] for name in _SUMMARY_ENTRIES},
+        **{name: report[name] for name in _SUMMARY_ENTRIES if name in report},
         "planning": planning and {name: planning[name] for name in _PLANNING},
     }
 

@@ -14,7 +14,8 @@ from lidarsim.columns.table import VELOCITY
 from lidarsim.media.materials import MaterialTable
 from lidarsim.media.weather import FOG_LIDAR_RATIO_SR
 from lidarsim.motion.headings import CORNER_M
-from lidarsim.motion.trajectory import Track, presence_ns
+from lidarsim.motion.navigation import Gnss, Imu
+from lidarsim.motion.trajectory import CENTER, Track, presence_ns
 from lidarsim.scene.files.mesh_formats import format_of
 from lidarsim.scene.files.meshfile import is_written_by_lidarpool
 from lidarsim.scene.scene import Scene
@@ -229,10 +230,41 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
             "the measurements of `navigation.imu` jump at the poses of a trajectory with linear "
             "interpolation. Set `trajectory.interpolation: smooth`"
         )
+    yield from _georeferencing_notes(scenario)
     if scenario.noise.velocity_m_s and VELOCITY not in scenario.cloud.columns:
         yield (
             f"`noise.velocity_m_s` has no effect without the column {VELOCITY}. Add it to "
             "`cloud.columns`"
+        )
+
+
+def _georeferencing_notes(scenario: Scenario) -> Iterator[str]:
+    """Yield notes about errors of the trajectory that have no effect on the points."""
+    navigation = scenario.navigation
+    if navigation is None:
+        return
+    imu = navigation.imu
+    gnss = navigation.gnss
+    attitude = imu is not None and (imu.roll_pitch_deg or imu.heading_deg)
+    mount = navigation.mount_error != CENTER
+    if scenario.cloud.georeferencing == "exact":
+        names = ["navigation.mount_error"] * mount
+        names += ["navigation.imu.roll_pitch_deg", "navigation.imu.heading_deg"] if attitude else []
+        if names:
+            yield (
+                f"{', '.join(f'`{name}`' for name in names)}: these errors affect only points that "
+                "are georeferenced by the measured trajectory. Set `cloud.georeferencing: measured`"
+            )
+        return
+    if imu is not None and imu != Imu(rate_hz=imu.rate_hz, mount=imu.mount) and not attitude:
+        yield (
+            "the errors of `navigation.imu` affect its samples, but the measured trajectory has no "
+            "errors of the attitude. Set `navigation.imu.roll_pitch_deg` and `heading_deg`"
+        )
+    if not mount and not attitude and gnss in (None, gnss and Gnss(rate_hz=gnss.rate_hz)):
+        yield (
+            "points are georeferenced by the measured trajectory, which has no errors. Set errors "
+            "in `navigation`, such as `gnss.drift_horizontal_m` or `mount_error`"
         )
 
 

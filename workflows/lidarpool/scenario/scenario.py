@@ -32,6 +32,7 @@ from lidarsim.survey.survey import MAX_SENSORS, CloudOptions, StepCount
 from .actor_motion import ActorSection, MountedSensorEntry, MountEntry, TrajectoryEntry
 from .sections import (
     CopiesSection,
+    FlightSection,
     NoiseSection,
     OutputSection,
     PlanningSection,
@@ -127,8 +128,8 @@ class Scenario(Section):
 
     Parameters
     ----------
-    scene, world, sensor, materials, returns, noise, weather, navigation, faults, cloud, output, \
-    planning, pool
+    scene, world, sensor, materials, returns, noise, weather, navigation, flight, faults, cloud, \
+    output, planning, pool
         See `lidarpool.scenario.sections`.
     poses
         Poses of the sensor, in the coordinates of the scene. In the scene of the demo, the default
@@ -235,6 +236,13 @@ class Scenario(Section):
         about(
             "IMU and GNSS receiver of the platform, with drifting errors",
             {"imu": {"rate_hz": 200}, "gnss": {"rate_hz": 10}},
+        ),
+    ] = None
+    flight: Annotated[
+        FlightSection | None,
+        about(
+            "plan of an airborne survey, as written by `lidarpool flight`, with which `lidarpool "
+            "check` and the report compare the density"
         ),
     ] = None
     faults: Annotated[

@@ -740,6 +740,26 @@ class OutputSection(Section):
         return tuple(dict.fromkeys(name for entry in self.write for name in entry.needs))
 
 
+Ring = Annotated[Several[Pair], Field(min_length=3)]
+
+
+class FlightSection(Section):
+    """Plan of an airborne survey, with which the density of the points is compared."""
+
+    density_m2: Annotated[
+        float, about("planned number of points per square meter", 20, gt=0, le=1e6)
+    ]
+    area: Annotated[
+        Several[Ring],
+        about(
+            "corners [x, y] of the planned area, in meters, as a list of rings; a ring within "
+            "another ring is a hole",
+            [[[0, 0], [400, 0], [400, 200], [0, 200]]],
+            min_length=1,
+        ),
+    ]
+
+
 class ReturnsSection(Section, Returns):
     """Sub-rays of the beams, and the returns that are reported."""
 

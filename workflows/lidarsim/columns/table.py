@@ -309,6 +309,16 @@ OPTIONAL = (
         )
         for axis in "xyz"
     ),
+    *(
+        Column(
+            f"true_{axis}",
+            "float64",
+            "m",
+            f"{axis} coordinate of the point by the true trajectory, in world coordinates",
+            coordinates="world",
+        )
+        for axis in "xyz"
+    ),
     Column(
         "red",
         "uint8",

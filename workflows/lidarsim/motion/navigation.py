@@ -32,7 +32,7 @@ from ..numerics.elementary_scalars import exp_of, sin_cos_of
 from ..numerics.random_numbers import Purpose, named_seed, normal
 from ..numerics.vectors import hypot, matmul, matvec, norm, rotate, rotate_into_frames
 from ..schema.checks import check_fields, check_order
-from ..schema.declared import FileSection, MinMax, Seed, Several, UnitShare, about
+from ..schema.declared import FileSection, MinMax, Seed, Several, Triple, UnitShare, about
 from ..schema.value_texts import one_line
 from .rotations import rotation_sines
 from .trajectory import AT_CENTER, CENTER, Pose, Trajectory, full_poses, velocities
@@ -56,6 +56,9 @@ Deviation = Annotated[float, Field(ge=0, le=1e6)]  # meters
 Correlation = Annotated[float, Field(ge=0.001, le=1e9)]  # seconds
 Skew = Annotated[float, Field(ge=0, le=10)]  # degrees
 Span = Annotated[float, Field(ge=0, le=1e9)]  # seconds
+AttitudeError = Annotated[float, Field(ge=0, le=45)]  # degrees
+# Correlation time in seconds. It must be longer than the interval between two attitude errors.
+AttitudeTime = Annotated[float, Field(ge=1, le=1e9)]
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,9 @@ class Imu(FileSection):
     By default, the measurements have no errors.
 
     `mount` is the pose of the IMU in the platform frame. The noise parameters have the names and
-    units of Kalibr's `imu.yaml`.
+    units of Kalibr's `imu.yaml`. They affect the samples of the IMU. The errors of roll, pitch and
+    heading are those of the attitude that a navigation system computes, and only affect the
+    measured trajectory.
 
     Raises
     ------
@@ -109,6 +114,21 @@ class Imu(FileSection):
     misalignment_deg: Annotated[
         Skew, about("standard deviation in degrees of the misalignment between axes")
     ] = 0.0
+    roll_pitch_deg: Annotated[
+        AttitudeError,
+        about(
+            "standard deviation in degrees of the roll and pitch errors of the measured "
+            "trajectory (first-order Gauss-Markov process)"
+        ),
+    ] = 0.0
+    heading_deg: Annotated[
+        AttitudeError,
+        about("standard deviation in degrees of the heading error of the measured trajectory"),
+    ] = 0.0
+    attitude_time_s: Annotated[
+        AttitudeTime,
+        about("correlation time of the roll, pitch and heading errors in seconds"),
+    ] = 300.0
 
     __repr__ = one_line
 
@@ -149,6 +169,13 @@ class Gnss(FileSection):
         Deviation, about("standard deviation of the vertical drift, in meters")
     ] = 0.0
     drift_time_s: Annotated[Correlation, about("correlation time of the drift in seconds")] = 600.0
+    offset_m: Annotated[
+        Triple,
+        about(
+            "constant error to the east, north and up in meters, such as that of a base station",
+            [0.05, 0, -0.1],
+        ),
+    ] = (0, 0, 0)
     outages: Annotated[
         Several[MinMax[Span]],
         about(
@@ -183,6 +210,10 @@ class Navigation(FileSection):
     ----------
     imu, gnss
         The IMU and the GNSS receiver, or None if the platform does not have them.
+    mount_error
+        Error of the calibrated mounts of the sensors. The position is the error of the lever arm in
+        the platform frame, and the angles are the boresight errors about the platform's axes. It
+        affects points that are georeferenced by the measured trajectory.
     gravity_m_s2
         Gravitational acceleration in m/s^2, which points down along the z axis of the world.
     seed
@@ -209,6 +240,16 @@ class Navigation(FileSection):
             {"rate_hz": 10, "horizontal_m": 0.02, "drift_horizontal_m": 0.5},
         ),
     ] = None
+    mount_error: Annotated[
+        Pose,
+        AT_CENTER,
+        about(
+            "error of the calibrated mounts of all sensors, for `cloud.georeferencing: measured`: "
+            "the position is the lever arm error in meters, and the angles are the boresight "
+            "errors in degrees, in the platform frame",
+            {"position": [0.01, 0, 0], "roll_deg": 0.01},
+        ),
+    ] = CENTER
     gravity_m_s2: Annotated[
         float,
         about(
@@ -368,31 +409,80 @@ def gnss_fixes(drive: InstrumentedDrive, block: int = BLOCK) -> Iterator[GnssFix
     if navigation is None or navigation.gnss is None:
         return
     gnss = navigation.gnss
-    errors = _Errors(
-        named_seed(named_seed(navigation.seed, drive.platform_name), "gnss"),
-        1 / gnss.rate_hz,
-        np.array([gnss.horizontal_m, gnss.horizontal_m, gnss.vertical_m]),
-        np.array([gnss.drift_horizontal_m, gnss.drift_horizontal_m, gnss.drift_vertical_m]),
-        gnss.drift_time_s,
-        np.zeros(3),
-    )
+    errors = GnssErrors(navigation, drive.platform_name)
     count = math.floor(drive.duration_ns * gnss.rate_hz / 1e9 + 1e-6) + 1
     for first in range(0, count, block):
         samples = np.arange(first, min(first + block, count))
         times = np.asarray(samples * 1e9 / gnss.rate_hz, np.float64)
         positions = _mounted_motion(path, gnss.mount, times).positions
         positions = positions + errors.next_errors(samples)
-        for number, (begin, end) in enumerate(gnss.outages):
-            if navigation.imu is None:
+        if navigation.imu is None:
+            for begin, end in gnss.outages:
                 received = (times < begin * 1e9) | (times >= end * 1e9)
                 times = times[received]
                 positions = positions[received]
-            else:
-                since_s = times / 1e9 - begin
-                positions += _bridging_errors(
-                    navigation.imu, errors.seed, number, since_s, end - begin
-                )
         yield GnssFixes(np.rint(times).astype(np.int64), positions)
+
+
+class GnssErrors:
+    """Errors of consecutive positions from a GNSS receiver, including outages that an IMU bridges.
+
+    Errors must be requested in order.
+    """
+
+    def __init__(self, navigation: Navigation, platform_name: str) -> None:
+        gnss = navigation.gnss
+        assert gnss is not None  # callers check this
+        self._gnss = gnss
+        self._imu = navigation.imu
+        self._errors = _Errors(
+            named_seed(named_seed(navigation.seed, platform_name), "gnss"),
+            1 / gnss.rate_hz,
+            np.array([gnss.horizontal_m, gnss.horizontal_m, gnss.vertical_m]),
+            np.array([gnss.drift_horizontal_m, gnss.drift_horizontal_m, gnss.drift_vertical_m]),
+            gnss.drift_time_s,
+            np.zeros(3),
+        )
+
+    def next_errors(self, samples: Ints) -> Floats:
+        """Return the errors of the next positions in meters.
+
+        For indices of shape (k,), the result has shape (k, 3).
+        """
+        errors = self._errors.next_errors(samples) + np.array(self._gnss.offset_m)
+        if self._imu is not None:
+            times_s = samples / self._gnss.rate_hz
+            for number, (begin, end) in enumerate(self._gnss.outages):
+                errors += _bridging_errors(
+                    self._imu, self._errors.seed, number, times_s - begin, end - begin
+                )
+        return errors
+
+
+class AttitudeErrors:
+    """Errors of roll, pitch and heading that a navigation system measures, in degrees.
+
+    Errors must be requested in order.
+    """
+
+    def __init__(self, navigation: Navigation, platform_name: str, rate_hz: float) -> None:
+        imu = navigation.imu
+        assert imu is not None  # callers check this
+        self._errors = _Errors(
+            named_seed(named_seed(navigation.seed, platform_name), "attitude"),
+            1 / rate_hz,
+            np.zeros(3),
+            np.array([imu.roll_pitch_deg, imu.roll_pitch_deg, imu.heading_deg]),
+            imu.attitude_time_s,
+            np.zeros(3),
+        )
+
+    def next_errors(self, samples: Ints) -> Floats:
+        """Return the errors of roll, pitch and heading for the next samples in degrees.
+
+        For indices of shape (k,), the result has shape (k, 3).
+        """
+        return self._errors.next_errors(samples)
 
 
 def _bridging_errors(

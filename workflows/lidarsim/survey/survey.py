@@ -27,6 +27,7 @@ from ..environment.notebook import html_picture, html_table
 from ..errors import ArgumentError, LidarError
 from ..media.materials import ClassNames, Material, find_class_names_error
 from ..media.weather import EXIT_M, FAINTEST, Air, Weather, particle_range
+from ..motion.measured_trajectory import MeasuredTrajectory, check_measurable, measured_mount
 from ..motion.navigation import Navigation, check_navigation
 from ..motion.trajectory import CENTER, Pose, Stations, Trajectory, as_pose, check_trajectory_type
 from ..numerics.arrays import Floats, Ints
@@ -182,6 +183,13 @@ class CloudOptions(FileSection):
             "frame of the coordinates: world, or sensor for the sensor frame at the time of firing"
         ),
     ] = "world"
+    georeferencing: Annotated[
+        Literal["exact", "measured"],
+        about(
+            "trajectory and mounts by which points are transformed to world coordinates: exact, or "
+            "measured with the errors in `navigation`"
+        ),
+    ] = "exact"
     columns: Annotated[
         Sequence[str | Column],
         scenario_type(Several[Literal[(*OPTIONAL_NAMES, *TABLE)]]),  # includes the default columns
@@ -263,6 +271,7 @@ class Survey(CloudOptions, Weather):
         Noise of ranges and angles, and lost returns. The default is that of the sensor.
     navigation
         IMU and GNSS receiver of the platform, whose samples are written to files next to the cloud.
+        With `georeferencing="measured"`, points contain their errors and those of the mounts.
     faults
         Sensor faults, such as dirt or lost packets.
     classes
@@ -398,6 +407,8 @@ class Survey(CloudOptions, Weather):
         """Check that the options are compatible with each other and with the sensors."""
         if self.epsg in WORLD_EPSG:
             raise LidarError(f"epsg is {self.epsg}, {OF_THE_WORLD}.")
+        if self.georeferencing == "measured":
+            check_measurable(self.navigation)
         if self.navigation is not None:
             check_navigation(self.navigation, self.path, self.epsg)
         if self.start is not None and (self.start.tzinfo is None or self.start < START_FROM):
@@ -512,6 +523,25 @@ class Survey(CloudOptions, Weather):
         """Trajectory of the platform, which has one station per pose if `poses` is set."""
         assert self.trajectory is not None  # set in __post_init__
         return self.trajectory
+
+    @cached_property
+    def measured(self) -> MeasuredTrajectory | None:
+        """Trajectory by which points are georeferenced, or None if it is the true trajectory."""
+        return MeasuredTrajectory.from_drive(self) if self.georeferencing == "measured" else None
+
+    @property
+    def reported_path(self) -> Trajectory:
+        """Trajectory of the platform as reported with the points, either measured or true."""
+        return self.path if self.measured is None else self.measured
+
+    @cached_property
+    def reported_mounts(self) -> tuple[Pose, ...]:
+        """Mount of each sensor as reported with the points, either calibrated or true."""
+        mounts = tuple(mounted.mount for mounted in self.mounted_sensors)
+        if self.measured is None or self.navigation is None:
+            return mounts
+        error = self.navigation.mount_error
+        return tuple(measured_mount(mount, error) for mount in mounts)
 
     @cached_property
     def mounted_sensors(self) -> tuple[Mounted, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,8 @@ from ..survey.survey import Survey
 
 IMU_FILE = "imu.csv"
 GNSS_FILE = "gnss.csv"
-INSTRUMENT_FILES = (IMU_FILE, GNSS_FILE)
+TRAJECTORY_FILE = "trajectory.csv"  # measured trajectory
+INSTRUMENT_FILES = (IMU_FILE, GNSS_FILE, TRAJECTORY_FILE)
 
 
 @dataclass(frozen=True)
@@ -36,12 +37,14 @@ class Instruments:
     imu: Instrument | None
     gnss: Instrument | None
     folder: Path | None = None  # None until the files are written
+    trajectory: bool = False  # whether points are georeferenced by the measured trajectory
 
     @classmethod
     def from_survey(cls, survey: Survey) -> Instruments | None:
         """Return the instruments of a survey, or None if the survey has none."""
         navigation = survey.navigation
-        if navigation is None or (navigation.imu is None and navigation.gnss is None):
+        measured = survey.measured is not None
+        if navigation is None or not (navigation.imu or navigation.gnss or measured):
             return None
         imu = gnss = None
         if navigation.imu is not None:
@@ -53,22 +56,21 @@ class Instruments:
             horizontal = receiver.horizontal_m**2 + receiver.drift_horizontal_m**2
             vertical = receiver.vertical_m**2 + receiver.drift_vertical_m**2
             gnss = _instrument(receiver.mount, [horizontal, horizontal, vertical])
-        return cls(imu, gnss)
+        return cls(imu, gnss, trajectory=measured)
 
     @property
     def files(self) -> list[str]:
         """Names of the files that the instruments write."""
-        instruments = (self.imu, self.gnss)
-        return [
-            name
-            for name, instrument in zip(INSTRUMENT_FILES, instruments, strict=True)
-            if instrument is not None
-        ]
+        written = (self.imu is not None, self.gnss is not None, self.trajectory)
+        return [name for name, exists in zip(INSTRUMENT_FILES, written, strict=True) if exists]
 
     def to_json(self) -> dict[str, Any]:
         """Convert the instruments to a JSON-serializable dictionary, without the folder."""
         instruments = {"imu": self.imu, "gnss": self.gnss}
-        return {name: instrument and asdict(instrument) for name, instrument in instruments.items()}
+        values: dict[str, Any] = {
+            name: instrument and asdict(instrument) for name, instrument in instruments.items()
+        }
+        return values | ({"trajectory": True} if self.trajectory else {})
 
     @classmethod
     def from_json(cls, values: dict[str, Any], folder: Path) -> Instruments:
@@ -78,10 +80,10 @@ class Instruments:
         """
         imu = values["imu"] and Instrument(**values["imu"])
         gnss = values["gnss"] and Instrument(**values["gnss"])
-        instruments = cls(imu, gnss, folder)
+        instruments = cls(imu, gnss, folder, values.get("trajectory", False))
         if all((folder / name).exists() for name in instruments.files):
             return instruments
-        return cls(imu, gnss)
+        return replace(instruments, folder=None)
 
     def rows(self, name: str) -> Iterator[list[str]]:
         """Yield the rows of a file after its header.

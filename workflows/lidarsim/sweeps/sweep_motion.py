@@ -192,7 +192,7 @@ def compute_knots(survey: Survey, lidars: Sequence[LidarTraits], rotations: Floa
         sweep, in meters in the world frame, and the quaternion x, y, z, w of the rotation since the
         start in the sensor frame. If no sensor moves, the result is `STILL`.
     """
-    path = survey.path
+    path = survey.reported_path
     if not path.moves:
         return STILL
     spans = [
@@ -208,7 +208,7 @@ def compute_knots(survey: Survey, lidars: Sequence[LidarTraits], rotations: Floa
             rows = np.flatnonzero(stations == station)
             for part in np.array_split(rows, -(-len(rows) * count // _POSES) or 1):
                 times_ns = begins_ns[part, None] + np.linspace(0, 1, count) * span[part, None]
-                mount = survey.mounted_sensors[number].mount
+                mount = survey.reported_mounts[number]
                 knots[first + part] = _relative_poses(
                     path, station, times_ns, mount, rotations[first + part]
                 )

@@ -559,7 +559,7 @@ class Sweeps:
         firsts = [first_scans for first_scans, _, _ in survey.sweeps_each]
         positions = np.concatenate([sweeps.positions for sweeps in by_sensor])
         rotations = np.concatenate([sweeps.rotations for sweeps in by_sensor])
-        mounts = [carried.mount for carried in survey.mounted_sensors]
+        mounts = survey.reported_mounts
         traits = tuple(
             LidarTraits.from_sensor(carried.sensor, returns.mode)
             for carried, returns in zip(survey.mounted_sensors, survey.returns_each, strict=True)
@@ -805,8 +805,8 @@ class _SensorSweeps(NamedTuple):
 
 def _sensor_sweeps(survey: Survey, number: int) -> _SensorSweeps:
     """Compute the sweeps of the sensor with index `number` in a survey."""
-    path = survey.path
-    mount = survey.mounted_sensors[number].mount
+    path = survey.reported_path
+    mount = survey.reported_mounts[number]
     firsts, starts, _ = survey.sweeps_each[number]
     times = starts[: len(starts) // path.stations]
     positions = []

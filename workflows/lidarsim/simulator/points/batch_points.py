@@ -143,13 +143,21 @@ class BatchPoints:
 
         A frozen sensor sends an old sweep again, with the times of the sweep that it replaces.
         """
-        spec = self.specs[0]
-        stamp = self._firing_times_ns
-        if spec.repeats is not None:
-            repeated_start_ns, current_start_ns = map(self.survey.begins_ns, spec.repeats)
-            stamp = stamp + round(current_start_ns - repeated_start_ns)
-        jumps = self.survey.sensor_faults(spec.sensor, "time_jump").values()
+        stamp = self._sent_times_ns
+        jumps = self.survey.sensor_faults(self.specs[0].sensor, "time_jump").values()
         return sum((jump.time_errors_ns(stamp) for jump in jumps), stamp)
+
+    @cached_property
+    def _sent_times_ns(self) -> Ints:
+        """Time at which each return is sent, in nanoseconds since the start of the survey.
+
+        It differs from the firing time if a frozen sensor sends an old sweep again.
+        """
+        spec = self.specs[0]
+        if spec.repeats is None:
+            return self._firing_times_ns
+        repeated_start_ns, current_start_ns = map(self.survey.begins_ns, spec.repeats)
+        return self._firing_times_ns + round(current_start_ns - repeated_start_ns)
 
     @property
     def _actor_times_ns(self) -> Ints:
@@ -198,12 +206,49 @@ class BatchPoints:
 
     @cached_property
     def positions(self) -> Floats:
+        """Reported positions of the points in the scene frame, in meters.
+
+        The shape is (n, 3). They are the true positions unless the points are georeferenced by the
+        measured trajectory.
+        """
+        return self._georeferenced(self.true_positions)
+
+    @cached_property
+    def true_positions(self) -> Floats:
         """End points of the rays in the scene frame, in meters.
 
         The shape is (n, 3). Points that a frozen sensor sends again stay fixed in the sensor frame,
         and so move with the sensor.
         """
         return self._moved_with_frozen_sensor(self._scene_positions)
+
+    def _georeferenced(self, points: Floats) -> Floats:
+        """Move points of the scene frame to where the measured trajectory places them.
+
+        If the survey reports true positions, the points are returned unchanged.
+        """
+        measured = self.survey.measured
+        if measured is None:
+            return points
+        reported_mount = self.survey.reported_mounts[self.specs[0].sensor]
+        return measured.georeference(
+            points, self._sent_times_ns, self.carried.mount, reported_mount
+        )
+
+    @property
+    def true_x(self) -> Floats:
+        """The x coordinate of the true positions in world coordinates."""
+        return self.true_positions[:, 0] + self.scene.origin[0]
+
+    @property
+    def true_y(self) -> Floats:
+        """The y coordinate of the true positions in world coordinates."""
+        return self.true_positions[:, 1] + self.scene.origin[1]
+
+    @property
+    def true_z(self) -> Floats:
+        """The z coordinate of the true positions in world coordinates."""
+        return self.true_positions[:, 2] + self.scene.origin[2]
 
     def _moved_with_frozen_sensor(self, points: Floats) -> Floats:
         """Move points along with a frozen sensor, from its old pose to its current pose.
@@ -226,7 +271,8 @@ class BatchPoints:
         """
         if self.survey.coordinates == "sensor":
             return self._in_sensor(np.zeros(len(self)))
-        return self._moved_with_frozen_sensor(self.origins) + self.scene.origin
+        origins = self._georeferenced(self._moved_with_frozen_sensor(self.origins))
+        return origins + self.scene.origin
 
     @property
     def origin_x(self) -> Floats:

@@ -79,7 +79,8 @@ def _device_column_names(scene: Scene, survey: Survey) -> set[str]:
     if scene.has_mixed_objects:  # the device does not know the materials of faces
         computable -= {*_ENERGIES, "class"}
     computable -= {"time"} if any(fault.by_s for fault in survey.faults) else set()
-    return computable - {axis.name for axis in AXES if survey.coordinates == "sensor"}
+    on_host = survey.coordinates == "sensor" or survey.georeferencing == "measured"
+    return computable - {axis.name for axis in AXES if on_host}
 
 
 def needs_hits(scene: Scene, survey: Survey) -> bool:

@@ -1,0 +1,173 @@
+"""Areas of airborne surveys, which are read from GeoJSON, WKT or bounds."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from lidarsim.environment.extras import install_command
+from lidarsim.errors import LidarError, convert_errors
+from lidarsim.io.input_files import read_input_text
+
+GEOGRAPHIC = 4326  # EPSG code of longitudes and latitudes
+_GEOJSON = (".geojson", ".json")
+_WKT = (".wkt", ".txt")
+_CRS_CODE = re.compile(r"(?:EPSG:{1,2}|EPSG/0/)(\d+)$", re.IGNORECASE)
+_CRS84 = re.compile(r"CRS84$", re.IGNORECASE)
+
+
+class Area(NamedTuple):
+    """Area of a survey, as polygons of shapely."""
+
+    shape: Any  # Polygon or MultiPolygon
+    epsg: int | None  # EPSG code of the coordinates, 4326 for longitudes and latitudes
+
+
+def read_area(text: str) -> Area | None:
+    """Read an area from a GeoJSON or WKT file, from a WKT string, or from bounds.
+
+    Parameters
+    ----------
+    text
+        Path of a file (.geojson, .json, .wkt or .txt), a polygon as WKT, or the bounds
+        ``XMIN,YMIN,XMAX,YMAX``.
+
+    Returns
+    -------
+    The area, or None if the text describes neither of these, such as the path of a mesh.
+
+    Raises
+    ------
+    LidarError
+        If the area is invalid or is not a polygon, or if shapely is not installed.
+
+    Examples
+    --------
+    >>> read_area("0,0,100,50").shape.area
+    5000.0
+    """
+    suffix = Path(text).suffix.lower()
+    is_wkt = text.lstrip().upper().startswith(("POLYGON", "MULTIPOLYGON"))
+    bounds = re.fullmatch(r"\s*(?:[-+.\deE]+\s*,\s*){3}[-+.\deE]+\s*", text)
+    if not (is_wkt or bounds or suffix in (*_GEOJSON, *_WKT)):
+        return None
+    shapely = _shapely()
+    epsg = None
+    with convert_errors(f"The area {_shorten(text)} cannot be read"):
+        if bounds:
+            x0, y0, x1, y1 = map(float, text.split(","))
+            if not (x0 < x1 and y0 < y1):
+                raise ValueError("bounds must be XMIN,YMIN,XMAX,YMAX in ascending order")
+            shape = shapely.box(x0, y0, x1, y1)
+        elif is_wkt:
+            shape = shapely.from_wkt(text)
+        elif suffix in _WKT:
+            shape = shapely.from_wkt(read_input_text(Path(text)).strip())
+        else:
+            content = json.loads(read_input_text(Path(text)))
+            epsg = _geojson_epsg(content)
+            geometries = [shapely.geometry.shape(geometry) for geometry in _geometries(content)]
+            shape = shapely.union_all([g for g in geometries if "Polygon" in g.geom_type])
+    _check_shape(shape, text)
+    return Area(shape, epsg)
+
+
+def _check_shape(shape: Any, text: str) -> None:
+    """Raise LidarError unless a geometry is a valid polygon with an area."""
+    if shape.geom_type not in ("Polygon", "MultiPolygon") or not shape.area > 0:
+        raise LidarError(
+            f"The area {_shorten(text)} must be a polygon, but is {shape.geom_type} with an area "
+            f"of {shape.area:g}. Draw the outline of the survey as a polygon."
+        )
+    if not shape.is_valid:
+        reason = import_module("shapely").is_valid_reason(shape)
+        raise LidarError(f"The area {_shorten(text)} is not a valid polygon: {reason}.")
+
+
+def _geometries(content: Any) -> Iterator[Any]:
+    """Yield the geometries of a GeoJSON object."""
+    kind = content["type"]
+    if kind == "FeatureCollection":
+        for feature in content["features"]:
+            yield from _geometries(feature)
+    elif kind == "Feature":
+        yield from _geometries(content["geometry"])
+    elif kind == "GeometryCollection":
+        for geometry in content["geometries"]:
+            yield from _geometries(geometry)
+    else:
+        yield content
+
+
+def _geojson_epsg(content: Any) -> int:
+    """Return the EPSG code of a GeoJSON object, which is 4326 unless it has the member `crs`."""
+    crs = content.get("crs")
+    if crs is None:
+        return GEOGRAPHIC
+    name = crs["properties"]["name"]
+    if _CRS84.search(name):
+        return GEOGRAPHIC
+    match = _CRS_CODE.search(name)
+    if match is None:
+        raise ValueError(f"the coordinate system {name!r} is unknown. Use an EPSG code")
+    return int(match[1])
+
+
+def utm_epsg(shape: Any) -> int:
+    """Return the EPSG code of the UTM zone (WGS 84) that contains the center of an area.
+
+    The coordinates of the area are longitudes and latitudes.
+
+    Examples
+    --------
+    >>> import shapely
+    >>> utm_epsg(shapely.box(9.1, 48.7, 9.2, 48.8))
+    32632
+    """
+    longitude, latitude = shape.centroid.x, shape.centroid.y
+    zone = int((longitude + 180) // 6) % 60 + 1
+    return (32600 if latitude >= 0 else 32700) + zone
+
+
+def transform_shape(shape: Any, source: int, target: int) -> Any:
+    """Transform a geometry of shapely between two coordinate systems.
+
+    `source` and `target` are EPSG codes.
+
+    Raises
+    ------
+    LidarError
+        If rasterio is not installed or does not know a code.
+    """
+    if source == target:
+        return shape
+    if find_spec("rasterio") is None:
+        raise LidarError(
+            f"A conversion from EPSG:{source} to EPSG:{target} requires rasterio. Run "
+            f"{install_command('lidarpool[geo]')}."
+        )
+    shapely = _shapely()
+    with convert_errors(f"A conversion from EPSG:{source} to EPSG:{target} is not possible"):
+        transformed = import_module("rasterio.warp").transform_geom(
+            f"EPSG:{source}", f"EPSG:{target}", shapely.geometry.mapping(shape)
+        )
+    return shapely.geometry.shape(transformed)
+
+
+def _shapely() -> Any:
+    """Import shapely. Raise LidarError if it is not installed."""
+    if find_spec("shapely") is None:
+        raise LidarError(
+            f"A flight plan requires shapely. Run {install_command('lidarpool[geo]')}."
+        )
+    import_module("shapely.geometry")
+    return import_module("shapely")
+
+
+def _shorten(text: str) -> str:
+    return text if len(text) <= 60 else text[:57] + "..."
