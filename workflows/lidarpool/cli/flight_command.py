@@ -36,6 +36,9 @@ FILES = (SCENARIO_FILE, PATH_FILE, PICTURE_FILE, GEOJSON_FILE, KML_FILE)
 _SHOWN_LINES = 20  # maximum number of lines listed individually
 _STEP_DEG = 360  # time step in degrees of the scanner's cycle: one cycle per scan
 _STEP_RAYS = 100_000  # a cycle with more rays is divided into steps of 10 degrees
+# Level ground extends beyond the trajectory by this multiple of half the swath.
+_GROUND_MARGIN = 1.5
+_MIN_MARGIN_M = 50
 _ORIGIN_M = 100.0  # the origin of a plan in a UTM zone is a multiple of this length
 
 
@@ -61,8 +64,8 @@ def _parse_speeds(text: str) -> tuple[float, float]:
         speeds = math.nan, math.nan
     if not 0.1 <= speeds[0] <= speeds[1] <= 400:
         raise click.BadParameter(
-            f"{text!r} is not a valid speed. Expected a speed from 0.1 to 400 m/s such as 8, or its "
-            "limits such as 4-12."
+            f"{text!r} is not a valid speed. Expected a speed from 0.1 to 400 m/s such as 8, or "
+            "its limits such as 4-12."
         )
     return speeds
 
@@ -154,18 +157,7 @@ def _parse_speeds(text: str) -> tuple[float, float]:
 @options.mesh_reading
 @overwrite
 @options.as_json
-def flight(
-    area: str,
-    model: str,
-    terrain: Path | None,
-    epsg: int | None,
-    fov_deg: float | None,
-    out: Path | None,
-    overwrite: bool,
-    as_json: bool,
-    of_mesh: dict[str, Any],
-    **settings: Any,
-) -> None:
+def flight(area: str, model: str, of_mesh: dict[str, Any], **settings: Any) -> None:
     """Plan the flight lines of an airborne survey.
 
     AREA is a polygon in a GeoJSON file or in WKT, bounds such as 0,0,400,200, or a mesh or scenario
@@ -184,20 +176,24 @@ def flight(
       lidarpool flight site.geojson --sensor vq780i.yaml --terrain dem.tif --agl 500 --follow
       lidarpool flight 0,0,400,200 --sensor riegl-vq780i --agl 150 --speed 4-12 --cross 1
     """  # noqa: D301 - Click requires the character \b
+    as_json = settings.pop("as_json")
     print_first_step("reading the area", quiet=as_json)
     from lidarsim.schema.model_names import full_name
 
     from ..clouds.folder import result_folder
-    from ..plan.flight import Scanner, plan_flight
+    from ..plan.flight import plan_flight
+    from ..plan.flight_scanner import Scanner
     from .terminal import Terminal
 
     terminal = Terminal(quiet=as_json)
-    scanner = Scanner.load(full_name(model), fov_deg)  # reported before the scene is read
-    site = _read_site(area, terrain, epsg, of_mesh, terminal)
-    folder = Path(f"{site.name}-flight") if out is None else out
+    # An unsuitable sensor is reported before the scene is read.
+    scanner = Scanner.load(full_name(model), settings.pop("fov_deg"))
+    site = _read_site(area, settings.pop("terrain"), settings.pop("epsg"), of_mesh, terminal)
+    folder = settings.pop("out") or Path(f"{site.name}-flight")
+    overwrites = settings.pop("overwrite")
     with result_folder(folder):
         existing = [folder / name for name in FILES if (folder / name).exists()]
-        if existing and not overwrite:
+        if existing and not overwrites:
             raise LidarError(
                 f"{existing[0]} already exists. Use another folder with `--out`, or pass "
                 "`--overwrite`."
@@ -242,8 +238,8 @@ def _read_site(
     import numpy as np
     import shapely
 
-    from ..plan.flight import Ground
     from ..plan.flight_area import GEOGRAPHIC, read_area, utm_epsg
+    from ..plan.flight_lines import Ground
 
     drawn = read_area(area)
     if drawn is None and terrain is not None:
@@ -354,45 +350,12 @@ def _yaml(data: dict[str, Any]) -> str:
 
 def _scenario_data(plan: FlightPlan, site: _Site, folder: Path) -> dict[str, Any]:
     """Return the content of the scenario: the scanner, once per line, along the path."""
-    scanner = plan.scanner
-    first, stop = scanner.sensor.firings(0)
-    entry: dict[str, Any] = {"model": sensor_entry(scanner.model, folder)}
-    rays = (plan.pulses_per_cycle or scanner.sensor.period or _STEP_RAYS) * scanner.sensor.channels
-    step_deg = _STEP_DEG if rays <= _STEP_RAYS else 10
-    if plan.pulses_per_cycle is not None:
-        entry["columns"] = plan.pulses_per_cycle
-    if scanner.rates_hz[0] < scanner.rates_hz[1]:
-        entry["rate_hz"] = round(plan.rate_hz, 6)
-    if hasattr(scanner.sensor.head, "step_deg"):
-        entry["step_deg"] = step_deg
-        steps_hz = plan.rate_hz * 360 / step_deg
-    else:
-        steps_hz = plan.fired_hz / scanner.sensor.channels / (stop - first)
-    if scanner.mount.pitch_deg:
-        entry["mount"] = {"pitch_deg": scanner.mount.pitch_deg}
-    world: dict[str, Any] = {}
-    if site.scenario is not None:
-        sections = scene_sections(site.scenario, folder)
-        world = sections.pop("world", {})
-    else:
-        sections = {"scene": {"ground": {"height_m": 0, "margin_m": 50}}}
-        if site.origin.any():
-            world["origin"] = site.origin[:2].tolist()
-    if site.epsg is not None:
-        world["epsg"] = site.epsg
-    durations = zip(plan.path.starts_s.tolist(), plan.path.durations_s.tolist(), strict=True)
-    sensors = {
-        line.name: entry
-        | {"start_s": round(start_s, 4), "steps": max(math.ceil(duration_s * steps_hz), 1)}
-        for line, (start_s, duration_s) in zip(plan.lines, durations, strict=True)
-    }
     parts = getattr(plan.area, "geoms", [plan.area])
     rings = [ring for part in parts for ring in (part.exterior, *part.interiors)]
     return {
-        **sections,
-        **({"world": world} if world else {}),
+        **_site_sections(plan, site, folder),
         "trajectory": {"file": PATH_FILE, "interpolation": "smooth"},
-        "sensors": sensors,
+        "sensors": _sensor_sections(plan, folder),
         "flight": {
             "density_m2": round(plan.density_m2 or plan.densities_m2[0], 3),
             "area": [
@@ -400,6 +363,43 @@ def _scenario_data(plan: FlightPlan, site: _Site, folder: Path) -> dict[str, Any
             ],
         },
         "cloud": {"precision_m": 0.001, "columns": ["time", "range"]},
+    }
+
+
+def _site_sections(plan: FlightPlan, site: _Site, folder: Path) -> dict[str, Any]:
+    """Return the sections `scene` and `world` of the scenario."""
+    reach_m = plan.layout.agl_m * max(plan.scanner.tangent, plan.scanner.ahead)
+    margin_m = max(math.ceil(reach_m * _GROUND_MARGIN), _MIN_MARGIN_M)
+    sections: dict[str, Any] = {"scene": {"ground": {"height_m": 0, "margin_m": margin_m}}}
+    if site.scenario is not None:
+        sections = scene_sections(site.scenario, folder)
+    world = sections.pop("world", {})
+    if site.scenario is None and site.origin.any():
+        world["origin"] = site.origin[:2].tolist()
+    if site.epsg is not None:
+        world["epsg"] = site.epsg
+    return sections | ({"world": world} if world else {})
+
+
+def _sensor_sections(plan: FlightPlan, folder: Path) -> dict[str, Any]:
+    """Return the section `sensors` of the scenario, with an entry for each line."""
+    scanner = plan.scanner
+    rates = plan.rates
+    cycle_rays = rates.fired_hz / rates.scan_hz
+    step_deg = _STEP_DEG if cycle_rays <= _STEP_RAYS else 10
+    entry: dict[str, Any] = {"model": sensor_entry(scanner.model, folder), "step_deg": step_deg}
+    if rates.pulses_per_cycle is not None:
+        entry["columns"] = rates.pulses_per_cycle
+    if scanner.rates_hz[0] < scanner.rates_hz[1]:
+        entry["rate_hz"] = round(rates.scan_hz, 6)
+    if scanner.mount.pitch_deg:
+        entry["mount"] = {"pitch_deg": scanner.mount.pitch_deg}
+    steps_hz = rates.scan_hz * 360 / step_deg
+    durations = zip(plan.path.starts_s.tolist(), plan.path.durations_s.tolist(), strict=True)
+    return {
+        line.name: entry
+        | {"start_s": round(start_s, 4), "steps": max(math.ceil(duration_s * steps_hz), 1)}
+        for line, (start_s, duration_s) in zip(plan.lines, durations, strict=True)
     }
 
 
@@ -429,11 +429,11 @@ def _summary(plan: FlightPlan, density: AreaDensity | None) -> Iterator[str]:
     spacing = "" if plan.spacing_m is None else f", {plan.spacing_m:.1f} m apart"
     yield (
         f"{plural(len(plan.lines), 'flight line')}{spacing}, {plan.length_m / 1000:,.2f} km in "
-        f"total, {plan.duration_s / 60:.1f} min in the air at {plan.speed_m_s:g} m/s."
+        f"total, {plan.duration_s / 60:.1f} min in the air at {plan.rates.speed_m_s:g} m/s."
     )
     yield (
-        f"{scanner.sensor.model}: {format_rounded(plan.fired_hz / 1000)} kHz, {plan.rate_hz:g} Hz, "
-        f"a swath of {scanner.swath_m(plan.agl_m):.0f} m at {plan.agl_m:g} m."
+        f"{scanner.sensor.model}: {format_rounded(plan.rates.fired_hz / 1000)} kHz, "
+        f"{plan.rates.scan_hz:g} Hz, a swath of {plan.swath_m:.0f} m at {plan.layout.agl_m:g} m."
     )
     if density is not None:
         yield (
@@ -475,9 +475,8 @@ def _lines(plan: FlightPlan, density: AreaDensity | None, notes: list[str]) -> I
             f"{line.name:<8} {start_s:8,.1f} s {line.leg.length_m:11,.1f} m "
             f"{low_m:9,.1f} to {high_m:,.1f} m {line.swath_m[0]:9,.0f} to {line.swath_m[1]:,.0f} m"
         )
-    if further := len(plan.lines) - _SHOWN_LINES:
-        if further > 0:
-            yield f"{further} further lines"
+    if (further := len(plan.lines) - _SHOWN_LINES) and further > 0:
+        yield f"{further} further lines"
     yield from map("note: {}".format, notes)
 
 
@@ -487,10 +486,10 @@ def _figures(
     """Return a flight plan as a dictionary for JSON."""
     return {
         "sensor": plan.scanner.sensor.model,
-        "speed_m_s": plan.speed_m_s,
-        "pulse_rate_hz": plan.fired_hz,
-        "scan_rate_hz": plan.rate_hz,
-        "swath_m": plan.scanner.swath_m(plan.agl_m),
+        "speed_m_s": plan.rates.speed_m_s,
+        "pulse_rate_hz": plan.rates.fired_hz,
+        "scan_rate_hz": plan.rates.scan_hz,
+        "swath_m": plan.swath_m,
         "spacing_m": plan.spacing_m,
         "min_overlap": plan.min_overlap,
         "strip_density_m2": list(plan.densities_m2),

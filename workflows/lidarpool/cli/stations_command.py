@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from ..plan.stations import StationPlan, SurveyCoverage
     from ..scenario.prepare import PreparedScenario
     from ..scenario.scenario import Scenario
-    from .terminal import Terminal
 
 PLAN_FILE = "stations.yaml"
 PICTURE_FILE = "stations.png"

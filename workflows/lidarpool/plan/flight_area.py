@@ -79,14 +79,14 @@ def read_area(text: str) -> Area | None:
 
 def _check_shape(shape: Any, text: str) -> None:
     """Raise LidarError unless a geometry is a valid polygon with an area."""
+    if not shape.is_valid:
+        reason = import_module("shapely").is_valid_reason(shape)
+        raise LidarError(f"The area {_shorten(text)} is not a valid polygon: {reason}.")
     if shape.geom_type not in ("Polygon", "MultiPolygon") or not shape.area > 0:
         raise LidarError(
             f"The area {_shorten(text)} must be a polygon, but is {shape.geom_type} with an area "
             f"of {shape.area:g}. Draw the outline of the survey as a polygon."
         )
-    if not shape.is_valid:
-        reason = import_module("shapely").is_valid_reason(shape)
-        raise LidarError(f"The area {_shorten(text)} is not a valid polygon: {reason}.")
 
 
 def _geometries(content: Any) -> Iterator[Any]:

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsim.motion.trajectory import full_poses
-from lidarsim.numerics.arrays import Bools, Floats
-from lidarsim.numerics.vectors import rotate, rotate_into_frames
+from lidarsim.numerics.arrays import Bools, Floats, Ints
+from lidarsim.numerics.vectors import matmul, rotate_into_frames
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.survey.survey import Mounted, Survey
@@ -120,28 +120,29 @@ def _sampled_hits(
 ) -> Floats:
     """Return the points that one in `every` rays of a sensor hits, in local coordinates."""
     sensor = mounted.sensor
-    channels = sensor.channels
-    rays = sensor.firings(steps - 1)[1] * channels
+    rays = sensor.firings(steps - 1)[1] * sensor.channels
     # Multiples of the golden ratio spread the rays evenly over firings and channels.
     number = np.arange(rays // every, dtype=np.int64)
     ray = number * every + (number * _GOLDEN % 1 * every).astype(np.int64)
-    firing, channel = np.divmod(ray, channels)
+    firing, channel = np.divmod(ray, sensor.channels)
     fired, row = np.unique(firing, return_inverse=True)
-    times_ns = np.minimum(sensor.begins_ns(fired) + sensor.lead_ns, survey.path.duration_ns)
-    positions, rotations = full_poses(survey.path, 0, times_ns)
-    to_scene = rotations.transpose(0, 2, 1)
+    origins, rotations = _sensor_poses(survey, mounted, fired)
     directions = sensor.directions(fired)[row, channel]
-    in_platform = rotate(directions, mounted.mount.rotation)
-    starts = positions + rotate_into_frames(
-        np.broadcast_to(np.array(mounted.mount.position), positions.shape), to_scene
-    )
-    towards = rotate_into_frames(in_platform, to_scene[row])
-    origins = starts[row]
-    found = caster.cast(origins, towards)
-    hit = (
-        found.hit & (found.distance >= sensor.min_range_m) & (found.distance <= sensor.max_range_m)
-    )
-    return np.asarray(origins[hit] + found.distance[hit, None] * towards[hit])
+    towards = rotate_into_frames(directions, rotations.transpose(0, 2, 1)[row])
+    found = caster.cast(origins[row], towards)
+    in_range = (found.distance >= sensor.min_range_m) & (found.distance <= sensor.max_range_m)
+    hit = found.hit & in_range
+    return np.asarray(origins[row[hit]] + found.distance[hit, None] * towards[hit])
+
+
+def _sensor_poses(survey: Survey, mounted: Mounted, firings: Ints) -> tuple[Floats, Floats]:
+    """Return the positions and rotations of a sensor at firings of shape (k,)."""
+    sensor = mounted.sensor
+    times_ns = np.minimum(sensor.begins_ns(firings) + sensor.lead_ns, survey.path.duration_ns)
+    positions, rotations = full_poses(survey.path, 0, times_ns)
+    levers = np.broadcast_to(np.array(mounted.mount.position), positions.shape)
+    origins = positions + rotate_into_frames(levers, rotations.transpose(0, 2, 1))
+    return origins, matmul(rotations, mounted.mount.rotation_matrix)
 
 
 def _count_cells(points: Floats, weights: Floats, area: Sequence[Ring]) -> DensityMap:

@@ -42,7 +42,7 @@ def _features(plan: FlightPlan, epsg: int | None, origin: Floats) -> Iterator[_F
             return geometry
         return transform_shape(translate(geometry, *origin.tolist()), epsg, GEOGRAPHIC)
 
-    properties: dict[str, Any] = {"agl_m": plan.agl_m, "overlap": plan.overlap}
+    properties: dict[str, Any] = {"agl_m": plan.layout.agl_m, "overlap": plan.layout.overlap}
     yield _Feature("area", "area", placed(plan.area), properties)
     for line, start_s in zip(plan.lines, plan.path.starts_s.tolist(), strict=True):
         leg = line.leg
@@ -53,7 +53,7 @@ def _features(plan: FlightPlan, epsg: int | None, origin: Floats) -> Iterator[_F
         properties = {
             "start_s": round(start_s, 3),
             "length_m": round(leg.length_m, 2),
-            "speed_m_s": plan.speed_m_s,
+            "speed_m_s": plan.rates.speed_m_s,
             "min_clearance_m": round(line.clearance_m[0], 2),
             "max_clearance_m": round(line.clearance_m[2], 2),
             "min_swath_m": round(line.swath_m[0], 2),

@@ -13,8 +13,9 @@ from lidarsim.words import format_rounded, plural
 from lidarview.render import theme
 from lidarview.render.picture_page import FONT, Page
 
-from ..plan.flight import FlightLine, FlightPlan
+from ..plan.flight import FlightPlan
 from ..plan.flight_density import DensityMap
+from ..plan.flight_lines import FlightLine
 
 SIZE = (1600, 1000)
 _FRAME = (0.075, 0.10, 0.755, 0.735)  # left, bottom, width and height of the map
@@ -30,8 +31,8 @@ def draw_flight(plan: FlightPlan, expected: DensityMap) -> Page:
     """Draw the flight lines, the area, the turns and the expected density as seen from above."""
     page = Page(SIZE)
     axes = page.map_chart(_FRAME, _limits(plan))
-    high = float(np.quantile(expected.density_m2[expected.density_m2 > 0], 0.98))
-    norm = Normalize(0, high)
+    densities = expected.density_m2[expected.density_m2 > 0]
+    norm = Normalize(0, float(np.quantile(densities, 0.98)) if len(densities) else 1.0)
     rows, columns = expected.density_m2.shape
     x0, y0 = expected.corner.tolist()
     extent = (x0, x0 + columns * expected.cell_m, y0, y0 + rows * expected.cell_m)
@@ -74,8 +75,8 @@ def _draw_line(axes: Axes, page: Page, line: FlightLine, *, named: bool) -> None
     halo = [withStroke(linewidth=2.6 * page.unit, foreground=theme.PAGE)]
     axes.annotate(
         "",
-        line.leg.stop,
-        line.leg.start,
+        tuple(line.leg.stop.tolist()),
+        tuple(line.leg.start.tolist()),
         arrowprops={
             "arrowstyle": "-|>",
             "color": color,
@@ -88,9 +89,10 @@ def _draw_line(axes: Axes, page: Page, line: FlightLine, *, named: bool) -> None
         zorder=4,
     )
     if named:
-        place = line.leg.start + 0.03 * (line.leg.stop - line.leg.start)
+        x, y = (line.leg.start + 0.03 * (line.leg.stop - line.leg.start)).tolist()
         axes.text(
-            *place,
+            x,
+            y,
             line.name,
             fontsize=6.2 * page.unit,
             family=FONT,
@@ -122,10 +124,10 @@ def _details(plan: FlightPlan) -> tuple[str, str]:
     if plan.densities_m2[1] > 1.02 * plan.densities_m2[0]:
         strip += f" to {plan.densities_m2[1]:.3g}"
     target = "" if plan.density_m2 is None else f" (planned: {plan.density_m2:g})"
-    heights = (f"{plan.agl_m:g} m above ground", f"swath {plan.scanner.swath_m(plan.agl_m):.0f} m")
+    heights = (f"{plan.layout.agl_m:g} m above ground", f"swath {plan.swath_m:.0f} m")
     spacing = "" if plan.spacing_m is None else f", line spacing {plan.spacing_m:.1f} m"
     return (
-        f"{plan.scanner.sensor.model}: {format_rounded(plan.fired_hz / 1000)} kHz, "
-        f"{plan.rate_hz:g} Hz, {plan.speed_m_s:g} m/s",
+        f"{plan.scanner.sensor.model}: {format_rounded(plan.rates.fired_hz / 1000)} kHz, "
+        f"{plan.rates.scan_hz:g} Hz, {plan.rates.speed_m_s:g} m/s",
         f"{', '.join(heights)}{spacing}; {strip} points per m²{target}",
     )

@@ -123,7 +123,7 @@ class MeasuredTrajectory:
         array
             Points in the scene frame, in meters. Shape (n, 3).
         """
-        times = np.minimum(np.asarray(times_ns, np.float64), self.duration_ns)
+        times = np.minimum(times_ns, self.duration_ns)
         positions, rotations = full_poses(self.path, 0, times)
         measured_positions, measured_rotations = self._with_errors(times, positions, rotations)
         in_platform = rotate_into_frames(points - positions, rotations)

@@ -407,10 +407,7 @@ class Survey(CloudOptions, Weather):
         """Check that the options are compatible with each other and with the sensors."""
         if self.epsg in WORLD_EPSG:
             raise LidarError(f"epsg is {self.epsg}, {OF_THE_WORLD}.")
-        if self.georeferencing == "measured":
-            check_measurable(self.navigation)
-        if self.navigation is not None:
-            check_navigation(self.navigation, self.path, self.epsg)
+        self._check_navigation()
         if self.start is not None and (self.start.tzinfo is None or self.start < START_FROM):
             raise LidarError(
                 "start must be a time from 2017 on with its time zone, such as "
@@ -428,6 +425,13 @@ class Survey(CloudOptions, Weather):
         if self.rain_mm_h or self.snow_mm_h or self.dust_mg_m3 or self.spray_g_m3:
             for number in range(len(self.mounted_sensors)):
                 self._check_air(number)
+
+    def _check_navigation(self) -> None:
+        """Check that instruments and a measured trajectory can be simulated."""
+        if self.georeferencing == "measured":
+            check_measurable(self.navigation)
+        if self.navigation is not None:
+            check_navigation(self.navigation, self.path, self.epsg)
 
     def _check_waveform(self, sensor: Sensor, returns: Returns) -> None:
         """Check that the waveform samples are suitable for a sensor's pulse and for LAS files."""

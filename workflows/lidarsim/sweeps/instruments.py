@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,8 @@ class Instruments:
     imu: Instrument | None
     gnss: Instrument | None
     folder: Path | None = None  # None until the files are written
-    trajectory: bool = False  # whether points are georeferenced by the measured trajectory
+    # Whether points are georeferenced by the measured trajectory.
+    trajectory: bool = field(default=False, kw_only=True)
 
     @classmethod
     def from_survey(cls, survey: Survey) -> Instruments | None:
@@ -80,7 +81,7 @@ class Instruments:
         """
         imu = values["imu"] and Instrument(**values["imu"])
         gnss = values["gnss"] and Instrument(**values["gnss"])
-        instruments = cls(imu, gnss, folder, values.get("trajectory", False))
+        instruments = cls(imu, gnss, folder, trajectory=values.get("trajectory", False))
         if all((folder / name).exists() for name in instruments.files):
             return instruments
         return replace(instruments, folder=None)

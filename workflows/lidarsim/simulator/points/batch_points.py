@@ -232,7 +232,7 @@ class BatchPoints:
             return points
         reported_mount = self.survey.reported_mounts[self.specs[0].sensor]
         return measured.georeference(
-            points, self._sent_times_ns, self.carried.mount, reported_mount
+            points, self._sent_times_ns.astype(np.float64), self.carried.mount, reported_mount
         )
 
     @property

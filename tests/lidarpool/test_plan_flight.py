@@ -1,0 +1,292 @@
+"""Flight plans against closed forms and against simulations."""
+
+from __future__ import annotations
+
+import json
+import math
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import shapely
+from tests.shapes import level, quad
+from tests.simulated_drives import simulated_points
+
+from lidarpool import LidarError, Mounted, Scene, Survey, Track, load_sensor
+from lidarpool.plan.flight import plan_flight
+from lidarpool.plan.flight_area import read_area, transform_shape
+from lidarpool.plan.flight_density import (
+    DensityMap,
+    expected_density,
+    is_inside,
+    summarize_density,
+)
+from lidarpool.plan.flight_files import to_geojson, to_kml
+from lidarpool.plan.flight_lines import Ground
+from lidarpool.plan.flight_path import Leg, fly, shortest_turn, turn_radius_m
+from lidarpool.plan.flight_scanner import Scanner
+
+SQUARE = shapely.box(0, 0, 1000, 1000)
+RIEGL = "airborne/riegl-vq780i"  # 60°, 666,600 pulses per second on average, 20 to 300 Hz
+
+
+@pytest.fixture(scope="module")
+def scanner():
+    return Scanner.load(RIEGL)
+
+
+def planned(scanner, area=SQUARE, ground=None, agl_m=500, **options):
+    return plan_flight(area, ground or Ground(), scanner, agl_m=agl_m, **options)
+
+
+def test_swath_and_spacing(scanner):
+    plan = planned(scanner, overlap=0.3)
+    swath = 2 * 500 * math.tan(math.radians(30))
+    assert plan.swath_m == pytest.approx(swath)
+    # Three strips cover the square. Two would need an overlap of less than 30 %.
+    assert plan.spacing_m == pytest.approx((1000 - swath) / 2)
+    assert plan.min_overlap == pytest.approx(1 - plan.spacing_m / swath)
+    across = sorted(float(line.leg.start[1]) for line in plan.lines)
+    assert across == pytest.approx([swath / 2, 500, 1000 - swath / 2])
+    assert not plan.notes
+
+
+def test_speed_and_rates_for_a_density(scanner):
+    plan = planned(scanner, density_m2=20)
+    rates = plan.rates
+    assert rates.speed_m_s == math.floor(scanner.pulses_hz / (20 * plan.swath_m) * 10) / 10
+    assert rates.fired_hz <= scanner.fired_hz
+    assert plan.densities_m2[0] == pytest.approx(20, rel=0.02)
+    assert plan.along_m == pytest.approx(plan.across_m, rel=0.02)
+    # At the speed limit, the pulse rate is reduced instead.
+    slow = planned(scanner, density_m2=20, speeds_m_s=(5, 30))
+    assert slow.rates.speed_m_s == 30
+    assert slow.rates.fired_hz < 0.6 * scanner.fired_hz
+    assert slow.densities_m2[0] == pytest.approx(20, rel=0.01)
+    assert slow.rates.pulses_per_cycle * slow.rates.scan_hz == pytest.approx(slow.rates.fired_hz)
+
+
+def test_lines_follow_the_longest_side_and_alternate(scanner):
+    area = shapely.affinity.rotate(shapely.box(0, 0, 2000, 900), 30)
+    plan = planned(scanner, area)
+    directions = [math.degrees(line.leg.direction) % 360 for line in plan.lines]
+    assert directions == pytest.approx([30, 210][: len(directions)])
+    north = planned(scanner, area, heading_deg=0)
+    assert math.degrees(north.lines[0].leg.direction) == pytest.approx(90)
+
+
+def test_cross_strips_are_perpendicular(scanner):
+    plan = planned(scanner, shapely.box(0, 0, 800, 400), cross=2)
+    crossing = [line for line in plan.lines if line.kind == "cross"]
+    assert [line.name for line in crossing] == ["cross-1", "cross-2"]
+    assert [float(line.leg.start[0]) for line in crossing] == pytest.approx([600, 200])
+    assert [line.leg.length_m for line in crossing] == pytest.approx([404, 404])
+
+
+def test_lines_end_where_the_area_ends_within_their_swath(scanner):
+    triangle = shapely.Polygon([(0, 0), (3000, 0), (0, 1200)])
+    plan = planned(scanner, triangle)
+    lengths = [line.leg.length_m for line in plan.lines]
+    assert lengths == sorted(lengths, reverse=True)
+    low = float(plan.lines[-1].leg.start[1]) - plan.swath_m / 2
+    assert lengths[-1] == pytest.approx(3000 * (1 - low / 1200) + 4, abs=0.01)
+
+
+def test_hills_narrow_the_spacing_and_slow_the_aircraft(scanner):
+    hill = quad("Ridge", (-2000, -2000, 0), (2000, -2000, 0), (2000, 3000, 150), (-2000, 3000, 150))
+    area = shapely.box(-500, 0, 1500, 1000)
+    ground = Ground(Scene.from_meshes([hill]))
+    plan = planned(scanner, area, ground, density_m2=10, heading_deg=90)
+    level_plan = planned(scanner, area, density_m2=10, heading_deg=90)
+    assert plan.min_overlap >= 0.29
+    assert plan.lowest_m < 495
+    assert plan.rates.speed_m_s < level_plan.rates.speed_m_s
+    # Each line is level, at its height above the mean ground below it.
+    for line in plan.lines:
+        below = 0.03 * (float(line.leg.start[1]) + 2000)
+        assert line.leg.heights == pytest.approx(below + 500)
+        assert line.clearance_m[1] == pytest.approx(500)
+
+
+def test_an_aircraft_follows_the_ground(scanner):
+    slope = quad("Slope", (-500, -500, 0), (1500, -500, 200), (1500, 1500, 200), (-500, 1500, 0))
+    ground = Ground(Scene.from_meshes([slope]))
+    plan = planned(scanner, ground=ground, heading_deg=90, agl_m=200, follow=True)
+    line = plan.lines[0].leg
+    assert line.heights[len(line.heights) // 2] == pytest.approx(300, abs=1)
+    assert np.ptp(line.heights) > 80
+    assert planned(scanner, ground=ground, heading_deg=90, agl_m=200).lowest_m < plan.lowest_m
+
+
+def test_a_path_passes_all_lines_at_their_times(scanner):
+    plan = planned(scanner, cross=1)
+    path = plan.path
+    track = Track(path.times_s, path.positions, yaw_deg=path.yaw_deg, roll_deg=path.roll_deg,
+                  smooth=True)  # fmt: skip
+    for line, start_s, duration_s in zip(
+        plan.lines, path.starts_s, path.durations_s, strict=True
+    ):
+        for share in (0, 0.5, 1):
+            pose = track.pose(0, (start_s + share * duration_s) * 1e9)
+            expected = line.leg.start + share * (line.leg.stop - line.leg.start)
+            assert pose.position[:2] == pytest.approx(expected, abs=1e-3)
+            assert abs(pose.roll_deg) < 1e-3
+            off = (pose.yaw_deg - math.degrees(line.leg.direction) + 180) % 360 - 180
+            assert abs(off) < 1e-3
+    steps = np.hypot(*np.diff(path.positions[:, :2], axis=0).T) / np.diff(path.times_s)
+    assert steps == pytest.approx(plan.rates.speed_m_s, rel=0.02)
+
+
+def test_turns_are_as_short_as_possible():
+    radius = turn_radius_m(30)
+    half_circle = shortest_turn(np.zeros(2), 0.0, np.array([0, 2 * radius]), math.pi, radius)
+    assert sum(s.length_m for s in half_circle) == pytest.approx(math.pi * radius)
+    straight = shortest_turn(np.zeros(2), 0.0, np.array([500.0, 0]), 0.0, radius)
+    assert sum(s.length_m for s in straight) == pytest.approx(500)
+    # Lines that are closer than the diameter of a turn require a turn of three arcs.
+    narrow = shortest_turn(np.zeros(2), 0.0, np.array([0, radius]), math.pi, radius)
+    assert all(s.curvature for s in narrow)
+    legs = [Leg(np.zeros(2), np.array([100.0, 0]), np.array([50.0])) for _ in range(2)]
+    assert fly(legs, 30).times_s[-1] > 2 * 100 / 30
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"density_m2": 500, "speeds_m_s": (50, 70)}, "Reduce `--speed` to 2.3, `--agl` to 23"),
+        ({"agl_m": 6000}, r"maximum range of RIEGL VQ-780i is 5600 m. Reduce `--agl` to 4800"),
+        ({"agl_m": 60}, "minimum range of RIEGL VQ-780i is 100 m. Increase `--agl` to 100"),
+        ({"agl_m": 150, "speeds_m_s": (70, 70)}, "maximum scan frequency is 300 Hz. Reduce `--sp"),
+    ],
+)
+def test_what_a_plan_cannot_meet(scanner, options, words):
+    plan = planned(scanner, **options)
+    assert any(words in note for note in plan.notes), plan.notes
+
+
+def test_the_advice_of_a_shortfall_is_sufficient(scanner):
+    short = planned(scanner, density_m2=30, speeds_m_s=(60, 60))
+    assert short.notes
+    for options in ({"speeds_m_s": (38, 38)}, {"agl_m": 320}):
+        better = planned(scanner, density_m2=30, **{"speeds_m_s": (60, 60), **options})
+        assert not any("density" in note for note in better.notes), options
+
+
+def test_what_cannot_be_planned(scanner):
+    with pytest.raises(LidarError, match="no ground below line-1"):
+        planned(scanner, ground=Ground(Scene.from_meshes([level("Far", middle=(9000, 0))])))
+    with pytest.raises(LidarError, match="needs .* flight lines, but the limit is 255"):
+        planned(scanner, shapely.box(0, 0, 30_000, 30_000), agl_m=120)
+    with pytest.raises(LidarError, match="field of view of RIEGL VQ-780i .* is 60°"):
+        Scanner.load(RIEGL, 75)
+    with pytest.raises(LidarError, match="The ground rises"):
+        tower = [level("Ground", half=2000), level("Roof", 90, half=400, middle=(500, 500))]
+        planned(scanner, ground=Ground(Scene.from_meshes(tower)), agl_m=30)
+
+
+def strip(agl_m=200.0, speed=40.0, seconds=4.0, slope=0.0, columns=400):
+    """A strip along x, over ground that rises by `slope` per meter."""
+    sensor = load_sensor(RIEGL, rate_hz=40, columns=columns, step_deg=360)
+    track = Track([0, seconds], [[0, 0, agl_m], [speed * seconds, 0, agl_m]], yaw_deg=0)
+    survey = Survey(trajectory=track, sensors=[Mounted(sensor)], precision_m=0.01)
+    ends = [(x, x * slope) for x in (-50.0, speed * seconds + 50)]
+    ground = quad(
+        "Ground", *((x, y, z) for (x, z), ys in zip(ends, [(300, -300), (-300, 300)], strict=True)
+                    for y in ys)
+    )  # fmt: skip
+    return Scene.from_meshes([ground]), survey
+
+
+def test_the_density_of_a_strip_over_flat_ground_and_a_slope():
+    # The ground below a line scanner is level across the track, so that the closed form holds at
+    # each position along the track.
+    for slope in (0.0, 0.3):
+        scene, survey = strip(slope=slope)
+        points = simulated_points(scene, survey).positions
+        for begin, end in ((10, 60), (100, 150)):
+            height = 200 - slope * (begin + end) / 2
+            swath = 2 * height * math.tan(math.radians(30))
+            strip_points = points[(points[:, 0] >= begin) & (points[:, 0] < end)]
+            found = len(strip_points) / ((end - begin) * swath)
+            assert found == pytest.approx(40 * 400 / (40 * swath), rel=0.03)
+            assert np.ptp(strip_points[:, 1]) == pytest.approx(
+                swath * (1 + slope * 25 / height), rel=0.02
+            )
+
+
+def test_the_expected_density_is_that_of_a_simulation():
+    scene, survey = strip(slope=0.2)
+    area = [[(20, -80), (140, -80), (140, 80), (20, 80)]]
+    expected = expected_density(scene, survey, area)
+    points = simulated_points(scene, survey).positions[:, :2]
+    low = np.array([20, -80])
+    shape = np.array(expected.density_m2.shape[::-1])
+    column, row = np.floor((points - low) / expected.cell_m).astype(int).T
+    inside = (column >= 0) & (row >= 0) & (column < shape[0]) & (row < shape[1])
+    counts = np.zeros(shape[::-1])
+    np.add.at(counts, (row[inside], column[inside]), 1)
+    assert expected.density_m2 == pytest.approx(counts / expected.cell_m**2, rel=0.01)
+    summary = summarize_density(expected, area, 2.0)
+    assert summary.mean_m2 == pytest.approx(inside.sum() / (120 * 160), rel=0.02)
+    assert summary.low_m2 < summary.mean_m2
+
+
+def test_areas_with_holes():
+    area = [[(0, 0), (10, 0), (10, 10), (0, 10)], [(4, 4), (6, 4), (6, 6), (4, 6)]]
+    points = np.array([[5.0, 5], [1, 1], [5, 7], [-1, 5], [11, 5]])
+    assert is_inside(points, area).tolist() == [False, True, True, False, False]
+    grid = DensityMap(np.arange(100.0).reshape(10, 10), np.zeros(2), 1.0)
+    within = grid.within(area)
+    assert len(within) == 96
+    assert not {44.0, 45, 54, 55} & {*within.tolist()}
+
+
+def test_areas_from_text_and_files(tmp_path):
+    assert read_area("hills.ply") is None
+    assert read_area("-5,0,5,20").shape.bounds == (-5, 0, 5, 20)
+    wkt = "POLYGON ((0 0, 100 0, 100 50, 0 0))"
+    (tmp_path / "area.wkt").write_text(wkt)
+    for text in (wkt, str(tmp_path / "area.wkt")):
+        assert read_area(text).shape.area == 2500
+        assert read_area(text).epsg is None
+    ring = [[9.1, 48.7], [9.2, 48.7], [9.2, 48.8], [9.1, 48.7]]
+    polygon = {"type": "Polygon", "coordinates": [ring]}
+    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}
+    file = tmp_path / "area.geojson"
+    for content, epsg in (
+        (polygon, 4326),
+        ({"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": polygon}]}, 4326),
+        (polygon | {"crs": crs}, 25832),
+    ):  # fmt: skip
+        file.write_text(json.dumps(content))
+        assert read_area(str(file)).epsg == epsg
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("5,0,-5,20", "bounds must be"),
+        ("POLYGON ((0 0, 1 1", "cannot be read"),
+        ("POLYGON ((0 0, 10 10, 10 0, 0 10, 0 0))", "not a valid polygon: Self-intersection"),
+        ("missing.geojson", "missing.geojson does not exist"),
+    ],
+)
+def test_areas_that_are_invalid(text, words):
+    with pytest.raises(LidarError, match=words):
+        read_area(text)
+
+
+def test_geojson_and_kml_are_in_longitudes_and_latitudes(scanner):
+    plan = planned(scanner, shapely.box(0, 0, 800, 400), cross=1)
+    origin = np.array([512_000.0, 5_403_000.0, 0.0])
+    content = json.loads(to_geojson(plan, 32632, origin))
+    by_name = {f["properties"]["name"]: f for f in content["features"]}
+    assert set(by_name) == {"area", "line-1", "cross-1", "path"}
+    back = transform_shape(shapely.geometry.shape(by_name["line-1"]["geometry"]), 4326, 32632)
+    start = np.array(back.coords)[0, :2] - origin[:2]
+    assert start == pytest.approx(plan.lines[0].leg.start, abs=1e-3)
+    root = ElementTree.fromstring(to_kml(plan, 32632, origin))
+    names = [e.text for e in root.iter("{http://www.opengis.net/kml/2.2}name")]
+    assert names == ["Flight plan", "area", "line-1", "cross-1", "path"]
+    local = json.loads(to_geojson(plan, None, np.zeros(3)))
+    assert local["features"][1]["geometry"]["coordinates"][0][:2] == [-2.0, 200.0]
