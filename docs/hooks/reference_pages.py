@@ -48,6 +48,8 @@ _SECTIONS = {
     "navigation: imu": "Imu",
     "navigation: gnss": "Gnss",
     "navigation: mount": "InstrumentPose",
+    "navigation: mount_error": "InstrumentPose",
+    "flight": "FlightSection",
     "faults": "Fault",
     "cloud": "CloudOptions",
     "output": "OutputSection",

@@ -96,8 +96,8 @@ def test_hills_narrow_the_spacing_and_slow_the_aircraft(scanner):
     hill = quad("Ridge", (-2000, -2000, 0), (2000, -2000, 0), (2000, 3000, 150), (-2000, 3000, 150))
     area = shapely.box(-500, 0, 1500, 1000)
     ground = Ground(Scene.from_meshes([hill]))
-    plan = planned(scanner, area, ground, density_m2=10, heading_deg=90)
-    level_plan = planned(scanner, area, density_m2=10, heading_deg=90)
+    plan = planned(scanner, area, ground, density_m2=20, heading_deg=90)
+    level_plan = planned(scanner, area, density_m2=20, heading_deg=90)
     assert plan.min_overlap >= 0.29
     assert plan.lowest_m < 495
     assert plan.rates.speed_m_s < level_plan.rates.speed_m_s

@@ -449,11 +449,18 @@ def _density_notes(plan: FlightPlan, density: AreaDensity | None) -> Iterator[st
             "The density cannot be estimated, because the area is smaller than a cell of the "
             "density map. Plan a larger area or a higher density"
         )
-    elif plan.density_m2 is not None and density.reached < 0.95 and not plan.notes:
+        return
+    if density.empty > 0:
+        yield (
+            f"{max(density.empty, 0.001):.1%} of the area has no points in cells of "
+            f"{density.cell_m:g} m, because it is out of range, hidden, or outside the swath over "
+            "high ground. Increase `--overlap` or `--agl`, or follow the terrain with `--follow`"
+        )
+    if plan.density_m2 is not None and density.reached < 0.95:
         yield (
             f"{1 - density.reached:.0%} of the area has fewer than {plan.density_m2:g} points per "
-            f"m² in cells of {density.cell_m:g} m, because the points are not evenly distributed "
-            f"across the swath or because of slopes. 95 % of the area has at least "
+            f"m² in cells of {density.cell_m:g} m, because of slopes, or because the points are "
+            "not evenly distributed across the swath. 95 % of the area has at least "
             f"{density.low_m2:.3g}. To increase this value, increase `--density` or `--overlap`"
         )
 

@@ -247,10 +247,10 @@ def _shortfalls(plan: FlightPlan) -> Iterator[str]:
     yield from _range_shortfalls(plan)
     overlap = plan.min_overlap
     if overlap is not None and overlap < plan.layout.overlap - 0.02:
+        remedy = "" if plan.layout.follow else ", or follow the terrain with `--follow`"
         yield (
             f"Over the highest ground, the overlap is {overlap:.0%} instead of "
-            f"{plan.layout.overlap:.0%}. Increase `--overlap`, or follow the terrain with "
-            "`--follow`"
+            f"{plan.layout.overlap:.0%}. Increase `--overlap`{remedy}"
         )
     ratio = plan.along_m / plan.across_m
     slowest, fastest = plan.scanner.rates_hz

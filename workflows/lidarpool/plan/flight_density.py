@@ -51,7 +51,8 @@ class AreaDensity(NamedTuple):
     mean_m2: float
     low_m2: float  # density that 95 % of the area exceeds
     reached: float  # share of the area with at least the planned density
-    cell_m: float  # side of the cells to which the last two values refer
+    empty: float  # share of the area without points
+    cell_m: float  # side of the cells to which the last three values refer
 
 
 def summarize_density(
@@ -69,6 +70,7 @@ def summarize_density(
         float(densities.mean()),
         float(np.quantile(densities, 0.05)),
         float((densities >= planned_m2).mean()),
+        float((densities == 0).mean()),
         found.cell_m,
     )
 

@@ -169,13 +169,6 @@ class Gnss(FileSection):
         Deviation, about("standard deviation of the vertical drift, in meters")
     ] = 0.0
     drift_time_s: Annotated[Correlation, about("correlation time of the drift in seconds")] = 600.0
-    offset_m: Annotated[
-        Triple,
-        about(
-            "constant error to the east, north and up in meters, such as that of a base station",
-            [0.05, 0, -0.1],
-        ),
-    ] = (0, 0, 0)
     outages: Annotated[
         Several[MinMax[Span]],
         about(
@@ -191,6 +184,13 @@ class Gnss(FileSection):
             [48.7758, 9.1829, 290.0],
         ),
     ] = None
+    offset_m: Annotated[
+        Triple,
+        about(
+            "constant error to the east, north and up in meters, such as that of a base station",
+            [0.05, 0, -0.1],
+        ),
+    ] = (0, 0, 0)
 
     __repr__ = one_line
 
@@ -210,14 +210,14 @@ class Navigation(FileSection):
     ----------
     imu, gnss
         The IMU and the GNSS receiver, or None if the platform does not have them.
-    mount_error
-        Error of the calibrated mounts of the sensors. The position is the error of the lever arm in
-        the platform frame, and the angles are the boresight errors about the platform's axes. It
-        affects points that are georeferenced by the measured trajectory.
     gravity_m_s2
         Gravitational acceleration in m/s^2, which points down along the z axis of the world.
     seed
         Seed for the measurement errors.
+    mount_error
+        Error of the calibrated mounts of the sensors. The position is the error of the lever arm in
+        the platform frame, and the angles are the boresight errors about the platform's axes. It
+        affects points that are georeferenced by the measured trajectory.
 
     Raises
     ------
@@ -240,6 +240,15 @@ class Navigation(FileSection):
             {"rate_hz": 10, "horizontal_m": 0.02, "drift_horizontal_m": 0.5},
         ),
     ] = None
+    gravity_m_s2: Annotated[
+        float,
+        about(
+            "gravitational acceleration in m/s^2 along the negative z axis of the world",
+            ge=-100,
+            le=100,
+        ),
+    ] = 9.80665
+    seed: Annotated[Seed, about("seed of the errors; the same seed produces the same errors")] = 0
     mount_error: Annotated[
         Pose,
         AT_CENTER,
@@ -250,15 +259,6 @@ class Navigation(FileSection):
             {"position": [0.01, 0, 0], "roll_deg": 0.01},
         ),
     ] = CENTER
-    gravity_m_s2: Annotated[
-        float,
-        about(
-            "gravitational acceleration in m/s^2 along the negative z axis of the world",
-            ge=-100,
-            le=100,
-        ),
-    ] = 9.80665
-    seed: Annotated[Seed, about("seed of the errors; the same seed produces the same errors")] = 0
 
     __repr__ = one_line
 
