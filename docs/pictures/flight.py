@@ -14,75 +14,55 @@ from docs.pictures.options import IMAGES
 from matplotlib.colors import Normalize
 
 from lidarpool import Cloud, read_cloud
-from lidarsim.numerics.arrays import Floats, Ints
+from lidarsim.numerics.arrays import Floats
 from lidarview.render import theme
 from lidarview.render.picture_page import Page
 
 SIZE = (1600, 760)
-CELL_M = 5.0
-LIMIT_MM = 200.0
-MIN_POINTS = 40  # minimum number of points of a strip in a cell
-ROUGH_M = 0.10  # maximum standard deviation of the points from the plane of their cell
+CELL_M = 4.0
+LIMIT_MM = 150.0
+LOW, HIGH = np.array([-210.0, -160.0]), np.array([210.0, 160.0])
 _COLORMAP = "RdBu_r"
 
 
-def strip_differences(cloud: Cloud, low: Floats, high: Floats) -> Floats:
-    """Return the height of the first strip minus that of the second in cells, in mm.
-
-    The heights are those of planes at the centers of the cells. Cells without enough points of both
-    strips, and cells that are not flat, are NaN.
-    """
-    shape = np.ceil((high - low) / CELL_M).astype(int)
-    heights = [
-        _plane_heights(cloud[cloud["sensor"] == sensor].positions, low, shape) for sensor in (0, 1)
-    ]
-    return 1000 * (heights[0] - heights[1]).reshape(shape[1], shape[0])
-
-
-def _plane_heights(points: Floats, low: Floats, shape: Ints) -> Floats:
-    """Fit a plane to the points in each cell, and return its height at the center."""
-    column, row = np.floor((points[:, :2] - low) / CELL_M).astype(int).T
+def strip_errors(clean: Cloud, noisy: Cloud, sensor: int) -> Floats:
+    """Return the mean height error of a strip in cells in mm, or NaN without points."""
+    rows = clean["sensor"] == sensor
+    points = clean.positions[rows]
+    errors = noisy.positions[rows, 2] - points[:, 2]
+    shape = np.ceil((HIGH - LOW) / CELL_M).astype(int)
+    column, row = np.floor((points[:, :2] - LOW) / CELL_M).astype(int).T
     inside = (column >= 0) & (row >= 0) & (column < shape[0]) & (row < shape[1])
     cell = (row * shape[0] + column)[inside]
-    count = int(shape.prod())
-    centers = low + (np.column_stack([column, row])[inside] + 0.5) * CELL_M
-    x, y = (points[inside, :2] - centers).T
-    z = points[inside, 2]
-    terms = np.stack([np.ones_like(x), x, y])
-    normal = np.array([[np.bincount(cell, a * b, count) for b in terms] for a in terms])
-    right = np.array([np.bincount(cell, a * z, count) for a in terms])
-    usable = (normal[0, 0] > MIN_POINTS) & (np.linalg.det(normal.T) > 1)
-    planes = np.full((count, 3), np.nan)
-    planes[usable] = np.linalg.solve(normal.T[usable], right.T[usable][..., None])[..., 0]
-    squares = (z - (planes[cell] * terms.T).sum(axis=1)) ** 2
-    rough_m = np.sqrt(np.bincount(cell, squares, count) / np.maximum(normal[0, 0], 1))
-    return np.where(rough_m < ROUGH_M, planes[:, 0], np.nan)
+    count = np.bincount(cell, minlength=shape.prod())
+    total = np.bincount(cell, errors[inside], minlength=shape.prod())
+    return 1000 * np.where(count > 0, total / np.maximum(count, 1), np.nan).reshape(shape[::-1])
 
 
 def draw(folder: Path) -> Page:
-    """Draw the height differences of two strips with and without errors."""
-    low, high = np.array([-160.0, -130.0]), np.array([160.0, 130.0])
+    """Draw the height errors of two strips, which are those of the measured trajectory."""
+    clean, noisy = (read_cloud(folder / name / "cloud.ply") for name in ("clean", "noisy"))
     page = Page(SIZE)
     norm = Normalize(-LIMIT_MM, LIMIT_MM)
-    for number, name in enumerate(("clean", "noisy")):
-        found = strip_differences(read_cloud(folder / name / "cloud.ply"), low, high)
-        frame = (0.085 + 0.40 * number, 0.13, 0.35, 0.65)
-        axes = page.map_chart(frame, np.stack([low, high]), tick_count=5)
-        extent = (low[0], high[0], low[1], high[1])
-        axes.imshow(found, cmap=_COLORMAP, norm=norm, extent=extent, origin="lower")
-        axes.set(aspect="equal")
-        known = found[np.isfinite(found)]
-        page.heading(
-            axes,
-            f"{name}: mean {known.mean():+.0f} mm, RMSE {np.sqrt((known**2).mean()):.0f} mm",
+    for number, name in enumerate(("line-1", "cross-1")):
+        found = strip_errors(clean, noisy, number)
+        axes = page.map_chart(
+            (0.08 + 0.42 * number, 0.13, 0.345, 0.65), np.stack([LOW, HIGH]), tick_count=5
         )
+        extent = (LOW[0], HIGH[0], LOW[1], HIGH[1])
+        axes.imshow(found, cmap=_COLORMAP, norm=norm, extent=extent, origin="lower", zorder=1)
+        axes.set(aspect="equal")
+        page.heading(axes, f"{name}: mean error {np.nanmean(found):+.0f} mm")
     page.color_bar(
         theme.apply_colormap(_COLORMAP, np.linspace(0, 1, 256)),
         norm,
-        "height of line-1 minus cross-1 (mm)",
+        "height error (mm)",
         (0.90, 0.16, 0.014, 0.58),
     )
-    page.title("Two crossing strips", f"Height differences in cells of {CELL_M:g} m")
+    page.title(
+        "Two crossing strips",
+        f"Height of points by the measured trajectory minus their true height, cells of {CELL_M:g} m",
+    )
     return page
 
 

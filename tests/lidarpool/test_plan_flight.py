@@ -153,7 +153,7 @@ def test_turns_are_as_short_as_possible():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"density_m2": 500, "speeds_m_s": (50, 70)}, "Reduce `--speed` to 2.3, `--agl` to 23"),
+        ({"density_m2": 500, "speeds_m_s": (50, 70)}, "Reduce `--speed` to 2.3 or `--agl` to 23"),
         ({"agl_m": 6000}, r"maximum range of RIEGL VQ-780i is 5600 m. Reduce `--agl` to 4800"),
         ({"agl_m": 60}, "minimum range of RIEGL VQ-780i is 100 m. Increase `--agl` to 100"),
         ({"agl_m": 150, "speeds_m_s": (70, 70)}, "maximum scan frequency is 300 Hz. Reduce `--sp"),

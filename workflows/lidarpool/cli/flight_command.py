@@ -456,7 +456,8 @@ def _density_notes(plan: FlightPlan, density: AreaDensity | None) -> Iterator[st
             f"{density.cell_m:g} m, because it is out of range, hidden, or outside the swath over "
             "high ground. Increase `--overlap` or `--agl`, or follow the terrain with `--follow`"
         )
-    if plan.density_m2 is not None and density.reached < 0.95:
+    is_short = plan.density_m2 is None or plan.densities_m2[0] < 0.98 * plan.density_m2
+    if density.reached < 0.95 and not is_short:
         yield (
             f"{1 - density.reached:.0%} of the area has fewer than {plan.density_m2:g} points per "
             f"m² in cells of {density.cell_m:g} m, because of slopes, or because the points are "

@@ -276,14 +276,13 @@ def _density_shortfall(plan: FlightPlan) -> Iterator[str]:
     if plan.density_m2 is None or found >= 0.98 * plan.density_m2:
         return
     share = found / plan.density_m2
-    fov_deg = 2 * math.degrees(math.atan(plan.scanner.tangent * share))
     speed_m_s = plan.rates.speed_m_s
     yield (
         f"The density of {plan.density_m2:g} points per m² is not reached. At the maximum rate of "
         f"{plan.scanner.pulses_hz / 1000:,.4g} kHz within the swath and a speed of {speed_m_s:g} "
         f"m/s, a strip has {found:.3g} points per m². Reduce `--speed` to "
-        f"{_floor(speed_m_s * share)}, `--agl` to {_floor(plan.layout.agl_m * share)} or `--fov` "
-        f"to {_floor(fov_deg)}, or use a sensor with a higher pulse rate"
+        f"{_floor(speed_m_s * share)} or `--agl` to {_floor(plan.layout.agl_m * share)}, or use a "
+        "sensor with a higher pulse rate"
     )
 
 
