@@ -258,7 +258,8 @@ def _altitudes(heights: Floats, length_m: float, layout: Layout) -> Floats:
     If the aircraft follows the ground, the ground below the swath is averaged over a distance equal
     to the height above ground.
     """
-    known = np.where(np.isnan(heights).all(axis=1)[:, None], np.nanmean(heights), heights)
+    without_ground = np.asarray(np.isnan(heights).all(axis=1))
+    known = np.where(without_ground[:, None], np.nanmean(heights), heights)
     below = np.nanmean(known, axis=1)
     if not layout.follow:
         return np.full(len(below), below.mean() + layout.agl_m)
