@@ -61,7 +61,7 @@ def draw(folder: Path) -> Page:
     )
     page.title(
         "Two crossing strips",
-        f"Height of points by the measured trajectory minus their true height, cells of {CELL_M:g} m",
+        f"Measured minus true height of the points, mean in cells of {CELL_M:g} m",
     )
     return page
 

@@ -22,9 +22,9 @@ from lidarpool.plan.flight_density import (
     summarize_density,
 )
 from lidarpool.plan.flight_files import to_geojson, to_kml
-from lidarpool.plan.flight_lines import Ground
-from lidarpool.plan.flight_path import Leg, fly, shortest_turn, turn_radius_m
-from lidarpool.plan.flight_scanner import Scanner
+from lidarpool.plan.flight_lines import Terrain
+from lidarpool.plan.flight_path import FlightLeg, fly, shortest_turn, turn_radius_m
+from lidarpool.plan.flight_scanner import AirborneScanner
 
 SQUARE = shapely.box(0, 0, 1000, 1000)
 RIEGL = "airborne/riegl-vq780i"  # 60°, 666,600 pulses per second on average, 20 to 300 Hz
@@ -32,11 +32,11 @@ RIEGL = "airborne/riegl-vq780i"  # 60°, 666,600 pulses per second on average, 2
 
 @pytest.fixture(scope="module")
 def scanner():
-    return Scanner.load(RIEGL)
+    return AirborneScanner.load(RIEGL)
 
 
-def planned(scanner, area=SQUARE, ground=None, agl_m=500, **options):
-    return plan_flight(area, ground or Ground(), scanner, agl_m=agl_m, **options)
+def planned(scanner, area=SQUARE, terrain=None, agl_m=500, **options):
+    return plan_flight(area, terrain or Terrain(), scanner, agl_m=agl_m, **options)
 
 
 def test_swath_and_spacing(scanner):
@@ -95,7 +95,7 @@ def test_lines_end_where_the_area_ends_within_their_swath(scanner):
 def test_hills_narrow_the_spacing_and_slow_the_aircraft(scanner):
     hill = quad("Ridge", (-2000, -2000, 0), (2000, -2000, 0), (2000, 3000, 150), (-2000, 3000, 150))
     area = shapely.box(-500, 0, 1500, 1000)
-    ground = Ground(Scene.from_meshes([hill]))
+    ground = Terrain(Scene.from_meshes([hill]))
     plan = planned(scanner, area, ground, density_m2=20, heading_deg=90)
     level_plan = planned(scanner, area, density_m2=20, heading_deg=90)
     assert plan.min_overlap >= 0.29
@@ -110,12 +110,12 @@ def test_hills_narrow_the_spacing_and_slow_the_aircraft(scanner):
 
 def test_an_aircraft_follows_the_ground(scanner):
     slope = quad("Slope", (-500, -500, 0), (1500, -500, 200), (1500, 1500, 200), (-500, 1500, 0))
-    ground = Ground(Scene.from_meshes([slope]))
-    plan = planned(scanner, ground=ground, heading_deg=90, agl_m=200, follow=True)
+    ground = Terrain(Scene.from_meshes([slope]))
+    plan = planned(scanner, terrain=ground, heading_deg=90, agl_m=200, follow=True)
     line = plan.lines[0].leg
     assert line.heights[len(line.heights) // 2] == pytest.approx(300, abs=1)
     assert np.ptp(line.heights) > 80
-    assert planned(scanner, ground=ground, heading_deg=90, agl_m=200).lowest_m < plan.lowest_m
+    assert planned(scanner, terrain=ground, heading_deg=90, agl_m=200).lowest_m < plan.lowest_m
 
 
 def test_a_path_passes_all_lines_at_their_times(scanner):
@@ -123,9 +123,7 @@ def test_a_path_passes_all_lines_at_their_times(scanner):
     path = plan.path
     track = Track(path.times_s, path.positions, yaw_deg=path.yaw_deg, roll_deg=path.roll_deg,
                   smooth=True)  # fmt: skip
-    for line, start_s, duration_s in zip(
-        plan.lines, path.starts_s, path.durations_s, strict=True
-    ):
+    for line, start_s, duration_s in zip(plan.lines, path.starts_s, path.durations_s, strict=True):
         for share in (0, 0.5, 1):
             pose = track.pose(0, (start_s + share * duration_s) * 1e9)
             expected = line.leg.start + share * (line.leg.stop - line.leg.start)
@@ -146,7 +144,7 @@ def test_turns_are_as_short_as_possible():
     # Lines that are closer than the diameter of a turn require a turn of three arcs.
     narrow = shortest_turn(np.zeros(2), 0.0, np.array([0, radius]), math.pi, radius)
     assert all(s.curvature for s in narrow)
-    legs = [Leg(np.zeros(2), np.array([100.0, 0]), np.array([50.0])) for _ in range(2)]
+    legs = [FlightLeg(np.zeros(2), np.array([100.0, 0]), np.array([50.0])) for _ in range(2)]
     assert fly(legs, 30).times_s[-1] > 2 * 100 / 30
 
 
@@ -174,14 +172,14 @@ def test_the_advice_of_a_shortfall_is_sufficient(scanner):
 
 def test_what_cannot_be_planned(scanner):
     with pytest.raises(LidarError, match="no ground below line-1"):
-        planned(scanner, ground=Ground(Scene.from_meshes([level("Far", middle=(9000, 0))])))
-    with pytest.raises(LidarError, match="needs .* flight lines, but the limit is 255"):
+        planned(scanner, terrain=Terrain(Scene.from_meshes([level("Far", middle=(9000, 0))])))
+    with pytest.raises(LidarError, match=r"needs .* flight lines, but the limit is 255"):
         planned(scanner, shapely.box(0, 0, 30_000, 30_000), agl_m=120)
-    with pytest.raises(LidarError, match="field of view of RIEGL VQ-780i .* is 60°"):
-        Scanner.load(RIEGL, 75)
+    with pytest.raises(LidarError, match=r"field of view of RIEGL VQ-780i .* is 60°"):
+        AirborneScanner.load(RIEGL, 75)
     with pytest.raises(LidarError, match="The ground rises"):
         tower = [level("Ground", half=2000), level("Roof", 90, half=400, middle=(500, 500))]
-        planned(scanner, ground=Ground(Scene.from_meshes(tower)), agl_m=30)
+        planned(scanner, terrain=Terrain(Scene.from_meshes(tower)), agl_m=30)
 
 
 def strip(agl_m=200.0, speed=40.0, seconds=4.0, slope=0.0, columns=400):
@@ -253,9 +251,13 @@ def test_areas_from_text_and_files(tmp_path):
     polygon = {"type": "Polygon", "coordinates": [ring]}
     crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}
     file = tmp_path / "area.geojson"
+    collection = {
+        "type": "FeatureCollection",
+        "features": [{"type": "Feature", "geometry": polygon}],
+    }
     for content, epsg in (
         (polygon, 4326),
-        ({"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": polygon}]}, 4326),
+        (collection, 4326),
         (polygon | {"crs": crs}, 25832),
     ):  # fmt: skip
         file.write_text(json.dumps(content))
@@ -276,6 +278,7 @@ def test_areas_that_are_invalid(text, words):
         read_area(text)
 
 
+@pytest.mark.extended
 def test_geojson_and_kml_are_in_longitudes_and_latitudes(scanner):
     plan = planned(scanner, shapely.box(0, 0, 800, 400), cross=1)
     origin = np.array([512_000.0, 5_403_000.0, 0.0])

@@ -123,6 +123,7 @@ def test_points_follow_the_gnss_positions(scene):
     assert np.abs(errors).max() > 0.05
 
 
+@pytest.mark.extended
 def test_the_spread_of_attitude_errors(scene):
     # Over many seeds, the roll error at the nadir has the standard deviation of the model.
     imu = Imu(roll_pitch_deg=0.02, heading_deg=0.05, attitude_time_s=60)
@@ -134,7 +135,8 @@ def test_the_spread_of_attitude_errors(scene):
         error = true[0].T @ measured[0]
         angles.append(np.degrees([error[2, 1], error[0, 2], error[1, 0]]))
     assert np.std(angles, axis=0) == pytest.approx([0.02, 0.02, 0.05], rel=0.15)
-    assert np.abs(np.mean(angles, axis=0)) == pytest.approx([0, 0, 0], abs=0.01)
+    # Five standard errors of the mean of 300 values.
+    assert (np.abs(np.mean(angles, axis=0)) < 0.3 * np.array([0.02, 0.02, 0.05])).all()
 
 
 def test_a_trajectory_without_errors_changes_no_byte(scene):

@@ -25,7 +25,11 @@ def folder(tmp_path, monkeypatch):
     [
         (("--overlap", "99%"), "'99%' is not a valid overlap. Expected a value from 0% to 95%"),
         (("--speed", "12-4"), "'12-4' is not a valid speed. Expected a speed from 0.1 to 400"),
-        (("--unit", "mm"), "`--unit` and `--up-axis` require a terrain."),
+        pytest.param(
+            ("--unit", "mm"),
+            "`--unit` and `--up-axis` require a terrain.",
+            marks=pytest.mark.extended,
+        ),
         (("--fov", "80"), "`--fov` is 80°, but the field of view of RIEGL VQ-780i"),
     ],
 )

@@ -182,12 +182,12 @@ def flight(area: str, model: str, of_mesh: dict[str, Any], **settings: Any) -> N
 
     from ..clouds.folder import result_folder
     from ..plan.flight import plan_flight
-    from ..plan.flight_scanner import Scanner
+    from ..plan.flight_scanner import AirborneScanner
     from .terminal import Terminal
 
     terminal = Terminal(quiet=as_json)
     # An unsuitable sensor is reported before the scene is read.
-    scanner = Scanner.load(full_name(model), settings.pop("fov_deg"))
+    scanner = AirborneScanner.load(full_name(model), settings.pop("fov_deg"))
     site = _read_site(area, settings.pop("terrain"), settings.pop("epsg"), of_mesh, terminal)
     folder = settings.pop("out") or Path(f"{site.name}-flight")
     overwrites = settings.pop("overwrite")
@@ -199,7 +199,7 @@ def flight(area: str, model: str, of_mesh: dict[str, Any], **settings: Any) -> N
                 "`--overwrite`."
             )
         with terminal.status("planning the flight lines"):
-            plan = plan_flight(site.shape, site.ground, scanner, **settings)
+            plan = plan_flight(site.shape, site.terrain, scanner, **settings)
         density = _write_plan(plan, site, folder, terminal)
     notes = [*site.notes, *plan.notes, *_density_notes(plan, density)]
     if site.epsg is None:
@@ -220,7 +220,7 @@ class _Site(NamedTuple):
 
     name: str
     shape: Any  # polygon of shapely in the coordinates of the scenario
-    ground: Any
+    terrain: Any
     scenario: Scenario | None  # scenario with the terrain, or None for level ground
     epsg: int | None  # EPSG code of the coordinates of the scenario plus `origin`
     origin: Floats  # (3,), world origin of the scenario, meters
@@ -239,7 +239,7 @@ def _read_site(
     import shapely
 
     from ..plan.flight_area import GEOGRAPHIC, read_area, utm_epsg
-    from ..plan.flight_lines import Ground
+    from ..plan.flight_lines import Terrain
 
     drawn = read_area(area)
     if drawn is None and terrain is not None:
@@ -260,14 +260,20 @@ def _read_site(
         if drawn.epsg is not None:
             origin[:2] = np.floor(np.array(shape.centroid.coords[0]) / _ORIGIN_M) * _ORIGIN_M
             shape = shapely.affinity.translate(shape, *(-origin[:2]).tolist())
-        return _Site(_area_name(area), shape, Ground(), None, epsg, origin, [])
+        return _Site(_area_name(area), shape, Terrain(), None, epsg, origin, [])
     from ..scenario.scenario import Scenario
 
     scenario = Scenario.load(source, of_mesh)
     prepared, notes = prepared_with_notes(scenario, terminal)
     scene = prepared.scene.with_world_origin((0, 0, 0))
     origin = np.array(scenario.world.origin, np.float64)
-    epsg = prepared.survey.epsg or epsg
+    stated = prepared.survey.epsg
+    if epsg is not None and stated not in (None, epsg):
+        raise LidarError(
+            f"`--epsg` is {epsg}, but the coordinate system of {source} is EPSG:{stated}. Omit "
+            "`--epsg`."
+        )
+    epsg = stated or epsg
     if drawn is None:
         low, high = scene.bounds + scene.origin
         shape = shapely.box(*low[:2].tolist(), *high[:2].tolist())
@@ -276,7 +282,7 @@ def _read_site(
         if drawn.epsg is not None:
             shape = shapely.affinity.translate(shape, *(-origin[:2]).tolist())
     name = source.stem if drawn is None else _area_name(area)
-    return _Site(name, shape, Ground(scene), scenario, epsg, origin, notes)
+    return _Site(name, shape, Terrain(scene), scenario, epsg, origin, notes)
 
 
 def _in_system(drawn: Any, epsg: int | None) -> Any:

@@ -18,9 +18,9 @@ from lidarsim.schema.checks import check_number
 from lidarsim.survey.survey import MAX_SENSORS
 from lidarsim.words import plural
 
-from .flight_lines import FlightLine, Ground, Layout, longest_side, place_lines
+from .flight_lines import FlightLine, Layout, Terrain, longest_side, place_lines
 from .flight_path import FlightPath, fly
-from .flight_scanner import Scanner
+from .flight_scanner import AirborneScanner
 
 SPEEDS_M_S = (3.0, 70.0)  # default limits of the speed over ground
 _QUANTILES = (0.05, 0.95)  # of the height above ground, for the spacing and for the speed
@@ -50,7 +50,7 @@ class FlightPlan:
     """
 
     area: Any  # polygon of shapely
-    scanner: Scanner
+    scanner: AirborneScanner
     lines: tuple[FlightLine, ...]
     path: FlightPath
     rates: Rates
@@ -98,8 +98,8 @@ class FlightPlan:
 
 def plan_flight(
     area: Any,
-    ground: Ground,
-    scanner: Scanner,
+    terrain: Terrain,
+    scanner: AirborneScanner,
     *,
     agl_m: float,
     overlap: float = 0.3,
@@ -119,7 +119,7 @@ def plan_flight(
     ----------
     area
         Polygon or multipolygon of shapely, in world coordinates in meters.
-    ground
+    terrain
         Ground of the survey.
     scanner
         The scanner.
@@ -150,8 +150,8 @@ def plan_flight(
     Examples
     --------
     >>> import shapely
-    >>> scanner = Scanner.load("airborne/riegl-vq780i")
-    >>> plan = plan_flight(shapely.box(0, 0, 2000, 900), Ground(), scanner, agl_m=700)
+    >>> scanner = AirborneScanner.load("airborne/riegl-vq780i")
+    >>> plan = plan_flight(shapely.box(0, 0, 2000, 900), Terrain(), scanner, agl_m=700)
     >>> len(plan.lines), round(plan.scanner.swath_m(700))
     (2, 808)
     """
@@ -162,10 +162,10 @@ def plan_flight(
         check_number("density_m2", density_m2, gt=0, le=1e5)
     heading = longest_side(area) if heading_deg is None else math.radians(90 - heading_deg)
     layout = Layout(agl_m, heading, overlap, cross, follow)
-    strips = place_lines(area, ground, scanner, layout, agl_m)
+    strips = place_lines(area, terrain, scanner, layout, agl_m)
     lowest_m = float(np.quantile(strips.clearances_m, _QUANTILES[0]))
     if lowest_m < agl_m:  # the swath is narrower over high ground
-        strips = place_lines(area, ground, scanner, layout, max(lowest_m, 0.05 * agl_m))
+        strips = place_lines(area, terrain, scanner, layout, max(lowest_m, 0.05 * agl_m))
     if not strips.clearances_m.min() > 0:
         raise LidarError(
             f"The ground rises {-strips.clearances_m.min():.0f} m above a flight line. Increase "
@@ -192,7 +192,7 @@ def plan_flight(
 
 
 def _choose_rates(
-    scanner: Scanner,
+    scanner: AirborneScanner,
     wide_m: float,
     swath_m: float,
     density_m2: float | None,
@@ -234,7 +234,7 @@ def _choose_rates(
     return Rates(speed_m_s, scan_hz, lines_hz, pulses_hz, fired_hz, count)
 
 
-def _scan_rate(scanner: Scanner, lines_hz: float) -> float:
+def _scan_rate(scanner: AirborneScanner, lines_hz: float) -> float:
     """Return the number of cycles per second for a number of scan lines, within the limits."""
     slowest, fastest = scanner.rates_hz
     rate_hz = round(lines_hz / scanner.lines_per_cycle, 1)

@@ -15,8 +15,8 @@ from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.survey.survey import MAX_SENSORS
 from raybeam import RayCaster
 
-from .flight_path import Leg
-from .flight_scanner import Scanner
+from .flight_path import FlightLeg
+from .flight_scanner import AirborneScanner
 
 Kind = Literal["line", "cross"]
 _Track = tuple[Floats, Floats]  # start and stop, with shape (2,)
@@ -26,7 +26,7 @@ _ALONG = 400  # maximum number of ground samples along a line
 _MARGIN_M = 2.0  # distance by which a line extends beyond the area
 
 
-class Ground:
+class Terrain:
     """Ground of a survey, which is a scene or, without a scene, level at a height of 0."""
 
     def __init__(self, scene: Scene | None = None) -> None:
@@ -55,7 +55,7 @@ class FlightLine(NamedTuple):
 
     name: str
     kind: Kind
-    leg: Leg
+    leg: FlightLeg
     clearance_m: tuple[float, float, float]  # minimum, mean and maximum height above ground
     swath_m: tuple[float, float]  # at the minimum and the maximum height above ground
 
@@ -95,7 +95,7 @@ class Strips(NamedTuple):
 
 
 def place_lines(
-    area: Any, ground: Ground, scanner: Scanner, layout: Layout, narrow_m: float
+    area: Any, terrain: Terrain, scanner: AirborneScanner, layout: Layout, narrow_m: float
 ) -> Strips:
     """Place flight lines so that their strips cover an area.
 
@@ -103,7 +103,7 @@ def place_lines(
     ----------
     area
         Polygon or multipolygon of shapely.
-    ground, scanner, layout
+    terrain, scanner, layout
         Ground, scanner and requirements.
     narrow_m
         Height above ground in meters at which the swath results in the requested overlap.
@@ -127,7 +127,7 @@ def place_lines(
     clearances = []
     for kind, ends in tracks.items():
         for number, (start, stop) in enumerate(ends, 1):
-            heights = _ground_below(ground, start, stop, scanner.swath_m(layout.agl_m))
+            heights = _ground_below(terrain, start, stop, scanner.swath_m(layout.agl_m))
             line = _line(f"{kind}-{number}", kind, start, stop, heights, scanner, layout)
             lines.append(line)
             clearances.append((line.leg.heights[:, None] - heights).ravel())
@@ -143,7 +143,7 @@ def _line(
     start: Floats,
     stop: Floats,
     heights: Floats,
-    scanner: Scanner,
+    scanner: AirborneScanner,
     layout: Layout,
 ) -> FlightLine:
     """Return a flight line above the ground `heights` of shape (along, across)."""
@@ -156,7 +156,9 @@ def _line(
     above_m = altitudes[:, None] - heights
     low_m, mean_m, high_m = (float(f(above_m)) for f in (np.nanmin, np.nanmean, np.nanmax))
     swaths_m = scanner.swath_m(low_m), scanner.swath_m(high_m)
-    return FlightLine(name, kind, Leg(start, stop, altitudes), (low_m, mean_m, high_m), swaths_m)
+    return FlightLine(
+        name, kind, FlightLeg(start, stop, altitudes), (low_m, mean_m, high_m), swaths_m
+    )
 
 
 def _check_count(count: int) -> None:
@@ -240,7 +242,7 @@ def _tracks(
     return tracks
 
 
-def _ground_below(ground: Ground, start: Floats, stop: Floats, swath_m: float) -> Floats:
+def _ground_below(terrain: Terrain, start: Floats, stop: Floats, swath_m: float) -> Floats:
     """Return the ground heights below a line and its swath, with shape (along, across)."""
     length_m = float(np.hypot(*(stop - start)))
     ahead = (stop - start) / length_m
@@ -249,7 +251,7 @@ def _ground_below(ground: Ground, start: Floats, stop: Floats, swath_m: float) -
     across = np.linspace(-swath_m / 2, swath_m / 2, _ACROSS)
     left = np.array([-ahead[1], ahead[0]])
     points = start + along[:, None, None] * ahead + across[None, :, None] * left
-    return ground.heights(points.reshape(-1, 2)).reshape(count, _ACROSS)
+    return terrain.heights(points.reshape(-1, 2)).reshape(count, _ACROSS)
 
 
 def _altitudes(heights: Floats, length_m: float, layout: Layout) -> Floats:

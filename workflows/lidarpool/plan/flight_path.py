@@ -29,7 +29,7 @@ _WORDS = {
 }
 
 
-class Leg(NamedTuple):
+class FlightLeg(NamedTuple):
     """A straight line that an aircraft flies while its scanner is on."""
 
     start: Floats  # (2,), meters
@@ -74,7 +74,7 @@ def turn_radius_m(speed_m_s: float) -> float:
     return speed_m_s**2 / (_GRAVITY_M_S2 * math.tan(math.radians(BANK_DEG)))
 
 
-def fly(legs: Sequence[Leg], speed_m_s: float) -> FlightPath:
+def fly(legs: Sequence[FlightLeg], speed_m_s: float) -> FlightPath:
     """Return the path along flight lines, in their order, at a constant speed over ground.
 
     Before and after each line, the aircraft flies straight for `LEAD_S`. The turns are the shortest
@@ -118,7 +118,7 @@ def fly(legs: Sequence[Leg], speed_m_s: float) -> FlightPath:
     )
 
 
-def _turn(leg: Leg, following: Leg, lead_m: float, radius_m: float) -> list[_Section]:
+def _turn(leg: FlightLeg, following: FlightLeg, lead_m: float, radius_m: float) -> list[_Section]:
     """Return the turn from the end of a line to the start of the next, including their leads."""
     directions = leg.direction, following.direction
     ahead = [np.array([math.cos(angle), math.sin(angle)]) for angle in directions]
@@ -230,7 +230,7 @@ def _follow(sections: Sequence[_Section], start: Floats, angle: float, along_m: 
     return _Plane(positions, directions, curvatures)
 
 
-def _heights(legs: Sequence[Leg], starts_m: Floats, along_m: Floats) -> Floats:
+def _heights(legs: Sequence[FlightLeg], starts_m: Floats, along_m: Floats) -> Floats:
     """Return the heights along a path, which change smoothly between the legs."""
     heights = np.empty(len(along_m))
     stops_m = starts_m + [leg.length_m for leg in legs]

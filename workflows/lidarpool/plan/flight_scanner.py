@@ -22,7 +22,7 @@ _SAMPLED_PULSES = 50_000
 
 
 @dataclass(frozen=True)
-class Scanner:
+class AirborneScanner:
     """A scanner that looks down from an aircraft, with the limits of its rates.
 
     Parameters
@@ -61,7 +61,7 @@ class Scanner:
     has_pulse_count: bool
 
     @classmethod
-    def load(cls, model: str, fov_deg: float | None = None) -> Scanner:
+    def load(cls, model: str, fov_deg: float | None = None) -> AirborneScanner:
         """Load a sensor model and determine its field of view and rates.
 
         Sensors whose head rotates about the z axis, and sensors that look forward, are mounted with
