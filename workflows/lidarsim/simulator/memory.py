@@ -46,6 +46,8 @@ POINT = 64
 POINT_BYTE = 3.2
 VISIBILITY = 160  # bytes per ray that is cast at a time to determine the visibility of actors
 COLOR = 16  # bytes per ray if reflectance comes from colors
+# Bytes per point that is georeferenced by the measured trajectory (2026-11-30).
+GEOREFERENCED = 450
 # Copies of the columns that come from a device: CuPy rounds page-locked memory up to a power of
 # two, and columns of several groups of scans are concatenated.
 PAGE_LOCKED = 2
@@ -160,7 +162,8 @@ def _point_bytes(setup: Setup, scans: int, on_device: bool) -> float:
         single_run = scans <= survey.steps_each[setup.number] and len(survey.mounted_sensors) == 1
         return (PAGE_LOCKED + (0 if single_run else JOINED)) * columns
     # NumPy computes all columns. Columns that are copied from the device count once more.
-    return POINT + POINT_BYTE * columns + columns * on_device
+    georeferenced = GEOREFERENCED * (survey.georeferencing == "measured")
+    return POINT + POINT_BYTE * columns + columns * on_device + georeferenced
 
 
 def _returns_per_pulse(setup: Setup) -> float:
