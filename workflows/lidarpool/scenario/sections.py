@@ -543,7 +543,8 @@ class SensorSection(Section):
     columns: Annotated[
         int | None,
         about(
-            "number of azimuth steps per revolution (Ouster sensors and beam tables only)",
+            "number of azimuth steps per revolution, or of pulses per cycle of a mirror (Ouster "
+            "sensors, sensors with a mirror, and beam tables only)",
             512,
             ge=1,
             le=100_000,
