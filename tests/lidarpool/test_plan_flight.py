@@ -58,6 +58,7 @@ def test_speed_and_rates_for_a_density(scanner):
     assert rates.fired_hz <= scanner.fired_hz
     assert plan.densities_m2[0] == pytest.approx(20, rel=0.02)
     assert plan.along_m == pytest.approx(plan.across_m, rel=0.02)
+    assert plan.line_density_m2(plan.lines[0]) == pytest.approx(plan.densities_m2)
     # At the speed limit, the pulse rate is reduced instead.
     slow = planned(scanner, density_m2=20, speeds_m_s=(5, 30))
     assert slow.rates.speed_m_s == 30

@@ -482,14 +482,16 @@ def _lines(plan: FlightPlan, density: AreaDensity | None, notes: list[str]) -> I
         f"A strip has {strip} points per m²{target}, {plan.along_m:.2f} m apart along the track "
         f"and {plan.across_m:.2f} m across."
     )
-    yield "line        start        length  height above ground         swath"
+    yield "line        start        length    above ground (m)       swath (m)   points per m²"
     for line, start_s in zip(plan.lines[:_SHOWN_LINES], plan.path.starts_s.tolist(), strict=False):
-        low_m, _, high_m = line.clearance_m
+        above = "{:.0f} to {:.0f}".format(*line.clearance_m[::2])
+        swath = "{:.0f} to {:.0f}".format(*line.swath_m)
+        points = "{:.3g} to {:.3g}".format(*plan.line_density_m2(line))
         yield (
-            f"{line.name:<8} {start_s:8,.1f} s {line.leg.length_m:11,.1f} m "
-            f"{low_m:9,.1f} to {high_m:,.1f} m {line.swath_m[0]:9,.0f} to {line.swath_m[1]:,.0f} m"
+            f"{line.name:<8} {start_s:8,.1f} s {line.leg.length_m:11,.1f} m {above:>19} "
+            f"{swath:>15} {points:>15}"
         )
-    if (further := len(plan.lines) - _SHOWN_LINES) and further > 0:
+    if (further := len(plan.lines) - _SHOWN_LINES) > 0:
         yield f"{further} further lines"
     yield from map("note: {}".format, notes)
 
@@ -518,6 +520,7 @@ def _figures(
                 "start_s": start_s,
                 "clearance_m": list(line.clearance_m),
                 "swath_m": list(line.swath_m),
+                "density_m2": list(plan.line_density_m2(line)),
             }
             for line, start_s in zip(plan.lines, plan.path.starts_s.tolist(), strict=True)
         ],

@@ -68,6 +68,11 @@ class FlightPlan:
         """Width of the swath at the requested height above ground, in meters."""
         return self.scanner.swath_m(self.layout.agl_m)
 
+    def line_density_m2(self, line: FlightLine) -> tuple[float, float]:
+        """Return the densities of a strip over the lowest and the highest ground below it."""
+        narrow_m, wide_m = line.swath_m
+        return self.rates.density_m2(wide_m), self.rates.density_m2(narrow_m)
+
     @property
     def min_overlap(self) -> float | None:
         """Overlap of adjacent strips over the highest ground, or None for a single line."""

@@ -50,6 +50,7 @@ def _features(plan: FlightPlan, epsg: int | None, origin: Floats) -> Iterator[_F
         points = np.column_stack([leg.start + share * (leg.stop - leg.start), leg.heights])
         if np.ptp(leg.heights) < 0.01:
             points = points[[0, -1]]
+        low_m2, high_m2 = plan.line_density_m2(line)
         properties = {
             "start_s": round(start_s, 3),
             "length_m": round(leg.length_m, 2),
@@ -58,6 +59,8 @@ def _features(plan: FlightPlan, epsg: int | None, origin: Floats) -> Iterator[_F
             "max_clearance_m": round(line.clearance_m[2], 2),
             "min_swath_m": round(line.swath_m[0], 2),
             "max_swath_m": round(line.swath_m[1], 2),
+            "min_density_m2": round(low_m2, 3),
+            "max_density_m2": round(high_m2, 3),
         }
         yield _Feature(line.name, line.kind, placed(LineString(points)), properties)
     every = max(1, len(plan.path.positions) // _PATH_POINTS)
