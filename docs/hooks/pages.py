@@ -20,6 +20,7 @@ from reference_pages import (
     command_page,
     members_page,
     scenario_page,
+    vehicle_page,
 )
 
 ROOT = Path(__file__).parents[2]
@@ -77,6 +78,7 @@ def on_files(files: Files, config: Any) -> Files:
     pages["reference/command.md"] = command_page()
     pages["reference/scenario.md"] = scenario_page()
     pages["reference/campaign.md"] = campaign_page()
+    pages["reference/vehicle.md"] = vehicle_page()
     pages["reference/columns.md"] = columns_page()
     for package in ("lidarpool", "poolpart", "poolpart.deploy", "raybeam"):
         pages[f"reference/{package}.md"] = members_page(package)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from dataclasses import is_dataclass
 from importlib import import_module
 from typing import Any, get_type_hints
@@ -14,7 +14,7 @@ from pydantic import TypeAdapter
 from pydantic.warnings import UnsupportedFieldAttributeWarning
 
 from lidarpool.cli.commands import cli
-from lidarpool.scenario.schema import campaign_schema, scenario_schema
+from lidarpool.scenario.schema import campaign_schema, scenario_schema, vehicle_schema
 from lidarsim.columns.ply_format import file_type
 from lidarsim.columns.table import ALWAYS, AXES, OPTIONAL, SCAN, Column
 
@@ -64,6 +64,19 @@ _OF_CAMPAIGNS = {
     "vary: normal": "NormalDistribution",
     "vary: sample": "RowSample",
     "keep": "DatasetFormat",
+}
+
+# Sections of vehicle files. Those of scenarios have their tables on the page of scenario files.
+_OF_VEHICLES = {
+    "body": "BodyPart",
+    "sensors": "CandidateSensor",
+    "sensors: ranges": "MountRanges",
+    "targets": "TargetSection",
+    "region": "RegionSection",
+    "traffic": "TrafficTargets",
+    "map": "MapSection",
+    "rank": "RankSection",
+    "search": "MountSearch",
 }
 
 # What a reader of a package looks for first; the rest follows by the alphabet.
@@ -150,7 +163,28 @@ def campaign_page() -> str:
     return _schema_page(head, schema, _OF_CAMPAIGNS)
 
 
-def _schema_page(head: str, schema: dict[str, Any], sections: dict[str, str]) -> str:
+def vehicle_page() -> str:
+    """Generate tables of the fields of a vehicle file from its JSON schema."""
+    schema = vehicle_schema()
+    summary, _, _ = schema["description"].partition("\n\n")
+    head = (
+        f"# Vehicle files\n\n{summary} `lidarpool mount` reads this file; see "
+        "[Mounting positions](../how-to/mount.md). Fields that are not in these tables are "
+        "rejected. `lidarpool schema --vehicle` prints this as JSON Schema.\n"
+    )
+    shared = set(schema["$defs"]) & set(_SECTIONS.values())
+    page = _schema_page(head, schema, _OF_VEHICLES, shared)
+    for heading, name in _SECTIONS.items():
+        anchor = heading.replace(": ", "-")
+        if name in shared:
+            page = page.replace(f"](#{anchor})", f"](scenario.md#{anchor})")
+    return page
+
+
+def _schema_page(
+    head: str, schema: dict[str, Any], sections: dict[str, str], elsewhere: Set[str] = frozenset()
+) -> str:
+    """Generate a page with a table for each section, except for sections on other pages."""
     parts = [head, "## The file\n", _table(schema["properties"], schema.get("required", []))]
     for heading, name in sections.items():
         section = schema["$defs"][name]
@@ -159,7 +193,7 @@ def _schema_page(head: str, schema: dict[str, Any], sections: dict[str, str]) ->
         required = fields.get("required", [])
         words = f"{section['description']}\n".replace("`Sensor`", "[Sensor][lidarpool.Sensor]")
         parts += [f"## `{heading}`\n", words, _table(fields["properties"], required)]
-    missing = set(schema["$defs"]) - set(sections.values())
+    missing = set(schema["$defs"]) - set(sections.values()) - elsewhere
     if missing:
         raise ValueError(f"sections that the page of their file does not show: {missing}")
     return "\n".join(parts)
@@ -241,8 +275,9 @@ def _kinds(content: dict[str, Any]) -> str:
 
 def _section(name: str) -> str:
     """Return a link to the table of a section on this page, given its name in the schema."""
-    both = _SECTIONS | _OF_CAMPAIGNS
-    heading = next(heading for heading, section in both.items() if section == name)
+    tables = (_SECTIONS, _OF_CAMPAIGNS, _OF_VEHICLES)
+    pairs = (pair for table in tables for pair in table.items())
+    heading = next(heading for heading, section in pairs if section == name)
     return f"[{heading}](#{heading.replace(': ', '-')})"
 
 

@@ -39,6 +39,7 @@ from .augment_command import augment
 from .first_step import print_first_step
 from .flight_command import flight
 from .follow_command import follow
+from .mount_command import mount
 from .play_command import play
 from .result_commands import compare, export, fit, plot, view
 from .scenario_commands import check, import_, init, scene, schema, sensors
@@ -231,7 +232,7 @@ class _Commands(click.Group):
 @click.group(
     cls=_Commands,
     commands=[
-        *(init, import_, check, schema, scene, sensors, stations, flight),
+        *(init, import_, check, schema, scene, sensors, stations, flight, mount),
         *(view, play, follow, serve, plot, export, compare, fit, twin, augment),
     ],
     context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]},

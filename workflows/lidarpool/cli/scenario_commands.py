@@ -302,7 +302,8 @@ def _unused_target(target: Path | Storage) -> str:
 
 @click.command()
 @click.option("--campaign", is_flag=True, help="Print the schema of campaign files.")
-def schema(campaign: bool) -> None:
+@click.option("--vehicle", is_flag=True, help="Print the schema of vehicle files.")
+def schema(campaign: bool, vehicle: bool) -> None:
     """Print the JSON Schema of scenario files.
 
     Editors can use the schema to complete and check scenarios. Visual Studio Code requires the
@@ -316,10 +317,14 @@ def schema(campaign: bool) -> None:
     Examples:
       lidarpool schema > scenario.schema.json
       lidarpool schema --campaign > campaign.schema.json
+      lidarpool schema --vehicle > vehicle.schema.json
     """  # noqa: D301 - Click requires the character \b
-    from ..scenario.schema import campaign_schema, scenario_schema, schema_text
+    from ..scenario.schema import campaign_schema, scenario_schema, schema_text, vehicle_schema
 
-    click.echo(schema_text(campaign_schema() if campaign else scenario_schema()), nl=False)
+    if campaign and vehicle:
+        raise click.UsageError("`--campaign` and `--vehicle` cannot be combined.")
+    chosen = campaign_schema if campaign else vehicle_schema if vehicle else scenario_schema
+    click.echo(schema_text(chosen()), nl=False)
 
 
 @click.group(name="scene")

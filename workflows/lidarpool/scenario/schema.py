@@ -1,4 +1,4 @@
-"""JSON Schemas of scenarios and campaigns, and scenario files for `lidarpool init`."""
+"""JSON Schemas of scenarios, campaigns and vehicle files, and scenario files for `lidarpool init`."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from lidarsim.schema.section_fields import fields_of, is_section, kinds_of
 
 from .campaign_sections import CampaignSection
 from .default_poses import as_yaml_line
+from .mount_sections import VehicleFile
 from .scenario import Scenario
 from .sections import Section
 
@@ -74,6 +75,14 @@ def campaign_schema() -> dict[str, Any]:
     `Campaign.load` checks both.
     """
     return _section_schema(CampaignSection, "lidarpool campaign")
+
+
+def vehicle_schema() -> dict[str, Any]:
+    """Return the JSON Schema of vehicle files, which `lidarpool mount` reads.
+
+    The schema does not check combinations of fields. `VehicleFile.load` checks them.
+    """
+    return _section_schema(VehicleFile, "lidarpool vehicle")
 
 
 def _section_schema(section: type[Section], title: str) -> dict[str, Any]:

@@ -8,6 +8,9 @@ from __future__ import annotations
 BACKENDS = ("auto", "cuda", "tiles", "numpy")
 # Objects that `lidarpool augment` can insert without a file.
 INSERTIONS = ("car", "pedestrian")
+# Built-in bodies and targets of `lidarpool mount`.
+BODIES = ("saloon", "estate", "van")
+TARGETS = ("pedestrian", "child", "car", "cyclist", "curb", "cone")
 # Values of `lidarsim.sensor.optics.Mode`. A test compares them.
 RETURN_MODES = ("strongest", "first", "last", "dual", "two_strongest", "all")
 PICTURES = ("scene", "hits", "intensity", "cloud", "path")

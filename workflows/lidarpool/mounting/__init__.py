@@ -1,0 +1,1 @@
+"""Evaluation of the mounting positions of lidars on a vehicle."""

@@ -1,0 +1,348 @@
+"""Pictures of candidates: blind areas, points on targets, and trade-offs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import BoundaryNorm, ListedColormap, LogNorm, to_rgb
+from matplotlib.patheffects import withStroke
+from matplotlib.projections.polar import PolarAxes
+
+from lidarsim.numerics.arrays import Floats, Ints
+from lidarsim.words import shorten_name
+from lidarview.render import theme
+from lidarview.render.picture_page import FONT, Page
+
+from .evaluation import SHARE_DEG
+from .ranking import CandidateResult, points_by_position
+from .study import Study, StudyResult
+
+MAX_PANELS = 6  # candidates whose blind areas are compared, and classes of targets
+_SIZE = (1600, 1200)
+_PANELS = (0.05, 0.08, 0.8, 0.74)  # left, bottom, width and height of all panels
+# Colors from "visible on the ground" to "an object of the largest height is hidden".
+_BANDS = ("#eef3f7", "#fddbc7", "#f4a582", "#d6604d", "#b2182b", "#8e0c25", "#67001f", "#4d0018",
+          "#33000f")  # fmt: skip
+_VEHICLE = "#7d8794"
+_COUNTS = ("#b2182b", "#d1e5f0", "#67a9cf", "#2166ac")  # cells seen by 0, 1, 2, and more sensors
+_FRONT = "#d6336c"
+_OTHER = "#5b8fd0"
+
+
+class _Panel(NamedTuple):
+    """Position of a panel on a page, in fractions of the page."""
+
+    frame: tuple[float, float, float, float]
+
+
+def _panels(count: int, columns: int) -> list[_Panel]:
+    """Divide the area of a page among panels."""
+    left, bottom, width, height = _PANELS
+    rows = -(-count // columns)
+    panels = []
+    for number in range(count):
+        row, column = divmod(number, columns)
+        side_x, side_y = width / columns, height / rows
+        y = bottom + (rows - 1 - row) * side_y
+        panels.append(_Panel((left + column * side_x, y, 0.84 * side_x, 0.8 * side_y)))
+    return panels
+
+
+def _columns(count: int) -> int:
+    return 1 if count == 1 else 2 if count in (2, 4) else 3
+
+
+def draw_blind_area(result: StudyResult) -> Page:
+    """Draw the blind area of the best candidate, with the vehicle and its sensors."""
+    page = Page(_SIZE)
+    axes = page.chart((0.07, 0.08, 0.74, 0.76))
+    _draw_map(
+        page, axes, result.study, _bands(result.study, result.best), _band_colors(result.study)
+    )
+    _mark_sensors(page, axes, result.best, named=True)
+    page.legend(
+        [*zip(_band_names(result.study), _band_colors(result.study), strict=True)], "sensor"
+    )
+    height = result.study.rules.ranked_height_m
+    blind = result.best.blind_m2[height]
+    page.title(
+        f"Blind area of {result.best.candidate.name}",
+        f"{blind:,.1f} of {result.best.map_m2:,.0f} m² around the vehicle are blind to objects of "
+        f"{height:g} m; forward is up",
+    )
+    return page
+
+
+def draw_comparison(result: StudyResult) -> Page:
+    """Draw the blind areas of the best candidates side by side."""
+    shown = result.ranked[:MAX_PANELS]
+    page = Page(_SIZE)
+    colors = _band_colors(result.study)
+    height = result.study.rules.ranked_height_m
+    for panel, candidate in zip(_panels(len(shown), _columns(len(shown))), shown, strict=True):
+        axes = page.chart(panel.frame)
+        _draw_map(page, axes, result.study, _bands(result.study, candidate), colors)
+        _mark_sensors(page, axes, candidate, named=False)
+        name = shorten_name(candidate.candidate.name, 30)
+        page.heading(axes, f"{name}: {candidate.blind_m2[height]:,.1f} m² at {height:g} m")
+    page.legend([*zip(_band_names(result.study), colors, strict=True)], "sensor")
+    page.title("Blind areas of the candidates", "in the order of their ranks; forward is up")
+    return page
+
+
+def draw_redundancy(result: StudyResult) -> Page:
+    """Draw how many sensors of the best candidate see an object in each cell."""
+    study = result.study
+    height = study.rules.ranked_height_m
+    lowest = np.stack([sensor.blind.lowest_m for sensor in result.best.sensors.values()])
+    counts = (lowest <= np.float32(height)).sum(axis=0).clip(0, len(_COUNTS) - 1)
+    page = Page(_SIZE)
+    axes = page.chart((0.07, 0.08, 0.74, 0.76))
+    _draw_map(page, axes, study, counts, _COUNTS)
+    _mark_sensors(page, axes, result.best, named=True)
+    words = ("no sensor", "1 sensor", "2 sensors", "3 or more sensors")
+    shown = min(len(lowest) + 1, len(_COUNTS))
+    page.legend([*zip(words[:shown], _COUNTS[:shown], strict=True)], "sensor")
+    page.title(
+        f"Redundancy of {result.best.candidate.name}",
+        f"number of sensors that see an object of {height:g} m",
+    )
+    return page
+
+
+def draw_points(result: StudyResult) -> Page:
+    """Draw the points on each class of targets by distance and bearing, for the best candidate."""
+    placements = result.study.placements
+    rows = [k for k in range(len(placements.targets)) if (placements.target == k).any()]
+    rows = rows[:MAX_PANELS]
+    page = Page(_SIZE)
+    norm = LogNorm(1, max(10.0, float(result.best.points.max())))
+    colors = theme.apply_colormap("viridis", np.linspace(0, 1, 256))
+    for panel, target in zip(_panels(len(rows), _columns(len(rows))), rows, strict=True):
+        axes = page.figure.add_axes(panel.frame, projection="polar")
+        assert isinstance(axes, PolarAxes)
+        _draw_polar(page, axes, result.best, result, target, norm)
+        needed = placements.targets[target]
+        rate = result.best.detection[needed.name]
+        page.heading(
+            axes,
+            f"{needed.name}: {rate:.0%} with at least {needed.points} points",
+            pad=14 * page.unit,
+        )
+    page.color_bar(colors, norm, "points on the target")
+    page.title(
+        f"Points on targets of {result.best.candidate.name}",
+        "mean over all headings, by distance in meters and bearing; gray: no points; forward is up",
+    )
+    return page
+
+
+def draw_detection(result: StudyResult) -> Page:
+    """Draw the detection probability of the best candidate by distance, and the trade-off."""
+    page = Page((1600, 760))
+    axes = page.chart(
+        (0.06, 0.13, 0.36, 0.62), xlabel="distance, m", ylabel="share with enough points",
+        ylim=(-0.03, 1.03),
+    )  # fmt: skip
+    placements = result.study.placements
+    enough = np.array([t.points for t in placements.targets])[placements.target]
+    detected = result.best.points >= enough
+    handles = []
+    for number, target in enumerate(placements.targets):
+        rows = np.flatnonzero(placements.target == number)
+        if not len(rows):
+            continue
+        distances, shares = _by_distance(placements.distances_m[rows], detected[rows])
+        color = theme.OBJECT_COLORS[number % len(theme.OBJECT_COLORS)]
+        (line,) = axes.plot(
+            distances, shares, "o-", color=color, lw=1.6 * page.unit, ms=3.5 * page.unit
+        )
+        line.set_label(shorten_name(f"{target.name} (≥ {target.points})", 28))
+        handles.append(line)
+    page.key(handles, 6.6, bbox_to_anchor=(0.43, 0.45))
+    page.heading(axes, f"Detection by distance: {shorten_name(result.best.candidate.name, 40)}")
+    _draw_tradeoff(page, result)
+    page.title("Detection and trade-off")
+    return page
+
+
+def _draw_tradeoff(page: Page, result: StudyResult) -> None:
+    """Draw all candidates by detection rate and blind area."""
+    height = result.study.rules.ranked_height_m
+    axes = page.chart(
+        (0.645, 0.13, 0.335, 0.62), xlabel=f"blind area at {height:g} m, m²",
+        ylabel="detection rate",
+    )  # fmt: skip
+    blind = np.array([one.blind_m2[height] for one in result.ranked])
+    rates = np.array([one.detection_rate for one in result.ranked])
+    front = result.on_front
+    axes.plot(blind[~front], rates[~front], "o", color=_OTHER, ms=4 * page.unit, mew=0, alpha=0.7)
+    order = np.flatnonzero(front)[np.argsort(blind[front], kind="stable")]
+    axes.plot(blind[order], rates[order], "o-", color=_FRONT, ms=5 * page.unit, lw=1.4 * page.unit)
+    axes.margins(0.18)
+    halo = [withStroke(linewidth=2 * page.unit, foreground=theme.GROUND)]
+    for index in range(min(len(result.ranked), MAX_PANELS)):
+        axes.annotate(
+            shorten_name(result.ranked[index].candidate.name, 24),
+            (float(blind[index]), float(rates[index])),
+            xytext=(0, 6 * page.unit),
+            textcoords="offset points",
+            ha="center",
+            fontsize=6.4 * page.unit,
+            color=theme.INK,
+            family=FONT,
+            path_effects=halo,
+            parse_math=False,
+        )
+    page.heading(axes, "Candidates; the trade-off curve is red")
+
+
+def _by_distance(distances: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """Return the mean of values at each distance, or in ten bins if there are many distances."""
+    unique = np.unique(distances.round(3))
+    if len(unique) > 12:
+        edges = np.linspace(0, unique[-1], 11)
+        unique = (edges[1:] + edges[:-1]) / 2
+        owner = np.minimum(np.searchsorted(edges, distances, "right") - 1, 9)
+    else:
+        owner = np.searchsorted(unique, distances.round(3))
+    counts = np.bincount(owner, minlength=len(unique))
+    totals = np.bincount(owner, values, minlength=len(unique))
+    return unique[counts > 0], totals[counts > 0] / counts[counts > 0]
+
+
+def draw_blocked(result: StudyResult) -> Page:
+    """Draw the beams that the vehicle blocks, for each sensor of the best candidate."""
+    shown = [*result.best.sensors.items()][:MAX_PANELS]
+    page = Page((1600, 130 + 330 * len(shown)))
+    height = page.size[1]
+    for row, (name, sensor) in enumerate(shown):
+        share = sensor.blocked_share
+        rows = np.flatnonzero(np.isfinite(share).any(axis=1))
+        low, high = int(rows[0]), int(rows[-1]) + 1
+        bottom = (height - 110 - 330 * (row + 1) + 80) / height
+        limits = (low * SHARE_DEG - 90, high * SHARE_DEG - 90)
+        axes = page.chart((0.07, bottom, 0.76, 210 / height), ylabel="elevation, °")
+        image = np.ones((*share.shape, 3)) * to_rgb(theme.UNSEEN)
+        known = np.isfinite(share)
+        light, dark = np.array(to_rgb("#d1e5f0")), np.array(to_rgb("#b2182b"))
+        image[known] = light + share[known, None] * (dark - light)
+        axes.imshow(
+            image[low:high, ::-1], aspect="auto", origin="lower", interpolation="nearest",
+            extent=(180, -180, *limits),
+        )  # fmt: skip
+        axes.grid(False)
+        axes.set_xlabel("azimuth in the sensor frame, ° (positive is left)")
+        page.heading(axes, f"{name}: {sensor.blocked / sensor.beams:.1%} of the beams are blocked")
+    page.legend([("free", "#d1e5f0"), ("blocked", "#b2182b"), ("no beams", theme.UNSEEN)], "")
+    page.title("Occlusion by the vehicle")
+    return page
+
+
+def _bands(study: Study, candidate: CandidateResult) -> Ints:
+    """Return the index of the lowest visible height of the map in each cell."""
+    heights = np.array(study.rules.heights_m, np.float32)
+    bands: Ints = (candidate.lowest_m[..., None] > heights).sum(axis=-1)
+    return bands
+
+
+def _band_names(study: Study) -> list[str]:
+    """Return the legend entries of the bands."""
+    heights = study.rules.heights_m
+    words = ["ground" if height == 0 else f"objects of {height:g} m" for height in heights]
+    return [f"{word} visible" for word in words] + [f"{heights[-1]:g} m blind"]
+
+
+def _band_colors(study: Study) -> tuple[str, ...]:
+    return _BANDS[: len(study.rules.heights_m) + 1]
+
+
+def _draw_map(page: Page, axes: Axes, study: Study, kinds: Ints, colors: Sequence[str]) -> None:
+    """Draw the kind of each cell in a color, with the vehicle on top. Forward is up."""
+    grid = study.evaluator.grid
+    extent_x = (grid.x, grid.x + grid.columns * grid.cell_m)
+    extent_y = (grid.y, grid.y + grid.rows * grid.cell_m)
+    norm = BoundaryNorm(np.arange(len(colors) + 1) - 0.5, len(colors))
+    image = ListedColormap(colors)(norm(kinds))[..., :3]
+    # The rows of the picture are x, and its columns are y, which decreases to the right.
+    axes.imshow(
+        image.swapaxes(0, 1)[:, ::-1], origin="lower", interpolation="nearest",
+        extent=(extent_y[1], extent_y[0], *extent_x),
+    )  # fmt: skip
+    axes.grid(False)
+    axes.set_aspect("equal")
+    axes.set(xlabel="y, m", ylabel="x, m")
+    body = study.evaluator.body
+    corners = body.vertices[body.faces][..., [1, 0]]
+    axes.add_collection(PolyCollection(list(corners), facecolors=_VEHICLE, edgecolors="none"))
+
+
+def _mark_sensors(page: Page, axes: Axes, candidate: CandidateResult, *, named: bool) -> None:
+    """Draw the sensors of a candidate as dots, with their names."""
+    halo = [withStroke(linewidth=2 * page.unit, foreground=theme.PAGE)]
+    for name, pose in candidate.candidate.mounts.items():
+        x, y, _ = pose.position
+        axes.plot([y], [x], "o", color=theme.SENSOR, ms=4 * page.unit, mec=theme.PAGE)
+        if named:
+            axes.annotate(
+                shorten_name(name, 20), (y, x), xytext=(0, 5 * page.unit), ha="center",
+                textcoords="offset points", fontsize=6.6 * page.unit, color=theme.INK,
+                family=FONT, path_effects=halo, parse_math=False,
+            )  # fmt: skip
+
+
+def _draw_polar(
+    page: Page,
+    axes: PolarAxes,
+    candidate: CandidateResult,
+    result: StudyResult,
+    target: int,
+    norm: LogNorm,
+) -> None:
+    """Draw the points on a class of targets in a polar chart."""
+    placements = result.study.placements
+    axes.set_theta_zero_location("N")
+    axes.set_facecolor(theme.GROUND)
+    axes.grid(False)
+    if result.study.vehicle.traffic is not None:
+        rows = np.flatnonzero(placements.target == target)
+        points = candidate.points[rows]
+        colors = theme.apply_colormap("viridis", np.asarray(norm(np.maximum(points, 1)).data))
+        colors[points == 0] = to_rgb(theme.UNSEEN)
+        angles = np.radians(placements.bearings_deg[rows])
+        axes.scatter(angles, placements.distances_m[rows], c=colors, s=6 * page.unit**2, lw=0)
+    else:
+        distances, bearings, mean = points_by_position(candidate, placements, target)
+        rings = np.arange(len(distances) + 1)
+        half = np.pi / len(bearings)
+        edges = np.radians(np.append(bearings, bearings[0] + 360)) - half
+        colors = theme.apply_colormap("viridis", np.asarray(norm(np.maximum(mean, 1)).data))
+        colors[mean == 0] = to_rgb(theme.UNSEEN)
+        colors[~np.isfinite(mean)] = to_rgb(_VEHICLE)
+        axes.pcolormesh(edges, rings, np.zeros(mean.shape), shading="flat").set(
+            array=None, facecolors=colors.reshape(-1, 3)
+        )
+        axes.set_yticks(rings[:-1] + 0.5, [f"{distance:g}" for distance in distances])
+    axes.set_xticks(np.radians([0, 90, 180, 270]), ["0°", "90°", "180°", "270°"])
+    axes.spines[:].set(color=theme.LINE, linewidth=0.6 * page.unit)
+    axes.tick_params(
+        labelsize=5.8 * page.unit, labelcolor=theme.MUTED, labelfontfamily=FONT, pad=-1 * page.unit
+    )
+    axes.set_rlabel_position(22.5)
+
+
+def draw_all(result: StudyResult) -> dict[str, Page]:
+    """Return all pictures of a ranking by name."""
+    pictures = {"blind": draw_blind_area(result)}
+    if len(result.ranked) > 1:
+        pictures["comparison"] = draw_comparison(result)
+    if len(result.best.sensors) > 1:
+        pictures["redundancy"] = draw_redundancy(result)
+    pictures["points"] = draw_points(result)
+    pictures["detection"] = draw_detection(result)
+    pictures["blocked"] = draw_blocked(result)
+    return pictures

@@ -1,0 +1,358 @@
+"""Study of the mounting positions in a vehicle file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lidarscenes.procedural.cars import MODELS, car
+from lidarscenes.procedural.road_users import ROAD_USERS
+from lidarsim.errors import LidarError
+from lidarsim.motion.trajectory import Pose
+from lidarsim.numerics.arrays import Bools
+from lidarsim.numerics.vectors import rotate
+from lidarsim.scene.scene_mesh import SceneMesh, stack_meshes
+from lidarsim.schema.declared import declared_values
+from lidarsim.schema.vocabulary import BODIES
+from lidarsim.sensor import Noise, Returns
+from lidarsim.media.weather import Weather
+from lidarsim.words import plural
+from raybeam import RayCaster
+
+from ..run.cluster.worker_map import parallel_map
+from ..scenario.mount_sections import MAX_CELLS, BodyPart, VehicleFile
+from ..scenario.sections import ShapeSection
+from ..scenario.static_scene import FileFindings, ShapeLoader
+from .blind_loops import CellGrid
+from .evaluation import VEHICLE, MountEvaluator, MountResult
+from .placements import Placements, Target, grid_placements
+from .ranking import Candidate, CandidateResult, RankingRules, pareto_front, rank_candidates
+from .search import CandidateSearch
+from .traffic_placements import traffic_placements
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+_WORKER_BYTES = 1 << 30
+_MANY_BLOCKED = 0.5  # share of blocked beams that causes a note
+_CARS = dict(zip(BODIES, MODELS, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class StudyResult:
+    """Ranked candidates of a vehicle file.
+
+    Attributes
+    ----------
+    study
+        The study.
+    ranked
+        All candidates, best first.
+    on_front
+        Whether each candidate is on the trade-off curve. Shape (candidates,).
+    mounts
+        Number of evaluated mounts of all sensors.
+    notes
+        Notes for the user.
+    """
+
+    study: Study
+    ranked: Sequence[CandidateResult]
+    on_front: Bools
+    mounts: int
+    notes: tuple[str, ...]
+
+    @property
+    def best(self) -> CandidateResult:
+        """The candidate with the highest score."""
+        return self.ranked[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """Vehicle, targets and map of a vehicle file, ready to be evaluated.
+
+    Attributes
+    ----------
+    vehicle
+        The vehicle file.
+    evaluator
+        Evaluator of sensors at a mount.
+    rules
+        Rules of the score.
+    notes
+        Notes about the files.
+    """
+
+    vehicle: VehicleFile
+    evaluator: MountEvaluator
+    rules: RankingRules
+    notes: tuple[str, ...] = field(default=())
+
+    @classmethod
+    def from_file(cls, vehicle: VehicleFile) -> Study:
+        """Read the meshes of a vehicle file, and place the targets.
+
+        Raises
+        ------
+        LidarError
+            If a mesh or scenario cannot be read, or if no target is outside the vehicle.
+        """
+        findings = FileFindings()
+        loader = ShapeLoader(vehicle.files, findings)
+        body = _body(vehicle.body, loader)
+        if float(body.bounds[0, 2]) < -0.5:
+            findings.notes.append(
+                f"the body extends to {body.bounds[0, 2]:.2f} m below the ground, which is z = 0 "
+                "in the frame of the vehicle"
+            )
+        everywhere = _placements(vehicle, loader)
+        placements = everywhere.without_collisions(body.bounds[:, :2])
+        if not len(placements):
+            raise LidarError(
+                f"{vehicle.source}: No target is outside the vehicle. Use larger distances in "
+                "`region.distances_m`."
+            )
+        grid = _grid(vehicle, body)
+        weather = declared_values(vehicle.weather, Weather)
+        evaluator = MountEvaluator(
+            body,
+            placements,
+            grid,
+            max(vehicle.map.heights_m),
+            vehicle.map.reflectance,
+            Returns(**declared_values(vehicle.returns, Returns)),
+            {"noise": Noise(**declared_values(vehicle.noise, Noise)), **weather},
+        )
+        rules = RankingRules(
+            tuple(sorted(vehicle.map.heights_m)),
+            vehicle.ranked_height_m,
+            vehicle.rank.blind_weight,
+            _outside(body, grid),
+            grid.cell_m**2,
+        )
+        return cls(vehicle, evaluator, rules, (*findings.notes, *findings.remarks))
+
+    @property
+    def placements(self) -> Placements:
+        """Targets that are evaluated."""
+        return self.evaluator.placements
+
+    def run(
+        self,
+        *,
+        client: Client | None = None,
+        workers: int | None = None,
+        progress: Callable[[int], None] = lambda done: None,
+    ) -> StudyResult:
+        """Evaluate all candidates, and rank them.
+
+        The result does not depend on the number of workers.
+
+        Parameters
+        ----------
+        client
+            Client of a cluster whose OTHER workers evaluate the mounts. By default, processes on
+            this machine do.
+        workers
+            Number of processes on this machine. By default, it depends on the number of cores and
+            the memory.
+        progress
+            Function that is called with the number of evaluated mounts.
+
+        Raises
+        ------
+        LidarError
+            If a sensor cannot be simulated, or if the cluster is lost.
+        """
+        vehicle = self.vehicle
+        done = 0
+        with parallel_map(client, self._batch, _WORKER_BYTES, workers) as run:
+
+            def evaluate(mounts: Sequence[tuple[str, Pose]]) -> list[MountResult]:
+                nonlocal done
+                results = []
+                mounted = [vehicle.mounted_sensor(name, pose) for name, pose in mounts]
+                for result in run(self.evaluator, mounted):
+                    results.append(result)
+                    done += 1
+                    progress(done)
+                return results
+
+            search = CandidateSearch(vehicle, self.placements, self.rules, evaluate)
+            found = rank_candidates(search.run())
+        if vehicle.is_search:
+            found = [_named(result, f"mount {n}") for n, result in enumerate(found, 1)]
+        front = pareto_front(found, self.rules.ranked_height_m)
+        return StudyResult(self, found, front, done, (*self.notes, *_notes(found[0], self)))
+
+    @property
+    def _batch(self) -> int:
+        """Largest number of mounts that are evaluated together."""
+        if not self.vehicle.is_search:
+            return sum(len(sensor.mounts) for sensor in self.vehicle.sensors.values())
+        return self.vehicle.search.samples
+
+
+def _named(result: CandidateResult, name: str) -> CandidateResult:
+    return replace(result, candidate=Candidate(name, result.candidate.mounts))
+
+
+def _notes(best: CandidateResult, study: Study) -> list[str]:
+    """Return notes about the best candidate."""
+    notes = []
+    for name, sensor in best.sensors.items():
+        if sensor.blocked > _MANY_BLOCKED * sensor.beams:
+            notes.append(
+                f"the vehicle blocks {sensor.blocked / sensor.beams:.0%} of the beams of {name} in "
+                "the best candidate. Check whether the mount is inside the body"
+            )
+        elif sensor.blocked_near:
+            notes.append(
+                f"{plural(sensor.blocked_near, 'beam')} of {name} in the best candidate "
+                f"{'meets' if sensor.blocked_near == 1 else 'meet'} the vehicle within the minimum "
+                "range of the sensor. These beams count as blocked"
+            )
+    missing = [t.name for k, t in enumerate(study.placements.targets)
+               if not (study.placements.target == k).any()]  # fmt: skip
+    if missing:
+        notes.append(f"all positions of {', '.join(missing)} overlap the vehicle")
+    return notes
+
+
+def _rounded(mesh: SceneMesh, name: str) -> SceneMesh:
+    """Return a renamed mesh without colors, whose vertices have single precision as in files."""
+    vertices = mesh.vertices.astype(np.float32).astype(np.float64)
+    return SceneMesh(name, vertices, mesh.faces)
+
+
+def _body(parts: Sequence[BodyPart], loader: ShapeLoader) -> SceneMesh:
+    """Return all parts of a vehicle body as one mesh in the vehicle frame."""
+    pieces = []
+    for part in parts:
+        if part.model is not None:
+            mesh = car(_CARS[part.model])
+        else:
+            mesh = loader.load_mesh(ShapeSection(name=VEHICLE, file=part.file, box=part.box))
+        vertices = rotate(mesh.vertices, part.at.rotation) + part.at.position
+        pieces.append((vertices, mesh.faces))
+    return _rounded(SceneMesh(VEHICLE, *stack_meshes(pieces)), VEHICLE)
+
+
+def _placements(vehicle: VehicleFile, loader: ShapeLoader) -> Placements:
+    """Return the targets of a vehicle file, which may overlap the vehicle."""
+    if vehicle.traffic is not None:
+        found = traffic_placements(vehicle, vehicle.traffic)
+        meshes = tuple(_rounded(mesh, mesh.name) for mesh in found.meshes)
+        return replace(found, meshes=meshes)
+    targets = []
+    meshes_by_class = []
+    for name, section in vehicle.targets.items():
+        if section.file is None and section.box is None:
+            mesh = ROAD_USERS[name]()
+        else:
+            mesh = loader.load_mesh(ShapeSection(name=name, file=section.file, box=section.box))
+        targets.append(Target(name, section.points, section.reflectance, section.weight))
+        meshes_by_class.append(_rounded(mesh, name))
+    region = vehicle.region
+    return grid_placements(
+        targets, meshes_by_class, region.distances_m, region.bearings, region.headings_deg
+    )
+
+
+def _grid(vehicle: VehicleFile, body: SceneMesh) -> CellGrid:
+    """Return the cells of the map, whose borders are multiples of the cell size.
+
+    Raise LidarError if there are too many cells.
+    """
+    cell = vehicle.map.cell_m
+    margin = vehicle.map.margin_m
+    lower = np.floor((body.bounds[0, :2] - margin) / cell).astype(int)
+    upper = np.ceil((body.bounds[1, :2] + margin) / cell).astype(int)
+    columns, rows = (upper - lower).tolist()
+    if columns * rows > MAX_CELLS:
+        raise LidarError(
+            f"{vehicle.source}: The map has {columns * rows:,} cells, but the limit is "
+            f"{MAX_CELLS:,}. Increase `map.cell_m`, or reduce `map.margin_m`."
+        )
+    x, y = (lower * cell).round(9).tolist()
+    return CellGrid(x, y, cell, columns, rows)
+
+
+def _outside(body: SceneMesh, grid: CellGrid) -> Bools:
+    """Return the cells whose centers are not below the vehicle. Shape (rows, columns)."""
+    x = grid.x + (np.arange(grid.columns) + 0.5) * grid.cell_m
+    y = grid.y + (np.arange(grid.rows) + 0.5) * grid.cell_m
+    centers = np.stack([*np.meshgrid(x, y), np.full((grid.rows, grid.columns), -100.0)], axis=-1)
+    up = np.tile([0.0, 0.0, 1.0], (centers[..., 0].size, 1))
+    hits = RayCaster(body.vertices, body.faces).cast(centers.reshape(-1, 3), up)
+    return ~hits.hit.reshape(grid.rows, grid.columns)
+
+
+def figures_of(result: StudyResult) -> dict[str, Any]:
+    """Return a ranking as a dictionary for JSON."""
+    study = result.study
+    vehicle = study.vehicle
+    placements = study.placements
+    return {
+        "vehicle": vehicle.source,
+        "sensors": {
+            name: vehicle.mounted_sensor(name, Pose((0, 0, 0))).sensor.model
+            for name in vehicle.sensors
+        },
+        "targets": {
+            target.name: {
+                "points": target.points,
+                "reflectance": target.reflectance,
+                "weight": target.weight,
+                "placements": int((placements.target == number).sum()),
+            }
+            for number, target in enumerate(placements.targets)
+        },
+        "map_m2": _tidy(result.best.map_m2),
+        "ranked_height_m": study.rules.ranked_height_m,
+        "blind_weight": study.rules.blind_weight,
+        "seed": vehicle.search.seed if vehicle.is_search else None,
+        "evaluated_mounts": result.mounts,
+        "candidates": [
+            _candidate_figures(one, bool(front))
+            for one, front in zip(result.ranked, result.on_front, strict=True)
+        ],
+        "notes": list(result.notes),
+    }
+
+
+def _candidate_figures(result: CandidateResult, on_front: bool) -> dict[str, Any]:  # noqa: FBT001
+    return {
+        "name": result.candidate.name,
+        "score": _tidy(result.score),
+        "on_tradeoff_curve": on_front,
+        "detection_rate": _tidy(result.detection_rate),
+        "detection": {name: _tidy(value) for name, value in result.detection.items()},
+        "mean_points": {name: _tidy(value) for name, value in result.mean_points.items()},
+        "redundancy": {name: _tidy(value) for name, value in result.redundancy.items()},
+        "blind_m2": {f"{h:g}": _tidy(area) for h, area in result.blind_m2.items()},
+        "hidden_by_vehicle_m2": {f"{h:g}": _tidy(area) for h, area in result.hidden_m2.items()},
+        "seen_twice_m2": {f"{h:g}": _tidy(area) for h, area in result.twice_m2.items()},
+        "sensors": {
+            name: {
+                **pose_entry(result.candidate.mounts[name]),
+                "blocked_by_vehicle": _tidy(sensor.blocked / sensor.beams),
+            }
+            for name, sensor in result.sensors.items()
+        },
+    }
+
+
+def pose_entry(pose: Pose) -> dict[str, Any]:
+    """Return a pose as a mapping for YAML or JSON, without angles that are zero."""
+    angles = {name: getattr(pose, name) for name in ("yaw_deg", "pitch_deg", "roll_deg")}
+    return {"position": [*pose.position], **{name: v for name, v in angles.items() if v}}
+
+
+def _tidy(value: float) -> float | None:
+    """Return a value with six digits after the decimal point, or None for NaN."""
+    return None if np.isnan(value) else round(float(value), 6)
