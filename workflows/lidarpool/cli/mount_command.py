@@ -139,6 +139,6 @@ def _class_lines(result: StudyResult) -> Iterator[str]:
     for target in targets:
         name = target.name
         yield (
-            f"{printable(name):<{width}} {best.detection[name]:10.1%} {best.redundancy[name]:16.1%} "
-            f"{best.mean_points[name]:13,.1f}"
+            f"{printable(name):<{width}} {best.detection[name]:10.1%} "
+            f"{best.redundancy[name]:16.1%} {best.mean_points[name]:13,.1f}"
         )

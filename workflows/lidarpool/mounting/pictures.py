@@ -23,7 +23,11 @@ from .study import Study, StudyResult
 
 MAX_PANELS = 6  # candidates whose blind areas are compared, and classes of targets
 _SIZE = (1600, 1200)
-_PANELS = (0.05, 0.08, 0.8, 0.74)  # left, bottom, width and height of all panels
+# Layout of pages with several charts, pixels.
+_LEFT = 90
+_TOP = 190
+_GAP = 110  # between rows of charts
+_PANELS_WIDTH = 1340
 # Colors from "visible on the ground" to "an object of the largest height is hidden".
 _BANDS = ("#eef3f7", "#fddbc7", "#f4a582", "#d6604d", "#b2182b", "#8e0c25", "#67001f", "#4d0018",
           "#33000f")  # fmt: skip
@@ -33,27 +37,33 @@ _FRONT = "#d6336c"
 _OTHER = "#5b8fd0"
 
 
-class _Panel(NamedTuple):
-    """Position of a panel on a page, in fractions of the page."""
+class _PanelGrid(NamedTuple):
+    """Charts of equal size on a page, in pixels."""
 
-    frame: tuple[float, float, float, float]
+    count: int
+    width: int
+    height: int
 
+    @property
+    def columns(self) -> int:
+        return min(self.count, 2 if self.count == 4 else 3)
 
-def _panels(count: int, columns: int) -> list[_Panel]:
-    """Divide the area of a page among panels."""
-    left, bottom, width, height = _PANELS
-    rows = -(-count // columns)
-    panels = []
-    for number in range(count):
-        row, column = divmod(number, columns)
-        side_x, side_y = width / columns, height / rows
-        y = bottom + (rows - 1 - row) * side_y
-        panels.append(_Panel((left + column * side_x, y, 0.84 * side_x, 0.8 * side_y)))
-    return panels
+    @property
+    def page(self) -> Page:
+        rows = -(-self.count // self.columns)
+        return Page((_SIZE[0], _TOP + rows * (self.height + _GAP)))
 
-
-def _columns(count: int) -> int:
-    return 1 if count == 1 else 2 if count in (2, 4) else 3
+    def frames(self, page: Page) -> list[tuple[float, float, float, float]]:
+        """Return the position and size of each chart in fractions of the page."""
+        width, height = page.size
+        pitch = (_PANELS_WIDTH - _LEFT) / self.columns
+        frames = []
+        for number in range(self.count):
+            row, column = divmod(number, self.columns)
+            x = _LEFT + column * pitch
+            y = height - _TOP - row * (self.height + _GAP) - self.height
+            frames.append((x / width, y / height, self.width / width, self.height / height))
+        return frames
 
 
 def draw_blind_area(result: StudyResult) -> Page:
@@ -80,11 +90,12 @@ def draw_blind_area(result: StudyResult) -> Page:
 def draw_comparison(result: StudyResult) -> Page:
     """Draw the blind areas of the best candidates side by side."""
     shown = result.ranked[:MAX_PANELS]
-    page = Page(_SIZE)
+    grid = _PanelGrid(len(shown), 360, 420)
+    page = grid.page
     colors = _band_colors(result.study)
     height = result.study.rules.ranked_height_m
-    for panel, candidate in zip(_panels(len(shown), _columns(len(shown))), shown, strict=True):
-        axes = page.chart(panel.frame)
+    for frame, candidate in zip(grid.frames(page), shown, strict=True):
+        axes = page.chart(frame)
         _draw_map(page, axes, result.study, _bands(result.study, candidate), colors)
         _mark_sensors(page, axes, candidate, named=False)
         name = shorten_name(candidate.candidate.name, 30)
@@ -119,11 +130,12 @@ def draw_points(result: StudyResult) -> Page:
     placements = result.study.placements
     rows = [k for k in range(len(placements.targets)) if (placements.target == k).any()]
     rows = rows[:MAX_PANELS]
-    page = Page(_SIZE)
+    grid = _PanelGrid(len(rows), 370, 370)
+    page = grid.page
     norm = LogNorm(1, max(10.0, float(result.best.points.max())))
     colors = theme.apply_colormap("viridis", np.linspace(0, 1, 256))
-    for panel, target in zip(_panels(len(rows), _columns(len(rows))), rows, strict=True):
-        axes = page.figure.add_axes(panel.frame, projection="polar")
+    for frame, target in zip(grid.frames(page), rows, strict=True):
+        axes = page.figure.add_axes(frame, projection="polar")
         assert isinstance(axes, PolarAxes)
         _draw_polar(page, axes, result.best, result, target, norm)
         needed = placements.targets[target]
@@ -253,7 +265,7 @@ def _bands(study: Study, candidate: CandidateResult) -> Ints:
 def _band_names(study: Study) -> list[str]:
     """Return the legend entries of the bands."""
     heights = study.rules.heights_m
-    words = ["ground" if height == 0 else f"objects of {height:g} m" for height in heights]
+    words = ["ground" if height == 0 else f"{height:g} m" for height in heights]
     return [f"{word} visible" for word in words] + [f"{heights[-1]:g} m blind"]
 
 
@@ -327,11 +339,12 @@ def _draw_polar(
             array=None, facecolors=colors.reshape(-1, 3)
         )
         axes.set_yticks(rings[:-1] + 0.5, [f"{distance:g}" for distance in distances])
-    axes.set_xticks(np.radians([0, 90, 180, 270]), ["0°", "90°", "180°", "270°"])
+    axes.set_xticks([])
     axes.spines[:].set(color=theme.LINE, linewidth=0.6 * page.unit)
-    axes.tick_params(
-        labelsize=5.8 * page.unit, labelcolor=theme.MUTED, labelfontfamily=FONT, pad=-1 * page.unit
-    )
+    axes.tick_params(labelsize=5.8 * page.unit, labelcolor=theme.INK, labelfontfamily=FONT)
+    halo = [withStroke(linewidth=1.6 * page.unit, foreground=theme.PAGE)]
+    for label in axes.get_yticklabels():
+        label.set_path_effects(halo)
     axes.set_rlabel_position(22.5)
 
 

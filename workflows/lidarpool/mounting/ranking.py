@@ -11,8 +11,10 @@ import numpy as np
 from lidarsim.motion.trajectory import Pose
 from lidarsim.numerics.arrays import Bools, Floats, Floats32, Ints
 
-from .evaluation import MountResult
+from .evaluation import BlindMap, MountResult
 from .placements import Placements
+
+_REACHED_M = 1.5e-3  # beams that reach the ground have this height at most
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,36 @@ class CandidateResult:
         return (-self.score, sum(self.blind_m2.values()), -sum(self.mean_points.values()))
 
 
+class _Areas(NamedTuple):
+    """Areas of the map for each height, in square meters."""
+
+    blind: dict[float, float]
+    hidden: dict[float, float]
+    twice: dict[float, float]
+    all: float
+
+    @classmethod
+    def from_maps(cls, maps: Sequence[BlindMap], rules: RankingRules) -> _Areas:
+        """Measure the areas that the sensors with the given maps see together."""
+        lowest = np.stack([one.lowest_m for one in maps])
+        combined = lowest.min(axis=0)
+        unobstructed = np.stack([one.unobstructed_m for one in maps]).min(axis=0)
+
+        def area(mask: Bools) -> float:
+            return float((mask & rules.outside).sum()) * rules.cell_m2
+
+        areas = cls({}, {}, {}, area(np.ones_like(rules.outside)))
+        for height in rules.heights_m:
+            # Maps have single precision.
+            limit = float(np.float32(height))
+            # Without the vehicle, the ground returns light wherever a beam reaches it.
+            is_open = unobstructed <= max(limit, _REACHED_M)
+            areas.blind[height] = area(combined > limit)
+            areas.hidden[height] = area((combined > limit) & is_open)
+            areas.twice[height] = area((lowest <= limit).sum(axis=0) >= 2)
+        return areas
+
+
 def evaluate_candidate(
     candidate: Candidate,
     sensors: Mapping[str, MountResult],
@@ -121,56 +153,37 @@ def evaluate_candidate(
     rules: RankingRules,
 ) -> CandidateResult:
     """Combine the evaluations of a candidate's sensors."""
-    results = list(sensors.values())
-    each = np.stack([result.points for result in results])
+    each = np.stack([result.points for result in sensors.values()])
     points = each.sum(axis=0)
     needed = np.array([target.points for target in placements.targets])[placements.target]
-    lowest = np.stack([result.blind.lowest_m for result in results])
-    open_lowest = np.stack([result.blind.unobstructed_m for result in results]).min(axis=0)
-    combined = lowest.min(axis=0)
-    outside = rules.outside
-
-    def area(mask: Bools) -> float:
-        return float((mask & outside).sum()) * rules.cell_m2
-
-    # Without a vehicle, the ground returns light wherever a beam reaches it.
-    blind = {height: area(combined > _visible_at(height)) for height in rules.heights_m}
-    hidden = {
-        height: area((combined > _visible_at(height)) & (open_lowest <= max(height, _REACHED_M)))
-        for height in rules.heights_m
-    }
-    twice = {
-        height: area((lowest <= _visible_at(height)).sum(axis=0) >= 2) for height in rules.heights_m
-    }
+    maps = [result.blind for result in sensors.values()]
+    areas = _Areas.from_maps(maps, rules)
     detection = _by_class(points >= needed, placements)
-    weights = np.array([target.weight for target in placements.targets])
-    rates = np.array([detection[target.name] for target in placements.targets])
-    known = np.isfinite(rates) & (weights > 0)
-    rate = float((rates * weights)[known].sum() / weights[known].sum()) if known.any() else 0.0
-    map_m2 = area(outside)
+    rate = _weighted_rate(detection, placements)
+    blind_share = areas.blind[rules.ranked_height_m] / max(areas.all, 1e-9)
     return CandidateResult(
         candidate=candidate,
         sensors=sensors,
         points=points,
-        lowest_m=combined,
+        lowest_m=np.stack([one.lowest_m for one in maps]).min(axis=0),
         detection=detection,
         mean_points=_by_class(points, placements),
         redundancy=_by_class((each >= needed).sum(axis=0) >= 2, placements),
         detection_rate=rate,
-        blind_m2=blind,
-        hidden_m2=hidden,
-        twice_m2=twice,
-        map_m2=map_m2,
-        score=rate - rules.blind_weight * blind[rules.ranked_height_m] / max(map_m2, 1e-9),
+        blind_m2=areas.blind,
+        hidden_m2=areas.hidden,
+        twice_m2=areas.twice,
+        map_m2=areas.all,
+        score=rate - rules.blind_weight * blind_share,
     )
 
 
-_REACHED_M = 1.5e-3  # beams that reach the ground have this height at most
-
-
-def _visible_at(height_m: float) -> float:
-    """Return the largest height in a map at which an object of the given height is visible."""
-    return float(np.float32(height_m))
+def _weighted_rate(detection: Mapping[str, float], placements: Placements) -> float:
+    """Return the weighted mean of the detection of the classes that have placements."""
+    weights = np.array([target.weight for target in placements.targets])
+    rates = np.array([detection[target.name] for target in placements.targets])
+    known = np.isfinite(rates) & (weights > 0)
+    return float((rates * weights)[known].sum() / weights[known].sum()) if known.any() else 0.0
 
 
 def _by_class(values: Bools | Ints, placements: Placements) -> dict[str, float]:

@@ -10,7 +10,8 @@ import numpy as np
 
 from lidarscenes.procedural.cars import MODELS, car
 from lidarscenes.procedural.road_users import ROAD_USERS
-from lidarsim.errors import LidarError
+from lidarsim.errors import LidarError, prefix_errors
+from lidarsim.media.weather import Weather
 from lidarsim.motion.trajectory import Pose
 from lidarsim.numerics.arrays import Bools
 from lidarsim.numerics.vectors import rotate
@@ -18,7 +19,6 @@ from lidarsim.scene.scene_mesh import SceneMesh, stack_meshes
 from lidarsim.schema.declared import declared_values
 from lidarsim.schema.vocabulary import BODIES
 from lidarsim.sensor import Noise, Returns
-from lidarsim.media.weather import Weather
 from lidarsim.words import plural
 from raybeam import RayCaster
 
@@ -236,7 +236,9 @@ def _body(parts: Sequence[BodyPart], loader: ShapeLoader) -> SceneMesh:
         if part.model is not None:
             mesh = car(_CARS[part.model])
         else:
-            mesh = loader.load_mesh(ShapeSection(name=VEHICLE, file=part.file, box=part.box))
+            section = ShapeSection(name=VEHICLE, file=part.file, box=part.box)
+            with prefix_errors(f"{loader.scenario.source}: body"):
+                mesh = loader.load_mesh(section)
         vertices = rotate(mesh.vertices, part.at.rotation) + part.at.position
         pieces.append((vertices, mesh.faces))
     return _rounded(SceneMesh(VEHICLE, *stack_meshes(pieces)), VEHICLE)
@@ -254,7 +256,9 @@ def _placements(vehicle: VehicleFile, loader: ShapeLoader) -> Placements:
         if section.file is None and section.box is None:
             mesh = ROAD_USERS[name]()
         else:
-            mesh = loader.load_mesh(ShapeSection(name=name, file=section.file, box=section.box))
+            shape = ShapeSection(name=name, file=section.file, box=section.box)
+            with prefix_errors(f"{vehicle.source}: targets: {name}"):
+                mesh = loader.load_mesh(shape)
         targets.append(Target(name, section.points, section.reflectance, section.weight))
         meshes_by_class.append(_rounded(mesh, name))
     region = vehicle.region
@@ -325,7 +329,7 @@ def figures_of(result: StudyResult) -> dict[str, Any]:
     }
 
 
-def _candidate_figures(result: CandidateResult, on_front: bool) -> dict[str, Any]:  # noqa: FBT001
+def _candidate_figures(result: CandidateResult, on_front: bool) -> dict[str, Any]:
     return {
         "name": result.candidate.name,
         "score": _tidy(result.score),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,14 @@ import yaml
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim._version import __version__
 from lidarsim.errors import explain_os_errors
+from lidarsim.media.weather import Weather
 from lidarsim.motion.trajectory import Pose
 from lidarsim.scene.scene import Scene
+from lidarsim.schema.declared import declared_values
 
 from ..clouds.folder import staging
 from ..report.page.rendering import render_template
+from ..scenario.mount_sections import VehicleFile
 from .evaluation import CONTACT_M
 from .pictures import draw_all
 from .study import StudyResult, figures_of, pose_entry
@@ -72,33 +75,11 @@ def _title(result: StudyResult) -> str:
     return Path(result.study.vehicle.source).stem
 
 
-def _scenario(result: StudyResult, folder: Path, target_files: list[str]) -> str:
+def _scenario(result: StudyResult, folder: Path, target_files: Sequence[str]) -> str:
     """Return the text of a scenario with the best candidate and a target of each shape."""
-    study = result.study
-    vehicle = study.vehicle
-    placements = study.placements
-    targets = placements.targets
-    actors = []
-    for number, file in enumerate(target_files):
-        angle = 2 * math.pi * number / len(target_files)
-        mesh = placements.meshes[number]
-        x, y = _SHOWN_DISTANCE_M * math.cos(angle), _SHOWN_DISTANCE_M * math.sin(angle)
-        at = {"position": [round(x, 3), round(y, 3), 0.0], "yaw_deg": 90}
-        actors.append({"name": mesh.name, "file": file, "at": at})
-    materials = [
-        {"objects": mesh.name, "reflectance": targets[placements.mesh_target[number]].reflectance}
-        for number, mesh in enumerate(placements.meshes[: len(target_files)])
-    ]
-    sections = {
-        name: section.model_dump(mode="json", exclude_unset=True, by_alias=True)
-        for name, section in (("returns", vehicle.returns), ("noise", vehicle.noise))
-    }
-    weather = {
-        name: getattr(vehicle.weather, name)
-        for name in vars(vehicle.weather)
-        if getattr(vehicle.weather, name) != getattr(type(vehicle.weather)(), name)
-    }
+    vehicle = result.study.vehicle
     near = {name for name, sensor in result.best.sensors.items() if sensor.blocked_near}
+    ground = {"objects": "*", "reflectance": vehicle.map.reflectance}
     data = {
         "scene": {"files": [VEHICLE_FILE], "ground": {"margin_m": 50.0}},
         "sensors": {
@@ -106,10 +87,9 @@ def _scenario(result: StudyResult, folder: Path, target_files: list[str]) -> str
             for name, pose in result.best.candidate.mounts.items()
         },
         "poses": [[0.0, 0.0, 0.0]],
-        "actors": actors,
-        "materials": [*materials, {"objects": "*", "reflectance": study.evaluator.reflectance}],
-        **{name: content for name, content in sections.items() if content},
-        **({"weather": weather} if weather else {}),
+        "actors": _target_actors(result, target_files),
+        "materials": [*_target_materials(result, len(target_files)), ground],
+        **_conditions(vehicle),
         "cloud": {"columns": ["range"]},
     }
     head = (
@@ -118,10 +98,44 @@ def _scenario(result: StudyResult, folder: Path, target_files: list[str]) -> str
     )
     if near:
         head += (
-            "# A minimum range of 0.001 m lets the vehicle block beams at close range. Ignore points "
-            "that are\n# closer than the minimum range of the sensor.\n"
+            "# A minimum range of 0.001 m lets the vehicle block beams at close range. Ignore "
+            "points that\n# are closer than the minimum range of the sensor.\n"
         )
     return head + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
+
+
+def _target_actors(result: StudyResult, files: Sequence[str]) -> list[dict[str, Any]]:
+    """Return actors that stand in a circle around the vehicle."""
+    actors = []
+    for number, (file, mesh) in enumerate(zip(files, result.study.placements.meshes, strict=False)):
+        angle = 2 * math.pi * number / len(files)
+        position = [_SHOWN_DISTANCE_M * math.cos(angle), _SHOWN_DISTANCE_M * math.sin(angle), 0.0]
+        at = {"position": [round(value, 3) + 0.0 for value in position], "yaw_deg": 90.0}
+        actors.append({"name": mesh.name, "file": file, "at": at})
+    return actors
+
+
+def _target_materials(result: StudyResult, count: int) -> list[dict[str, Any]]:
+    """Return materials with the reflectances of the first meshes."""
+    placements = result.study.placements
+    return [
+        {"objects": mesh.name, "reflectance": placements.targets[target].reflectance}
+        for mesh, target in zip(
+            placements.meshes[:count], placements.mesh_target[:count].tolist(), strict=True
+        )
+    ]
+
+
+def _conditions(vehicle: VehicleFile) -> dict[str, Any]:
+    """Return the sections of a scenario with the weather, noise and returns of a vehicle file."""
+    clear = Weather()
+    weather = declared_values(vehicle.weather, Weather)
+    sections = {
+        "returns": vehicle.returns.model_dump(mode="json", exclude_unset=True, by_alias=True),
+        "noise": vehicle.noise.model_dump(mode="json", exclude_unset=True, by_alias=True),
+        "weather": {k: value for k, value in weather.items() if value != getattr(clear, k)},
+    }
+    return {name: content for name, content in sections.items() if content}
 
 
 def _sensor_entry(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from fnmatch import fnmatchcase
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,18 +15,26 @@ from lidarsim.numerics.vectors import matmul, matvec
 from lidarsim.scene.actors import Actor
 
 from ..scenario.mount_sections import TargetSection, TrafficTargets, VehicleFile
-from ..scenario.prepare import prepare
+from ..scenario.prepare import PreparedScenario, prepare
 from ..scenario.scenario import Scenario
 from .placements import Placements, Target
 
 _ALL = "actor"  # name of the only class if no classes are given
 
 
+class _PlatformPath(NamedTuple):
+    """Sampled poses of the platform."""
+
+    times_ns: Floats  # (n,)
+    positions: Floats  # (n, 3)
+    rotations: Floats  # (n, 3, 3)
+
+
 def traffic_placements(vehicle: VehicleFile, section: TrafficTargets) -> Placements:
     """Return targets at the sampled positions of a scenario's actors.
 
-    The ground below the platform is z = 0 in the vehicle frame, so only horizontal positions and
-    headings are used. The shapes are those of the actors.
+    The ground below the vehicle is z = 0, so only horizontal positions and headings are used. The
+    shapes are those of the actors.
 
     Raises
     ------
@@ -39,64 +49,67 @@ def traffic_placements(vehicle: VehicleFile, section: TrafficTargets) -> Placeme
         )
     with prefix_errors(vehicle.source):
         prepared = prepare(scenario, plans=False)
-    path = prepared.survey.path
-    platform = [actor for actor in prepared.scene.actors if actor.trajectory is path]
-    others = [actor for actor in prepared.scene.actors if actor.trajectory is not path]
-    step_ns = section.interval_s * 1e9
-    times = np.arange(0.0, max(path.duration_ns, 1.0), step_ns)
-    origins, rotations = full_poses(path, 0, times)
+    platform = _platform_path(prepared, section)
     classes = dict(section.classes) or {_ALL: ("*",)}
-    names = [*classes]
-    rows = []
-    for index, actor in enumerate(others):
-        kind = next(
-            (k for k, name in enumerate(names) if _matches(actor.name, classes[name])), None
-        )
-        if kind is not None:
-            rows += _sampled(actor, index, kind, times, (origins, rotations), section)
-    if not rows:
+    actors: list[Actor] = []
+    kinds: list[int] = []
+    samples: list[Floats] = []
+    for actor in prepared.scene.actors:
+        kind = _class_of(actor.name, [*classes.values()])
+        if kind is None or actor.trajectory is prepared.survey.path:
+            continue
+        rows = _samples_nearby(actor, platform, section.max_distance_m)
+        if len(rows):
+            actors.append(actor)
+            kinds.append(kind)
+            samples.append(rows)
+    if not actors:
         raise LidarError(
-            f"No actor of {scenario.source} comes within {section.max_distance_m:g} m of the "
-            "platform, or none matches `traffic.classes`. The scenario has "
-            f"{len(others)} actors besides {len(platform)} on the platform."
+            f"No actor of {scenario.source} that matches `traffic.classes` comes within "
+            f"{section.max_distance_m:g} m of the platform. Increase `max_distance_m`, or check "
+            "the names of the actors."
         )
-    table = np.array(rows)
-    used, mesh = np.unique(table[:, 0].astype(int), return_inverse=True)
-    kinds = {int(row[0]): int(row[1]) for row in rows}
     default = TargetSection()
-    targets = [Target(name, default.points, default.reflectance, default.weight) for name in names]
+    table = np.concatenate(samples)
     return Placements(
-        tuple(targets),
-        tuple(others[index].mesh for index in used.tolist()),
-        np.array([kinds[index] for index in used.tolist()]),
-        mesh,
-        np.column_stack([table[:, 2:4], np.zeros(len(table))]),
-        table[:, 4],
+        tuple(
+            Target(name, default.points, default.reflectance, default.weight) for name in classes
+        ),
+        tuple(actor.mesh for actor in actors),
+        np.array(kinds),
+        np.repeat(np.arange(len(actors)), [len(rows) for rows in samples]),
+        np.column_stack([table[:, :2], np.zeros(len(table))]),
+        table[:, 2],
     )
 
 
-def _matches(name: str, patterns: tuple[str, ...]) -> bool:
-    return any(fnmatchcase(name, pattern) for pattern in patterns)
+def _platform_path(prepared: PreparedScenario, section: TrafficTargets) -> _PlatformPath:
+    path = prepared.survey.path
+    times = np.arange(0.0, max(path.duration_ns, 1.0), section.interval_s * 1e9)
+    return _PlatformPath(times, *full_poses(path, 0, times))
 
 
-def _sampled(
-    actor: Actor,
-    index: int,
-    kind: int,
-    times: Floats,
-    platform: tuple[Floats, Floats],
-    section: TrafficTargets,
-) -> list[tuple[float, ...]]:
-    """Return index, class, x, y and heading of an actor at the times at which it is close."""
+def _class_of(name: str, patterns: Sequence[Sequence[str]]) -> int | None:
+    """Return the index of the first class whose patterns match a name, or None."""
+    for index, several in enumerate(patterns):
+        if any(fnmatchcase(name, pattern) for pattern in several):
+            return index
+    return None
+
+
+def _samples_nearby(actor: Actor, platform: _PlatformPath, max_distance_m: float) -> Floats:
+    """Return x, y and heading of an actor in the platform frame while it is close.
+
+    The result has shape (k, 3), in meters and degrees.
+    """
     first, last = presence_ns(actor.trajectory)
-    present = (times >= first) & (times <= last)
-    positions, rotations = full_poses(actor.trajectory, 0, times[present])
-    origins, axes = (values[present] for values in platform)
-    rows: list[tuple[float, ...]] = []
-    for position, rotation, origin, frame in zip(positions, rotations, origins, axes, strict=True):
-        relative = matvec(frame.T, position - origin)
-        if np.hypot(relative[0], relative[1]) <= section.max_distance_m:
-            forward = matmul(frame.T, rotation)[:, 0]
-            heading = float(np.degrees(np.arctan2(forward[1], forward[0])))
-            rows.append((index, kind, *relative[:2].round(6).tolist(), round(heading, 6)))
-    return rows
+    present = np.flatnonzero((platform.times_ns >= first) & (platform.times_ns <= last))
+    if not len(present):
+        return np.zeros((0, 3))
+    positions, rotations = full_poses(actor.trajectory, 0, platform.times_ns[present])
+    to_platform = platform.rotations[present].swapaxes(1, 2)
+    relative = matvec(to_platform, positions - platform.positions[present])
+    forward = matmul(to_platform, rotations)[..., 0]
+    headings = np.degrees(np.arctan2(forward[:, 1], forward[:, 0]))
+    near = np.hypot(relative[:, 0], relative[:, 1]) <= max_distance_m
+    return np.column_stack([relative[:, :2], headings])[near].round(6)

@@ -80,6 +80,8 @@ class BodyPart(Section):
 def _as_parts(value: Any) -> Any:
     """Convert the short forms of a body to a list of parts."""
     parts = value if isinstance(value, list) else [value]
+    if any(isinstance(part, str) and part not in BODIES and "." not in part for part in parts):
+        raise not_allowed_error(f"{', '.join(BODIES)}, a mesh file, or a list of parts")
     return [
         {"model" if part in BODIES else "file": part} if isinstance(part, str) else part
         for part in parts
@@ -518,8 +520,11 @@ class VehicleFile(Section):
         elif (
             self.combine == "names" and len({frozenset(mounts) for mounts in several.values()}) > 1
         ):
-            described = [f"{name} has {list_names([*m])}" for name, m in several.items()]
+            described = [
+                f"the mounts of {name} are {join_names([*mounts])}"
+                for name, mounts in several.items()
+            ]
             yield (
                 "`combine: names` requires the same names of mounts for all sensors with several "
-                f"mounts, but {join_names(described)}."
+                f"mounts, but {', and '.join(described)}."
             )

@@ -1,4 +1,4 @@
-"""JSON Schemas of scenarios, campaigns and vehicle files, and scenario files for `lidarpool init`."""
+"""JSON Schemas of scenarios, campaigns and vehicle files, and files for `lidarpool init`."""
 
 from __future__ import annotations
 
