@@ -32,6 +32,11 @@ def test_a_quiet_command_tells_no_step(command, quiet, tmp_path):
     assert "reading" not in ended.stderr
 
 
+def test_the_first_step_of_mount_is_the_vehicle(tmp_path):
+    ended = CliRunner().invoke(cli, ["mount", str(tmp_path / "none.yaml")])
+    assert "reading the vehicle\n" in ended.stderr and "none.yaml" in str(ended.exception)
+
+
 def test_compiling_is_told_where_logs_are_dropped(capsys, monkeypatch):
     logger = logging.getLogger("raybeam.compiled")
     monkeypatch.setattr(logging.root.manager, "disable", logging.CRITICAL)

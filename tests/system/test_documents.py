@@ -47,10 +47,11 @@ from lidarpool.cli.commands import cli
 from lidarpool.clouds.format_table import EXPORTS, LAYOUTS, point_suffixes
 from lidarpool.datasets.dataset import DATA_SETS
 from lidarpool.scenario.campaign_sections import CampaignSection
+from lidarpool.scenario.mount_sections import VehicleFile
 from lidarpool.scenario.plausibility import plausibility_warnings
 from lidarpool.scenario.prepare import prepare
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scenario.schema import campaign_schema, scenario_schema
+from lidarpool.scenario.schema import campaign_schema, scenario_schema, vehicle_schema
 from lidarpool.scenario.sensors_file import SensorsFile
 from lidarsim.columns.table import TABLE
 from lidarsim.scene.files.mesh_formats import endings, option_names
@@ -397,7 +398,8 @@ def words_of_schema(schema: Any) -> Iterator[str]:
 def known_words() -> set[str]:
     """Names of this project and of Dask that pages write as code: fields, columns, functions, …"""
     words = {*EXPORTS, *LAYOUTS, *DATA_SETS}
-    for schema in (scenario_schema(), campaign_schema(), SensorModel.model_json_schema()):
+    schemas = (scenario_schema(), campaign_schema(), vehicle_schema())
+    for schema in (*schemas, SensorModel.model_json_schema()):
         words |= {*words_of_schema(schema)}
     for column in TABLE.values():
         words |= {column.name, column.in_files}
@@ -458,6 +460,8 @@ def test_yaml_is_what_it_is_for(block):
         assert (ROOT / block.title).read_text("utf-8").endswith(f"\n{block.code}")
     elif block.title == "sensors.yaml":
         assert SensorsFile.model_validate(data).sensors_on_frames()
+    elif block.title == "vehicle.yaml":
+        VehicleFile.from_data({"body": "van", "sensors": {"a": {"mounts": [0, 0, 3]}}} | data)
     elif data.keys() & {"base", "vary"}:
         CampaignSection.model_validate({"base": "base.yaml"} | data)
     elif "beams" in data:

@@ -10,7 +10,7 @@ import yaml
 
 from lidarpool import LidarError, Pose
 from lidarpool.mounting.placements import azimuths_in_view, pack_sweeps
-from lidarpool.mounting.study import Study
+from lidarpool.mounting.study import MountStudy
 from lidarpool.scenario.mount_sections import VehicleFile
 
 POST = {"box": [0.2, 0.2, 0.2]}  # a body that hides almost nothing
@@ -46,7 +46,7 @@ def study(folder, model="ring.yaml", body=POST, mount=(0, 0, HEIGHT_M), **sectio
         "region": {"distances_m": [10], "bearings": 1, "headings_deg": [0]},
         **sections,
     }
-    return Study.from_file(VehicleFile.from_data(data, folder=folder))
+    return MountStudy.from_file(VehicleFile.from_data(data, folder=folder))
 
 
 def evaluate(a_study):

@@ -15,6 +15,8 @@ from lidarpool.cli.commands import cli
 from lidarpool.mounting.search import listed_candidates
 from lidarpool.scenario.mount_sections import VehicleFile
 from lidarpool.scenario.scenario import Scenario
+from lidarscenes.procedural.road_users import ROAD_USERS
+from lidarsim.schema.vocabulary import BODIES, TARGETS
 
 RING = {
     "name": "Rings",
@@ -167,6 +169,16 @@ def test_the_ranking_is_written(folder):
     assert told == figures
 
 
+def test_built_in_names_are_listed_once():
+    assert [*ROAD_USERS] == [*TARGETS]
+    for name, make in ROAD_USERS.items():
+        mesh = make()
+        low, high = mesh.bounds
+        assert mesh.name == name and low[2] == pytest.approx(0, abs=1e-6) and high[2] < 1.8
+        assert np.abs(low[:2] + high[:2]).max() < 0.5  # centered, as footprints are
+        assert load({"body": [*BODIES], "sensors": sensors([0, 0, 3]), "targets": [name]})
+
+
 def test_workers_are_not_combined_with_a_cluster(folder):
     outcome = mount("car.yaml", "--workers", 2, "--scheduler", "tcp://127.0.0.1:9")
     assert outcome.exit_code == 2 and "cannot be combined" in outcome.output
@@ -175,7 +187,7 @@ def test_workers_are_not_combined_with_a_cluster(folder):
 @pytest.mark.extended
 def test_ranges_are_searched_with_the_stated_seed(folder):
     """Of heights from 0.6 to 2.2 m and pitches of up to 20°, a lone sensor sees most from above."""
-    from lidarpool.mounting.study import Study
+    from lidarpool.mounting.study import MountStudy
 
     data = {
         **SMALL,
@@ -188,7 +200,7 @@ def test_ranges_are_searched_with_the_stated_seed(folder):
         },
         "search": {"samples": 4, "refinements": 2, "seed": 3},
     }
-    first, again = (Study.from_file(load(data)).run(workers=1) for _ in range(2))
+    first, again = (MountStudy.from_file(load(data)).run(workers=1) for _ in range(2))
     assert [one.candidate for one in first.ranked] == [one.candidate for one in again.ranked]
     assert first.best.candidate.name == "mount 1" and first.mounts == len(first.ranked) >= 8
     poses = [one.candidate.mounts["top"] for one in first.ranked]
@@ -199,7 +211,7 @@ def test_ranges_are_searched_with_the_stated_seed(folder):
     scores = [one.score for one in first.ranked]
     assert scores == sorted(scores, reverse=True)
     data["search"]["seed"] = 4
-    other = Study.from_file(load(data)).run(workers=1)
+    other = MountStudy.from_file(load(data)).run(workers=1)
     assert {*poses} != {one.candidate.mounts["top"] for one in other.ranked}
 
 
@@ -218,16 +230,16 @@ actors:
 
 def test_targets_follow_the_traffic_of_a_scenario(folder):
     """A parked car at (15, 6) is 15 m ahead at the start, and 5 m ahead after 1 s."""
-    from lidarpool.mounting.study import Study
+    from lidarpool.mounting.study import MountStudy
 
     Path("drive.yaml").write_text(DRIVE)
     data = {"body": "saloon", "sensors": sensors([0, 0, 1.8])}
     data["traffic"] = {"scenario": "drive.yaml", "classes": {"car": "Car*", "other": "*"}}
-    placements = Study.from_file(load(data)).placements
+    placements = MountStudy.from_file(load(data)).placements
     np.testing.assert_allclose(placements.positions, [[15, 6, 0], [5, 6, 0]], atol=1e-6)
     np.testing.assert_allclose(np.abs(placements.headings_deg), 180, atol=1e-6)
     assert [target.name for target in placements.targets] == ["car", "other"]
     assert placements.target.tolist() == [0, 0]
     data["traffic"]["classes"] = {"bus": "Bus*"}
     with pytest.raises(LidarError, match=r"No actor of drive\.yaml"):
-        Study.from_file(load(data))
+        MountStudy.from_file(load(data))

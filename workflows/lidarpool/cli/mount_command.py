@@ -19,7 +19,7 @@ from .shared_options import overwrite
 
 if TYPE_CHECKING:
     from ..connection.tls_files import TlsFiles
-    from ..mounting.study import StudyResult
+    from ..mounting.study import MountRanking
 
 _SHOWN = 10  # candidates in the printed table
 
@@ -73,7 +73,7 @@ def mount(
         )
     print_first_step("reading the vehicle", quiet=as_json)
     from ..clouds.folder import result_folder
-    from ..mounting.study import Study, figures_of
+    from ..mounting.study import MountStudy, figures_of
     from ..mounting.study_files import FIGURES_FILE, PAGE_FILE, SCENARIO_FILE, write_study
     from ..processes.fork_server import keep_freed_memory
     from ..run.cluster.connection import connect_client
@@ -82,7 +82,7 @@ def mount(
 
     keep_freed_memory()
     terminal = Terminal(quiet=as_json)
-    study = Study.from_file(VehicleFile.load(vehicle))
+    study = MountStudy.from_file(VehicleFile.load(vehicle))
     folder = Path(f"{vehicle.stem}-mounts") if out is None else out
     with result_folder(folder):
         if (folder / FIGURES_FILE).exists() and not overwrite:
@@ -102,7 +102,7 @@ def mount(
         click.echo(f"next: lidarpool run {shlex.quote(str(folder / SCENARIO_FILE))}")
 
 
-def _lines(result: StudyResult) -> Iterator[str]:
+def _lines(result: MountRanking) -> Iterator[str]:
     """Format a ranking as lines of text."""
     study = result.study
     height = study.rules.ranked_height_m
@@ -130,7 +130,7 @@ def _lines(result: StudyResult) -> Iterator[str]:
     yield from (f"note: {note}" for note in result.notes)
 
 
-def _class_lines(result: StudyResult) -> Iterator[str]:
+def _class_lines(result: MountRanking) -> Iterator[str]:
     """Format the detection of each class by the best candidate as lines of text."""
     best = result.best
     targets = [t for t in result.study.placements.targets if best.detection[t.name] >= 0]

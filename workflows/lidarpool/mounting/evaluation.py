@@ -117,7 +117,7 @@ class MountEvaluator:
         Examples
         --------
         >>> from lidarpool import Pose, load_sensor
-        >>> from lidarpool.mounting.study import Study
+        >>> from lidarpool.mounting.study import MountStudy
         >>> from lidarpool.scenario.mount_sections import VehicleFile
         >>> vehicle = VehicleFile.from_data({
         ...     "body": "saloon",
@@ -125,7 +125,7 @@ class MountEvaluator:
         ...     "targets": ["car"],
         ...     "region": {"distances_m": [10], "bearings": 1, "headings_deg": [0]},
         ... })
-        >>> study = Study.from_file(vehicle)
+        >>> study = MountStudy.from_file(vehicle)
         >>> result = study.evaluator(vehicle.mounted_sensor("top", Pose((0, 0, 1.8))))
         >>> bool(50 < result.points[0] < 200)
         True

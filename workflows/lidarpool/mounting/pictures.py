@@ -12,19 +12,19 @@ from matplotlib.colors import BoundaryNorm, ListedColormap, LogNorm, to_rgb
 from matplotlib.patheffects import withStroke
 from matplotlib.projections.polar import PolarAxes
 
-from lidarsim.numerics.arrays import Floats, Ints
+from lidarsim.numerics.arrays import Bools, Floats, Ints
 from lidarsim.words import shorten_name
 from lidarview.render import theme
 from lidarview.render.picture_page import FONT, Page
 
 from .evaluation import SHARE_DEG
 from .ranking import CandidateResult, points_by_position
-from .study import Study, StudyResult
+from .study import MountRanking, MountStudy
 
 MAX_PANELS = 6  # candidates whose blind areas are compared, and classes of targets
 _SIZE = (1600, 1200)
 # Layout of pages with several charts, pixels.
-_LEFT = 90
+_LEFT = 80
 _TOP = 190
 _GAP = 110  # between rows of charts
 _PANELS_WIDTH = 1340
@@ -40,17 +40,19 @@ _OTHER = "#5b8fd0"
 class _PanelGrid(NamedTuple):
     """Charts of equal size on a page, in pixels."""
 
-    count: int
+    charts: int
     width: int
     height: int
 
     @property
     def columns(self) -> int:
-        return min(self.count, 2 if self.count == 4 else 3)
+        """Number of charts side by side."""
+        return min(self.charts, 2 if self.charts == 4 else 3)
 
     @property
     def page(self) -> Page:
-        rows = -(-self.count // self.columns)
+        """An empty page of the required height."""
+        rows = -(-self.charts // self.columns)
         return Page((_SIZE[0], _TOP + rows * (self.height + _GAP)))
 
     def frames(self, page: Page) -> list[tuple[float, float, float, float]]:
@@ -58,7 +60,7 @@ class _PanelGrid(NamedTuple):
         width, height = page.size
         pitch = (_PANELS_WIDTH - _LEFT) / self.columns
         frames = []
-        for number in range(self.count):
+        for number in range(self.charts):
             row, column = divmod(number, self.columns)
             x = _LEFT + column * pitch
             y = height - _TOP - row * (self.height + _GAP) - self.height
@@ -66,7 +68,7 @@ class _PanelGrid(NamedTuple):
         return frames
 
 
-def draw_blind_area(result: StudyResult) -> Page:
+def draw_blind_area(result: MountRanking) -> Page:
     """Draw the blind area of the best candidate, with the vehicle and its sensors."""
     page = Page(_SIZE)
     axes = page.chart((0.07, 0.08, 0.74, 0.76))
@@ -87,7 +89,7 @@ def draw_blind_area(result: StudyResult) -> Page:
     return page
 
 
-def draw_comparison(result: StudyResult) -> Page:
+def draw_comparison(result: MountRanking) -> Page:
     """Draw the blind areas of the best candidates side by side."""
     shown = result.ranked[:MAX_PANELS]
     grid = _PanelGrid(len(shown), 360, 420)
@@ -100,12 +102,16 @@ def draw_comparison(result: StudyResult) -> Page:
         _mark_sensors(page, axes, candidate, named=False)
         name = shorten_name(candidate.candidate.name, 30)
         page.heading(axes, f"{name}: {candidate.blind_m2[height]:,.1f} m² at {height:g} m")
+        axes.set_ylabel("")
     page.legend([*zip(_band_names(result.study), colors, strict=True)], "sensor")
-    page.title("Blind areas of the candidates", "in the order of their ranks; forward is up")
+    page.title(
+        "Blind areas of the candidates",
+        "in the order of their ranks; vertical: x, m; forward is up",
+    )
     return page
 
 
-def draw_redundancy(result: StudyResult) -> Page:
+def draw_redundancy(result: MountRanking) -> Page:
     """Draw how many sensors of the best candidate see an object in each cell."""
     study = result.study
     height = study.rules.ranked_height_m
@@ -125,7 +131,7 @@ def draw_redundancy(result: StudyResult) -> Page:
     return page
 
 
-def draw_points(result: StudyResult) -> Page:
+def draw_points(result: MountRanking) -> Page:
     """Draw the points on each class of targets by distance and bearing, for the best candidate."""
     placements = result.study.placements
     rows = [k for k in range(len(placements.targets)) if (placements.target == k).any()]
@@ -142,7 +148,7 @@ def draw_points(result: StudyResult) -> Page:
         rate = result.best.detection[needed.name]
         page.heading(
             axes,
-            f"{needed.name}: {rate:.0%} with at least {needed.points} points",
+            f"{needed.name}: {rate:.0%} with {needed.points} points or more",
             pad=14 * page.unit,
         )
     page.color_bar(colors, norm, "points on the target")
@@ -153,7 +159,7 @@ def draw_points(result: StudyResult) -> Page:
     return page
 
 
-def draw_detection(result: StudyResult) -> Page:
+def draw_detection(result: MountRanking) -> Page:
     """Draw the detection probability of the best candidate by distance, and the trade-off."""
     page = Page((1600, 760))
     axes = page.chart(
@@ -182,7 +188,7 @@ def draw_detection(result: StudyResult) -> Page:
     return page
 
 
-def _draw_tradeoff(page: Page, result: StudyResult) -> None:
+def _draw_tradeoff(page: Page, result: MountRanking) -> None:
     """Draw all candidates by detection rate and blind area."""
     height = result.study.rules.ranked_height_m
     axes = page.chart(
@@ -213,7 +219,7 @@ def _draw_tradeoff(page: Page, result: StudyResult) -> None:
     page.heading(axes, "Candidates; the trade-off curve is red")
 
 
-def _by_distance(distances: Floats, values: Floats) -> tuple[Floats, Floats]:
+def _by_distance(distances: Floats, values: Bools) -> tuple[Floats, Floats]:
     """Return the mean of values at each distance, or in ten bins if there are many distances."""
     unique = np.unique(distances.round(3))
     if len(unique) > 12:
@@ -227,7 +233,7 @@ def _by_distance(distances: Floats, values: Floats) -> tuple[Floats, Floats]:
     return unique[counts > 0], totals[counts > 0] / counts[counts > 0]
 
 
-def draw_blocked(result: StudyResult) -> Page:
+def draw_blocked(result: MountRanking) -> Page:
     """Draw the beams that the vehicle blocks, for each sensor of the best candidate."""
     shown = [*result.best.sensors.items()][:MAX_PANELS]
     page = Page((1600, 130 + 330 * len(shown)))
@@ -255,25 +261,27 @@ def draw_blocked(result: StudyResult) -> Page:
     return page
 
 
-def _bands(study: Study, candidate: CandidateResult) -> Ints:
+def _bands(study: MountStudy, candidate: CandidateResult) -> Ints:
     """Return the index of the lowest visible height of the map in each cell."""
     heights = np.array(study.rules.heights_m, np.float32)
     bands: Ints = (candidate.lowest_m[..., None] > heights).sum(axis=-1)
     return bands
 
 
-def _band_names(study: Study) -> list[str]:
+def _band_names(study: MountStudy) -> list[str]:
     """Return the legend entries of the bands."""
     heights = study.rules.heights_m
     words = ["ground" if height == 0 else f"{height:g} m" for height in heights]
     return [f"{word} visible" for word in words] + [f"{heights[-1]:g} m blind"]
 
 
-def _band_colors(study: Study) -> tuple[str, ...]:
+def _band_colors(study: MountStudy) -> tuple[str, ...]:
     return _BANDS[: len(study.rules.heights_m) + 1]
 
 
-def _draw_map(page: Page, axes: Axes, study: Study, kinds: Ints, colors: Sequence[str]) -> None:
+def _draw_map(
+    page: Page, axes: Axes, study: MountStudy, kinds: Ints, colors: Sequence[str]
+) -> None:
     """Draw the kind of each cell in a color, with the vehicle on top. Forward is up."""
     grid = study.evaluator.grid
     extent_x = (grid.x, grid.x + grid.columns * grid.cell_m)
@@ -311,7 +319,7 @@ def _draw_polar(
     page: Page,
     axes: PolarAxes,
     candidate: CandidateResult,
-    result: StudyResult,
+    result: MountRanking,
     target: int,
     norm: LogNorm,
 ) -> None:
@@ -342,13 +350,12 @@ def _draw_polar(
     axes.set_xticks([])
     axes.spines[:].set(color=theme.LINE, linewidth=0.6 * page.unit)
     axes.tick_params(labelsize=5.8 * page.unit, labelcolor=theme.INK, labelfontfamily=FONT)
-    halo = [withStroke(linewidth=1.6 * page.unit, foreground=theme.PAGE)]
     for label in axes.get_yticklabels():
-        label.set_path_effects(halo)
+        label.set_path_effects([withStroke(linewidth=1.6 * page.unit, foreground=theme.PAGE)])
     axes.set_rlabel_position(22.5)
 
 
-def draw_all(result: StudyResult) -> dict[str, Page]:
+def draw_all(result: MountRanking) -> dict[str, Page]:
     """Return all pictures of a ranking by name."""
     pictures = {"blind": draw_blind_area(result)}
     if len(result.ranked) > 1:

@@ -18,7 +18,7 @@ _REACHED_M = 1.5e-3  # beams that reach the ground have this height at most
 
 
 @dataclass(frozen=True)
-class Candidate:
+class MountCandidate:
     """A mount for each sensor of the vehicle.
 
     Attributes
@@ -96,7 +96,7 @@ class CandidateResult:
         Detection rate, minus the weighted blind share of the map.
     """
 
-    candidate: Candidate
+    candidate: MountCandidate
     sensors: Mapping[str, MountResult]
     points: Ints
     lowest_m: Floats32
@@ -147,7 +147,7 @@ class _Areas(NamedTuple):
 
 
 def evaluate_candidate(
-    candidate: Candidate,
+    candidate: MountCandidate,
     sensors: Mapping[str, MountResult],
     placements: Placements,
     rules: RankingRules,
@@ -215,7 +215,8 @@ def pareto_front(results: Sequence[CandidateResult], height_m: float) -> Bools:
     blind = np.array([result.blind_m2[height_m] for result in results])
     no_worse: Bools = (rates[None] >= rates[:, None]) & (blind[None] <= blind[:, None])
     better: Bools = (rates[None] > rates[:, None]) | (blind[None] < blind[:, None])
-    return ~(no_worse & better).any(axis=1)
+    dominated: Bools = np.any(no_worse & better, axis=1)
+    return np.logical_not(dominated)
 
 
 def points_by_position(

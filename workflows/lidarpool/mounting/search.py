@@ -14,21 +14,22 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lidarsim.motion.trajectory import Pose
+from lidarsim.numerics.arrays import Floats
 from lidarsim.numerics.random_numbers import named_seed
 
 from ..scenario.mount_sections import MountRanges, VehicleFile
 from .evaluation import MountResult
 from .placements import Placements
-from .ranking import Candidate, CandidateResult, RankingRules, evaluate_candidate
+from .ranking import CandidateResult, MountCandidate, RankingRules, evaluate_candidate
 
 EvaluateMounts = Callable[[Sequence[tuple[str, Pose]]], Iterable[MountResult]]
 
 _DECIMALS = (3, 3, 3, 1, 1, 1)  # digits of x, y, z, yaw, pitch and roll
 _FIRST_STEP = 0.25  # first step of a refinement, as a share of a range
-_MAX_MOVES = 8  # moves of a sensor in a refinement
+_MAX_MOVES = 4  # moves of a sensor in a refinement
 
 
-def listed_candidates(vehicle: VehicleFile) -> Iterator[Candidate]:
+def listed_candidates(vehicle: VehicleFile) -> Iterator[MountCandidate]:
     """Yield the candidates of a vehicle file without ranges."""
     mounts = {name: sensor.mounts for name, sensor in vehicle.sensors.items()}
     if vehicle.combine == "names":
@@ -38,13 +39,13 @@ def listed_candidates(vehicle: VehicleFile) -> Iterator[Candidate]:
                 name: poses[key] if len(poses) > 1 else next(iter(poses.values()))
                 for name, poses in mounts.items()
             }
-            yield Candidate(key, chosen)
+            yield MountCandidate(key, chosen)
         return
     choices = [[(name, key) for key in poses] for name, poses in mounts.items()]
     for combination in itertools.product(*choices):
         words = [f"{name} {key}" for name, key in combination if len(mounts[name]) > 1]
         chosen = {name: mounts[name][key] for name, key in combination}
-        yield Candidate(", ".join(words) or "mount", chosen)
+        yield MountCandidate(", ".join(words) or "mount", chosen)
 
 
 @dataclass(eq=False)
@@ -81,7 +82,7 @@ class CandidateSearch:
         count = len(self.vehicle.sensors)
         return [r for r in self._found.values() if len(r.candidate.mounts) == count]
 
-    def _score(self, candidates: Sequence[Candidate]) -> list[CandidateResult]:
+    def _score(self, candidates: Sequence[MountCandidate]) -> list[CandidateResult]:
         """Return the results of candidates, evaluating only mounts that are new."""
         wanted = dict.fromkeys(mount for c in candidates for mount in c.mounts.items())
         missing = [mount for mount in wanted if mount not in self._mounts]
@@ -111,7 +112,7 @@ class CandidateSearch:
         self, chosen: Mapping[str, Pose], name: str, poses: Sequence[Pose]
     ) -> CandidateResult:
         """Return the best candidate with one of several mounts of a sensor."""
-        candidates = [Candidate("", {**chosen, name: pose}) for pose in poses]
+        candidates = [MountCandidate("", {**chosen, name: pose}) for pose in poses]
         return min(self._score(candidates), key=lambda result: result.order)
 
     def _random_mounts(self, name: str, ranges: MountRanges) -> list[Pose]:
@@ -136,7 +137,7 @@ class CandidateSearch:
         self, chosen: dict[str, Pose], name: str, ranges: MountRanges, share: float
     ) -> dict[str, Pose]:
         for _ in range(_MAX_MOVES):
-            current = self._score([Candidate("", chosen)])[0]
+            current = self._score([MountCandidate("", chosen)])[0]
             neighbors = _neighbors(chosen[name], ranges, share)
             if not neighbors:
                 break
@@ -147,7 +148,7 @@ class CandidateSearch:
         return chosen
 
 
-def _pose(values: np.ndarray) -> Pose:  # type: ignore[type-arg]
+def _pose(values: Floats) -> Pose:
     """Return a pose with x, y, z, yaw, pitch and roll, rounded to millimeters and 0.1°."""
     rounded = [round(float(v), digits) + 0.0 for v, digits in zip(values, _DECIMALS, strict=True)]
     return Pose((rounded[0], rounded[1], rounded[2]), *rounded[3:])

@@ -12,14 +12,14 @@ from lidarscenes.procedural.cars import MODELS, car
 from lidarscenes.procedural.road_users import ROAD_USERS
 from lidarsim.errors import LidarError, prefix_errors
 from lidarsim.media.weather import Weather
-from lidarsim.motion.trajectory import Pose
+from lidarsim.motion.trajectory import CENTER, Pose
 from lidarsim.numerics.arrays import Bools
 from lidarsim.numerics.vectors import rotate
 from lidarsim.scene.scene_mesh import SceneMesh, stack_meshes
 from lidarsim.schema.declared import declared_values
 from lidarsim.schema.vocabulary import BODIES
 from lidarsim.sensor import Noise, Returns
-from lidarsim.words import plural
+from lidarsim.words import join_names, plural
 from raybeam import RayCaster
 
 from ..run.cluster.worker_map import parallel_map
@@ -29,7 +29,7 @@ from ..scenario.static_scene import FileFindings, ShapeLoader
 from .blind_loops import CellGrid
 from .evaluation import VEHICLE, MountEvaluator, MountResult
 from .placements import Placements, Target, grid_placements
-from .ranking import Candidate, CandidateResult, RankingRules, pareto_front, rank_candidates
+from .ranking import CandidateResult, MountCandidate, RankingRules, pareto_front, rank_candidates
 from .search import CandidateSearch
 from .traffic_placements import traffic_placements
 
@@ -42,7 +42,7 @@ _CARS = dict(zip(BODIES, MODELS, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
-class StudyResult:
+class MountRanking:
     """Ranked candidates of a vehicle file.
 
     Attributes
@@ -59,7 +59,7 @@ class StudyResult:
         Notes for the user.
     """
 
-    study: Study
+    study: MountStudy
     ranked: Sequence[CandidateResult]
     on_front: Bools
     mounts: int
@@ -72,7 +72,7 @@ class StudyResult:
 
 
 @dataclass(frozen=True, eq=False)
-class Study:
+class MountStudy:
     """Vehicle, targets and map of a vehicle file, ready to be evaluated.
 
     Attributes
@@ -93,7 +93,7 @@ class Study:
     notes: tuple[str, ...] = field(default=())
 
     @classmethod
-    def from_file(cls, vehicle: VehicleFile) -> Study:
+    def from_file(cls, vehicle: VehicleFile) -> MountStudy:
         """Read the meshes of a vehicle file, and place the targets.
 
         Raises
@@ -147,7 +147,7 @@ class Study:
         client: Client | None = None,
         workers: int | None = None,
         progress: Callable[[int], None] = lambda done: None,
-    ) -> StudyResult:
+    ) -> MountRanking:
         """Evaluate all candidates, and rank them.
 
         The result does not depend on the number of workers.
@@ -187,7 +187,7 @@ class Study:
         if vehicle.is_search:
             found = [_named(result, f"mount {n}") for n, result in enumerate(found, 1)]
         front = pareto_front(found, self.rules.ranked_height_m)
-        return StudyResult(self, found, front, done, (*self.notes, *_notes(found[0], self)))
+        return MountRanking(self, found, front, done, (*self.notes, *_notes(found[0], self)))
 
     @property
     def _batch(self) -> int:
@@ -198,10 +198,10 @@ class Study:
 
 
 def _named(result: CandidateResult, name: str) -> CandidateResult:
-    return replace(result, candidate=Candidate(name, result.candidate.mounts))
+    return replace(result, candidate=MountCandidate(name, result.candidate.mounts))
 
 
-def _notes(best: CandidateResult, study: Study) -> list[str]:
+def _notes(best: CandidateResult, study: MountStudy) -> list[str]:
     """Return notes about the best candidate."""
     notes = []
     for name, sensor in best.sensors.items():
@@ -216,11 +216,23 @@ def _notes(best: CandidateResult, study: Study) -> list[str]:
                 f"{'meets' if sensor.blocked_near == 1 else 'meet'} the vehicle within the minimum "
                 "range of the sensor. These beams count as blocked"
             )
+    without = [name for name in best.sensors if not _has_range_limit(study.vehicle, name)]
+    if without:
+        notes.append(
+            f"reflectance and weather do not limit the range of {join_names(without)}, because no "
+            "detection range is set. Set `performance: datasheet`, or `noise.detection_range_m`"
+        )
     missing = [t.name for k, t in enumerate(study.placements.targets)
                if not (study.placements.target == k).any()]  # fmt: skip
     if missing:
         notes.append(f"all positions of {', '.join(missing)} overlap the vehicle")
     return notes
+
+
+def _has_range_limit(vehicle: VehicleFile, name: str) -> bool:
+    """Return whether a sensor has a detection range, which depends on the reflectance."""
+    noise = vehicle.mounted_sensor(name, CENTER).noise or vehicle.noise
+    return noise.detection_range_m is not None
 
 
 def _rounded(mesh: SceneMesh, name: str) -> SceneMesh:
@@ -296,7 +308,7 @@ def _outside(body: SceneMesh, grid: CellGrid) -> Bools:
     return ~hits.hit.reshape(grid.rows, grid.columns)
 
 
-def figures_of(result: StudyResult) -> dict[str, Any]:
+def figures_of(result: MountRanking) -> dict[str, Any]:
     """Return a ranking as a dictionary for JSON."""
     study = result.study
     vehicle = study.vehicle
@@ -304,8 +316,7 @@ def figures_of(result: StudyResult) -> dict[str, Any]:
     return {
         "vehicle": vehicle.source,
         "sensors": {
-            name: vehicle.mounted_sensor(name, Pose((0, 0, 0))).sensor.model
-            for name in vehicle.sensors
+            name: vehicle.mounted_sensor(name, CENTER).sensor.model for name in vehicle.sensors
         },
         "targets": {
             target.name: {

@@ -24,7 +24,7 @@ from ..report.page.rendering import render_template
 from ..scenario.mount_sections import VehicleFile
 from .evaluation import CONTACT_M
 from .pictures import draw_all
-from .study import StudyResult, figures_of, pose_entry
+from .study import MountRanking, figures_of, pose_entry
 
 SCENARIO_FILE = "best.yaml"
 PAGE_FILE = "report.html"
@@ -36,7 +36,7 @@ _SHOWN_DISTANCE_M = 10.0  # distance of the targets in the scenario
 _SHOWN_TARGETS = 12
 
 
-def write_study(result: StudyResult, folder: Path) -> list[Path]:
+def write_study(result: MountRanking, folder: Path) -> list[Path]:
     """Write the report, the ranking and a scenario to a folder that the caller has locked.
 
     Raises
@@ -71,11 +71,11 @@ def write_study(result: StudyResult, folder: Path) -> list[Path]:
         return [(staged / name).replace(folder / name) for name in (*texts, *meshes)]
 
 
-def _title(result: StudyResult) -> str:
+def _title(result: MountRanking) -> str:
     return Path(result.study.vehicle.source).stem
 
 
-def _scenario(result: StudyResult, folder: Path, target_files: Sequence[str]) -> str:
+def _scenario(result: MountRanking, folder: Path, target_files: Sequence[str]) -> str:
     """Return the text of a scenario with the best candidate and a target of each shape."""
     vehicle = result.study.vehicle
     near = {name for name, sensor in result.best.sensors.items() if sensor.blocked_near}
@@ -104,7 +104,7 @@ def _scenario(result: StudyResult, folder: Path, target_files: Sequence[str]) ->
     return head + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
 
 
-def _target_actors(result: StudyResult, files: Sequence[str]) -> list[dict[str, Any]]:
+def _target_actors(result: MountRanking, files: Sequence[str]) -> list[dict[str, Any]]:
     """Return actors that stand in a circle around the vehicle."""
     actors = []
     for number, (file, mesh) in enumerate(zip(files, result.study.placements.meshes, strict=False)):
@@ -115,7 +115,7 @@ def _target_actors(result: StudyResult, files: Sequence[str]) -> list[dict[str, 
     return actors
 
 
-def _target_materials(result: StudyResult, count: int) -> list[dict[str, Any]]:
+def _target_materials(result: MountRanking, count: int) -> list[dict[str, Any]]:
     """Return materials with the reflectances of the first meshes."""
     placements = result.study.placements
     return [
@@ -139,7 +139,7 @@ def _conditions(vehicle: VehicleFile) -> dict[str, Any]:
 
 
 def _sensor_entry(
-    result: StudyResult, name: str, pose: Pose, folder: Path, *, is_near: bool
+    result: MountRanking, name: str, pose: Pose, folder: Path, *, is_near: bool
 ) -> Mapping[str, Any]:
     """Return the entry of a sensor in a scenario, which scans one revolution."""
     vehicle = result.study.vehicle

@@ -94,16 +94,13 @@ BodyEntry = Annotated[
 ]
 
 
-def _as_range(kind: Any) -> Any:
-    """Return the type of a range of numbers, for which a single number is a short form."""
-    is_number = lambda value: type(value) in (int, float)  # noqa: E731 - used once
-    return Annotated[
-        MinMax[kind], accept_short_form(is_number, lambda v: [v, v], kind | MinMax[kind])
-    ]
+def _accept_number(allowed: Any) -> Any:
+    """Accept a number as a short form of a range that contains only this number."""
+    return accept_short_form(lambda v: type(v) in (int, float), lambda v: [v, v], allowed)
 
 
-CoordinateRange = _as_range(Coordinate)
-AngleRange = _as_range(AngleDeg)
+CoordinateRange = Annotated[MinMax[Coordinate], _accept_number(Coordinate | MinMax[Coordinate])]
+AngleRange = Annotated[MinMax[AngleDeg], _accept_number(AngleDeg | MinMax[AngleDeg])]
 
 
 class MountRanges(Section):
