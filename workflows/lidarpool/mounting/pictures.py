@@ -148,7 +148,7 @@ def draw_points(result: MountRanking) -> Page:
         rate = result.best.detection[needed.name]
         page.heading(
             axes,
-            f"{needed.name}: {rate:.0%} with {needed.points} points or more",
+            f"{needed.name}: {rate:.0%} (≥ {needed.points} points)",
             pad=14 * page.unit,
         )
     page.color_bar(colors, norm, "points on the target")

@@ -212,9 +212,8 @@ def _notes(best: CandidateResult, study: MountStudy) -> list[str]:
             )
         elif sensor.blocked_near:
             notes.append(
-                f"{plural(sensor.blocked_near, 'beam')} of {name} in the best candidate "
-                f"{'meets' if sensor.blocked_near == 1 else 'meet'} the vehicle within the minimum "
-                "range of the sensor. These beams count as blocked"
+                f"the vehicle blocks {plural(sensor.blocked_near, 'beam')} of {name} in the best "
+                "candidate within the minimum range of the sensor"
             )
     without = [name for name in best.sensors if not _has_range_limit(study.vehicle, name)]
     if without:
