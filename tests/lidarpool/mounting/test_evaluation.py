@@ -83,11 +83,17 @@ def test_a_ring_meets_level_ground_at_its_height_over_the_tangent(folder):
     below_map_height = (distance > 0.31 / slope + 0.1) & (distance < radius / 2)
     assert (lowest[below_map_height] < np.inf).all()
     assert (lowest[distance < 0.3 / slope - 0.1] == np.inf).all()
+    # A cell is visible if any part of it is in the ring between both distances.
+    sides = np.abs(np.stack(cells(one)))
+    nearest = np.linalg.norm(np.maximum(sides - 0.05, 0), axis=0)
+    farthest = np.linalg.norm(sides + 0.05, axis=0)
     result = one.run(workers=1).best
     for height in (0.3, 1.0):
         inner = (HEIGHT_M - height) / slope
-        seen = result.map_m2 - result.blind_m2[height]
-        assert seen == pytest.approx(math.pi * (radius**2 - inner**2), rel=0.02)
+        visible = (nearest <= radius) & (farthest >= inner)
+        seen_m2 = result.map_m2 - result.blind_m2[height]
+        assert 0.98 < seen_m2 / (0.01 * visible.sum()) <= 1  # few corners are between two beams
+        assert seen_m2 == pytest.approx(math.pi * (radius**2 - inner**2), rel=0.07)
 
 
 def test_the_edge_of_a_roof_hides_the_ground_behind_it(folder):

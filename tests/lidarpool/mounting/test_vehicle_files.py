@@ -228,6 +228,21 @@ actors:
 """
 
 
+@pytest.mark.extended
+def test_traffic_is_in_the_report(folder):
+    Path("drive.yaml").write_text(DRIVE)
+    Path("car.yaml").write_text(
+        "body: saloon\nsensors: {top: {model: rings.yaml, mounts: [[0, 0, 1.8], [2, 0, 1.2]]}}\n"
+        "traffic: drive.yaml\nmap: {cell_m: 1}\n"
+    )
+    outcome = mount("car.yaml", "--workers", "1")
+    assert outcome.exit_code == 0, outcome.output
+    assert "2 candidates, 2 simulated mounts, 2 targets" in outcome.stdout
+    assert "do not limit the range of top" in outcome.stdout
+    best = Scenario.load("car-mounts/best.yaml")
+    assert [actor.name for actor in best.actors] == ["Car.1"]
+
+
 def test_targets_follow_the_traffic_of_a_scenario(folder):
     """A parked car at (15, 6) is 15 m ahead at the start, and 5 m ahead after 1 s."""
     from lidarpool.mounting.study import MountStudy
